@@ -1,0 +1,53 @@
+"""Cameras, views and scenes: what every loader produces and every consumer reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in the OpenCV frame (x right, y down, z forward; see docs/conventions.md)."""
+
+    width: int
+    height: int
+    K: NDArray[np.float64]  # [3, 3], pixels, skew 0
+    viewmat: NDArray[np.float64]  # [4, 4], world to camera
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Camera centre in world coordinates, [3]."""
+        return -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
+
+
+@dataclass(frozen=True)
+class View:
+    """A photo with its camera. The photo stays uint8 in memory."""
+
+    name: str
+    camera: Camera
+    image: NDArray[np.uint8]  # [H, W, 3] sRGB
+    mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts; None: everywhere
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Training views, held-out views and the sparse points that initialise the Gaussians."""
+
+    name: str
+    train: list[View]
+    test: list[View]
+    points: NDArray[np.float32]  # [P, 3], world
+    point_colors: NDArray[np.uint8]  # [P, 3]
+    source: str  # the format it was read from: "colmap", "llff", "transforms", "embedded"
+    notes: list[str] = field(default_factory=list)  # what a reader of the report should know
+
+    @property
+    def extent(self) -> float:
+        """Radius of the camera positions: 1.1 max |c - mean(c)|, or 1 for a single camera."""
+        centers = np.stack([v.camera.center for v in self.train])
+        radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+        return 1.1 * radius if radius > 0 else 1.0

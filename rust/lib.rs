@@ -1,0 +1,1 @@
+//! A CPU rasterizer for 3D Gaussian Splatting. Modules in pipeline order.
