@@ -1,1 +1,23 @@
-//! A CPU rasterizer for 3D Gaussian Splatting. Modules in pipeline order.
+//! A fast, deterministic CPU rasterizer for 3D Gaussian Splatting, with exact gradients.
+//!
+//! Modules in pipeline order: [`scene`] and [`camera`] describe the input, [`project`] turns Gaussians into
+//! splats ([`sh`] gives their colours), [`tiles`] orders them and bins them, [`composite`] blends them.
+//! Each stage has its forward function and its vector-Jacobian product side by side, works on borrowed
+//! slices in f32 or f64, and gives the same bits for any number of threads.
+
+pub mod camera;
+pub mod composite;
+pub mod constants;
+pub mod error;
+mod geometry;
+mod kernel;
+pub mod project;
+#[cfg(feature = "python")]
+mod python;
+pub mod real;
+pub mod scene;
+pub mod sh;
+pub mod threads;
+pub mod tiles;
+
+pub use error::Error;

@@ -1,0 +1,476 @@
+//! Front-to-back compositing of binned splats, forward and VJP, tile by tile in parallel.
+
+use crate::{
+    camera::Camera,
+    constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
+    error::{Error, check_len},
+    kernel::{self, ABSOLUTE, Adjoint, Grid, Layers, Local, MOMENTS, Pixels, UNIT},
+    project::{Projection, Splat},
+    real::Real,
+    tiles::Tiles,
+};
+use fearless_simd::{Level, Simd, dispatch};
+use rayon::prelude::*;
+
+/// Everything that both passes read.
+#[derive(Debug, Clone, Copy)]
+pub struct CompositeInput<'a, T> {
+    /// Projected Gaussians.
+    pub projection: &'a Projection,
+    /// Their tile lists.
+    pub tiles: &'a Tiles,
+    /// Image size.
+    pub camera: &'a Camera,
+    /// Colours, [N, channels].
+    pub colors: &'a [T],
+    /// Number of channels, at least 1.
+    pub channels: usize,
+    /// Colour behind everything, [channels].
+    pub background: Option<&'a [T]>,
+}
+
+impl<T: Real> CompositeInput<'_, T> {
+    /// Check the lengths of the arrays.
+    ///
+    /// # Errors
+    /// Names `colors` or `backgrounds`.
+    pub fn check(&self) -> Result<(), Error> {
+        if self.channels == 0 {
+            return Err(Error::new("colors", "must have at least one channel"));
+        }
+        check_len("colors", self.colors, self.projection.splats.len() * self.channels)?;
+        self.background.map_or(Ok(()), |b| check_len("backgrounds", b, self.channels))
+    }
+
+    fn pixels(&self) -> usize {
+        self.camera.width * self.camera.height
+    }
+
+    fn color(&self, i: usize) -> &[T] {
+        &self.colors[i * self.channels..(i + 1) * self.channels]
+    }
+
+    fn splat(&self, i: usize) -> &Splat {
+        &self.projection.splats[i]
+    }
+
+    /// The image's pixels in tile `tile`: (index in block order, index in the image).
+    fn tile_pixels(&self, tile: usize) -> impl Iterator<Item = (usize, usize)> + use<'_, T> {
+        let (top, left) = (tile / self.tiles.columns * TILE, tile % self.tiles.columns * TILE);
+        let (width, height) = (self.camera.width, self.camera.height);
+        (0..TILE_PIXELS).filter_map(move |p| {
+            let (row, column) = kernel::position(p);
+            let (y, x) = (top + row, left + column);
+            (y < height && x < width).then_some((p, y * width + x))
+        })
+    }
+
+    fn tile_center(&self, tile: usize) -> [f64; 2] {
+        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
+        [middle(tile % self.tiles.columns), middle(tile / self.tiles.columns)]
+    }
+}
+
+/// What the backward pass replays.
+#[derive(Debug, Default)]
+pub struct Composited<T> {
+    /// For each pair the blocks in which it changed a pixel.
+    hits: Vec<u16>,
+    /// Transmittance after the last layer, tile by tile in block order.
+    transmittance: Vec<T>,
+}
+
+/// Counts of the work done, for reports and tests.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Work {
+    /// (Gaussian, tile) pairs.
+    pub pairs: u64,
+    /// Blocks evaluated by the forward pass.
+    pub blocks: u64,
+    /// Blocks in which a pixel changed: what the backward pass evaluates.
+    pub hit_blocks: u64,
+}
+
+/// Split `data` into consecutive pieces of the given lengths.
+fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+    lengths
+        .map(|n| {
+            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
+            data = tail;
+            head
+        })
+        .collect()
+}
+
+/// Call a kernel for the number of channels: the common ones are compiled for it.
+macro_rules! for_channels {
+    ($channels:expr, $function:ident, $simd:expr, $types:ty, ($($argument:expr),*)) => {
+        match $channels {
+            1 => $function::<_, $types, 1>($simd, $($argument),*),
+            3 => $function::<_, $types, 3>($simd, $($argument),*),
+            4 => $function::<_, $types, 4>($simd, $($argument),*),
+            _ => $function::<_, $types, 0>($simd, $($argument),*),
+        }
+    };
+}
+
+/// Composite all tiles into `image` [H, W, channels] and `alphas` [H, W].
+///
+/// # Errors
+/// When the length of an array does not fit; nothing is written then.
+pub fn forward<T: Real>(
+    input: &CompositeInput<T>,
+    image: &mut [T],
+    alphas: &mut [T],
+) -> Result<(Composited<T>, Work), Error> {
+    input.check()?;
+    check_len("render_colors", image, input.pixels() * input.channels)?;
+    check_len("render_alphas", alphas, input.pixels())?;
+    let tiles = input.tiles;
+    let count = tiles.columns * tiles.rows;
+    let mut hits = vec![0u16; tiles.pairs()];
+    let mut transmittance = vec![T::ZERO; count * TILE_PIXELS];
+    let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * input.channels];
+    let grid = Grid::new();
+    let level = Level::new();
+    let hit_lists = split(&mut hits, tiles.offsets.windows(2).map(|w| w[1] - w[0]));
+    let jobs: Vec<_> = hit_lists
+        .into_iter()
+        .zip(transmittance.chunks_mut(TILE_PIXELS))
+        .zip(colors.chunks_mut(input.channels))
+        .enumerate()
+        .collect();
+    let work = jobs
+        .into_par_iter()
+        .map(|(tile, ((hits, transmittance), colors))| {
+            let Ok(transmittance) = transmittance.try_into() else { unreachable!("chunks of a tile") };
+            dispatch!(level, simd => for_channels!(
+                input.channels, forward_tile, simd, T, (input, &grid, tile, hits, transmittance, colors)
+            ))
+        })
+        .reduce(Work::default, |a, b| Work {
+            pairs: a.pairs + b.pairs,
+            blocks: a.blocks + b.blocks,
+            hit_blocks: a.hit_blocks + b.hit_blocks,
+        });
+    let (width, channels) = (input.camera.width, input.channels);
+    image
+        .par_chunks_mut(TILE * width * channels)
+        .zip(alphas.par_chunks_mut(TILE * width))
+        .enumerate()
+        .for_each(|(row, (image, alphas))| {
+            let base = row * TILE * width;
+            for tile in row * tiles.columns..(row + 1) * tiles.columns {
+                let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
+                let colors = &colors[tile * channels..(tile + 1) * channels];
+                for (p, pixel) in input.tile_pixels(tile) {
+                    let pixel = pixel - base;
+                    alphas[pixel] = T::from_f64(1.0 - t[p].to_f64());
+                    let out = &mut image[pixel * channels..(pixel + 1) * channels];
+                    for (c, (o, color)) in out.iter_mut().zip(colors).enumerate() {
+                        let behind = input.background.map_or(0.0, |b| b[c].to_f64());
+                        *o = T::from_f64(color[p].to_f64() + t[p].to_f64() * behind);
+                    }
+                }
+            }
+        });
+    Ok((Composited { hits, transmittance }, work))
+}
+
+#[inline(always)]
+fn forward_tile<S: Simd, T: Real, const D: usize>(
+    simd: S,
+    input: &CompositeInput<T>,
+    grid: &Grid<T>,
+    tile: usize,
+    hits: &mut [u16],
+    transmittance: &mut Pixels<T>,
+    colors: &mut [Pixels<T>],
+) -> Work {
+    for (p, _) in input.tile_pixels(tile) {
+        transmittance[p] = T::ONE;
+    }
+    let mut alive = 0u16;
+    for block in 0..TILE_BLOCKS {
+        let pixels = &transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
+        alive |= u16::from(pixels.iter().any(|t| *t == T::ONE)) << block;
+    }
+    let mut finished = [T::ZERO; TILE_PIXELS];
+    let mut layers = Layers { transmittance, finished: &mut finished, alive };
+    let center = input.tile_center(tile);
+    let mut work = Work { pairs: hits.len() as u64, ..Work::default() };
+    for (i, hit) in input.tiles.entries(tile).zip(hits) {
+        let local = Local::new(input.splat(i), center);
+        let mask = kernel::reached(simd, &local, grid) & layers.alive;
+        if mask == 0 {
+            continue;
+        }
+        *hit = kernel::blend::<S, T, D>(simd, grid, &local, input.color(i), mask, &mut layers, colors);
+        work.blocks += u64::from(mask.count_ones());
+        work.hit_blocks += u64::from(hit.count_ones());
+        if layers.alive == 0 {
+            break;
+        }
+    }
+    for (t, finished) in transmittance.iter_mut().zip(finished) {
+        if finished > T::ZERO {
+            *t = finished;
+        }
+    }
+    work
+}
+
+/// Cotangents of the compositor's outputs.
+#[derive(Debug, Clone, Copy)]
+pub struct CompositeCotangents<'a, T> {
+    /// Of the image, [H, W, channels].
+    pub image: &'a [T],
+    /// Of the alphas, [H, W].
+    pub alphas: Option<&'a [T]>,
+}
+
+/// Gradients of the compositor's inputs, all [N, ...]; overwritten. `None` is not computed.
+#[derive(Debug, Default)]
+pub struct CompositeGrads<'a, T> {
+    /// Gradients of the geometry.
+    pub geometry: Option<GeometryGrads<'a, T>>,
+    /// Of `colors`, [N, channels].
+    pub colors: Option<&'a mut [T]>,
+    /// Of `background`, [channels].
+    pub background: Option<&'a mut [T]>,
+}
+
+/// Gradients with respect to what the projection computed.
+#[derive(Debug)]
+pub struct GeometryGrads<'a, T> {
+    /// Of `means2d`, [N, 2].
+    pub means2d: &'a mut [T],
+    /// Whitened gradient of the 2D covariance, [N, 3]; see `geometry.rs`.
+    pub whitened: &'a mut [T],
+    /// Of `opacities`, [N].
+    pub opacities: &'a mut [T],
+    /// Sum over the pixels of the absolute gradient of `means2d`, [N, 2].
+    pub absolute: Option<&'a mut [T]>,
+}
+
+/// VJP of [`forward`]; `image` is the image that it made.
+///
+/// # Errors
+/// When the length of an array does not fit; nothing is written then.
+pub fn backward<T: Real>(
+    input: &CompositeInput<T>,
+    composited: &Composited<T>,
+    image: &[T],
+    v: &CompositeCotangents<T>,
+    grads: CompositeGrads<T>,
+) -> Result<(), Error> {
+    input.check()?;
+    let (n, channels, tiles) = (input.projection.splats.len(), input.channels, input.tiles);
+    check_len("render_colors", image, input.pixels() * channels)?;
+    check_len("v_render_colors", v.image, input.pixels() * channels)?;
+    if let Some(alphas) = v.alphas {
+        check_len("v_render_alphas", alphas, input.pixels())?;
+    }
+    if let Some(background) = grads.background {
+        check_len("v_backgrounds", background, channels)?;
+        background_vjp(input, composited, v, background);
+    }
+    if grads.geometry.is_none() && grads.colors.is_none() {
+        return Ok(());
+    }
+    let absolute = grads.geometry.as_ref().is_some_and(|g| g.absolute.is_some());
+    let columns = Columns { geometry: grads.geometry.is_some(), absolute, channels };
+    let row = columns.row();
+    let mut pair_grads = vec![T::ZERO; tiles.pairs() * row];
+    let grid = Grid::new();
+    let level = Level::new();
+    let lengths = tiles.offsets.windows(2).map(|w| (w[1] - w[0]) * row);
+    let jobs: Vec<_> = split(&mut pair_grads, lengths).into_iter().enumerate().collect();
+    jobs.into_par_iter().for_each_init(
+        || vec![[T::ZERO; TILE_PIXELS]; channels],
+        |v_colors, (tile, out)| {
+            dispatch!(level, simd => for_channels!(
+                channels, backward_tile, simd, T, (input, composited, image, v, &grid, tile, columns, v_colors, out)
+            ));
+        },
+    );
+    gather(input, composited, &pair_grads, columns, n, grads.geometry, grads.colors)
+}
+
+/// Layout of one pair's gradients.
+#[derive(Debug, Clone, Copy)]
+struct Columns {
+    geometry: bool,
+    absolute: bool,
+    channels: usize,
+}
+
+impl Columns {
+    const fn colors(self) -> usize {
+        MOMENTS + if self.absolute { ABSOLUTE } else { 0 }
+    }
+
+    const fn row(self) -> usize {
+        self.colors() + self.channels
+    }
+}
+
+#[inline(always)]
+fn backward_tile<S: Simd, T: Real, const D: usize>(
+    simd: S,
+    input: &CompositeInput<T>,
+    composited: &Composited<T>,
+    image: &[T],
+    v: &CompositeCotangents<T>,
+    grid: &Grid<T>,
+    tile: usize,
+    columns: Columns,
+    v_colors: &mut [Pixels<T>],
+    out: &mut [T],
+) {
+    let channels = columns.channels;
+    let mut transmittance = [T::ZERO; TILE_PIXELS];
+    let mut behind = [T::ZERO; TILE_PIXELS];
+    v_colors.iter_mut().for_each(|c| c.fill(T::ZERO));
+    let last = &composited.transmittance[tile * TILE_PIXELS..];
+    let mut any = false;
+    for (p, pixel) in input.tile_pixels(tile) {
+        transmittance[p] = T::ONE;
+        let v_alpha = v.alphas.map_or(0.0, |a| a[pixel].to_f64());
+        any |= v_alpha != 0.0;
+        let mut sum = -v_alpha * last[p].to_f64();
+        for (c, v_color) in v_colors.iter_mut().enumerate() {
+            let v_c = v.image[pixel * channels + c];
+            any |= v_c != T::ZERO;
+            v_color[p] = v_c;
+            sum += v_c.to_f64() * image[pixel * channels + c].to_f64();
+        }
+        behind[p] = T::from_f64(sum);
+    }
+    if !any {
+        return; // the gradients are already zero
+    }
+    let mut adjoint = Adjoint {
+        transmittance: &mut transmittance,
+        behind: &mut behind,
+        v_colors,
+        geometry: columns.geometry,
+        absolute: columns.absolute,
+    };
+    let center = input.tile_center(tile);
+    let hits = &composited.hits[input.tiles.offsets[tile]..];
+    for ((i, &mask), out) in input.tiles.entries(tile).zip(hits).zip(out.chunks_exact_mut(columns.row())) {
+        if mask != 0 {
+            let local = Local::new(input.splat(i), center);
+            kernel::unblend::<S, T, D>(simd, grid, &local, input.color(i), mask, &mut adjoint, out);
+        }
+    }
+}
+
+/// Gaussians per unit of parallel work of `gather`.
+const GATHER_CHUNK: usize = 1024;
+
+/// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.
+fn gather<T: Real>(
+    input: &CompositeInput<T>,
+    composited: &Composited<T>,
+    pair_grads: &[T],
+    columns: Columns,
+    n: usize,
+    geometry: Option<GeometryGrads<T>>,
+    colors: Option<&mut [T]>,
+) -> Result<(), Error> {
+    let channels = columns.channels;
+    let (mut means2d, mut whitened, mut opacities, mut absolute) = (None, None, None, None);
+    if let Some(g) = geometry {
+        check_len("v_means2d", g.means2d, 2 * n)?;
+        check_len("v_whitened", g.whitened, 3 * n)?;
+        check_len("v_opacities", g.opacities, n)?;
+        (means2d, whitened, opacities, absolute) = (Some(g.means2d), Some(g.whitened), Some(g.opacities), g.absolute);
+    }
+    if let Some(colors) = &colors {
+        check_len("v_colors", colors, channels * n)?;
+    }
+    let jobs: Vec<_> = chunks(means2d, n, 2)
+        .into_iter()
+        .zip(chunks(whitened, n, 3))
+        .zip(chunks(opacities, n, 1))
+        .zip(chunks(absolute, n, 2))
+        .zip(chunks(colors, n, channels))
+        .enumerate()
+        .collect();
+    jobs.into_par_iter().for_each_init(
+        || vec![0.0f64; columns.row()],
+        |sums, (chunk, ((((mut means2d, mut whitened), mut opacities), mut absolute), mut colors))| {
+            for j in 0..GATHER_CHUNK.min(n - chunk * GATHER_CHUNK) {
+                let i = chunk * GATHER_CHUNK + j;
+                sums.fill(0.0);
+                let splat = input.splat(i);
+                if splat.visible() {
+                    for position in input.tiles.positions(i) {
+                        if composited.hits[position] != 0 {
+                            let row = &pair_grads[position * columns.row()..][..columns.row()];
+                            sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
+                        }
+                    }
+                }
+                let write = |out: &mut Option<&mut [T]>, values: &[f64]| {
+                    if let Some(out) = out {
+                        for (o, v) in out[j * values.len()..].iter_mut().zip(values) {
+                            *o = T::from_f64(*v);
+                        }
+                    }
+                };
+                write(&mut colors, &sums[columns.colors()..]);
+                let [s, m, t] = splat.factors;
+                // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
+                let (wu, wv) = (sums[1] / UNIT, sums[2] / UNIT);
+                write(&mut means2d, &[-s * wu, s * m * wu - t * wv]);
+                // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
+                let k = -0.5 / (UNIT * UNIT);
+                write(&mut whitened, &[k * sums[3], k * sums[4], k * sums[5]]);
+                // sigma enters as opacity exp(-sigma)
+                write(&mut opacities, &[if splat.visible() { -sums[0] / splat.opacity } else { 0.0 }]);
+                if columns.absolute {
+                    write(&mut absolute, &[s * sums[MOMENTS] / UNIT, sums[MOMENTS + 1] / (UNIT * UNIT)]);
+                }
+            }
+        },
+    );
+    Ok(())
+}
+
+/// Split an optional array of `n` rows into chunks of `GATHER_CHUNK` rows.
+fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T]>> {
+    match data {
+        Some(d) => d.chunks_mut(GATHER_CHUNK * row).map(Some).collect(),
+        None => (0..n.div_ceil(GATHER_CHUNK)).map(|_| None).collect(),
+    }
+}
+
+/// Gradient of the background: the sum of transmittance times cotangent, tile by tile in order.
+fn background_vjp<T: Real>(
+    input: &CompositeInput<T>,
+    composited: &Composited<T>,
+    v: &CompositeCotangents<T>,
+    out: &mut [T],
+) {
+    let channels = input.channels;
+    let parts: Vec<Vec<f64>> = composited
+        .transmittance
+        .par_chunks(TILE_PIXELS)
+        .enumerate()
+        .map(|(tile, t)| {
+            let mut sums = vec![0.0; channels];
+            for (p, pixel) in input.tile_pixels(tile) {
+                for (c, sum) in sums.iter_mut().enumerate() {
+                    *sum += t[p].to_f64() * v.image[pixel * channels + c].to_f64();
+                }
+            }
+            sums
+        })
+        .collect();
+    for (c, out) in out.iter_mut().enumerate() {
+        *out = T::from_f64(parts.iter().map(|p| p[c]).sum());
+    }
+}

@@ -1,0 +1,655 @@
+//! The Python binding: the only file that knows Python. numpy arrays are borrowed, never copied; the GIL is
+//! released while the crate works; each [`Error`] becomes a `ValueError`.
+
+use crate::{
+    camera::Camera,
+    composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads, Work},
+    error::Error,
+    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
+    real::Real,
+    scene::{Gaussians, Harmonics},
+    threads,
+    tiles::{self, Tiles},
+};
+use numpy::{Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::{exceptions::PyValueError, prelude::*};
+
+impl From<Error> for PyErr {
+    fn from(error: Error) -> Self {
+        PyValueError::new_err(error.to_string())
+    }
+}
+
+/// A borrowed C-contiguous array of known type.
+pub(crate) struct Array<'py, T: Element>(PyReadonlyArrayDyn<'py, T>);
+
+impl<'py, T: Element> Array<'py, T> {
+    /// Borrow `value`. rust-numpy's own `as_slice` accepts Fortran order, which would read a transposed
+    /// array silently wrong, so the layout is checked here.
+    pub fn new(name: &str, value: &Bound<'py, PyAny>) -> PyResult<Self> {
+        let array = value.cast::<PyArrayDyn<T>>().map_err(|_| {
+            let dtype = value.getattr("dtype").map_or_else(|_| "no array".into(), |d| d.to_string());
+            PyValueError::new_err(format!("{name}: expected an array of {}, got {dtype}", T::get_dtype(value.py())))
+        })?;
+        if !array.is_c_contiguous() {
+            return Err(PyValueError::new_err(format!(
+                "{name}: must be C-contiguous, got shape {:?} with strides {:?}",
+                array.shape(),
+                array.strides()
+            )));
+        }
+        Ok(Self(array.try_readonly().map_err(|e| PyValueError::new_err(format!("{name}: {e}")))?))
+    }
+
+    pub fn slice(&self) -> PyResult<&[T]> {
+        Ok(self.0.as_slice()?)
+    }
+
+    pub fn shape(&self) -> &[usize] {
+        self.0.shape()
+    }
+}
+
+type Optional<'a, 'py> = Option<&'a Bound<'py, PyAny>>;
+type Out<'py, T> = Option<Bound<'py, PyArray1<T>>>;
+
+fn optional<'py, T: Element>(name: &str, value: Optional<'_, 'py>) -> PyResult<Option<Array<'py, T>>> {
+    value.map(|v| Array::new(name, v)).transpose()
+}
+
+/// Whether `value` is an array of f32 (otherwise it must be of f64).
+pub(crate) fn is_f32(value: &Bound<'_, PyAny>) -> bool {
+    value.cast::<PyArrayDyn<f32>>().is_ok()
+}
+
+/// Zeros if wanted, else an empty vector.
+fn zeros<T: Real>(wanted: bool, n: usize) -> Vec<T> {
+    vec![T::ZERO; if wanted { n } else { 0 }]
+}
+
+fn some<T>(wanted: bool, data: &mut [T]) -> Option<&mut [T]> {
+    wanted.then_some(data)
+}
+
+/// The projection of N Gaussians into C cameras.
+#[pyclass(frozen, module = "hqgs._rust")]
+struct Frame {
+    cameras: Vec<Camera>,
+    projections: Vec<Projection>,
+    options: ProjectOptions,
+    n: usize,
+    sh_degree: Option<usize>,
+}
+
+/// Tile lists and replay state of a composited frame.
+#[pyclass(frozen, module = "hqgs._rust")]
+struct Composite {
+    tiles: Vec<Tiles>,
+    state: State,
+    work: Work,
+}
+
+#[pymethods]
+impl Frame {
+    /// Image width in pixels.
+    #[getter]
+    fn width(&self) -> usize {
+        self.cameras.first().map_or(0, |c| c.width)
+    }
+
+    /// Image height in pixels.
+    #[getter]
+    fn height(&self) -> usize {
+        self.cameras.first().map_or(0, |c| c.height)
+    }
+}
+
+enum State {
+    F32(Vec<Composited<f32>>),
+    F64(Vec<Composited<f64>>),
+}
+
+#[pymethods]
+impl Composite {
+    /// (pairs, blocks evaluated, blocks with a change): the work of the forward pass.
+    #[getter]
+    fn work(&self) -> (u64, u64, u64) {
+        (self.work.pairs, self.work.blocks, self.work.hit_blocks)
+    }
+}
+
+/// A scalar type that the binding offers.
+trait Scalar: Real + Element {
+    fn wrap(state: Vec<Composited<Self>>) -> State;
+    fn unwrap(state: &State) -> PyResult<&[Composited<Self>]>;
+}
+
+macro_rules! scalar {
+    ($type:ty, $variant:ident) => {
+        impl Scalar for $type {
+            fn wrap(state: Vec<Composited<Self>>) -> State {
+                State::$variant(state)
+            }
+            fn unwrap(state: &State) -> PyResult<&[Composited<Self>]> {
+                match state {
+                    State::$variant(s) => Ok(s),
+                    _ => Err(PyValueError::new_err("colors: dtype differs from the forward pass")),
+                }
+            }
+        }
+    };
+}
+scalar!(f32, F32);
+scalar!(f64, F64);
+
+/// Call the generic function for the dtype of an array.
+macro_rules! by_dtype {
+    ($array:expr, $function:ident($($argument:expr),* $(,)?)) => {
+        if is_f32($array) {
+            $function::<f32>($($argument),*)?.into_pyobject($array.py()).map(|t| t.into_any())
+        } else {
+            $function::<f64>($($argument),*)?.into_pyobject($array.py()).map(|t| t.into_any())
+        }
+    };
+}
+
+fn cameras(viewmats: &[f64], ks: &[f64], width: usize, height: usize) -> Result<Vec<Camera>, Error> {
+    if viewmats.len() % 16 != 0 || viewmats.len() / 16 * 9 != ks.len() {
+        return Err(Error::shape("viewmats, Ks", "[C, 4, 4] and [C, 3, 3]", format!("{} and {} elements", viewmats.len(), ks.len())));
+    }
+    let (views, _) = viewmats.as_chunks::<16>();
+    let (ks, _) = ks.as_chunks::<9>();
+    views.iter().zip(ks).map(|(v, k)| Camera::new(v, k, width, height)).collect()
+}
+
+/// Project Gaussians; see `hqgs/rasterize.py` for the shapes.
+#[pyfunction]
+#[pyo3(signature = (means, quats, scales, opacities, harmonics, viewmats, ks, width, height, options, sh_degree))]
+fn project_forward<'py>(
+    means: &Bound<'py, PyAny>,
+    quats: &Bound<'py, PyAny>,
+    scales: &Bound<'py, PyAny>,
+    opacities: &Bound<'py, PyAny>,
+    harmonics: Optional<'_, 'py>,
+    viewmats: &Bound<'py, PyAny>,
+    ks: &Bound<'py, PyAny>,
+    width: usize,
+    height: usize,
+    options: (f64, f64, f64, f64, bool),
+    sh_degree: Option<usize>,
+) -> PyResult<Bound<'py, PyAny>> {
+    by_dtype!(means, project_as(means, quats, scales, opacities, harmonics, viewmats, ks, width, height, options, sh_degree))
+}
+
+type Projected<'py, T> = (
+    Frame,
+    Bound<'py, PyArray1<T>>,
+    Bound<'py, PyArray1<T>>,
+    Bound<'py, PyArray1<T>>,
+    Bound<'py, PyArray1<i32>>,
+    Bound<'py, PyArray1<T>>,
+    Bound<'py, PyArray1<T>>,
+);
+
+fn project_as<'py, T: Scalar>(
+    means: &Bound<'py, PyAny>,
+    quats: &Bound<'py, PyAny>,
+    scales: &Bound<'py, PyAny>,
+    opacities: &Bound<'py, PyAny>,
+    harmonics: Optional<'_, 'py>,
+    viewmats: &Bound<'py, PyAny>,
+    ks: &Bound<'py, PyAny>,
+    width: usize,
+    height: usize,
+    options: (f64, f64, f64, f64, bool),
+    sh_degree: Option<usize>,
+) -> PyResult<Projected<'py, T>> {
+    let py = means.py();
+    let arrays = Arrays::<T>::new(means, quats, scales, opacities, harmonics)?;
+    let (viewmats, ks) = (Array::<f64>::new("viewmats", viewmats)?, Array::<f64>::new("Ks", ks)?);
+    let cameras = cameras(viewmats.slice()?, ks.slice()?, width, height)?;
+    let (near_plane, far_plane, radius_clip, eps2d, antialiased) = options;
+    let options = ProjectOptions { near_plane, far_plane, radius_clip, eps2d, antialiased };
+    let gaussians = arrays.gaussians()?;
+    let harmonics = arrays.harmonics(sh_degree)?;
+    let (n, c) = (gaussians.len(), cameras.len());
+    let (projections, out) = py.detach(|| {
+        threads::install(|| {
+            let mut means2d = zeros::<T>(true, 2 * c * n);
+            let mut depths = zeros::<T>(true, c * n);
+            let mut conics = zeros::<T>(true, 3 * c * n);
+            let mut radii = vec![0i32; 2 * c * n];
+            let mut opacities = zeros::<T>(true, c * n);
+            let color_row = if harmonics.is_some() { 3 * n } else { 0 };
+            let mut colors = zeros::<T>(true, c * color_row);
+            let mut projections = Vec::with_capacity(c);
+            for (i, camera) in cameras.iter().enumerate() {
+                let mut projection = Projection::default();
+                let out = ProjectOut {
+                    means2d: &mut means2d[2 * i * n..2 * (i + 1) * n],
+                    depths: &mut depths[i * n..(i + 1) * n],
+                    conics: &mut conics[3 * i * n..3 * (i + 1) * n],
+                    radii: &mut radii[2 * i * n..2 * (i + 1) * n],
+                    opacities: &mut opacities[i * n..(i + 1) * n],
+                    colors: &mut colors[i * color_row..(i + 1) * color_row],
+                };
+                project::forward(&gaussians, harmonics.as_ref(), camera, &options, &mut projection, out);
+                projections.push(projection);
+            }
+            (projections, (means2d, depths, conics, radii, opacities, colors))
+        })
+    });
+    let frame = Frame { cameras, projections, options, n, sh_degree };
+    let (means2d, depths, conics, radii, opacities, colors) = out;
+    Ok((
+        frame,
+        means2d.into_pyarray(py),
+        depths.into_pyarray(py),
+        conics.into_pyarray(py),
+        radii.into_pyarray(py),
+        opacities.into_pyarray(py),
+        colors.into_pyarray(py),
+    ))
+}
+
+/// The borrowed arrays of the Gaussians.
+struct Arrays<'py, T: Element> {
+    means: Array<'py, T>,
+    quats: Array<'py, T>,
+    scales: Array<'py, T>,
+    opacities: Array<'py, T>,
+    harmonics: Option<Array<'py, T>>,
+}
+
+impl<'py, T: Scalar> Arrays<'py, T> {
+    fn new(
+        means: &Bound<'py, PyAny>,
+        quats: &Bound<'py, PyAny>,
+        scales: &Bound<'py, PyAny>,
+        opacities: &Bound<'py, PyAny>,
+        harmonics: Optional<'_, 'py>,
+    ) -> PyResult<Self> {
+        Ok(Self {
+            means: Array::new("means", means)?,
+            quats: Array::new("quats", quats)?,
+            scales: Array::new("scales", scales)?,
+            opacities: Array::new("opacities", opacities)?,
+            harmonics: optional("colors", harmonics)?,
+        })
+    }
+
+    fn gaussians(&self) -> PyResult<Gaussians<'_, T>> {
+        let gaussians = Gaussians {
+            means: self.means.slice()?,
+            quats: self.quats.slice()?,
+            scales: self.scales.slice()?,
+            opacities: self.opacities.slice()?,
+        };
+        gaussians.check()?;
+        Ok(gaussians)
+    }
+
+    fn harmonics(&self, degree: Option<usize>) -> PyResult<Option<Harmonics<'_, T>>> {
+        let (Some(array), Some(degree)) = (&self.harmonics, degree) else { return Ok(None) };
+        let &[n, stored, 3] = array.shape() else {
+            return Err(Error::shape("colors", "[N, K, 3]", format!("{:?}", array.shape())).into());
+        };
+        let harmonics = Harmonics { coefficients: array.slice()?, stored, degree };
+        harmonics.check(self.opacities.slice()?.len().max(n))?;
+        Ok(Some(harmonics))
+    }
+}
+
+/// VJP of `project_forward`.
+#[pyfunction]
+fn project_backward<'py>(
+    frame: &Bound<'py, Frame>,
+    inputs: (
+        Bound<'py, PyAny>,
+        Bound<'py, PyAny>,
+        Bound<'py, PyAny>,
+        Bound<'py, PyAny>,
+        Option<Bound<'py, PyAny>>,
+    ),
+    cotangents: Cotangents<'py>,
+    wanted: [bool; 6],
+) -> PyResult<Bound<'py, PyAny>> {
+    by_dtype!(&inputs.0, project_backward_as(frame, &inputs, cotangents, wanted))
+}
+
+/// means2d, whitened, opacities, depths, conics, colors
+type Cotangents<'py> = (
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Option<Bound<'py, PyAny>>,
+    Option<Bound<'py, PyAny>>,
+    Option<Bound<'py, PyAny>>,
+);
+
+type ProjectGrads<'py, T> =
+    (Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, f64>);
+
+fn project_backward_as<'py, T: Scalar>(
+    frame: &Bound<'py, Frame>,
+    inputs: &(
+        Bound<'py, PyAny>,
+        Bound<'py, PyAny>,
+        Bound<'py, PyAny>,
+        Bound<'py, PyAny>,
+        Option<Bound<'py, PyAny>>,
+    ),
+    v: Cotangents<'py>,
+    wanted: [bool; 6],
+) -> PyResult<ProjectGrads<'py, T>> {
+    let py = frame.py();
+    let frame = frame.get();
+    let arrays = Arrays::<T>::new(&inputs.0, &inputs.1, &inputs.2, &inputs.3, inputs.4.as_ref())?;
+    let gaussians = arrays.gaussians()?;
+    let harmonics = arrays.harmonics(frame.sh_degree)?;
+    let v_means2d = Array::<T>::new("v_means2d", &v.0)?;
+    let v_whitened = Array::<T>::new("v_whitened", &v.1)?;
+    let v_opacities = Array::<T>::new("v_opacities", &v.2)?;
+    let v_depths = optional::<T>("v_depths", v.3.as_ref())?;
+    let v_conics = optional::<T>("v_conics", v.4.as_ref())?;
+    let v_colors = optional::<T>("v_colors", v.5.as_ref())?;
+    let (n, c) = (frame.n, frame.cameras.len());
+    let part = |a: &Option<Array<'py, T>>| -> PyResult<Option<usize>> { Ok(a.as_ref().map(|a| a.shape().iter().product())) };
+    for (name, rows, got) in [
+        ("v_means2d", 2, Some(v_means2d.slice()?.len())),
+        ("v_whitened", 3, Some(v_whitened.slice()?.len())),
+        ("v_opacities", 1, Some(v_opacities.slice()?.len())),
+        ("v_depths", 1, part(&v_depths)?),
+        ("v_conics", 3, part(&v_conics)?),
+        ("v_colors", 3, part(&v_colors)?),
+    ] {
+        if got.is_some_and(|g| g != rows * c * n) || gaussians.len() != n {
+            return Err(Error::shape(name, format!("[{c}, {n}, {rows}]"), format!("{got:?} elements")).into());
+        }
+    }
+    let slices = (
+        v_means2d.slice()?,
+        v_whitened.slice()?,
+        v_opacities.slice()?,
+        v_depths.as_ref().map(Array::slice).transpose()?,
+        v_conics.as_ref().map(Array::slice).transpose()?,
+        v_colors.as_ref().map(Array::slice).transpose()?,
+    );
+    let [want_means, want_quats, want_scales, want_opacities, want_harmonics, want_viewmats] = wanted;
+    let harmonics_row = harmonics.as_ref().map_or(0, |h| 3 * h.stored);
+    let out = py.detach(|| {
+        threads::install(|| {
+            let mut means = zeros::<T>(want_means, 3 * n);
+            let mut quats = zeros::<T>(want_quats, 4 * n);
+            let mut scales = zeros::<T>(want_scales, 3 * n);
+            let mut opacities = zeros::<T>(want_opacities, n);
+            let mut sh = zeros::<T>(want_harmonics, harmonics_row * n);
+            let mut viewmats = Vec::with_capacity(16 * c);
+            for (i, camera) in frame.cameras.iter().enumerate() {
+                let cotangents = ProjectCotangents {
+                    means2d: &slices.0[2 * i * n..2 * (i + 1) * n],
+                    whitened: &slices.1[3 * i * n..3 * (i + 1) * n],
+                    opacities: &slices.2[i * n..(i + 1) * n],
+                    depths: slices.3.map(|s| &s[i * n..(i + 1) * n]),
+                    conics: slices.4.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
+                    colors: slices.5.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
+                };
+                let grads = GaussianGrads {
+                    means: some(want_means, &mut means),
+                    quats: some(want_quats, &mut quats),
+                    scales: some(want_scales, &mut scales),
+                    opacities: some(want_opacities, &mut opacities),
+                    harmonics: some(want_harmonics, &mut sh),
+                };
+                let camera_grad = project::backward(
+                    &gaussians,
+                    harmonics.as_ref(),
+                    camera,
+                    &frame.options,
+                    &frame.projections[i],
+                    &cotangents,
+                    grads,
+                );
+                viewmats.extend(camera_grad.viewmat(camera));
+            }
+            (means, quats, scales, opacities, sh, viewmats)
+        })
+    });
+    let (means, quats, scales, opacities, sh, viewmats) = out;
+    Ok((
+        want_means.then(|| means.into_pyarray(py)),
+        want_quats.then(|| quats.into_pyarray(py)),
+        want_scales.then(|| scales.into_pyarray(py)),
+        want_opacities.then(|| opacities.into_pyarray(py)),
+        want_harmonics.then(|| sh.into_pyarray(py)),
+        want_viewmats.then(|| viewmats.into_pyarray(py)),
+    ))
+}
+
+/// Colours of camera `i`: one set for all cameras, or one each.
+fn of_camera<T>(data: &[T], i: usize, len: usize) -> &[T] {
+    if data.len() == len { data } else { &data[i * len..(i + 1) * len] }
+}
+
+fn check_colors<T>(frame: &Frame, colors: &[T], background: Option<&[T]>, channels: usize) -> PyResult<()> {
+    let (n, c) = (frame.n, frame.cameras.len());
+    if colors.len() != n * channels && colors.len() != c * n * channels {
+        return Err(Error::shape("colors", format!("[{n}, {channels}] or [{c}, {n}, {channels}]"), format!("{} elements", colors.len())).into());
+    }
+    if background.is_some_and(|b| b.len() != c * channels) {
+        return Err(Error::shape("backgrounds", format!("[{c}, {channels}]"), "other").into());
+    }
+    Ok(())
+}
+
+/// Bin and composite a frame.
+#[pyfunction]
+#[pyo3(signature = (frame, colors, backgrounds, channels))]
+fn composite_forward<'py>(
+    frame: &Bound<'py, Frame>,
+    colors: &Bound<'py, PyAny>,
+    backgrounds: Optional<'_, 'py>,
+    channels: usize,
+) -> PyResult<Bound<'py, PyAny>> {
+    by_dtype!(colors, composite_as(frame, colors, backgrounds, channels))
+}
+
+fn composite_as<'py, T: Scalar>(
+    frame: &Bound<'py, Frame>,
+    colors: &Bound<'py, PyAny>,
+    backgrounds: Optional<'_, 'py>,
+    channels: usize,
+) -> PyResult<(Composite, Bound<'py, PyArray1<T>>, Bound<'py, PyArray1<T>>)> {
+    let py = colors.py();
+    let frame = frame.get();
+    let colors = Array::<T>::new("colors", colors)?;
+    let backgrounds = optional::<T>("backgrounds", backgrounds)?;
+    let colors = colors.slice()?;
+    let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
+    check_colors(frame, colors, backgrounds, channels)?;
+    let (state, image, alphas) = py.detach(|| {
+        threads::install(|| -> Result<_, Error> {
+            let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
+            let mut image = zeros::<T>(true, frame.cameras.len() * pixels * channels);
+            let mut alphas = zeros::<T>(true, frame.cameras.len() * pixels);
+            let (mut all_tiles, mut states, mut total) = (Vec::new(), Vec::new(), Work::default());
+            for (i, (camera, projection)) in frame.cameras.iter().zip(&frame.projections).enumerate() {
+                let tiles = tiles::bin(projection, camera)?;
+                let input = CompositeInput {
+                    projection,
+                    tiles: &tiles,
+                    camera,
+                    colors: of_camera(colors, i, frame.n * channels),
+                    channels,
+                    background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
+                };
+                let (state, work) = composite::forward(
+                    &input,
+                    &mut image[i * pixels * channels..(i + 1) * pixels * channels],
+                    &mut alphas[i * pixels..(i + 1) * pixels],
+                )?;
+                total.pairs += work.pairs;
+                total.blocks += work.blocks;
+                total.hit_blocks += work.hit_blocks;
+                states.push(state);
+                all_tiles.push(tiles);
+            }
+            Ok((Composite { tiles: all_tiles, state: T::wrap(states), work: total }, image, alphas))
+        })
+    })?;
+    Ok((state, image.into_pyarray(py), alphas.into_pyarray(py)))
+}
+
+/// VJP of `composite_forward`. `wanted`: geometry, absolute, colors, backgrounds.
+#[pyfunction]
+#[pyo3(signature = (frame, composite, colors, backgrounds, image, v_image, v_alphas, channels, wanted))]
+fn composite_backward<'py>(
+    frame: &Bound<'py, Frame>,
+    composite: &Bound<'py, Composite>,
+    colors: &Bound<'py, PyAny>,
+    backgrounds: Optional<'_, 'py>,
+    image: &Bound<'py, PyAny>,
+    v_image: &Bound<'py, PyAny>,
+    v_alphas: Optional<'_, 'py>,
+    channels: usize,
+    wanted: [bool; 4],
+) -> PyResult<Bound<'py, PyAny>> {
+    by_dtype!(
+        colors,
+        composite_backward_as(frame, composite, colors, backgrounds, image, v_image, v_alphas, channels, wanted)
+    )
+}
+
+type CompositeOut<'py, T> =
+    (Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>);
+
+fn composite_backward_as<'py, T: Scalar>(
+    frame: &Bound<'py, Frame>,
+    composite: &Bound<'py, Composite>,
+    colors: &Bound<'py, PyAny>,
+    backgrounds: Optional<'_, 'py>,
+    image: &Bound<'py, PyAny>,
+    v_image: &Bound<'py, PyAny>,
+    v_alphas: Optional<'_, 'py>,
+    channels: usize,
+    wanted: [bool; 4],
+) -> PyResult<CompositeOut<'py, T>> {
+    let py = colors.py();
+    let (frame, composite) = (frame.get(), composite.get());
+    let states = T::unwrap(&composite.state)?;
+    let colors = Array::<T>::new("colors", colors)?;
+    let backgrounds = optional::<T>("backgrounds", backgrounds)?;
+    let image = Array::<T>::new("render_colors", image)?;
+    let v_image = Array::<T>::new("v_render_colors", v_image)?;
+    let v_alphas = optional::<T>("v_render_alphas", v_alphas)?;
+    let colors = colors.slice()?;
+    let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
+    check_colors(frame, colors, backgrounds, channels)?;
+    let (image, v_image) = (image.slice()?, v_image.slice()?);
+    let v_alphas = v_alphas.as_ref().map(Array::slice).transpose()?;
+    let (n, c) = (frame.n, frame.cameras.len());
+    let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
+    for (name, got, expected) in [
+        ("render_colors", image.len(), c * pixels * channels),
+        ("v_render_colors", v_image.len(), c * pixels * channels),
+        ("v_render_alphas", v_alphas.map_or(c * pixels, <[T]>::len), c * pixels),
+    ] {
+        if got != expected {
+            return Err(Error::shape(name, format!("{expected} elements"), format!("{got} elements")).into());
+        }
+    }
+    let [want_geometry, want_absolute, want_colors, want_background] = wanted;
+    let out = py.detach(|| {
+        threads::install(|| -> Result<_, Error> {
+            let mut means2d = zeros::<T>(want_geometry, 2 * c * n);
+            let mut whitened = zeros::<T>(want_geometry, 3 * c * n);
+            let mut opacities = zeros::<T>(want_geometry, c * n);
+            let mut absolute = zeros::<T>(want_geometry && want_absolute, 2 * c * n);
+            let mut v_colors = zeros::<T>(want_colors, channels * c * n);
+            let mut v_background = zeros::<T>(want_background, channels * c);
+            for (i, camera) in frame.cameras.iter().enumerate() {
+                let input = CompositeInput {
+                    projection: &frame.projections[i],
+                    tiles: &composite.tiles[i],
+                    camera,
+                    colors: of_camera(colors, i, n * channels),
+                    channels,
+                    background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
+                };
+                let cotangents = CompositeCotangents {
+                    image: &v_image[i * pixels * channels..(i + 1) * pixels * channels],
+                    alphas: v_alphas.map(|a| &a[i * pixels..(i + 1) * pixels]),
+                };
+                let geometry = if want_geometry {
+                    Some(GeometryGrads {
+                        means2d: &mut means2d[2 * i * n..2 * (i + 1) * n],
+                        whitened: &mut whitened[3 * i * n..3 * (i + 1) * n],
+                        opacities: &mut opacities[i * n..(i + 1) * n],
+                        absolute: if want_absolute { Some(&mut absolute[2 * i * n..2 * (i + 1) * n]) } else { None },
+                    })
+                } else {
+                    None
+                };
+                let grads = CompositeGrads {
+                    geometry,
+                    colors: if want_colors { Some(&mut v_colors[i * n * channels..(i + 1) * n * channels]) } else { None },
+                    background: if want_background { Some(&mut v_background[i * channels..(i + 1) * channels]) } else { None },
+                };
+                composite::backward(
+                    &input,
+                    &states[i],
+                    &image[i * pixels * channels..(i + 1) * pixels * channels],
+                    &cotangents,
+                    grads,
+                )?;
+            }
+            Ok((means2d, whitened, opacities, absolute, v_colors, v_background))
+        })
+    })?;
+    let (means2d, whitened, opacities, absolute, v_colors, v_background) = out;
+    Ok((
+        want_geometry.then(|| means2d.into_pyarray(py)),
+        want_geometry.then(|| whitened.into_pyarray(py)),
+        want_geometry.then(|| opacities.into_pyarray(py)),
+        (want_geometry && want_absolute).then(|| absolute.into_pyarray(py)),
+        want_colors.then(|| v_colors.into_pyarray(py)),
+        want_background.then(|| v_background.into_pyarray(py)),
+    ))
+}
+
+/// Use this many threads from now on; results do not depend on it.
+#[pyfunction]
+fn set_num_threads(threads: usize) -> PyResult<()> {
+    Ok(threads::set(threads)?)
+}
+
+/// Number of threads in use.
+#[pyfunction]
+fn get_num_threads() -> usize {
+    threads::get()
+}
+
+/// Address of the first element of an array as the crate sees it, to test that nothing is copied.
+#[pyfunction]
+fn data_pointer(array: &Bound<'_, PyAny>) -> PyResult<usize> {
+    if is_f32(array) {
+        Ok(Array::<f32>::new("array", array)?.slice()?.as_ptr() as usize)
+    } else {
+        Ok(Array::<f64>::new("array", array)?.slice()?.as_ptr() as usize)
+    }
+}
+
+/// The extension module `hqgs._rust`.
+#[pymodule]
+fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<Frame>()?;
+    m.add_class::<Composite>()?;
+    m.add_function(wrap_pyfunction!(project_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(project_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(composite_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(composite_backward, m)?)?;
+    m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
+    Ok(())
+}

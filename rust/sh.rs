@@ -1,0 +1,135 @@
+//! Real spherical harmonics of degree 0..3 in the basis order and signs of the original 3DGS.
+
+/// Number of coefficients of all degrees up to `degree`.
+pub const fn count(degree: usize) -> usize {
+    (degree + 1) * (degree + 1)
+}
+
+/// Highest degree that is implemented.
+pub const MAX_DEGREE: usize = 3;
+
+/// Coefficients of degree 3.
+pub const MAX_COUNT: usize = count(MAX_DEGREE);
+
+const C0: f64 = 0.282_094_791_773_878_14; // sqrt(1 / 4 pi)
+const C1: f64 = 0.488_602_511_902_919_9; // sqrt(3 / 4 pi)
+const C2A: f64 = 1.092_548_430_592_079_2; // sqrt(15 / 4 pi)
+const C2B: f64 = 0.315_391_565_252_520_05; // sqrt(5 / 16 pi)
+const C2C: f64 = 0.546_274_215_296_039_6; // sqrt(15 / 16 pi)
+const C3A: f64 = 0.590_043_589_926_643_5; // sqrt(35 / 32 pi)
+const C3B: f64 = 2.890_611_442_640_554; // sqrt(105 / 4 pi)
+const C3C: f64 = 0.457_045_799_464_465_8; // sqrt(21 / 32 pi)
+const C3D: f64 = 0.373_176_332_590_115_4; // sqrt(7 / 16 pi)
+const C3E: f64 = 1.445_305_721_320_277; // sqrt(105 / 16 pi)
+
+/// Basis functions at the unit vector `(x, y, z)`; those above `degree` are 0.
+///
+/// For the zero vector (no direction) only the constant term is used, by passing `degree = 0`.
+#[inline]
+pub fn basis(degree: usize, [x, y, z]: [f64; 3]) -> [f64; MAX_COUNT] {
+    let mut b = [0.0; MAX_COUNT];
+    b[0] = C0;
+    if degree >= 1 {
+        b[1] = -C1 * y;
+        b[2] = C1 * z;
+        b[3] = -C1 * x;
+    }
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    if degree >= 2 {
+        b[4] = C2A * x * y;
+        b[5] = -C2A * y * z;
+        b[6] = C2B * (2.0 * zz - xx - yy);
+        b[7] = -C2A * x * z;
+        b[8] = C2C * (xx - yy);
+    }
+    if degree >= 3 {
+        b[9] = -C3A * y * (3.0 * xx - yy);
+        b[10] = C3B * x * y * z;
+        b[11] = -C3C * y * (4.0 * zz - xx - yy);
+        b[12] = C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
+        b[13] = -C3C * x * (4.0 * zz - xx - yy);
+        b[14] = C3E * z * (xx - yy);
+        b[15] = -C3A * x * (xx - 3.0 * yy);
+    }
+    b
+}
+
+/// Gradient of `sum_k weights[k] basis[k]` with respect to `(x, y, z)`, as free variables.
+#[inline]
+pub fn basis_vjp(degree: usize, [x, y, z]: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
+    let mut g = [0.0; 3];
+    if degree >= 1 {
+        g = [-C1 * w[3], -C1 * w[1], C1 * w[2]];
+    }
+    if degree >= 2 {
+        g[0] += C2A * (y * w[4] - z * w[7]) - 2.0 * C2B * x * w[6] + 2.0 * C2C * x * w[8];
+        g[1] += C2A * (x * w[4] - z * w[5]) - 2.0 * C2B * y * w[6] - 2.0 * C2C * y * w[8];
+        g[2] += -C2A * (y * w[5] + x * w[7]) + 4.0 * C2B * z * w[6];
+    }
+    if degree >= 3 {
+        let (xx, yy, zz) = (x * x, y * y, z * z);
+        g[0] += -6.0 * C3A * x * y * w[9] + C3B * y * z * w[10] + 2.0 * C3C * x * y * w[11]
+            - 6.0 * C3D * x * z * w[12]
+            - C3C * (4.0 * zz - 3.0 * xx - yy) * w[13]
+            + 2.0 * C3E * x * z * w[14]
+            - 3.0 * C3A * (xx - yy) * w[15];
+        g[1] += -3.0 * C3A * (xx - yy) * w[9] + C3B * x * z * w[10]
+            - C3C * (4.0 * zz - xx - 3.0 * yy) * w[11]
+            - 6.0 * C3D * y * z * w[12]
+            + 2.0 * C3C * x * y * w[13]
+            - 2.0 * C3E * y * z * w[14]
+            + 6.0 * C3A * x * y * w[15];
+        g[2] += C3B * x * y * w[10] - 8.0 * C3C * y * z * w[11]
+            + C3D * (6.0 * zz - 3.0 * xx - 3.0 * yy) * w[12]
+            - 8.0 * C3C * x * z * w[13]
+            + C3E * (xx - yy) * w[14];
+    }
+    g
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn basis_is_orthonormal() {
+        // Gauss-Legendre would be exact; a fine midpoint rule in (z, phi) is enough to see a wrong constant.
+        let (nz, np) = (400, 200);
+        let mut gram = [[0.0; MAX_COUNT]; MAX_COUNT];
+        for i in 0..nz {
+            let z = (i as f64 + 0.5) / nz as f64 * 2.0 - 1.0;
+            let r = (1.0 - z * z).sqrt();
+            for j in 0..np {
+                let phi = std::f64::consts::TAU * (j as f64 + 0.5) / np as f64;
+                let b = basis(3, [r * phi.cos(), r * phi.sin(), z]);
+                for (row, bi) in gram.iter_mut().zip(b) {
+                    for (g, bj) in row.iter_mut().zip(b) {
+                        *g += bi * bj * 2.0 * std::f64::consts::TAU / (nz * np) as f64;
+                    }
+                }
+            }
+        }
+        for (i, row) in gram.iter().enumerate() {
+            for (j, g) in row.iter().enumerate() {
+                let expected = f64::from(u8::from(i == j));
+                assert!((g - expected).abs() < 1e-4, "<Y{i}, Y{j}> = {g}");
+            }
+        }
+    }
+
+    #[test]
+    fn gradient_is_the_limit_of_differences() {
+        let p = [0.3, -0.8, 0.52];
+        let w: [f64; MAX_COUNT] = std::array::from_fn(|k| (k as f64 * 1.7).sin());
+        let value = |p| basis(3, p).iter().zip(w).map(|(b, w)| b * w).sum::<f64>();
+        let g = basis_vjp(3, p, &w);
+        for axis in 0..3 {
+            let h = 1e-5;
+            let (mut a, mut b) = (p, p);
+            a[axis] += h;
+            b[axis] -= h;
+            let difference = (value(a) - value(b)) / (2.0 * h);
+            assert!((g[axis] - difference).abs() < 1e-9, "axis {axis}: {} vs {difference}", g[axis]);
+        }
+    }
+}
