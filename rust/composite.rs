@@ -4,10 +4,10 @@ use crate::{
     camera::Camera,
     constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
-    kernel::{self, ABSOLUTE, Adjoint, Grid, Layers, Local, MOMENTS, Pixels, UNIT},
-    project::{Projection, Splat},
+    kernel::{self, ABSOLUTE, Adjoint, Grid, Layers, MOMENTS, Pixels, UNIT},
+    project::Projection,
     real::Real,
-    tiles::Tiles,
+    tiles::{Chunk, Tiles, split},
 };
 use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
@@ -18,13 +18,9 @@ pub struct CompositeInput<'a, T> {
     /// Projected Gaussians.
     pub projection: &'a Projection,
     /// Their tile lists.
-    pub tiles: &'a Tiles,
+    pub tiles: &'a Tiles<T>,
     /// Image size.
     pub camera: &'a Camera,
-    /// Colours, [N, channels].
-    pub colors: &'a [T],
-    /// Number of channels, at least 1.
-    pub channels: usize,
     /// Colour behind everything, [channels].
     pub background: Option<&'a [T]>,
 }
@@ -33,25 +29,17 @@ impl<T: Real> CompositeInput<'_, T> {
     /// Check the lengths of the arrays.
     ///
     /// # Errors
-    /// Names `colors` or `backgrounds`.
-    pub fn check(&self) -> Result<(), Error> {
-        if self.channels == 0 {
-            return Err(Error::new("colors", "must have at least one channel"));
-        }
-        check_len("colors", self.colors, self.projection.splats.len() * self.channels)?;
-        self.background.map_or(Ok(()), |b| check_len("backgrounds", b, self.channels))
+    /// Names `backgrounds`.
+    fn check(&self) -> Result<(), Error> {
+        self.background.map_or(Ok(()), |b| check_len("backgrounds", b, self.channels()))
+    }
+
+    fn channels(&self) -> usize {
+        self.tiles.channels
     }
 
     fn pixels(&self) -> usize {
         self.camera.width * self.camera.height
-    }
-
-    fn color(&self, i: usize) -> &[T] {
-        &self.colors[i * self.channels..(i + 1) * self.channels]
-    }
-
-    fn splat(&self, i: usize) -> &Splat {
-        &self.projection.splats[i]
     }
 
     /// The image's pixels in tile `tile`: (index in block order, index in the image).
@@ -63,11 +51,6 @@ impl<T: Real> CompositeInput<'_, T> {
             let (y, x) = (top + row, left + column);
             (y < height && x < width).then_some((p, y * width + x))
         })
-    }
-
-    fn tile_center(&self, tile: usize) -> [f64; 2] {
-        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
-        [middle(tile % self.tiles.columns), middle(tile / self.tiles.columns)]
     }
 }
 
@@ -89,17 +72,6 @@ pub struct Work {
     pub blocks: u64,
     /// Blocks in which a pixel changed: what the backward pass evaluates.
     pub hit_blocks: u64,
-}
-
-/// Split `data` into consecutive pieces of the given lengths.
-fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
-    lengths
-        .map(|n| {
-            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
-            data = tail;
-            head
-        })
-        .collect()
 }
 
 /// Call a kernel for the number of channels: the common ones are compiled for it.
@@ -124,20 +96,19 @@ pub fn forward<T: Real>(
     alphas: &mut [T],
 ) -> Result<(Composited<T>, Work), Error> {
     input.check()?;
-    check_len("render_colors", image, input.pixels() * input.channels)?;
+    check_len("render_colors", image, input.pixels() * input.channels())?;
     check_len("render_alphas", alphas, input.pixels())?;
-    let tiles = input.tiles;
+    let (tiles, channels) = (input.tiles, input.channels());
     let count = tiles.columns * tiles.rows;
     let mut hits = vec![0u16; tiles.pairs()];
     let mut transmittance = vec![T::ZERO; count * TILE_PIXELS];
-    let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * input.channels];
+    let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * channels];
     let grid = Grid::new();
     let level = Level::new();
-    let hit_lists = split(&mut hits, tiles.offsets.windows(2).map(|w| w[1] - w[0]));
-    let jobs: Vec<_> = hit_lists
+    let jobs: Vec<_> = split(&mut hits, tiles.lengths())
         .into_iter()
         .zip(transmittance.chunks_mut(TILE_PIXELS))
-        .zip(colors.chunks_mut(input.channels))
+        .zip(colors.chunks_mut(channels))
         .enumerate()
         .collect();
     let work = jobs
@@ -145,7 +116,7 @@ pub fn forward<T: Real>(
         .map(|(tile, ((hits, transmittance), colors))| {
             let Ok(transmittance) = transmittance.try_into() else { unreachable!("chunks of a tile") };
             dispatch!(level, simd => for_channels!(
-                input.channels, forward_tile, simd, T, (input, &grid, tile, hits, transmittance, colors)
+                channels, forward_tile, simd, T, (input, &grid, tile, hits, transmittance, colors)
             ))
         })
         .reduce(Work::default, |a, b| Work {
@@ -153,7 +124,7 @@ pub fn forward<T: Real>(
             blocks: a.blocks + b.blocks,
             hit_blocks: a.hit_blocks + b.hit_blocks,
         });
-    let (width, channels) = (input.camera.width, input.channels);
+    let width = input.camera.width;
     image
         .par_chunks_mut(TILE * width * channels)
         .zip(alphas.par_chunks_mut(TILE * width))
@@ -197,15 +168,19 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     }
     let mut finished = [T::ZERO; TILE_PIXELS];
     let mut layers = Layers { transmittance, finished: &mut finished, alive };
-    let center = input.tile_center(tile);
+    let list = input.tiles.tile(tile);
+    let channels = input.channels();
     let mut work = Work { pairs: hits.len() as u64, ..Work::default() };
-    for (i, hit) in input.tiles.entries(tile).zip(hits) {
-        let local = Local::new(input.splat(i), center);
-        let mask = kernel::reached(simd, &local, grid) & layers.alive;
+    for &k in list.order {
+        let k = k as usize;
+        let local = &list.records[k];
+        let mask = kernel::reached(simd, local, grid) & layers.alive;
         if mask == 0 {
             continue;
         }
-        *hit = kernel::blend::<S, T, D>(simd, grid, &local, input.color(i), mask, &mut layers, colors);
+        let color = &list.colors[k * channels..(k + 1) * channels];
+        let hit = kernel::blend::<S, T, D>(simd, grid, local, color, mask, &mut layers, colors);
+        hits[k] = hit;
         work.blocks += u64::from(mask.count_ones());
         work.hit_blocks += u64::from(hit.count_ones());
         if layers.alive == 0 {
@@ -229,7 +204,7 @@ pub struct CompositeCotangents<'a, T> {
     pub alphas: Option<&'a [T]>,
 }
 
-/// Gradients of the compositor's inputs, all [N, ...]; overwritten. `None` is not computed.
+/// Gradients of the compositor's inputs, all [N, ...], zeroed by the caller. `None` is not computed.
 #[derive(Debug, Default)]
 pub struct CompositeGrads<'a, T> {
     /// Gradients of the geometry.
@@ -265,7 +240,7 @@ pub fn backward<T: Real>(
     grads: CompositeGrads<T>,
 ) -> Result<(), Error> {
     input.check()?;
-    let (n, channels, tiles) = (input.projection.splats.len(), input.channels, input.tiles);
+    let (n, channels, tiles) = (input.projection.splats.len(), input.channels(), input.tiles);
     check_len("render_colors", image, input.pixels() * channels)?;
     check_len("v_render_colors", v.image, input.pixels() * channels)?;
     if let Some(alphas) = v.alphas {
@@ -284,8 +259,7 @@ pub fn backward<T: Real>(
     let mut pair_grads = vec![T::ZERO; tiles.pairs() * row];
     let grid = Grid::new();
     let level = Level::new();
-    let lengths = tiles.offsets.windows(2).map(|w| (w[1] - w[0]) * row);
-    let jobs: Vec<_> = split(&mut pair_grads, lengths).into_iter().enumerate().collect();
+    let jobs: Vec<_> = split(&mut pair_grads, tiles.lengths().map(|n| n * row)).into_iter().enumerate().collect();
     jobs.into_par_iter().for_each_init(
         || vec![[T::ZERO; TILE_PIXELS]; channels],
         |v_colors, (tile, out)| {
@@ -357,18 +331,17 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
         geometry: columns.geometry,
         absolute: columns.absolute,
     };
-    let center = input.tile_center(tile);
+    let list = input.tiles.tile(tile);
     let hits = &composited.hits[input.tiles.offsets[tile]..];
-    for ((i, &mask), out) in input.tiles.entries(tile).zip(hits).zip(out.chunks_exact_mut(columns.row())) {
-        if mask != 0 {
-            let local = Local::new(input.splat(i), center);
-            kernel::unblend::<S, T, D>(simd, grid, &local, input.color(i), mask, &mut adjoint, out);
+    for &k in list.order {
+        let k = k as usize;
+        if hits[k] != 0 {
+            let color = &list.colors[k * channels..(k + 1) * channels];
+            let out = &mut out[k * columns.row()..(k + 1) * columns.row()];
+            kernel::unblend::<S, T, D>(simd, grid, &list.records[k], color, hits[k], &mut adjoint, out);
         }
     }
 }
-
-/// Gaussians per unit of parallel work of `gather`.
-const GATHER_CHUNK: usize = 1024;
 
 /// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.
 fn gather<T: Real>(
@@ -386,34 +359,27 @@ fn gather<T: Real>(
         check_len("v_means2d", g.means2d, 2 * n)?;
         check_len("v_whitened", g.whitened, 3 * n)?;
         check_len("v_opacities", g.opacities, n)?;
-        (means2d, whitened, opacities, absolute) = (Some(g.means2d), Some(g.whitened), Some(g.opacities), g.absolute);
+        (means2d, whitened, opacities, absolute) =
+            (Some(g.means2d), Some(g.whitened), Some(g.opacities), g.absolute);
     }
     if let Some(colors) = &colors {
         check_len("v_colors", colors, channels * n)?;
     }
-    let jobs: Vec<_> = chunks(means2d, n, 2)
-        .into_iter()
-        .zip(chunks(whitened, n, 3))
-        .zip(chunks(opacities, n, 1))
-        .zip(chunks(absolute, n, 2))
-        .zip(chunks(colors, n, channels))
-        .enumerate()
+    let chunks = &input.tiles.chunks;
+    let jobs: Vec<_> = chunks
+        .iter()
+        .zip(rows(means2d, chunks, 2))
+        .zip(rows(whitened, chunks, 3))
+        .zip(rows(opacities, chunks, 1))
+        .zip(rows(absolute, chunks, 2))
+        .zip(rows(colors, chunks, channels))
         .collect();
-    jobs.into_par_iter().for_each_init(
-        || vec![0.0f64; columns.row()],
-        |sums, (chunk, ((((mut means2d, mut whitened), mut opacities), mut absolute), mut colors))| {
-            for j in 0..GATHER_CHUNK.min(n - chunk * GATHER_CHUNK) {
-                let i = chunk * GATHER_CHUNK + j;
-                sums.fill(0.0);
-                let splat = input.splat(i);
-                if splat.visible() {
-                    for position in input.tiles.positions(i) {
-                        if composited.hits[position] != 0 {
-                            let row = &pair_grads[position * columns.row()..][..columns.row()];
-                            sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
-                        }
-                    }
-                }
+    jobs.into_par_iter().for_each(
+        |(((((chunk, mut means2d), mut whitened), mut opacities), mut absolute), mut colors)| {
+            let mut sums = vec![0.0f64; columns.row()];
+            let mut finish = |i: usize, sums: &[f64]| {
+                let j = i - chunk.begin;
+                let splat = &input.projection.splats[i];
                 let write = |out: &mut Option<&mut [T]>, values: &[f64]| {
                     if let Some(out) = out {
                         for (o, v) in out[j * values.len()..].iter_mut().zip(values) {
@@ -430,21 +396,36 @@ fn gather<T: Real>(
                 let k = -0.5 / (UNIT * UNIT);
                 write(&mut whitened, &[k * sums[3], k * sums[4], k * sums[5]]);
                 // sigma enters as opacity exp(-sigma)
-                write(&mut opacities, &[if splat.visible() { -sums[0] / splat.opacity } else { 0.0 }]);
+                write(&mut opacities, &[-sums[0] / splat.opacity]);
                 if columns.absolute {
                     write(&mut absolute, &[s * sums[MOMENTS] / UNIT, sums[MOMENTS + 1] / (UNIT * UNIT)]);
                 }
+            };
+            let mut current = None;
+            chunk.pairs(input.tiles.columns, |i, position| {
+                if let Some(last) = current.filter(|&last| last != i) {
+                    finish(last, &sums);
+                    sums.fill(0.0);
+                }
+                current = Some(i);
+                if composited.hits[position] != 0 {
+                    let row = &pair_grads[position * columns.row()..][..columns.row()];
+                    sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
+                }
+            });
+            if let Some(last) = current {
+                finish(last, &sums);
             }
         },
     );
     Ok(())
 }
 
-/// Split an optional array of `n` rows into chunks of `GATHER_CHUNK` rows.
-fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T]>> {
+/// Split an optional array of `row` numbers per Gaussian into the ranges of `chunks`.
+fn rows<'a, T>(data: Option<&'a mut [T]>, chunks: &[Chunk], row: usize) -> Vec<Option<&'a mut [T]>> {
     match data {
-        Some(d) => d.chunks_mut(GATHER_CHUNK * row).map(Some).collect(),
-        None => (0..n.div_ceil(GATHER_CHUNK)).map(|_| None).collect(),
+        Some(d) => split(d, chunks.iter().map(|c| (c.end - c.begin) * row)).into_iter().map(Some).collect(),
+        None => chunks.iter().map(|_| None).collect(),
     }
 }
 
@@ -455,7 +436,7 @@ fn background_vjp<T: Real>(
     v: &CompositeCotangents<T>,
     out: &mut [T],
 ) {
-    let channels = input.channels;
+    let channels = input.channels();
     let parts: Vec<Vec<f64>> = composited
         .transmittance
         .par_chunks(TILE_PIXELS)

@@ -56,7 +56,7 @@ impl<T: Real> Grid<T> {
 /// A Gaussian as one tile sees it: `alpha = opacity 2^-(u^2 + v^2)` with `u = u0 + s x + n y`,
 /// `v = v0 + t y` and (x, y) relative to the tile's centre. u0 and v0 are computed in f64 before they are
 /// rounded, so that nothing cancels in f32, however long the Gaussian is.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Local<T> {
     pub u0: T,
     pub v0: T,
@@ -69,6 +69,8 @@ pub(crate) struct Local<T> {
     /// Centre, relative to the tile's centre.
     x: T,
     y: T,
+    /// Index of the Gaussian.
+    pub gaussian: u32,
 }
 
 /// `sqrt(log2(e) / 2)`: with it `2^-(u^2 + v^2) = exp(-sigma)`.
@@ -76,7 +78,7 @@ pub(crate) const UNIT: f64 = 0.849_321_800_288_019_1;
 
 impl<T: Real> Local<T> {
     #[inline(always)]
-    pub fn new(splat: &Splat, center: [f64; 2]) -> Self {
+    pub fn new(splat: &Splat, gaussian: u32, center: [f64; 2]) -> Self {
         let [s, m, t] = splat.factors;
         let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
         let (s, t) = (UNIT * s, UNIT * t);
@@ -91,6 +93,7 @@ impl<T: Real> Local<T> {
             limit: T::from_f64(reach * reach),
             x: T::from_f64(x),
             y: T::from_f64(y),
+            gaussian,
         }
     }
 }

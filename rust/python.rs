@@ -84,7 +84,6 @@ struct Frame {
 /// Tile lists and replay state of a composited frame.
 #[pyclass(frozen, module = "hqgs._rust")]
 struct Composite {
-    tiles: Vec<Tiles>,
     state: State,
     work: Work,
 }
@@ -104,9 +103,15 @@ impl Frame {
     }
 }
 
+/// One camera's tile lists and replay state.
+struct View<T> {
+    tiles: Tiles<T>,
+    composited: Composited<T>,
+}
+
 enum State {
-    F32(Vec<Composited<f32>>),
-    F64(Vec<Composited<f64>>),
+    F32(Vec<View<f32>>),
+    F64(Vec<View<f64>>),
 }
 
 #[pymethods]
@@ -120,17 +125,17 @@ impl Composite {
 
 /// A scalar type that the binding offers.
 trait Scalar: Real + Element {
-    fn wrap(state: Vec<Composited<Self>>) -> State;
-    fn unwrap(state: &State) -> PyResult<&[Composited<Self>]>;
+    fn wrap(state: Vec<View<Self>>) -> State;
+    fn unwrap(state: &State) -> PyResult<&[View<Self>]>;
 }
 
 macro_rules! scalar {
     ($type:ty, $variant:ident) => {
         impl Scalar for $type {
-            fn wrap(state: Vec<Composited<Self>>) -> State {
+            fn wrap(state: Vec<View<Self>>) -> State {
                 State::$variant(state)
             }
-            fn unwrap(state: &State) -> PyResult<&[Composited<Self>]> {
+            fn unwrap(state: &State) -> PyResult<&[View<Self>]> {
                 match state {
                     State::$variant(s) => Ok(s),
                     _ => Err(PyValueError::new_err("colors: dtype differs from the forward pass")),
@@ -472,18 +477,16 @@ fn composite_as<'py, T: Scalar>(
             let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
             let mut image = zeros::<T>(true, frame.cameras.len() * pixels * channels);
             let mut alphas = zeros::<T>(true, frame.cameras.len() * pixels);
-            let (mut all_tiles, mut states, mut total) = (Vec::new(), Vec::new(), Work::default());
+            let (mut views, mut total) = (Vec::new(), Work::default());
             for (i, (camera, projection)) in frame.cameras.iter().zip(&frame.projections).enumerate() {
-                let tiles = tiles::bin(projection, camera)?;
+                let tiles = tiles::bin(projection, of_camera(colors, i, frame.n * channels), channels, camera)?;
                 let input = CompositeInput {
                     projection,
                     tiles: &tiles,
                     camera,
-                    colors: of_camera(colors, i, frame.n * channels),
-                    channels,
                     background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 };
-                let (state, work) = composite::forward(
+                let (composited, work) = composite::forward(
                     &input,
                     &mut image[i * pixels * channels..(i + 1) * pixels * channels],
                     &mut alphas[i * pixels..(i + 1) * pixels],
@@ -491,10 +494,9 @@ fn composite_as<'py, T: Scalar>(
                 total.pairs += work.pairs;
                 total.blocks += work.blocks;
                 total.hit_blocks += work.hit_blocks;
-                states.push(state);
-                all_tiles.push(tiles);
+                views.push(View { tiles, composited });
             }
-            Ok((Composite { tiles: all_tiles, state: T::wrap(states), work: total }, image, alphas))
+            Ok((Composite { state: T::wrap(views), work: total }, image, alphas))
         })
     })?;
     Ok((state, image.into_pyarray(py), alphas.into_pyarray(py)))
@@ -536,7 +538,7 @@ fn composite_backward_as<'py, T: Scalar>(
 ) -> PyResult<CompositeOut<'py, T>> {
     let py = colors.py();
     let (frame, composite) = (frame.get(), composite.get());
-    let states = T::unwrap(&composite.state)?;
+    let views = T::unwrap(&composite.state)?;
     let colors = Array::<T>::new("colors", colors)?;
     let backgrounds = optional::<T>("backgrounds", backgrounds)?;
     let image = Array::<T>::new("render_colors", image)?;
@@ -570,10 +572,8 @@ fn composite_backward_as<'py, T: Scalar>(
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let input = CompositeInput {
                     projection: &frame.projections[i],
-                    tiles: &composite.tiles[i],
+                    tiles: &views[i].tiles,
                     camera,
-                    colors: of_camera(colors, i, n * channels),
-                    channels,
                     background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 };
                 let cotangents = CompositeCotangents {
@@ -597,7 +597,7 @@ fn composite_backward_as<'py, T: Scalar>(
                 };
                 composite::backward(
                     &input,
-                    &states[i],
+                    &views[i].composited,
                     &image[i * pixels * channels..(i + 1) * pixels * channels],
                     &cotangents,
                     grads,

@@ -1,107 +1,105 @@
-//! Depth order and tile lists: one stable sort of the visible Gaussians, then counting into tiles in that
-//! order, so that each tile's list is sorted without a sort of its own.
+//! Tile lists: which Gaussians reach which tile, front to back.
+//!
+//! Everything runs in the order of the Gaussians' indices, so that memory is read and written as streams: a
+//! tile's records lie in index order, and a small sort per tile, in cache, gives their depth order. The
+//! backward pass walks the same spans with one cursor per tile to sum each Gaussian's gradients, without an
+//! inverse index and in a fixed order.
 
 use crate::{
     camera::Camera,
     constants::{MAX_PAIRS, TILE},
     error::Error,
+    kernel::Local,
     project::{Projection, Splat},
+    real::Real,
 };
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-/// For each tile the Gaussians whose support reaches one of its pixel centres, front to back.
+/// A run of tiles in one row that one Gaussian reaches.
+#[derive(Debug, Clone, Copy)]
+struct Span {
+    gaussian: u32,
+    row: u16,
+    begin: u16,
+    end: u16,
+}
+
+/// The spans of a range of consecutive Gaussians.
+#[derive(Debug)]
+pub(crate) struct Chunk {
+    /// First Gaussian.
+    pub begin: usize,
+    /// End of the range.
+    pub end: usize,
+    /// By (Gaussian, row).
+    spans: Vec<Span>,
+    /// The same spans by (row, Gaussian): indices into `spans`.
+    by_row: Vec<u32>,
+    /// Begin of each row in `by_row`, and the end.
+    row_begins: Vec<u32>,
+    /// For each tile where this chunk's records begin, in the order of all records.
+    starts: Vec<u32>,
+}
+
+impl Chunk {
+    /// Call `f(gaussian, position of its record)` for each pair: by Gaussian, then by tile.
+    pub fn pairs(&self, columns: usize, mut f: impl FnMut(usize, usize)) {
+        let mut next = self.starts.clone();
+        for span in &self.spans {
+            let row = usize::from(span.row) * columns;
+            for position in &mut next[row + usize::from(span.begin)..row + usize::from(span.end)] {
+                f(span.gaussian as usize, *position as usize);
+                *position += 1;
+            }
+        }
+    }
+}
+
+/// For each tile the Gaussians whose support reaches one of its pixel centres.
 #[derive(Debug, Default)]
-pub struct Tiles {
+pub struct Tiles<T> {
     /// Tiles per row.
     pub columns: usize,
     /// Tiles per column.
     pub rows: usize,
-    /// Begin of each tile's list in `entries`, row-major, and the total at the end.
+    /// Begin of each tile's records, row-major, and the total at the end.
     pub offsets: Vec<usize>,
-    /// Gaussians, tile by tile, by (depth, index).
-    entries: Vec<AtomicU32>,
-    /// For the pairs Gaussian by Gaussian, where they lie in `entries`.
-    positions: Vec<AtomicU32>,
-    /// For each Gaussian the begin and end of its pairs in `positions`.
-    slots: Vec<[u32; 2]>,
+    /// What the kernels need of each pair; in a tile by index.
+    pub(crate) records: Vec<Local<T>>,
+    /// Colours of the records, [pairs, channels].
+    pub(crate) colors: Vec<T>,
+    /// Number of channels.
+    pub(crate) channels: usize,
+    /// For each tile its records by (depth, index), as offsets from the tile's first.
+    order: Vec<u32>,
+    pub(crate) chunks: Vec<Chunk>,
 }
 
-impl Tiles {
+/// One tile's part of [`Tiles`].
+pub(crate) struct Tile<'a, T> {
+    pub records: &'a [Local<T>],
+    pub colors: &'a [T],
+    pub order: &'a [u32],
+}
+
+impl<T> Tiles<T> {
     /// Number of (Gaussian, tile) pairs.
     pub fn pairs(&self) -> usize {
-        self.entries.len()
+        self.order.len()
     }
 
-    /// The Gaussians of tile `tile`, front to back.
-    pub fn entries(&self, tile: usize) -> impl Iterator<Item = usize> {
-        self.entries[self.offsets[tile]..self.offsets[tile + 1]].iter().map(|e| e.load(Relaxed) as usize)
+    /// Number of pairs of each tile.
+    pub fn lengths(&self) -> impl Iterator<Item = usize> {
+        self.offsets.windows(2).map(|w| w[1] - w[0])
     }
 
-    /// Where the pairs of Gaussian `i` lie in the tile-major order, in ascending tile order.
-    pub fn positions(&self, i: usize) -> impl Iterator<Item = usize> {
-        let [begin, end] = self.slots[i];
-        self.positions[begin as usize..end as usize].iter().map(|p| p.load(Relaxed) as usize)
-    }
-}
-
-/// The visible Gaussians by (depth, index).
-pub fn depth_order(projection: &Projection) -> Vec<u32> {
-    let depths = &projection.depths;
-    let mut keys: Vec<u64> = projection
-        .splats
-        .iter()
-        .zip(depths)
-        .enumerate()
-        .filter(|(_, (s, _))| s.visible())
-        // Positive floats order like their bits. The sort is on 32 bits; ties are ordered below.
-        .map(|(i, (_, d))| u64::from((*d as f32).to_bits()) << 32 | i as u64)
-        .collect();
-    radix_sort(&mut keys);
-    let index = |key: u64| key as u32;
-    let mut begin = 0;
-    while begin < keys.len() {
-        let mut end = begin + 1;
-        while end < keys.len() && keys[end] >> 32 == keys[begin] >> 32 {
-            end += 1;
+    pub(crate) fn tile(&self, tile: usize) -> Tile<'_, T> {
+        let range = self.offsets[tile]..self.offsets[tile + 1];
+        Tile {
+            records: &self.records[range.clone()],
+            colors: &self.colors[range.start * self.channels..range.end * self.channels],
+            order: &self.order[range],
         }
-        if end - begin > 1 {
-            // Equal as f32: order by the exact depth; the sort is stable, so ties stay by index.
-            keys[begin..end].sort_by(|a, b| {
-                depths[index(*a) as usize].total_cmp(&depths[index(*b) as usize])
-            });
-        }
-        begin = end;
-    }
-    keys.into_iter().map(index).collect()
-}
-
-/// Stable least-significant-digit radix sort by the upper 32 bits, 11 bits a pass.
-fn radix_sort(keys: &mut Vec<u64>) {
-    const BITS: u32 = 11;
-    const BUCKETS: usize = 1 << BITS;
-    let mut histograms = [[0usize; BUCKETS]; 3];
-    let digit = |key: u64, pass: u32| (key >> (32 + BITS * pass)) as usize & (BUCKETS - 1);
-    for &key in keys.iter() {
-        for (pass, histogram) in histograms.iter_mut().enumerate() {
-            histogram[digit(key, pass as u32)] += 1;
-        }
-    }
-    let mut other = vec![0u64; keys.len()];
-    for (pass, histogram) in histograms.iter_mut().enumerate() {
-        if histogram.contains(&keys.len()) {
-            continue; // one digit for all
-        }
-        let mut sum = 0;
-        for count in histogram.iter_mut() {
-            sum += std::mem::replace(count, sum);
-        }
-        for &key in keys.iter() {
-            let slot = &mut histogram[digit(key, pass as u32)];
-            other[*slot] = key;
-            *slot += 1;
-        }
-        std::mem::swap(keys, &mut other);
     }
 }
 
@@ -144,84 +142,161 @@ pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
     }
 }
 
-/// Order the visible Gaussians and bin them into tiles.
+/// The spans of the Gaussians `begin..end`, and the number of pairs of each tile.
+fn find_spans(projection: &Projection, begin: usize, end: usize, columns: usize, rows: usize) -> (Chunk, u64) {
+    let mut spans = Vec::with_capacity(end - begin);
+    let mut counts = vec![0u32; columns * rows];
+    let mut row_begins = vec![0u32; rows + 1];
+    let mut pairs = 0;
+    for i in begin..end {
+        let splat = &projection.splats[i];
+        if !splat.visible() {
+            continue;
+        }
+        tile_spans(splat, |row, x0, x1| {
+            spans.push(Span { gaussian: i as u32, row: row as u16, begin: x0 as u16, end: x1 as u16 });
+            row_begins[row + 1] += 1;
+            counts[row * columns + x0..row * columns + x1].iter_mut().for_each(|n| *n += 1);
+            pairs += (x1 - x0) as u64;
+        });
+    }
+    for row in 0..rows {
+        row_begins[row + 1] += row_begins[row];
+    }
+    let mut next = row_begins.clone();
+    let mut by_row = vec![0u32; spans.len()];
+    for (k, span) in spans.iter().enumerate() {
+        let slot = &mut next[usize::from(span.row)];
+        by_row[*slot as usize] = k as u32;
+        *slot += 1;
+    }
+    (Chunk { begin, end, spans, by_row, row_begins, starts: counts }, pairs)
+}
+
+/// Split `data` into consecutive pieces of the given lengths.
+pub(crate) fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+    lengths
+        .map(|n| {
+            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
+            data = tail;
+            head
+        })
+        .collect()
+}
+
+/// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry.
 ///
 /// # Errors
 /// When there are more than [`MAX_PAIRS`] (Gaussian, tile) pairs.
-pub fn bin(projection: &Projection, camera: &Camera) -> Result<Tiles, Error> {
-    let order = depth_order(projection);
-    let splats = &projection.splats;
+pub fn bin<T: Real>(
+    projection: &Projection,
+    colors: &[T],
+    channels: usize,
+    camera: &Camera,
+) -> Result<Tiles<T>, Error> {
+    let n = projection.splats.len();
     let (columns, rows) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
-    let chunk = order.len().div_ceil(rayon::current_num_threads().min(16)).max(1);
-
-    // Pairs per (chunk, tile), and per Gaussian.
-    let counted: Vec<(Vec<u32>, Vec<u32>, u64)> = order
-        .par_chunks(chunk)
-        .map(|ids| {
-            let mut per_tile = vec![0u32; columns * rows];
-            let mut total = 0;
-            let per_gaussian = ids
-                .iter()
-                .map(|&i| {
-                    let mut pairs = 0;
-                    tile_spans(&splats[i as usize], |y, x0, x1| {
-                        pairs += (x1 - x0) as u32;
-                        per_tile[y * columns + x0..y * columns + x1].iter_mut().for_each(|n| *n += 1);
-                    });
-                    total += u64::from(pairs);
-                    pairs
-                })
-                .collect();
-            (per_tile, per_gaussian, total)
-        })
-        .collect();
-    let total: u64 = counted.iter().map(|c| c.2).sum();
+    // Several chunks per thread balance the load; the number of chunks changes no result.
+    let size = n.div_ceil(4 * rayon::current_num_threads()).max(1024);
+    let (mut chunks, pairs): (Vec<_>, Vec<_>) = (0..n.div_ceil(size))
+        .into_par_iter()
+        .map(|k| find_spans(projection, k * size, n.min((k + 1) * size), columns, rows))
+        .unzip();
+    let total: u64 = pairs.iter().sum();
     if total > MAX_PAIRS {
         return Err(Error::new(
             "means",
             format!(
-                "{} visible Gaussians cover {total} (Gaussian, tile) pairs, more than {MAX_PAIRS}; \
-                 use fewer or smaller Gaussians, or a smaller image",
-                order.len()
+                "the Gaussians cover {total} (Gaussian, tile) pairs, more than {MAX_PAIRS}; \
+                 use fewer or smaller Gaussians, or a smaller image"
             ),
         ));
     }
-
-    // Where each (tile, chunk) begins: tile by tile, within a tile chunk by chunk, which is depth order.
+    // Counts to positions: tile by tile, within a tile chunk by chunk.
     let mut offsets = Vec::with_capacity(columns * rows + 1);
-    let mut starts: Vec<Vec<u32>> = counted.iter().map(|c| vec![0; c.0.len()]).collect();
-    let mut sum = 0usize;
+    let mut sum = 0;
     for tile in 0..columns * rows {
-        offsets.push(sum);
-        for (start, (per_tile, ..)) in starts.iter_mut().zip(&counted) {
-            start[tile] = sum as u32;
-            sum += per_tile[tile] as usize;
+        offsets.push(sum as usize);
+        for chunk in &mut chunks {
+            sum += std::mem::replace(&mut chunk.starts[tile], sum);
         }
     }
-    offsets.push(sum);
-    let mut slots = vec![[0u32; 2]; splats.len()];
-    let mut slot = 0;
-    for (ids, (_, per_gaussian, _)) in order.chunks(chunk).zip(&counted) {
-        for (&i, &pairs) in ids.iter().zip(per_gaussian) {
-            slots[i as usize] = [slot, slot + pairs];
-            slot += pairs;
+    offsets.push(sum as usize);
+
+    let mut records = vec![Local::default(); sum as usize];
+    let mut pair_colors = vec![T::ZERO; sum as usize * channels];
+    let mut order = vec![0u32; sum as usize];
+    let row_lengths = || (0..rows).map(|y| offsets[(y + 1) * columns] - offsets[y * columns]);
+    let jobs: Vec<_> = split(&mut records, row_lengths())
+        .into_iter()
+        .zip(split(&mut pair_colors, row_lengths().map(|n| n * channels)))
+        .zip(split(&mut order, row_lengths()))
+        .enumerate()
+        .collect();
+    let source = Source { projection, colors, channels, columns, chunks: &chunks, offsets: &offsets };
+    jobs.into_par_iter().for_each(|(row, ((records, colors), order))| {
+        source.fill_row(row, records, colors, order);
+    });
+    Ok(Tiles { columns, rows, offsets, records, colors: pair_colors, channels, order, chunks })
+}
+
+/// What the rows are filled from.
+struct Source<'a, T> {
+    projection: &'a Projection,
+    colors: &'a [T],
+    channels: usize,
+    columns: usize,
+    chunks: &'a [Chunk],
+    offsets: &'a [usize],
+}
+
+impl<T: Real> Source<'_, T> {
+    /// Write the records, colours and depth order of one row of tiles.
+    fn fill_row(&self, row: usize, records: &mut [Local<T>], colors: &mut [T], order: &mut [u32]) {
+        let tiles = row * self.columns..(row + 1) * self.columns;
+        let base = self.offsets[tiles.start];
+        let d = self.channels;
+        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
+        let mut keys = vec![0u64; records.len()];
+        for chunk in self.chunks {
+            let mut next = chunk.starts[tiles.clone()].to_vec();
+            let spans = &chunk.by_row[chunk.row_begins[row] as usize..chunk.row_begins[row + 1] as usize];
+            for span in spans.iter().map(|&k| &chunk.spans[k as usize]) {
+                let i = span.gaussian as usize;
+                let splat = &self.projection.splats[i];
+                let color = &self.colors[i * d..(i + 1) * d];
+                let key = u64::from((self.projection.depths[i] as f32).to_bits()) << 32;
+                for x in usize::from(span.begin)..usize::from(span.end) {
+                    let at = next[x] as usize - base;
+                    next[x] += 1;
+                    records[at] = Local::new(splat, span.gaussian, [middle(x), middle(row)]);
+                    colors[at * d..(at + 1) * d].copy_from_slice(color);
+                    // Positive floats order like their bits; the low half keeps the order of the indices.
+                    keys[at] = key | (at - (self.offsets[tiles.start + x] - base)) as u64;
+                }
+            }
+        }
+        for tile in tiles {
+            let range = self.offsets[tile] - base..self.offsets[tile + 1] - base;
+            let keys = &mut keys[range.clone()];
+            keys.sort_unstable();
+            for (o, key) in order[range.clone()].iter_mut().zip(keys.iter()) {
+                *o = *key as u32;
+            }
+            self.order_ties(keys, &records[range.clone()], &mut order[range]);
         }
     }
 
-    let make = |n: usize| (0..n).into_par_iter().map(|_| AtomicU32::new(0)).collect::<Vec<_>>();
-    let (entries, positions) = (make(sum), make(sum));
-    order.par_chunks(chunk).zip(starts).for_each(|(ids, mut next)| {
-        for &i in ids {
-            let mut slot = slots[i as usize][0] as usize;
-            tile_spans(&splats[i as usize], |y, x0, x1| {
-                for position in &mut next[y * columns + x0..y * columns + x1] {
-                    entries[*position as usize].store(i, Relaxed);
-                    positions[slot].store(*position, Relaxed);
-                    *position += 1;
-                    slot += 1;
-                }
-            });
+    /// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
+    /// equal ones stay in the order of their indices.
+    fn order_ties(&self, keys: &[u64], records: &[Local<T>], order: &mut [u32]) {
+        let depth = |o: &u32| self.projection.depths[records[*o as usize].gaussian as usize];
+        let mut begin = 0;
+        for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
+            if run.len() > 1 {
+                order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
+            }
+            begin += run.len();
         }
-    });
-    Ok(Tiles { columns, rows, offsets, entries, positions, slots })
+    }
 }
