@@ -57,7 +57,7 @@ impl<T: Real> CompositeInput<'_, T> {
 /// What the backward pass replays.
 #[derive(Debug, Default)]
 pub struct Composited<T> {
-    /// For each pair the blocks in which it changed a pixel.
+    /// For each record the blocks in which it changed a pixel.
     hits: Vec<u16>,
     /// Transmittance after the last layer, tile by tile in block order.
     transmittance: Vec<T>,
@@ -171,16 +171,13 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     let list = input.tiles.tile(tile);
     let channels = input.channels();
     let mut work = Work { pairs: hits.len() as u64, ..Work::default() };
-    for &k in list.order {
-        let k = k as usize;
-        let local = &list.records[k];
+    let pairs = list.records.iter().zip(list.colors.chunks_exact(channels));
+    for ((local, color), hit) in pairs.zip(hits) {
         let mask = kernel::reached(simd, local, grid) & layers.alive;
         if mask == 0 {
             continue;
         }
-        let color = &list.colors[k * channels..(k + 1) * channels];
-        let hit = kernel::blend::<S, T, D>(simd, grid, local, color, mask, &mut layers, colors);
-        hits[k] = hit;
+        *hit = kernel::blend::<S, T, D>(simd, grid, local, color, mask, &mut layers, colors);
         work.blocks += u64::from(mask.count_ones());
         work.hit_blocks += u64::from(hit.count_ones());
         if layers.alive == 0 {
@@ -268,7 +265,7 @@ pub fn backward<T: Real>(
             ));
         },
     );
-    gather(input, composited, &pair_grads, columns, n, grads.geometry, grads.colors)
+    gather(input, &pair_grads, columns, n, grads.geometry, grads.colors)
 }
 
 /// Layout of one pair's gradients.
@@ -333,12 +330,11 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     };
     let list = input.tiles.tile(tile);
     let hits = &composited.hits[input.tiles.offsets[tile]..];
-    for &k in list.order {
-        let k = k as usize;
-        if hits[k] != 0 {
-            let color = &list.colors[k * channels..(k + 1) * channels];
-            let out = &mut out[k * columns.row()..(k + 1) * columns.row()];
-            kernel::unblend::<S, T, D>(simd, grid, &list.records[k], color, hits[k], &mut adjoint, out);
+    let pairs = list.records.iter().zip(list.colors.chunks_exact(channels));
+    for (((local, color), &hit), &place) in pairs.zip(hits).zip(list.places) {
+        if hit != 0 {
+            let out = &mut out[place as usize * columns.row()..][..columns.row()];
+            kernel::unblend::<S, T, D>(simd, grid, local, color, hit, &mut adjoint, out);
         }
     }
 }
@@ -346,7 +342,6 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
 /// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.
 fn gather<T: Real>(
     input: &CompositeInput<T>,
-    composited: &Composited<T>,
     pair_grads: &[T],
     columns: Columns,
     n: usize,
@@ -408,10 +403,8 @@ fn gather<T: Real>(
                     sums.fill(0.0);
                 }
                 current = Some(i);
-                if composited.hits[position] != 0 {
-                    let row = &pair_grads[position * columns.row()..][..columns.row()];
-                    sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
-                }
+                let row = &pair_grads[position * columns.row()..][..columns.row()];
+                sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
             });
             if let Some(last) = current {
                 finish(last, &sums);

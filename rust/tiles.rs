@@ -64,14 +64,14 @@ pub struct Tiles<T> {
     pub rows: usize,
     /// Begin of each tile's records, row-major, and the total at the end.
     pub offsets: Vec<usize>,
-    /// What the kernels need of each pair; in a tile by index.
+    /// What the kernels need of each pair; in a tile by (depth, index), so that they read a stream.
     pub(crate) records: Vec<Local<T>>,
     /// Colours of the records, [pairs, channels].
     pub(crate) colors: Vec<T>,
     /// Number of channels.
     pub(crate) channels: usize,
-    /// For each tile its records by (depth, index), as offsets from the tile's first.
-    order: Vec<u32>,
+    /// For each record its place by index among the tile's records.
+    places: Vec<u32>,
     pub(crate) chunks: Vec<Chunk>,
 }
 
@@ -79,13 +79,13 @@ pub struct Tiles<T> {
 pub(crate) struct Tile<'a, T> {
     pub records: &'a [Local<T>],
     pub colors: &'a [T],
-    pub order: &'a [u32],
+    pub places: &'a [u32],
 }
 
 impl<T> Tiles<T> {
     /// Number of (Gaussian, tile) pairs.
     pub fn pairs(&self) -> usize {
-        self.order.len()
+        self.places.len()
     }
 
     /// Number of pairs of each tile.
@@ -98,7 +98,7 @@ impl<T> Tiles<T> {
         Tile {
             records: &self.records[range.clone()],
             colors: &self.colors[range.start * self.channels..range.end * self.channels],
-            order: &self.order[range],
+            places: &self.places[range],
         }
     }
 }
@@ -225,19 +225,19 @@ pub fn bin<T: Real>(
 
     let mut records = vec![Local::default(); sum as usize];
     let mut pair_colors = vec![T::ZERO; sum as usize * channels];
-    let mut order = vec![0u32; sum as usize];
+    let mut places = vec![0u32; sum as usize];
     let row_lengths = || (0..rows).map(|y| offsets[(y + 1) * columns] - offsets[y * columns]);
     let jobs: Vec<_> = split(&mut records, row_lengths())
         .into_iter()
         .zip(split(&mut pair_colors, row_lengths().map(|n| n * channels)))
-        .zip(split(&mut order, row_lengths()))
+        .zip(split(&mut places, row_lengths()))
         .enumerate()
         .collect();
     let source = Source { projection, colors, channels, columns, chunks: &chunks, offsets: &offsets };
-    jobs.into_par_iter().for_each(|(row, ((records, colors), order))| {
-        source.fill_row(row, records, colors, order);
+    jobs.into_par_iter().for_each(|(row, ((records, colors), places))| {
+        source.fill_row(row, records, colors, places);
     });
-    Ok(Tiles { columns, rows, offsets, records, colors: pair_colors, channels, order, chunks })
+    Ok(Tiles { columns, rows, offsets, records, colors: pair_colors, channels, places, chunks })
 }
 
 /// What the rows are filled from.
@@ -251,27 +251,27 @@ struct Source<'a, T> {
 }
 
 impl<T: Real> Source<'_, T> {
-    /// Write the records, colours and depth order of one row of tiles.
-    fn fill_row(&self, row: usize, records: &mut [Local<T>], colors: &mut [T], order: &mut [u32]) {
+    /// Write the records, colours and places of one row of tiles.
+    fn fill_row(&self, row: usize, records: &mut [Local<T>], colors: &mut [T], places: &mut [u32]) {
         let tiles = row * self.columns..(row + 1) * self.columns;
         let base = self.offsets[tiles.start];
         let d = self.channels;
         let middle = |k: usize| (k * TILE + TILE / 2) as f64;
+        // By index first.
         let mut keys = vec![0u64; records.len()];
+        let mut by_index = vec![Local::default(); records.len()];
         for chunk in self.chunks {
             let mut next = chunk.starts[tiles.clone()].to_vec();
             let spans = &chunk.by_row[chunk.row_begins[row] as usize..chunk.row_begins[row + 1] as usize];
             for span in spans.iter().map(|&k| &chunk.spans[k as usize]) {
                 let i = span.gaussian as usize;
                 let splat = &self.projection.splats[i];
-                let color = &self.colors[i * d..(i + 1) * d];
+                // Positive floats order like their bits; the low half keeps the order of the indices.
                 let key = u64::from((self.projection.depths[i] as f32).to_bits()) << 32;
                 for x in usize::from(span.begin)..usize::from(span.end) {
                     let at = next[x] as usize - base;
                     next[x] += 1;
-                    records[at] = Local::new(splat, span.gaussian, [middle(x), middle(row)]);
-                    colors[at * d..(at + 1) * d].copy_from_slice(color);
-                    // Positive floats order like their bits; the low half keeps the order of the indices.
+                    by_index[at] = Local::new(splat, span.gaussian, [middle(x), middle(row)]);
                     keys[at] = key | (at - (self.offsets[tiles.start + x] - base)) as u64;
                 }
             }
@@ -279,11 +279,21 @@ impl<T: Real> Source<'_, T> {
         for tile in tiles {
             let range = self.offsets[tile] - base..self.offsets[tile + 1] - base;
             let keys = &mut keys[range.clone()];
+            let by_index = &by_index[range.clone()];
+            let places = &mut places[range.clone()];
             keys.sort_unstable();
-            for (o, key) in order[range.clone()].iter_mut().zip(keys.iter()) {
-                *o = *key as u32;
+            for (place, key) in places.iter_mut().zip(keys.iter()) {
+                *place = *key as u32;
             }
-            self.order_ties(keys, &records[range.clone()], &mut order[range]);
+            self.order_ties(keys, by_index, places);
+            let colors = &mut colors[range.start * d..range.end * d];
+            for ((record, color), place) in
+                records[range].iter_mut().zip(colors.chunks_exact_mut(d)).zip(places.iter())
+            {
+                *record = by_index[*place as usize];
+                let i = record.gaussian as usize;
+                color.copy_from_slice(&self.colors[i * d..(i + 1) * d]);
+            }
         }
     }
 
