@@ -275,21 +275,22 @@ class _Composite(torch.autograd.Function):
         image = torch.from_numpy(image).view(c, height, width, channels)
         alphas = torch.from_numpy(alphas).view(c, height, width, 1)
         ctx.frame, ctx.state, ctx.absgrad = frame, state, absgrad
-        ctx.save_for_backward(means2d, colors, backgrounds, image)
+        ctx.save_for_backward(means2d, colors, backgrounds)
+        ctx.image_shape = image.shape
         ctx.set_materialize_grads(False)
         return image, alphas, state.work
 
     @staticmethod
     def backward(ctx: Any, v_image, v_alphas, _):  # noqa: ANN205
-        means2d, colors, backgrounds, image = ctx.saved_tensors
+        means2d, colors, backgrounds = ctx.saved_tensors
         _, need_means2d, need_link, need_alphas, need_colors, need_backgrounds, _ = ctx.needs_input_grad
         geometry = need_means2d or need_link or need_alphas
         if v_image is None and v_alphas is None:
             return (None,) * 7
         c, n, channels = means2d.shape[0], means2d.shape[1], colors.shape[-1]
-        v_image = torch.zeros_like(image) if v_image is None else v_image
+        v_image = means2d.new_zeros(ctx.image_shape) if v_image is None else v_image
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = _rust.composite_backward(
-            ctx.frame, ctx.state, _numpy(colors), _optional(backgrounds), _numpy(image), _numpy(v_image),
+            ctx.frame, ctx.state, _numpy(colors), _optional(backgrounds), _numpy(v_image),
             _optional(v_alphas), channels, [geometry, ctx.absgrad, need_colors, need_backgrounds],
         )  # fmt: skip
         if v_abs is not None:

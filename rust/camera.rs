@@ -32,9 +32,17 @@ impl Camera {
     /// # Errors
     /// When a number is not finite, a focal length is not positive, the skew is not 0, the last row of
     /// `viewmat` is not (0, 0, 0, 1), its linear part is singular, or the image is empty.
-    pub fn new(viewmat: &[f64; 16], k: &[f64; 9], width: usize, height: usize) -> Result<Self, Error> {
+    pub fn new(
+        viewmat: &[f64; 16],
+        k: &[f64; 9],
+        width: usize,
+        height: usize,
+    ) -> Result<Self, Error> {
         if width == 0 || height == 0 {
-            return Err(Error::new("width, height", format!("must be positive, got {width} x {height}")));
+            return Err(Error::new(
+                "width, height",
+                format!("must be positive, got {width} x {height}"),
+            ));
         }
         // 2^15 tiles per side keep tile coordinates in i16 and pixel indices in f32 exact.
         if width > 1 << 19 || height > 1 << 19 {
@@ -45,7 +53,9 @@ impl Camera {
         }
         // A transposed matrix shows in its last row; finite differences may still move it a little.
         let last_row = viewmat[12..].iter().zip([0.0, 0.0, 0.0, 1.0]);
-        if !viewmat.iter().all(|x| x.is_finite()) || last_row.into_iter().any(|(x, e)| (x - e).abs() > 1e-4) {
+        if !viewmat.iter().all(|x| x.is_finite())
+            || last_row.into_iter().any(|(x, e)| (x - e).abs() > 1e-4)
+        {
             return Err(Error::new(
                 "viewmats",
                 format!("must be finite with last row (0, 0, 0, 1), got {viewmat:?}"),
@@ -53,17 +63,27 @@ impl Camera {
         }
         let focal = DVec2::new(k[0], k[4]);
         if !k.iter().all(|x| x.is_finite()) || focal.min_element() <= 0.0 {
-            return Err(Error::new("Ks", format!("must be finite with positive focal lengths, got {k:?}")));
+            return Err(Error::new(
+                "Ks",
+                format!("must be finite with positive focal lengths, got {k:?}"),
+            ));
         }
         if k[1] != 0.0 || k[3] != 0.0 || k[6..] != [0.0, 0.0, 1.0] {
-            return Err(Error::new("Ks", format!("must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {k:?}")));
+            return Err(Error::new(
+                "Ks",
+                format!("must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {k:?}"),
+            ));
         }
         let v = viewmat;
-        let rotation = DMat3::from_cols_array(&[v[0], v[4], v[8], v[1], v[5], v[9], v[2], v[6], v[10]]);
+        let rotation =
+            DMat3::from_cols_array(&[v[0], v[4], v[8], v[1], v[5], v[9], v[2], v[6], v[10]]);
         let translation = DVec3::new(v[3], v[7], v[11]);
         let center = -(rotation.inverse() * translation);
         if !center.is_finite() {
-            return Err(Error::new("viewmats", format!("the rotation must be invertible, got {viewmat:?}")));
+            return Err(Error::new(
+                "viewmats",
+                format!("the rotation must be invertible, got {viewmat:?}"),
+            ));
         }
         let principal = DVec2::new(k[2], k[5]);
         let size = DVec2::new(width as f64, height as f64);
@@ -95,8 +115,11 @@ pub struct CameraGrad {
 
 impl CameraGrad {
     /// The zero gradient.
-    pub const ZERO: Self =
-        Self { rotation: DMat3::ZERO, translation: DVec3::ZERO, center: DVec3::ZERO };
+    pub const ZERO: Self = Self {
+        rotation: DMat3::ZERO,
+        translation: DVec3::ZERO,
+        center: DVec3::ZERO,
+    };
 
     /// Add another gradient.
     pub fn add(&mut self, other: &Self) {

@@ -31,7 +31,8 @@ impl<T: Real> CompositeInput<'_, T> {
     /// # Errors
     /// Names `backgrounds`.
     fn check(&self) -> Result<(), Error> {
-        self.background.map_or(Ok(()), |b| check_len("backgrounds", b, self.channels()))
+        self.background
+            .map_or(Ok(()), |b| check_len("backgrounds", b, self.channels()))
     }
 
     fn channels(&self) -> usize {
@@ -44,7 +45,10 @@ impl<T: Real> CompositeInput<'_, T> {
 
     /// The image's pixels in tile `tile`: (index in block order, index in the image).
     fn tile_pixels(&self, tile: usize) -> impl Iterator<Item = (usize, usize)> + use<'_, T> {
-        let (top, left) = (tile / self.tiles.columns * TILE, tile % self.tiles.columns * TILE);
+        let (top, left) = (
+            tile / self.tiles.columns * TILE,
+            tile % self.tiles.columns * TILE,
+        );
         let (width, height) = (self.camera.width, self.camera.height);
         (0..TILE_PIXELS).filter_map(move |p| {
             let (row, column) = kernel::position(p);
@@ -78,7 +82,6 @@ pub struct Work {
 macro_rules! for_channels {
     ($channels:expr, $function:ident, $simd:expr, $types:ty, ($($argument:expr),*)) => {
         match $channels {
-            1 => $function::<_, $types, 1>($simd, $($argument),*),
             3 => $function::<_, $types, 3>($simd, $($argument),*),
             4 => $function::<_, $types, 4>($simd, $($argument),*),
             _ => $function::<_, $types, 0>($simd, $($argument),*),
@@ -114,7 +117,9 @@ pub fn forward<T: Real>(
     let work = jobs
         .into_par_iter()
         .map(|(tile, ((hits, transmittance), colors))| {
-            let Ok(transmittance) = transmittance.try_into() else { unreachable!("chunks of a tile") };
+            let Ok(transmittance) = transmittance.try_into() else {
+                unreachable!("chunks of a tile")
+            };
             dispatch!(level, simd => for_channels!(
                 channels, forward_tile, simd, T, (input, &grid, tile, hits, transmittance, colors)
             ))
@@ -145,7 +150,13 @@ pub fn forward<T: Real>(
                 }
             }
         });
-    Ok((Composited { hits, transmittance }, work))
+    Ok((
+        Composited {
+            hits,
+            transmittance,
+        },
+        work,
+    ))
 }
 
 #[inline(always)]
@@ -167,10 +178,17 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
         alive |= u16::from(pixels.iter().any(|t| *t == T::ONE)) << block;
     }
     let mut finished = [T::ZERO; TILE_PIXELS];
-    let mut layers = Layers { transmittance, finished: &mut finished, alive };
+    let mut layers = Layers {
+        transmittance,
+        finished: &mut finished,
+        alive,
+    };
     let list = input.tiles.tile(tile);
     let channels = input.channels();
-    let mut work = Work { pairs: hits.len() as u64, ..Work::default() };
+    let mut work = Work {
+        pairs: hits.len() as u64,
+        ..Work::default()
+    };
     let pairs = list.records.iter().zip(list.colors.chunks_exact(channels));
     for ((local, color), hit) in pairs.zip(hits) {
         let mask = kernel::reached(simd, local, grid) & layers.alive;
@@ -225,20 +243,18 @@ pub struct GeometryGrads<'a, T> {
     pub absolute: Option<&'a mut [T]>,
 }
 
-/// VJP of [`forward`]; `image` is the image that it made.
+/// VJP of [`forward`].
 ///
 /// # Errors
 /// When the length of an array does not fit; nothing is written then.
 pub fn backward<T: Real>(
     input: &CompositeInput<T>,
     composited: &Composited<T>,
-    image: &[T],
     v: &CompositeCotangents<T>,
     grads: CompositeGrads<T>,
 ) -> Result<(), Error> {
     input.check()?;
     let (n, channels, tiles) = (input.projection.splats.len(), input.channels(), input.tiles);
-    check_len("render_colors", image, input.pixels() * channels)?;
     check_len("v_render_colors", v.image, input.pixels() * channels)?;
     if let Some(alphas) = v.alphas {
         check_len("v_render_alphas", alphas, input.pixels())?;
@@ -250,18 +266,28 @@ pub fn backward<T: Real>(
     if grads.geometry.is_none() && grads.colors.is_none() {
         return Ok(());
     }
-    let absolute = grads.geometry.as_ref().is_some_and(|g| g.absolute.is_some());
-    let columns = Columns { geometry: grads.geometry.is_some(), absolute, channels };
+    let absolute = grads
+        .geometry
+        .as_ref()
+        .is_some_and(|g| g.absolute.is_some());
+    let columns = Columns {
+        geometry: grads.geometry.is_some(),
+        absolute,
+        channels,
+    };
     let row = columns.row();
     let mut pair_grads = vec![T::ZERO; tiles.pairs() * row];
     let grid = Grid::new();
     let level = Level::new();
-    let jobs: Vec<_> = split(&mut pair_grads, tiles.lengths().map(|n| n * row)).into_iter().enumerate().collect();
+    let jobs: Vec<_> = split(&mut pair_grads, tiles.lengths().map(|n| n * row))
+        .into_iter()
+        .enumerate()
+        .collect();
     jobs.into_par_iter().for_each_init(
-        || vec![[T::ZERO; TILE_PIXELS]; channels],
-        |v_colors, (tile, out)| {
+        || Scratch { v_colors: vec![[T::ZERO; TILE_PIXELS]; channels], layers: Vec::new() },
+        |scratch, (tile, out)| {
             dispatch!(level, simd => for_channels!(
-                channels, backward_tile, simd, T, (input, composited, image, v, &grid, tile, columns, v_colors, out)
+                channels, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch, out)
             ));
         },
     );
@@ -286,55 +312,81 @@ impl Columns {
     }
 }
 
+/// Buffers of one thread, reused from tile to tile.
+struct Scratch<T> {
+    /// Cotangents of a tile's pixels, by channel.
+    v_colors: Vec<Pixels<T>>,
+    /// What `kernel::replay` stores.
+    layers: Vec<T>,
+}
+
 #[inline(always)]
 fn backward_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
     input: &CompositeInput<T>,
     composited: &Composited<T>,
-    image: &[T],
     v: &CompositeCotangents<T>,
     grid: &Grid<T>,
     tile: usize,
     columns: Columns,
-    v_colors: &mut [Pixels<T>],
+    scratch: &mut Scratch<T>,
     out: &mut [T],
 ) {
     let channels = columns.channels;
     let mut transmittance = [T::ZERO; TILE_PIXELS];
     let mut behind = [T::ZERO; TILE_PIXELS];
-    v_colors.iter_mut().for_each(|c| c.fill(T::ZERO));
-    let last = &composited.transmittance[tile * TILE_PIXELS..];
+    scratch.v_colors.iter_mut().for_each(|c| c.fill(T::ZERO));
     let mut any = false;
     for (p, pixel) in input.tile_pixels(tile) {
         transmittance[p] = T::ONE;
+        // Behind the last layer: the background, and the alpha, which is 1 - T.
         let v_alpha = v.alphas.map_or(0.0, |a| a[pixel].to_f64());
         any |= v_alpha != 0.0;
-        let mut sum = -v_alpha * last[p].to_f64();
-        for (c, v_color) in v_colors.iter_mut().enumerate() {
+        let mut sum = -v_alpha;
+        for (c, v_color) in scratch.v_colors.iter_mut().enumerate() {
             let v_c = v.image[pixel * channels + c];
             any |= v_c != T::ZERO;
             v_color[p] = v_c;
-            sum += v_c.to_f64() * image[pixel * channels + c].to_f64();
+            sum += v_c.to_f64() * input.background.map_or(0.0, |b| b[c].to_f64());
         }
         behind[p] = T::from_f64(sum);
     }
     if !any {
         return; // the gradients are already zero
     }
+    let list = input.tiles.tile(tile);
+    let hits = &composited.hits[input.tiles.offsets[tile]..][..list.records.len()];
+    let size = |hit: u16| hit.count_ones() as usize * kernel::LAYER;
+    scratch
+        .layers
+        .resize(hits.iter().map(|&hit| size(hit)).sum(), T::ZERO);
+    let mut rest = &mut scratch.layers[..];
+    for (local, &hit) in list.records.iter().zip(hits) {
+        let (layer, tail) = rest.split_at_mut(size(hit));
+        rest = tail;
+        kernel::replay(simd, grid, local, hit, &mut transmittance, layer);
+    }
     let mut adjoint = Adjoint {
-        transmittance: &mut transmittance,
         behind: &mut behind,
-        v_colors,
+        v_colors: &scratch.v_colors,
         geometry: columns.geometry,
         absolute: columns.absolute,
     };
-    let list = input.tiles.tile(tile);
-    let hits = &composited.hits[input.tiles.offsets[tile]..];
-    let pairs = list.records.iter().zip(list.colors.chunks_exact(channels));
-    for (((local, color), &hit), &place) in pairs.zip(hits).zip(list.places) {
+    let mut rest = &scratch.layers[..];
+    let colors = list.colors.chunks_exact(channels);
+    for (((local, color), &hit), &place) in list
+        .records
+        .iter()
+        .zip(colors)
+        .zip(hits)
+        .zip(list.places)
+        .rev()
+    {
         if hit != 0 {
+            let (head, layers) = rest.split_at(rest.len() - size(hit));
+            rest = head;
             let out = &mut out[place as usize * columns.row()..][..columns.row()];
-            kernel::unblend::<S, T, D>(simd, grid, local, color, hit, &mut adjoint, out);
+            kernel::unblend::<S, T, D>(simd, grid, local, color, hit, layers, &mut adjoint, out);
         }
     }
 }
@@ -354,8 +406,12 @@ fn gather<T: Real>(
         check_len("v_means2d", g.means2d, 2 * n)?;
         check_len("v_whitened", g.whitened, 3 * n)?;
         check_len("v_opacities", g.opacities, n)?;
-        (means2d, whitened, opacities, absolute) =
-            (Some(g.means2d), Some(g.whitened), Some(g.opacities), g.absolute);
+        (means2d, whitened, opacities, absolute) = (
+            Some(g.means2d),
+            Some(g.whitened),
+            Some(g.opacities),
+            g.absolute,
+        );
     }
     if let Some(colors) = &colors {
         check_len("v_colors", colors, channels * n)?;
@@ -393,7 +449,10 @@ fn gather<T: Real>(
                 // sigma enters as opacity exp(-sigma)
                 write(&mut opacities, &[-sums[0] / splat.opacity]);
                 if columns.absolute {
-                    write(&mut absolute, &[s * sums[MOMENTS] / UNIT, sums[MOMENTS + 1] / (UNIT * UNIT)]);
+                    write(
+                        &mut absolute,
+                        &[s * sums[MOMENTS] / UNIT, sums[MOMENTS + 1] / (UNIT * UNIT)],
+                    );
                 }
             };
             let mut current = None;
@@ -415,9 +474,16 @@ fn gather<T: Real>(
 }
 
 /// Split an optional array of `row` numbers per Gaussian into the ranges of `chunks`.
-fn rows<'a, T>(data: Option<&'a mut [T]>, chunks: &[Chunk], row: usize) -> Vec<Option<&'a mut [T]>> {
+fn rows<'a, T>(
+    data: Option<&'a mut [T]>,
+    chunks: &[Chunk],
+    row: usize,
+) -> Vec<Option<&'a mut [T]>> {
     match data {
-        Some(d) => split(d, chunks.iter().map(|c| (c.end - c.begin) * row)).into_iter().map(Some).collect(),
+        Some(d) => split(d, chunks.iter().map(|c| (c.end - c.begin) * row))
+            .into_iter()
+            .map(Some)
+            .collect(),
         None => chunks.iter().map(|_| None).collect(),
     }
 }

@@ -14,7 +14,10 @@ pub struct Error {
 impl Error {
     /// An error about the argument `name`.
     pub fn new(name: impl Into<String>, message: impl Into<String>) -> Self {
-        Self { name: name.into(), message: message.into() }
+        Self {
+            name: name.into(),
+            message: message.into(),
+        }
     }
 
     /// An error about the shape of `name`.
@@ -36,6 +39,10 @@ pub(crate) fn check_len<T>(name: &str, data: &[T], expected: usize) -> Result<()
     if data.len() == expected {
         Ok(())
     } else {
-        Err(Error::shape(name, format!("{expected} elements"), format!("{} elements", data.len())))
+        Err(Error::shape(
+            name,
+            format!("{expected} elements"),
+            format!("{} elements", data.len()),
+        ))
     }
 }

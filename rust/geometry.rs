@@ -69,9 +69,21 @@ pub(crate) struct GeometryGrad {
 fn rotation_matrix(q: DVec4) -> DMat3 {
     let (x, y, z, w) = (q.x, q.y, q.z, q.w);
     DMat3::from_cols(
-        DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        DVec3::new(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        DVec3::new(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+        DVec3::new(
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y + w * z),
+            2.0 * (x * z - w * y),
+        ),
+        DVec3::new(
+            2.0 * (x * y - w * z),
+            1.0 - 2.0 * (x * x + z * z),
+            2.0 * (y * z + w * x),
+        ),
+        DVec3::new(
+            2.0 * (x * z + w * y),
+            2.0 * (y * z - w * x),
+            1.0 - 2.0 * (x * x + y * y),
+        ),
     )
 }
 
@@ -122,7 +134,22 @@ impl Geometry {
         }
         let (a, c) = (aa + eps2d, cc + eps2d);
         Some(Self {
-            mean, quat, quat_norm, scale, rotation, p, ratio, clamped, jw, axes, rows, a, b, c, det_raw, det,
+            mean,
+            quat,
+            quat_norm,
+            scale,
+            rotation,
+            p,
+            ratio,
+            clamped,
+            jw,
+            axes,
+            rows,
+            a,
+            b,
+            c,
+            det_raw,
+            det,
         })
     }
 
@@ -138,7 +165,11 @@ impl Geometry {
 
     /// Factors (s, m, t) of the conic; see the head of this file.
     pub fn factors(&self) -> (f64, f64, f64) {
-        ((self.c / self.det).sqrt(), self.b / self.c, 1.0 / self.c.sqrt())
+        (
+            (self.c / self.det).sqrt(),
+            self.b / self.c,
+            1.0 / self.c.sqrt(),
+        )
     }
 
     /// `sqrt(det(cov2d - eps I) / det(cov2d))`: keeps a Gaussian's total energy under the low-pass
@@ -149,17 +180,27 @@ impl Geometry {
 
     /// Vector-Jacobian product; the camera's part is added to `camera_grad`.
     #[inline]
-    pub fn vjp(&self, v: &Cotangent, camera: &Camera, camera_grad: &mut CameraGrad) -> GeometryGrad {
+    pub fn vjp(
+        &self,
+        v: &Cotangent,
+        camera: &Camera,
+        camera_grad: &mut CameraGrad,
+    ) -> GeometryGrad {
         let (s, m, t) = self.factors();
         let [euu, euv, evv] = v.whitened;
         // Whitened rows: B = L^T A, on the unscaled axes.
         let white = [(self.axes[0] - m * self.axes[1]) * s, self.axes[1] * t];
-        let half = [white[0] * euu + white[1] * euv, white[0] * euv + white[1] * evv];
+        let half = [
+            white[0] * euu + white[1] * euv,
+            white[0] * euv + white[1] * evv,
+        ];
         // d cov = L E L^T gives dA = 2 L E B and, along each scale, 2 s_k B_k^T E B_k without cancellation.
         let mut scale = 2.0 * self.scale * (white[0] * half[0] + white[1] * half[1]);
         let scale2 = self.scale * self.scale;
-        let mut v_axes =
-            [2.0 * s * scale2 * half[0], 2.0 * scale2 * (t * half[1] - s * m * half[0])];
+        let mut v_axes = [
+            2.0 * s * scale2 * half[0],
+            2.0 * scale2 * (t * half[1] - s * m * half[0]),
+        ];
         if v.compensation != 0.0 || v.conic != [0.0; 3] {
             let direct = self.covariance_cotangent(v);
             let v_rows = [
@@ -211,7 +252,12 @@ impl Geometry {
         let [qa, qb, qc] = self.conic();
         // The conic's off-diagonal entry stands for two.
         let (va, vb, vc) = (v.conic[0], 0.5 * v.conic[1], v.conic[2]);
-        let left = [qa * va + qb * vb, qa * vb + qb * vc, qb * va + qc * vb, qb * vb + qc * vc];
+        let left = [
+            qa * va + qb * vb,
+            qa * vb + qb * vc,
+            qb * va + qc * vb,
+            qb * vb + qc * vc,
+        ];
         let mut g = [
             -(left[0] * qa + left[1] * qb),
             -(left[0] * qb + left[1] * qc),
@@ -233,8 +279,16 @@ impl Geometry {
     fn quat_vjp(&self, v: &DMat3) -> [f64; 4] {
         let at = |i: usize, j: usize| v.col(j)[i];
         let (x, y, z, w) = (self.quat.x, self.quat.y, self.quat.z, self.quat.w);
-        let (s01, s02, s12) = (at(0, 1) + at(1, 0), at(0, 2) + at(2, 0), at(1, 2) + at(2, 1));
-        let (d21, d02, d10) = (at(2, 1) - at(1, 2), at(0, 2) - at(2, 0), at(1, 0) - at(0, 1));
+        let (s01, s02, s12) = (
+            at(0, 1) + at(1, 0),
+            at(0, 2) + at(2, 0),
+            at(1, 2) + at(2, 1),
+        );
+        let (d21, d02, d10) = (
+            at(2, 1) - at(1, 2),
+            at(0, 2) - at(2, 0),
+            at(1, 0) - at(0, 1),
+        );
         let g = 2.0
             * DVec4::new(
                 y * s01 + z * s02 + w * d21 - 2.0 * x * (at(1, 1) + at(2, 2)),

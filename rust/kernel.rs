@@ -26,7 +26,10 @@ const fn width<S: Simd, T: Real>() -> usize {
 /// (row, column) in the tile of pixel `p` in block order.
 pub(crate) const fn position(p: usize) -> (usize, usize) {
     let (block, inner) = (p / BLOCK_PIXELS, p % BLOCK_PIXELS);
-    (block / BLOCKS_PER_SIDE * BLOCK + inner / BLOCK, block % BLOCKS_PER_SIDE * BLOCK + inner % BLOCK)
+    (
+        block / BLOCKS_PER_SIDE * BLOCK + inner / BLOCK,
+        block % BLOCKS_PER_SIDE * BLOCK + inner % BLOCK,
+    )
 }
 
 /// Coordinates that do not depend on the Gaussian, relative to the tile's centre.
@@ -160,15 +163,23 @@ impl<S: Simd, T: Real> Wide<S, T> {
         }
     }
 
-    /// (u, v, alpha before the cap) at pixels `at..`: the one function that both passes use.
+    /// (u, v) at pixels `at..`.
     #[inline(always)]
-    fn alpha(&self, simd: S, grid: &Grid<T>, at: usize) -> (Lanes<T, S>, Lanes<T, S>, Lanes<T, S>) {
+    fn position(&self, simd: S, grid: &Grid<T>, at: usize) -> (Lanes<T, S>, Lanes<T, S>) {
         let x = Lanes::<T, S>::from_slice(simd, &grid.x[at..at + width::<S, T>()]);
         let y = Lanes::<T, S>::from_slice(simd, &grid.y[at..at + width::<S, T>()]);
-        let u = self.s.mul_add(x, self.n.mul_add(y, self.u0));
-        let v = self.t.mul_add(y, self.v0);
+        (
+            self.s.mul_add(x, self.n.mul_add(y, self.u0)),
+            self.t.mul_add(y, self.v0),
+        )
+    }
+
+    /// alpha before the cap at pixels `at..`: the one function that both passes use.
+    #[inline(always)]
+    fn alpha(&self, simd: S, grid: &Grid<T>, at: usize) -> Lanes<T, S> {
+        let (u, v) = self.position(simd, grid, at);
         let power = u.mul_add(u, v * v);
-        (u, v, self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power))
+        self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power)
     }
 }
 
@@ -199,7 +210,11 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize>(
     let (rgb, colors) = (&rgb[..channels], &mut colors[..channels]);
     let wide = Wide::<S, T>::new(simd, g);
     let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(T::from_f64(ALPHA_MIN)));
-    let (least, one, zero) = (splat(T::from_f64(TRANSMITTANCE_MIN)), splat(T::ONE), splat(T::ZERO));
+    let (least, one, zero) = (
+        splat(T::from_f64(TRANSMITTANCE_MIN)),
+        splat(T::ONE),
+        splat(T::ZERO),
+    );
     let mut rest = mask;
     let mut hits = 0;
     while rest != 0 {
@@ -208,16 +223,19 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize>(
         let mut changed = 0;
         let mut stopped = false;
         for at in (block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS).step_by(width::<S, T>()) {
-            let (_, _, alpha) = wide.alpha(simd, grid, at);
+            let alpha = wide.alpha(simd, grid, at);
             let alpha = alpha.min(cap);
             let opaque = alpha.simd_ge(floor);
-            let t = Lanes::<T, S>::from_slice(simd, &layers.transmittance[at..at + width::<S, T>()]);
+            let t =
+                Lanes::<T, S>::from_slice(simd, &layers.transmittance[at..at + width::<S, T>()]);
             let next = t * (one - alpha);
             let blended = opaque & next.simd_gt(least);
             let weight = blended.select(t * alpha, zero);
             for (c, color) in rgb.iter().zip(colors.iter_mut()) {
                 let out = &mut color[at..at + width::<S, T>()];
-                weight.mul_add(splat(*c), Lanes::<T, S>::from_slice(simd, out)).store_slice(out);
+                weight
+                    .mul_add(splat(*c), Lanes::<T, S>::from_slice(simd, out))
+                    .store_slice(out);
             }
             let mut next = blended.select(next, t);
             let bits = blended.to_bitmask();
@@ -227,7 +245,8 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize>(
                 let bits = stop.to_bitmask();
                 if bits != 0 {
                     let out = &mut layers.finished[at..at + width::<S, T>()];
-                    stop.select(t, Lanes::<T, S>::from_slice(simd, out)).store_slice(out);
+                    stop.select(t, Lanes::<T, S>::from_slice(simd, out))
+                        .store_slice(out);
                     next = stop.select(zero, next);
                     changed |= bits;
                     stopped = true;
@@ -253,11 +272,57 @@ pub(crate) const MOMENTS: usize = 6;
 /// |d loss / d mean2d| summed pixel by pixel, x and y, where asked for.
 pub(crate) const ABSOLUTE: usize = 2;
 
-/// Inputs of the backward pass of one tile.
+/// Replay one Gaussian over the blocks `mask` (those that `blend` reported), front to back, and store for
+/// each the transmittance before it and its alpha (0 where it does not blend): one block of each in `out`.
+#[inline(always)]
+pub(crate) fn replay<S: Simd, T: Real>(
+    simd: S,
+    grid: &Grid<T>,
+    g: &Local<T>,
+    mask: u16,
+    transmittance: &mut Pixels<T>,
+    out: &mut [T],
+) {
+    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
+    let wide = Wide::<S, T>::new(simd, g);
+    let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(T::from_f64(ALPHA_MIN)));
+    let (least, one, zero) = (
+        splat(T::from_f64(TRANSMITTANCE_MIN)),
+        splat(T::ONE),
+        splat(T::ZERO),
+    );
+    let mut rest = mask;
+    for out in out.chunks_exact_mut(LAYER) {
+        let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
+        rest &= rest.wrapping_sub(1);
+        for i in (0..BLOCK_PIXELS).step_by(width::<S, T>()) {
+            let at = block * BLOCK_PIXELS + i;
+            let alpha = wide.alpha(simd, grid, at);
+            let alpha = alpha.min(cap);
+            let opaque = alpha.simd_ge(floor);
+            let state = &mut transmittance[at..at + width::<S, T>()];
+            let t = Lanes::<T, S>::from_slice(simd, state);
+            let next = t * (one - alpha);
+            let blended = opaque & next.simd_gt(least);
+            t.store_slice(&mut out[i..i + width::<S, T>()]);
+            let stored = blended.select(alpha, zero);
+            stored.store_slice(&mut out[BLOCK_PIXELS + i..BLOCK_PIXELS + i + width::<S, T>()]);
+            // A lane that stops here is finished: transmittance 0.
+            blended
+                .select(next, opaque.select(zero, t))
+                .store_slice(state);
+        }
+    }
+}
+
+/// Numbers that `replay` stores per block.
+pub(crate) const LAYER: usize = 2 * BLOCK_PIXELS;
+
+/// State of the backward pass of one tile.
 pub(crate) struct Adjoint<'a, T> {
-    /// Transmittance, replayed from 1.
-    pub transmittance: &'a mut Pixels<T>,
-    /// What of `sum_c v_c color_c` lies behind the layers seen so far, background and alpha included.
+    /// `sum_c v_c color_c` of all that lies behind the current layer, as seen through full transmittance.
+    /// Going back to front it is a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided,
+    /// nothing cancels, however deep the layer.
     pub behind: &'a mut Pixels<T>,
     /// Cotangent of each channel.
     pub v_colors: &'a [Pixels<T>],
@@ -267,8 +332,8 @@ pub(crate) struct Adjoint<'a, T> {
     pub absolute: bool,
 }
 
-/// Gradient of one Gaussian over the blocks `mask` (those that `blend` reported) into `out`:
-/// the moments, the absolute gradients if asked for, and the gradient of its colour.
+/// Gradient of one Gaussian over the blocks `mask` from what `replay` stored for them in `layers`, into
+/// `out`: the moments, the absolute gradients if asked for, and the gradient of its colour. Back to front.
 #[inline(always)]
 pub(crate) fn unblend<S: Simd, T: Real, const D: usize>(
     simd: S,
@@ -276,6 +341,7 @@ pub(crate) fn unblend<S: Simd, T: Real, const D: usize>(
     g: &Local<T>,
     rgb: &[T],
     mask: u16,
+    layers: &[T],
     adjoint: &mut Adjoint<T>,
     out: &mut [T],
 ) {
@@ -283,30 +349,25 @@ pub(crate) fn unblend<S: Simd, T: Real, const D: usize>(
     let channels = if D > 0 { D } else { rgb.len() };
     let (rgb, v_colors) = (&rgb[..channels], &adjoint.v_colors[..channels]);
     let wide = Wide::<S, T>::new(simd, g);
-    let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(T::from_f64(ALPHA_MIN)));
-    let (least, one, zero) = (splat(T::from_f64(TRANSMITTANCE_MIN)), splat(T::ONE), splat(T::ZERO));
+    let (cap, zero) = (splat(T::from_f64(ALPHA_MAX)), splat(T::ZERO));
     let mut moments = [zero; MOMENTS];
     let mut absolute = [zero; ABSOLUTE];
     let mut v_rgb = [zero; 4];
     let colors_at = MOMENTS + if adjoint.absolute { ABSOLUTE } else { 0 };
-    out[colors_at..].fill(T::ZERO);
+    if D == 0 {
+        out[colors_at..].fill(T::ZERO);
+    }
     let mut rest = mask;
-    while rest != 0 {
+    for layer in layers.chunks_exact(LAYER) {
         let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
-        rest &= rest - 1;
-        for at in (block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS).step_by(width::<S, T>()) {
+        rest &= rest.wrapping_sub(1);
+        for i in (0..BLOCK_PIXELS).step_by(width::<S, T>()) {
+            let at = block * BLOCK_PIXELS + i;
             let range = at..at + width::<S, T>();
-            let (u, v, raw) = wide.alpha(simd, grid, at);
-            let alpha = raw.min(cap);
-            let opaque = alpha.simd_ge(floor);
-            let t = Lanes::<T, S>::from_slice(simd, &adjoint.transmittance[range.clone()]);
-            let through = one - alpha;
-            let next = t * through;
-            let blended = opaque & next.simd_gt(least);
-            let weight = blended.select(t * alpha, zero);
-            // A lane that stops here is finished: transmittance 0.
-            let after = blended.select(next, opaque.select(zero, t));
-            after.store_slice(&mut adjoint.transmittance[range.clone()]);
+            let t = Lanes::<T, S>::from_slice(simd, &layer[i..i + width::<S, T>()]);
+            let alpha = &layer[BLOCK_PIXELS + i..BLOCK_PIXELS + i + width::<S, T>()];
+            let alpha = Lanes::<T, S>::from_slice(simd, alpha);
+            let weight = t * alpha;
             let mut q = zero;
             for (k, (c, v_color)) in rgb.iter().zip(v_colors).enumerate() {
                 let v_c = Lanes::<T, S>::from_slice(simd, &v_color[range.clone()]);
@@ -320,12 +381,13 @@ pub(crate) fn unblend<S: Simd, T: Real, const D: usize>(
             if !adjoint.geometry {
                 continue;
             }
-            let behind = Lanes::<T, S>::from_slice(simd, &adjoint.behind[range.clone()]) - weight * q;
-            behind.store_slice(&mut adjoint.behind[range.clone()]);
-            // d loss / d alpha; the division is by 1 - alpha >= 0.01 and recovers no transmittance.
-            let v_alpha = t * q - behind / through;
-            let free = blended & raw.simd_le(cap);
-            let w = free.select(zero - alpha * v_alpha, zero);
+            let state = &mut adjoint.behind[range];
+            let behind = Lanes::<T, S>::from_slice(simd, state);
+            let difference = q - behind;
+            alpha.mul_add(difference, behind).store_slice(state);
+            // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
+            let w = alpha.simd_lt(cap).select(weight * (behind - q), zero);
+            let (u, v) = wide.position(simd, grid, at);
             let (wu, wv) = (w * u, w * v);
             moments[0] += w;
             moments[1] += wu;

@@ -15,8 +15,10 @@ pub mod project;
 #[cfg(feature = "python")]
 mod python;
 pub mod real;
+pub mod render;
 pub mod scene;
 pub mod sh;
+pub mod synthetic;
 pub mod threads;
 pub mod tiles;
 

@@ -2,7 +2,9 @@
 
 use crate::{
     camera::{Camera, CameraGrad},
-    constants::{ALPHA_MIN, EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE},
+    constants::{
+        ALPHA_MIN, EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE,
+    },
     geometry::{Cotangent, Geometry},
     real::Real,
     scene::{Gaussians, Harmonics},
@@ -88,10 +90,19 @@ pub struct ProjectOut<'a, T> {
 }
 
 fn vec3<T: Real>(data: &[T], i: usize) -> DVec3 {
-    DVec3::new(data[3 * i].to_f64(), data[3 * i + 1].to_f64(), data[3 * i + 2].to_f64())
+    DVec3::new(
+        data[3 * i].to_f64(),
+        data[3 * i + 1].to_f64(),
+        data[3 * i + 2].to_f64(),
+    )
 }
 
-fn geometry<T: Real>(g: &Gaussians<T>, i: usize, camera: &Camera, o: &ProjectOptions) -> Option<Geometry> {
+fn geometry<T: Real>(
+    g: &Gaussians<T>,
+    i: usize,
+    camera: &Camera,
+    o: &ProjectOptions,
+) -> Option<Geometry> {
     let quat = std::array::from_fn(|k| g.quats[4 * i + k].to_f64());
     Geometry::new(
         vec3(g.means, i),
@@ -108,19 +119,39 @@ fn geometry<T: Real>(g: &Gaussians<T>, i: usize, camera: &Camera, o: &ProjectOpt
 fn direction(mean: DVec3, camera: &Camera, degree: usize) -> (DVec3, f64, usize) {
     let d = mean - camera.center;
     let length = d.length();
-    if length > 0.0 { (d / length, length, degree) } else { (DVec3::ZERO, 0.0, 0) }
+    if length > 0.0 {
+        (d / length, length, degree)
+    } else {
+        (DVec3::ZERO, 0.0, 0)
+    }
 }
 
 /// Range of tiles whose pixel centres lie within `center +- extent`, clipped to `size` pixels.
 fn tile_range(center: f64, extent: f64, size: usize) -> (u16, u16) {
     let first = (center - extent - 0.5).ceil().max(0.0);
     let last = (center + extent - 0.5).floor().min(size as f64 - 1.0);
-    if first <= last { ((first as usize / TILE) as u16, (last as usize / TILE + 1) as u16) } else { (0, 0) }
+    if first <= last {
+        (
+            (first as usize / TILE) as u16,
+            (last as usize / TILE + 1) as u16,
+        )
+    } else {
+        (0, 0)
+    }
 }
 
 /// Cull and pack one Gaussian. `radii` in pixels, rounded up.
-fn splat(geometry: &Geometry, opacity: f64, camera: &Camera, o: &ProjectOptions) -> Option<(Splat, [f64; 2])> {
-    let opacity = if o.antialiased { opacity * geometry.compensation() } else { opacity };
+fn splat(
+    geometry: &Geometry,
+    opacity: f64,
+    camera: &Camera,
+    o: &ProjectOptions,
+) -> Option<(Splat, [f64; 2])> {
+    let opacity = if o.antialiased {
+        opacity * geometry.compensation()
+    } else {
+        opacity
+    };
     if !(opacity >= ALPHA_MIN && opacity.is_finite()) {
         return None;
     }
@@ -199,7 +230,11 @@ pub fn forward<T: Real>(
                     means2d[2 * j..2 * j + 2].fill(T::ZERO);
                     conics[3 * j..3 * j + 3].fill(T::ZERO);
                     radii[2 * j..2 * j + 2].fill(0);
-                    colors.chunks_mut(3).skip(j).take(1).for_each(|c| c.fill(T::ZERO));
+                    colors
+                        .chunks_mut(3)
+                        .skip(j)
+                        .take(1)
+                        .for_each(|c| c.fill(T::ZERO));
                     continue;
                 };
                 splats[j] = s;
@@ -273,7 +308,10 @@ pub struct GaussianGrads<'a, T> {
 /// Split an optional array of `n` rows into chunks of `PROJECT_CHUNK` rows.
 fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T]>> {
     match data {
-        Some(d) => d.chunks_mut((PROJECT_CHUNK * row).max(1)).map(Some).collect(),
+        Some(d) => d
+            .chunks_mut((PROJECT_CHUNK * row).max(1))
+            .map(Some)
+            .collect(),
         None => (0..n.div_ceil(PROJECT_CHUNK)).map(|_| None).collect(),
     }
 }
@@ -310,44 +348,52 @@ pub fn backward<T: Real>(
     let parts: Vec<CameraGrad> = jobs
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, ((((mut means, mut quats), mut scales), mut opacities), mut sh_grad))| {
-            let mut camera_grad = CameraGrad::ZERO;
-            let begin = chunk * PROJECT_CHUNK;
-            for j in 0..PROJECT_CHUNK.min(n - begin) {
-                let i = begin + j;
-                if !projection.splats[i].visible() {
-                    continue;
+        .map(
+            |(chunk, ((((mut means, mut quats), mut scales), mut opacities), mut sh_grad))| {
+                let mut camera_grad = CameraGrad::ZERO;
+                let begin = chunk * PROJECT_CHUNK;
+                for j in 0..PROJECT_CHUNK.min(n - begin) {
+                    let i = begin + j;
+                    if !projection.splats[i].visible() {
+                        continue;
+                    }
+                    let Some(g) = geometry(gaussians, i, camera, options) else {
+                        continue;
+                    };
+                    let at = |data: &[T], row: usize, k: usize| data[row * i + k].to_f64();
+                    let v_opacity = at(v.opacities, 1, 0);
+                    let mut cotangent = Cotangent {
+                        mean2d: DVec2::new(at(v.means2d, 2, 0), at(v.means2d, 2, 1)),
+                        whitened: std::array::from_fn(|k| at(v.whitened, 3, k)),
+                        depth: v.depths.map_or(0.0, |d| at(d, 1, 0)),
+                        conic: v
+                            .conics
+                            .map_or([0.0; 3], |c| std::array::from_fn(|k| at(c, 3, k))),
+                        compensation: 0.0,
+                    };
+                    let mut v_input_opacity = v_opacity;
+                    if options.antialiased {
+                        cotangent.compensation = v_opacity * gaussians.opacities[i].to_f64();
+                        v_input_opacity = v_opacity * g.compensation();
+                    }
+                    let mut grad = g.vjp(&cotangent, camera, &mut camera_grad);
+                    if let (Some(h), Some(colors)) = (harmonics, v.colors) {
+                        let v_rgb = std::array::from_fn(|k| at(colors, 3, k));
+                        let out = sh_grad
+                            .as_mut()
+                            .map(|s| &mut s[j * harmonics_row..][..harmonics_row]);
+                        let v_mean = harmonics_vjp(gaussians, h, i, camera, v_rgb, out);
+                        grad.mean += v_mean;
+                        camera_grad.center -= v_mean;
+                    }
+                    add(&mut means, j, &grad.mean.to_array());
+                    add(&mut quats, j, &grad.quat);
+                    add(&mut scales, j, &grad.scale.to_array());
+                    add(&mut opacities, j, &[v_input_opacity]);
                 }
-                let Some(g) = geometry(gaussians, i, camera, options) else { continue };
-                let at = |data: &[T], row: usize, k: usize| data[row * i + k].to_f64();
-                let v_opacity = at(v.opacities, 1, 0);
-                let mut cotangent = Cotangent {
-                    mean2d: DVec2::new(at(v.means2d, 2, 0), at(v.means2d, 2, 1)),
-                    whitened: std::array::from_fn(|k| at(v.whitened, 3, k)),
-                    depth: v.depths.map_or(0.0, |d| at(d, 1, 0)),
-                    conic: v.conics.map_or([0.0; 3], |c| std::array::from_fn(|k| at(c, 3, k))),
-                    compensation: 0.0,
-                };
-                let mut v_input_opacity = v_opacity;
-                if options.antialiased {
-                    cotangent.compensation = v_opacity * gaussians.opacities[i].to_f64();
-                    v_input_opacity = v_opacity * g.compensation();
-                }
-                let mut grad = g.vjp(&cotangent, camera, &mut camera_grad);
-                if let (Some(h), Some(colors)) = (harmonics, v.colors) {
-                    let v_rgb = std::array::from_fn(|k| at(colors, 3, k));
-                    let out = sh_grad.as_mut().map(|s| &mut s[j * harmonics_row..][..harmonics_row]);
-                    let v_mean = harmonics_vjp(gaussians, h, i, camera, v_rgb, out);
-                    grad.mean += v_mean;
-                    camera_grad.center -= v_mean;
-                }
-                add(&mut means, j, &grad.mean.to_array());
-                add(&mut quats, j, &grad.quat);
-                add(&mut scales, j, &grad.scale.to_array());
-                add(&mut opacities, j, &[v_input_opacity]);
-            }
-            camera_grad
-        })
+                camera_grad
+            },
+        )
         .collect();
     parts.iter().fold(CameraGrad::ZERO, |mut sum, part| {
         sum.add(part);
@@ -373,7 +419,11 @@ fn harmonics_vjp<T: Real>(
     }
     if let Some(out) = out {
         let basis = sh::basis(degree, d.to_array());
-        for (y, row) in basis.iter().zip(out.chunks_exact_mut(3)).take(sh::count(degree)) {
+        for (y, row) in basis
+            .iter()
+            .zip(out.chunks_exact_mut(3))
+            .take(sh::count(degree))
+        {
             for (o, v) in row.iter_mut().zip(v) {
                 *o = T::from_f64(o.to_f64() + y * v);
             }

@@ -3,7 +3,9 @@
 
 use crate::{
     camera::Camera,
-    composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads, Work},
+    composite::{
+        self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads, Work,
+    },
     error::Error,
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
     real::Real,
@@ -11,7 +13,10 @@ use crate::{
     threads,
     tiles::{self, Tiles},
 };
-use numpy::{Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{
+    Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
+    PyUntypedArrayMethods,
+};
 use pyo3::{exceptions::PyValueError, prelude::*};
 
 impl From<Error> for PyErr {
@@ -28,8 +33,13 @@ impl<'py, T: Element> Array<'py, T> {
     /// array silently wrong, so the layout is checked here.
     pub fn new(name: &str, value: &Bound<'py, PyAny>) -> PyResult<Self> {
         let array = value.cast::<PyArrayDyn<T>>().map_err(|_| {
-            let dtype = value.getattr("dtype").map_or_else(|_| "no array".into(), |d| d.to_string());
-            PyValueError::new_err(format!("{name}: expected an array of {}, got {dtype}", T::get_dtype(value.py())))
+            let dtype = value
+                .getattr("dtype")
+                .map_or_else(|_| "no array".into(), |d| d.to_string());
+            PyValueError::new_err(format!(
+                "{name}: expected an array of {}, got {dtype}",
+                T::get_dtype(value.py())
+            ))
         })?;
         if !array.is_c_contiguous() {
             return Err(PyValueError::new_err(format!(
@@ -38,7 +48,9 @@ impl<'py, T: Element> Array<'py, T> {
                 array.strides()
             )));
         }
-        Ok(Self(array.try_readonly().map_err(|e| PyValueError::new_err(format!("{name}: {e}")))?))
+        Ok(Self(array.try_readonly().map_err(|e| {
+            PyValueError::new_err(format!("{name}: {e}"))
+        })?))
     }
 
     pub fn slice(&self) -> PyResult<&[T]> {
@@ -53,7 +65,10 @@ impl<'py, T: Element> Array<'py, T> {
 type Optional<'a, 'py> = Option<&'a Bound<'py, PyAny>>;
 type Out<'py, T> = Option<Bound<'py, PyArray1<T>>>;
 
-fn optional<'py, T: Element>(name: &str, value: Optional<'_, 'py>) -> PyResult<Option<Array<'py, T>>> {
+fn optional<'py, T: Element>(
+    name: &str,
+    value: Optional<'_, 'py>,
+) -> PyResult<Option<Array<'py, T>>> {
     value.map(|v| Array::new(name, v)).transpose()
 }
 
@@ -138,7 +153,9 @@ macro_rules! scalar {
             fn unwrap(state: &State) -> PyResult<&[View<Self>]> {
                 match state {
                     State::$variant(s) => Ok(s),
-                    _ => Err(PyValueError::new_err("colors: dtype differs from the forward pass")),
+                    _ => Err(PyValueError::new_err(
+                        "colors: dtype differs from the forward pass",
+                    )),
                 }
             }
         }
@@ -158,13 +175,26 @@ macro_rules! by_dtype {
     };
 }
 
-fn cameras(viewmats: &[f64], ks: &[f64], width: usize, height: usize) -> Result<Vec<Camera>, Error> {
+fn cameras(
+    viewmats: &[f64],
+    ks: &[f64],
+    width: usize,
+    height: usize,
+) -> Result<Vec<Camera>, Error> {
     if viewmats.len() % 16 != 0 || viewmats.len() / 16 * 9 != ks.len() {
-        return Err(Error::shape("viewmats, Ks", "[C, 4, 4] and [C, 3, 3]", format!("{} and {} elements", viewmats.len(), ks.len())));
+        return Err(Error::shape(
+            "viewmats, Ks",
+            "[C, 4, 4] and [C, 3, 3]",
+            format!("{} and {} elements", viewmats.len(), ks.len()),
+        ));
     }
     let (views, _) = viewmats.as_chunks::<16>();
     let (ks, _) = ks.as_chunks::<9>();
-    views.iter().zip(ks).map(|(v, k)| Camera::new(v, k, width, height)).collect()
+    views
+        .iter()
+        .zip(ks)
+        .map(|(v, k)| Camera::new(v, k, width, height))
+        .collect()
 }
 
 /// Project Gaussians; see `hqgs/rasterize.py` for the shapes.
@@ -183,7 +213,13 @@ fn project_forward<'py>(
     options: (f64, f64, f64, f64, bool),
     sh_degree: Option<usize>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    by_dtype!(means, project_as(means, quats, scales, opacities, harmonics, viewmats, ks, width, height, options, sh_degree))
+    by_dtype!(
+        means,
+        project_as(
+            means, quats, scales, opacities, harmonics, viewmats, ks, width, height, options,
+            sh_degree
+        )
+    )
 }
 
 type Projected<'py, T> = (
@@ -211,10 +247,19 @@ fn project_as<'py, T: Scalar>(
 ) -> PyResult<Projected<'py, T>> {
     let py = means.py();
     let arrays = Arrays::<T>::new(means, quats, scales, opacities, harmonics)?;
-    let (viewmats, ks) = (Array::<f64>::new("viewmats", viewmats)?, Array::<f64>::new("Ks", ks)?);
+    let (viewmats, ks) = (
+        Array::<f64>::new("viewmats", viewmats)?,
+        Array::<f64>::new("Ks", ks)?,
+    );
     let cameras = cameras(viewmats.slice()?, ks.slice()?, width, height)?;
     let (near_plane, far_plane, radius_clip, eps2d, antialiased) = options;
-    let options = ProjectOptions { near_plane, far_plane, radius_clip, eps2d, antialiased };
+    let options = ProjectOptions {
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        antialiased,
+    };
     let gaussians = arrays.gaussians()?;
     let harmonics = arrays.harmonics(sh_degree)?;
     let (n, c) = (gaussians.len(), cameras.len());
@@ -238,13 +283,29 @@ fn project_as<'py, T: Scalar>(
                     opacities: &mut opacities[i * n..(i + 1) * n],
                     colors: &mut colors[i * color_row..(i + 1) * color_row],
                 };
-                project::forward(&gaussians, harmonics.as_ref(), camera, &options, &mut projection, out);
+                project::forward(
+                    &gaussians,
+                    harmonics.as_ref(),
+                    camera,
+                    &options,
+                    &mut projection,
+                    out,
+                );
                 projections.push(projection);
             }
-            (projections, (means2d, depths, conics, radii, opacities, colors))
+            (
+                projections,
+                (means2d, depths, conics, radii, opacities, colors),
+            )
         })
     });
-    let frame = Frame { cameras, projections, options, n, sh_degree };
+    let frame = Frame {
+        cameras,
+        projections,
+        options,
+        n,
+        sh_degree,
+    };
     let (means2d, depths, conics, radii, opacities, colors) = out;
     Ok((
         frame,
@@ -295,11 +356,17 @@ impl<'py, T: Scalar> Arrays<'py, T> {
     }
 
     fn harmonics(&self, degree: Option<usize>) -> PyResult<Option<Harmonics<'_, T>>> {
-        let (Some(array), Some(degree)) = (&self.harmonics, degree) else { return Ok(None) };
+        let (Some(array), Some(degree)) = (&self.harmonics, degree) else {
+            return Ok(None);
+        };
         let &[n, stored, 3] = array.shape() else {
             return Err(Error::shape("colors", "[N, K, 3]", format!("{:?}", array.shape())).into());
         };
-        let harmonics = Harmonics { coefficients: array.slice()?, stored, degree };
+        let harmonics = Harmonics {
+            coefficients: array.slice()?,
+            stored,
+            degree,
+        };
         harmonics.check(self.opacities.slice()?.len().max(n))?;
         Ok(Some(harmonics))
     }
@@ -319,7 +386,10 @@ fn project_backward<'py>(
     cotangents: Cotangents<'py>,
     wanted: [bool; 6],
 ) -> PyResult<Bound<'py, PyAny>> {
-    by_dtype!(&inputs.0, project_backward_as(frame, &inputs, cotangents, wanted))
+    by_dtype!(
+        &inputs.0,
+        project_backward_as(frame, &inputs, cotangents, wanted)
+    )
 }
 
 /// means2d, whitened, opacities, depths, conics, colors
@@ -332,8 +402,14 @@ type Cotangents<'py> = (
     Option<Bound<'py, PyAny>>,
 );
 
-type ProjectGrads<'py, T> =
-    (Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, f64>);
+type ProjectGrads<'py, T> = (
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, f64>,
+);
 
 fn project_backward_as<'py, T: Scalar>(
     frame: &Bound<'py, Frame>,
@@ -349,7 +425,13 @@ fn project_backward_as<'py, T: Scalar>(
 ) -> PyResult<ProjectGrads<'py, T>> {
     let py = frame.py();
     let frame = frame.get();
-    let arrays = Arrays::<T>::new(&inputs.0, &inputs.1, &inputs.2, &inputs.3, inputs.4.as_ref())?;
+    let arrays = Arrays::<T>::new(
+        &inputs.0,
+        &inputs.1,
+        &inputs.2,
+        &inputs.3,
+        inputs.4.as_ref(),
+    )?;
     let gaussians = arrays.gaussians()?;
     let harmonics = arrays.harmonics(frame.sh_degree)?;
     let v_means2d = Array::<T>::new("v_means2d", &v.0)?;
@@ -359,7 +441,9 @@ fn project_backward_as<'py, T: Scalar>(
     let v_conics = optional::<T>("v_conics", v.4.as_ref())?;
     let v_colors = optional::<T>("v_colors", v.5.as_ref())?;
     let (n, c) = (frame.n, frame.cameras.len());
-    let part = |a: &Option<Array<'py, T>>| -> PyResult<Option<usize>> { Ok(a.as_ref().map(|a| a.shape().iter().product())) };
+    let part = |a: &Option<Array<'py, T>>| -> PyResult<Option<usize>> {
+        Ok(a.as_ref().map(|a| a.shape().iter().product()))
+    };
     for (name, rows, got) in [
         ("v_means2d", 2, Some(v_means2d.slice()?.len())),
         ("v_whitened", 3, Some(v_whitened.slice()?.len())),
@@ -369,7 +453,12 @@ fn project_backward_as<'py, T: Scalar>(
         ("v_colors", 3, part(&v_colors)?),
     ] {
         if got.is_some_and(|g| g != rows * c * n) || gaussians.len() != n {
-            return Err(Error::shape(name, format!("[{c}, {n}, {rows}]"), format!("{got:?} elements")).into());
+            return Err(Error::shape(
+                name,
+                format!("[{c}, {n}, {rows}]"),
+                format!("{got:?} elements"),
+            )
+            .into());
         }
     }
     let slices = (
@@ -380,7 +469,14 @@ fn project_backward_as<'py, T: Scalar>(
         v_conics.as_ref().map(Array::slice).transpose()?,
         v_colors.as_ref().map(Array::slice).transpose()?,
     );
-    let [want_means, want_quats, want_scales, want_opacities, want_harmonics, want_viewmats] = wanted;
+    let [
+        want_means,
+        want_quats,
+        want_scales,
+        want_opacities,
+        want_harmonics,
+        want_viewmats,
+    ] = wanted;
     let harmonics_row = harmonics.as_ref().map_or(0, |h| 3 * h.stored);
     let out = py.detach(|| {
         threads::install(|| {
@@ -433,13 +529,27 @@ fn project_backward_as<'py, T: Scalar>(
 
 /// Colours of camera `i`: one set for all cameras, or one each.
 fn of_camera<T>(data: &[T], i: usize, len: usize) -> &[T] {
-    if data.len() == len { data } else { &data[i * len..(i + 1) * len] }
+    if data.len() == len {
+        data
+    } else {
+        &data[i * len..(i + 1) * len]
+    }
 }
 
-fn check_colors<T>(frame: &Frame, colors: &[T], background: Option<&[T]>, channels: usize) -> PyResult<()> {
+fn check_colors<T>(
+    frame: &Frame,
+    colors: &[T],
+    background: Option<&[T]>,
+    channels: usize,
+) -> PyResult<()> {
     let (n, c) = (frame.n, frame.cameras.len());
     if colors.len() != n * channels && colors.len() != c * n * channels {
-        return Err(Error::shape("colors", format!("[{n}, {channels}] or [{c}, {n}, {channels}]"), format!("{} elements", colors.len())).into());
+        return Err(Error::shape(
+            "colors",
+            format!("[{n}, {channels}] or [{c}, {n}, {channels}]"),
+            format!("{} elements", colors.len()),
+        )
+        .into());
     }
     if background.is_some_and(|b| b.len() != c * channels) {
         return Err(Error::shape("backgrounds", format!("[{c}, {channels}]"), "other").into());
@@ -478,8 +588,15 @@ fn composite_as<'py, T: Scalar>(
             let mut image = zeros::<T>(true, frame.cameras.len() * pixels * channels);
             let mut alphas = zeros::<T>(true, frame.cameras.len() * pixels);
             let (mut views, mut total) = (Vec::new(), Work::default());
-            for (i, (camera, projection)) in frame.cameras.iter().zip(&frame.projections).enumerate() {
-                let tiles = tiles::bin(projection, of_camera(colors, i, frame.n * channels), channels, camera)?;
+            for (i, (camera, projection)) in
+                frame.cameras.iter().zip(&frame.projections).enumerate()
+            {
+                let tiles = tiles::bin(
+                    projection,
+                    of_camera(colors, i, frame.n * channels),
+                    channels,
+                    camera,
+                )?;
                 let input = CompositeInput {
                     projection,
                     tiles: &tiles,
@@ -496,7 +613,14 @@ fn composite_as<'py, T: Scalar>(
                 total.hit_blocks += work.hit_blocks;
                 views.push(View { tiles, composited });
             }
-            Ok((Composite { state: T::wrap(views), work: total }, image, alphas))
+            Ok((
+                Composite {
+                    state: T::wrap(views),
+                    work: total,
+                },
+                image,
+                alphas,
+            ))
         })
     })?;
     Ok((state, image.into_pyarray(py), alphas.into_pyarray(py)))
@@ -504,13 +628,12 @@ fn composite_as<'py, T: Scalar>(
 
 /// VJP of `composite_forward`. `wanted`: geometry, absolute, colors, backgrounds.
 #[pyfunction]
-#[pyo3(signature = (frame, composite, colors, backgrounds, image, v_image, v_alphas, channels, wanted))]
+#[pyo3(signature = (frame, composite, colors, backgrounds, v_image, v_alphas, channels, wanted))]
 fn composite_backward<'py>(
     frame: &Bound<'py, Frame>,
     composite: &Bound<'py, Composite>,
     colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
-    image: &Bound<'py, PyAny>,
     v_image: &Bound<'py, PyAny>,
     v_alphas: Optional<'_, 'py>,
     channels: usize,
@@ -518,19 +641,33 @@ fn composite_backward<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     by_dtype!(
         colors,
-        composite_backward_as(frame, composite, colors, backgrounds, image, v_image, v_alphas, channels, wanted)
+        composite_backward_as(
+            frame,
+            composite,
+            colors,
+            backgrounds,
+            v_image,
+            v_alphas,
+            channels,
+            wanted
+        )
     )
 }
 
-type CompositeOut<'py, T> =
-    (Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>, Out<'py, T>);
+type CompositeOut<'py, T> = (
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+    Out<'py, T>,
+);
 
 fn composite_backward_as<'py, T: Scalar>(
     frame: &Bound<'py, Frame>,
     composite: &Bound<'py, Composite>,
     colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
-    image: &Bound<'py, PyAny>,
     v_image: &Bound<'py, PyAny>,
     v_alphas: Optional<'_, 'py>,
     channels: usize,
@@ -541,23 +678,30 @@ fn composite_backward_as<'py, T: Scalar>(
     let views = T::unwrap(&composite.state)?;
     let colors = Array::<T>::new("colors", colors)?;
     let backgrounds = optional::<T>("backgrounds", backgrounds)?;
-    let image = Array::<T>::new("render_colors", image)?;
     let v_image = Array::<T>::new("v_render_colors", v_image)?;
     let v_alphas = optional::<T>("v_render_alphas", v_alphas)?;
     let colors = colors.slice()?;
     let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
     check_colors(frame, colors, backgrounds, channels)?;
-    let (image, v_image) = (image.slice()?, v_image.slice()?);
+    let v_image = v_image.slice()?;
     let v_alphas = v_alphas.as_ref().map(Array::slice).transpose()?;
     let (n, c) = (frame.n, frame.cameras.len());
     let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
     for (name, got, expected) in [
-        ("render_colors", image.len(), c * pixels * channels),
         ("v_render_colors", v_image.len(), c * pixels * channels),
-        ("v_render_alphas", v_alphas.map_or(c * pixels, <[T]>::len), c * pixels),
+        (
+            "v_render_alphas",
+            v_alphas.map_or(c * pixels, <[T]>::len),
+            c * pixels,
+        ),
     ] {
         if got != expected {
-            return Err(Error::shape(name, format!("{expected} elements"), format!("{got} elements")).into());
+            return Err(Error::shape(
+                name,
+                format!("{expected} elements"),
+                format!("{got} elements"),
+            )
+            .into());
         }
     }
     let [want_geometry, want_absolute, want_colors, want_background] = wanted;
@@ -585,25 +729,38 @@ fn composite_backward_as<'py, T: Scalar>(
                         means2d: &mut means2d[2 * i * n..2 * (i + 1) * n],
                         whitened: &mut whitened[3 * i * n..3 * (i + 1) * n],
                         opacities: &mut opacities[i * n..(i + 1) * n],
-                        absolute: if want_absolute { Some(&mut absolute[2 * i * n..2 * (i + 1) * n]) } else { None },
+                        absolute: if want_absolute {
+                            Some(&mut absolute[2 * i * n..2 * (i + 1) * n])
+                        } else {
+                            None
+                        },
                     })
                 } else {
                     None
                 };
                 let grads = CompositeGrads {
                     geometry,
-                    colors: if want_colors { Some(&mut v_colors[i * n * channels..(i + 1) * n * channels]) } else { None },
-                    background: if want_background { Some(&mut v_background[i * channels..(i + 1) * channels]) } else { None },
+                    colors: if want_colors {
+                        Some(&mut v_colors[i * n * channels..(i + 1) * n * channels])
+                    } else {
+                        None
+                    },
+                    background: if want_background {
+                        Some(&mut v_background[i * channels..(i + 1) * channels])
+                    } else {
+                        None
+                    },
                 };
-                composite::backward(
-                    &input,
-                    &views[i].composited,
-                    &image[i * pixels * channels..(i + 1) * pixels * channels],
-                    &cotangents,
-                    grads,
-                )?;
+                composite::backward(&input, &views[i].composited, &cotangents, grads)?;
             }
-            Ok((means2d, whitened, opacities, absolute, v_colors, v_background))
+            Ok((
+                means2d,
+                whitened,
+                opacities,
+                absolute,
+                v_colors,
+                v_background,
+            ))
         })
     })?;
     let (means2d, whitened, opacities, absolute, v_colors, v_background) = out;

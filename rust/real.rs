@@ -21,8 +21,15 @@ pub trait Real: SimdFloatElement + Send + Sync + 'static {
 }
 
 /// Coefficients of `2^f` on [-0.5, 0.5], constant term first: minimax in the relative error (1.9e-9).
-const EXP2_F32: [f32; 7] =
-    [1.0, 0.693_147_2, 0.240_226_47, 0.055_503_29, 0.009_618_489, 0.001_339_993_1, 0.000_153_458_12];
+const EXP2_F32: [f32; 7] = [
+    1.0,
+    0.693_147_2,
+    0.240_226_47,
+    0.055_503_29,
+    0.009_618_489,
+    0.001_339_993_1,
+    0.000_153_458_12,
+];
 
 /// Coefficients of `2^f` on [-0.5, 0.5]: Taylor series, `ln(2)^k / k!`, truncation error below 1e-17.
 const EXP2_F64: [f64; 14] = {

@@ -60,7 +60,10 @@ impl<T: Real> Harmonics<'_, T> {
     /// Names `sh_degree` or `colors`.
     pub fn check(&self, n: usize) -> Result<(), Error> {
         if self.degree > sh::MAX_DEGREE {
-            return Err(Error::new("sh_degree", format!("must be 0..=3, got {}", self.degree)));
+            return Err(Error::new(
+                "sh_degree",
+                format!("must be 0..=3, got {}", self.degree),
+            ));
         }
         if self.stored < sh::count(self.degree) {
             let needed = sh::count(self.degree);

@@ -129,7 +129,11 @@ mod tests {
             a[axis] += h;
             b[axis] -= h;
             let difference = (value(a) - value(b)) / (2.0 * h);
-            assert!((g[axis] - difference).abs() < 1e-9, "axis {axis}: {} vs {difference}", g[axis]);
+            assert!(
+                (g[axis] - difference).abs() < 1e-9,
+                "axis {axis}: {} vs {difference}",
+                g[axis]
+            );
         }
     }
 }

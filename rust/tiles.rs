@@ -143,7 +143,13 @@ pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
 }
 
 /// The spans of the Gaussians `begin..end`, and the number of pairs of each tile.
-fn find_spans(projection: &Projection, begin: usize, end: usize, columns: usize, rows: usize) -> (Chunk, u64) {
+fn find_spans(
+    projection: &Projection,
+    begin: usize,
+    end: usize,
+    columns: usize,
+    rows: usize,
+) -> (Chunk, u64) {
     let mut spans = Vec::with_capacity(end - begin);
     let mut counts = vec![0u32; columns * rows];
     let mut row_begins = vec![0u32; rows + 1];
@@ -154,9 +160,16 @@ fn find_spans(projection: &Projection, begin: usize, end: usize, columns: usize,
             continue;
         }
         tile_spans(splat, |row, x0, x1| {
-            spans.push(Span { gaussian: i as u32, row: row as u16, begin: x0 as u16, end: x1 as u16 });
+            spans.push(Span {
+                gaussian: i as u32,
+                row: row as u16,
+                begin: x0 as u16,
+                end: x1 as u16,
+            });
             row_begins[row + 1] += 1;
-            counts[row * columns + x0..row * columns + x1].iter_mut().for_each(|n| *n += 1);
+            counts[row * columns + x0..row * columns + x1]
+                .iter_mut()
+                .for_each(|n| *n += 1);
             pairs += (x1 - x0) as u64;
         });
     }
@@ -170,7 +183,17 @@ fn find_spans(projection: &Projection, begin: usize, end: usize, columns: usize,
         by_row[*slot as usize] = k as u32;
         *slot += 1;
     }
-    (Chunk { begin, end, spans, by_row, row_begins, starts: counts }, pairs)
+    (
+        Chunk {
+            begin,
+            end,
+            spans,
+            by_row,
+            row_begins,
+            starts: counts,
+        },
+        pairs,
+    )
 }
 
 /// Split `data` into consecutive pieces of the given lengths.
@@ -233,11 +256,28 @@ pub fn bin<T: Real>(
         .zip(split(&mut places, row_lengths()))
         .enumerate()
         .collect();
-    let source = Source { projection, colors, channels, columns, chunks: &chunks, offsets: &offsets };
-    jobs.into_par_iter().for_each(|(row, ((records, colors), places))| {
-        source.fill_row(row, records, colors, places);
-    });
-    Ok(Tiles { columns, rows, offsets, records, colors: pair_colors, channels, places, chunks })
+    let source = Source {
+        projection,
+        colors,
+        channels,
+        columns,
+        chunks: &chunks,
+        offsets: &offsets,
+    };
+    jobs.into_par_iter()
+        .for_each(|(row, ((records, colors), places))| {
+            source.fill_row(row, records, colors, places);
+        });
+    Ok(Tiles {
+        columns,
+        rows,
+        offsets,
+        records,
+        colors: pair_colors,
+        channels,
+        places,
+        chunks,
+    })
 }
 
 /// What the rows are filled from.
@@ -262,7 +302,8 @@ impl<T: Real> Source<'_, T> {
         let mut by_index = vec![Local::default(); records.len()];
         for chunk in self.chunks {
             let mut next = chunk.starts[tiles.clone()].to_vec();
-            let spans = &chunk.by_row[chunk.row_begins[row] as usize..chunk.row_begins[row + 1] as usize];
+            let spans =
+                &chunk.by_row[chunk.row_begins[row] as usize..chunk.row_begins[row + 1] as usize];
             for span in spans.iter().map(|&k| &chunk.spans[k as usize]) {
                 let i = span.gaussian as usize;
                 let splat = &self.projection.splats[i];
@@ -287,8 +328,10 @@ impl<T: Real> Source<'_, T> {
             }
             self.order_ties(keys, by_index, places);
             let colors = &mut colors[range.start * d..range.end * d];
-            for ((record, color), place) in
-                records[range].iter_mut().zip(colors.chunks_exact_mut(d)).zip(places.iter())
+            for ((record, color), place) in records[range]
+                .iter_mut()
+                .zip(colors.chunks_exact_mut(d))
+                .zip(places.iter())
             {
                 *record = by_index[*place as usize];
                 let i = record.gaussian as usize;
