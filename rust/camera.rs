@@ -132,7 +132,8 @@ impl CameraGrad {
     /// `d center = -rotation^-1 (d translation + d rotation center)`.
     pub fn viewmat(&self, camera: &Camera) -> [f64; 16] {
         let back = camera.rotation.inverse().transpose() * self.center;
-        let r = self.rotation - outer(back, camera.center);
+        let r = self.rotation
+            - DMat3::from_cols_array_2d(&camera.center.to_array().map(|c| (back * c).to_array()));
         let t = self.translation - back;
         let row = |i: usize| [r.col(0)[i], r.col(1)[i], r.col(2)[i], t[i]];
         let mut m = [0.0; 16];
@@ -141,9 +142,4 @@ impl CameraGrad {
         }
         m
     }
-}
-
-/// `a b^T`.
-pub(crate) fn outer(a: DVec3, b: DVec3) -> DMat3 {
-    DMat3::from_cols(a * b.x, a * b.y, a * b.z)
 }

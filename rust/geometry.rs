@@ -1,4 +1,5 @@
-//! The EWA projection of one Gaussian and its vector-Jacobian product, in f64 whatever the input type.
+//! The EWA projection of a group of Gaussians, one per SIMD lane, and its vector-Jacobian product. In f64,
+//! whatever the input type: it costs little here, and nothing after it can repair a lost digit.
 //!
 //! The covariance is kept in factors, so that nothing cancels for needles and discs (the naive
 //! determinant `ac - b^2` in f32 is wrong by a factor of 7 for 10,000 : 1):
@@ -9,139 +10,219 @@
 //!   `s = sqrt(c / det)`, `m = b / c`, `t = 1 / sqrt(c)`: never negative;
 //! - the gradient of the covariance arrives as its whitened form `E` (`d cov2d = L E L^T`), whose entries
 //!   are of order 1 for any anisotropy.
+//!
+//! Lanes that turn out invalid are computed to the end and ignored.
 
 use crate::{
-    camera::{Camera, CameraGrad, outer},
+    camera::{Camera, CameraGrad},
     constants::QUAT_NORM2_MIN,
+    lanes::{M3, V3, Wide, splat3},
 };
-use glam::{DMat3, DVec2, DVec3, DVec4};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+use glam::{DMat3, DVec3};
 
-/// What projection computes for one Gaussian; the VJP computes it again instead of storing it.
-pub(crate) struct Geometry {
-    mean: DVec3,
-    /// Unit quaternion, stored (x, y, z, w).
-    quat: DVec4,
-    quat_norm: f64,
-    scale: DVec3,
-    rotation: DMat3,
+type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
+
+/// A camera, the same in each lane.
+pub(crate) struct CameraLanes<S: Simd> {
+    rotation: M3<Wide<S>>,
+    translation: V3<Wide<S>>,
+    focal: [Wide<S>; 2],
+    principal: [Wide<S>; 2],
+    ratio_min: [Wide<S>; 2],
+    ratio_max: [Wide<S>; 2],
+    near: Wide<S>,
+    far: Wide<S>,
+    eps2d: Wide<S>,
+}
+
+impl<S: Simd> CameraLanes<S> {
+    #[inline(always)]
+    pub fn new(simd: S, camera: &Camera, near: f64, far: f64, eps2d: f64) -> Self {
+        let splat = |x| Wide::<S>::splat(simd, x);
+        let pair = |v: glam::DVec2| [splat(v.x), splat(v.y)];
+        let row = |i| splat3(simd, camera.rotation.row(i));
+        Self {
+            rotation: M3([row(0), row(1), row(2)]),
+            translation: splat3(simd, camera.translation),
+            focal: pair(camera.focal),
+            principal: pair(camera.principal),
+            ratio_min: pair(camera.ratio_min),
+            ratio_max: pair(camera.ratio_max),
+            near: splat(near),
+            far: splat(far),
+            eps2d: splat(eps2d),
+        }
+    }
+}
+
+/// What projection computes; the VJP computes it again instead of storing it.
+pub(crate) struct Geometry<S: Simd> {
+    pub mean: V3<Wide<S>>,
+    /// Unit quaternion w, x, y, z.
+    quat: [Wide<S>; 4],
+    quat_norm: Wide<S>,
+    scale: V3<Wide<S>>,
+    rotation: M3<Wide<S>>,
     /// Centre in the camera frame.
-    pub p: DVec3,
+    pub p: V3<Wide<S>>,
+    rz: Wide<S>,
+    /// Focal lengths over depth.
+    f: [Wide<S>; 2],
     /// `(x/z, y/z)`, clamped for the Jacobian.
-    ratio: DVec2,
-    clamped: [bool; 2],
+    ratio: [Wide<S>; 2],
+    /// 1 where the ratio is free, 0 where it is clamped.
+    free: [Wide<S>; 2],
     /// Rows of `J W`.
-    jw: [DVec3; 2],
+    jw: [V3<Wide<S>>; 2],
     /// Rows of `J W R`, before the scales.
-    axes: [DVec3; 2],
+    axes: [V3<Wide<S>>; 2],
     /// Rows of `A = J W R S`.
-    rows: [DVec3; 2],
+    rows: [V3<Wide<S>>; 2],
     /// Covariance entry xx, low-pass included.
-    pub a: f64,
+    pub a: Wide<S>,
     /// Covariance entry xy.
-    pub b: f64,
+    b: Wide<S>,
     /// Covariance entry yy, low-pass included.
-    pub c: f64,
-    det_raw: f64,
-    det: f64,
+    pub c: Wide<S>,
+    det_raw: Wide<S>,
+    det: Wide<S>,
+    /// Factors (s, m, t) of the conic.
+    pub factors: [Wide<S>; 3],
+    /// Inside the depth range, with a rotation, and finite.
+    pub valid: Mask<S>,
 }
 
-/// Cotangents of one projected Gaussian.
-#[derive(Default)]
-pub(crate) struct Cotangent {
-    pub mean2d: DVec2,
+/// Cotangents of the projection.
+pub(crate) struct Cotangent<S: Simd> {
+    pub mean2d: [Wide<S>; 2],
     /// Whitened gradient of the covariance: E_uu, E_uv, E_vv.
-    pub whitened: [f64; 3],
-    pub depth: f64,
-    pub conic: [f64; 3],
-    /// With respect to the compensation factor of the opacity.
-    pub compensation: f64,
+    pub whitened: [Wide<S>; 3],
+    pub depth: Wide<S>,
+    /// With respect to the conic and to the compensation of the opacity, if either is wanted.
+    pub direct: Option<([Wide<S>; 3], Wide<S>)>,
 }
 
-/// Gradient of one Gaussian's geometry.
-pub(crate) struct GeometryGrad {
-    pub mean: DVec3,
+/// Gradient of the geometry.
+pub(crate) struct GeometryGrad<S: Simd> {
+    pub mean: V3<Wide<S>>,
     /// w, x, y, z.
-    pub quat: [f64; 4],
-    pub scale: DVec3,
+    pub quat: [Wide<S>; 4],
+    pub scale: V3<Wide<S>>,
 }
 
-/// Rotation matrix of a unit quaternion stored (x, y, z, w).
-fn rotation_matrix(q: DVec4) -> DMat3 {
-    let (x, y, z, w) = (q.x, q.y, q.z, q.w);
-    DMat3::from_cols(
-        DVec3::new(
-            1.0 - 2.0 * (y * y + z * z),
-            2.0 * (x * y + w * z),
-            2.0 * (x * z - w * y),
-        ),
-        DVec3::new(
-            2.0 * (x * y - w * z),
-            1.0 - 2.0 * (x * x + z * z),
-            2.0 * (y * z + w * x),
-        ),
-        DVec3::new(
-            2.0 * (x * z + w * y),
-            2.0 * (y * z - w * x),
-            1.0 - 2.0 * (x * x + y * y),
-        ),
-    )
+/// Gradient of the camera, a sum per lane.
+pub(crate) struct CameraGradLanes<S: Simd> {
+    rotation: [V3<Wide<S>>; 3],
+    translation: V3<Wide<S>>,
+    pub center: V3<Wide<S>>,
 }
 
-impl Geometry {
-    /// Project; `None` when the Gaussian is outside the depth range, has no rotation, or is not finite.
-    /// Each guard is written so that NaN fails it.
-    #[inline]
+impl<S: Simd> CameraGradLanes<S> {
+    #[inline(always)]
+    pub fn zero(simd: S) -> Self {
+        let zero = splat3(simd, DVec3::ZERO);
+        Self {
+            rotation: [zero; 3],
+            translation: zero,
+            center: zero,
+        }
+    }
+
+    /// Sum of the lanes.
+    #[inline(always)]
+    pub fn sum(&self) -> CameraGrad {
+        let sum = |v: V3<Wide<S>>| DVec3::new(v.x.reduce_sum(), v.y.reduce_sum(), v.z.reduce_sum());
+        let [r0, r1, r2] = self.rotation.map(sum);
+        CameraGrad {
+            rotation: DMat3::from_cols(r0, r1, r2).transpose(),
+            translation: sum(self.translation),
+            center: sum(self.center),
+        }
+    }
+}
+
+/// Rotation matrix of a unit quaternion.
+#[inline(always)]
+fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4]) -> M3<Wide<S>> {
+    let (one, two) = (Wide::<S>::splat(simd, 1.0), Wide::<S>::splat(simd, 2.0));
+    M3([
+        V3::new(
+            one - two * (y * y + z * z),
+            two * (x * y - w * z),
+            two * (x * z + w * y),
+        ),
+        V3::new(
+            two * (x * y + w * z),
+            one - two * (x * x + z * z),
+            two * (y * z - w * x),
+        ),
+        V3::new(
+            two * (x * z - w * y),
+            two * (y * z + w * x),
+            one - two * (x * x + y * y),
+        ),
+    ])
+}
+
+impl<S: Simd> Geometry<S> {
+    /// Project. Each test of `valid` is written so that NaN fails it.
+    #[inline(always)]
     pub fn new(
-        mean: DVec3,
-        quat_wxyz: [f64; 4],
-        scale: DVec3,
-        camera: &Camera,
-        near: f64,
-        far: f64,
-        eps2d: f64,
-    ) -> Option<Self> {
-        let p = camera.rotation * mean + camera.translation;
-        if !(p.z >= near && p.z <= far && p.z > 0.0) {
-            return None;
-        }
-        let q = DVec4::new(quat_wxyz[1], quat_wxyz[2], quat_wxyz[3], quat_wxyz[0]);
-        let norm2 = q.length_squared();
-        if !(norm2 >= QUAT_NORM2_MIN && norm2.is_finite()) {
-            return None;
-        }
+        simd: S,
+        mean: V3<Wide<S>>,
+        quat: [Wide<S>; 4],
+        scale: V3<Wide<S>>,
+        camera: &CameraLanes<S>,
+    ) -> Self {
+        let splat = |x| Wide::<S>::splat(simd, x);
+        let infinity = splat(f64::INFINITY);
+        let p = camera.rotation.times(mean) + camera.translation;
+        let norm2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
         let quat_norm = norm2.sqrt();
-        let quat = q / quat_norm;
-        let rotation = rotation_matrix(quat);
-        let rz = 1.0 / p.z;
-        let free = DVec2::new(p.x * rz, p.y * rz);
-        let ratio = free.clamp(camera.ratio_min, camera.ratio_max);
-        let clamped = [ratio.x != free.x, ratio.y != free.y];
-        let w = &camera.rotation;
-        let (w0, w1, w2) = (w.row(0), w.row(1), w.row(2));
+        let inverse_norm = splat(1.0) / quat_norm;
+        let quat = quat.map(|q| q * inverse_norm);
+        let rotation = rotation_matrix(simd, quat);
+        let rz = splat(1.0) / p.z;
+        let ratios = [p.x * rz, p.y * rz];
+        let clamp = |k: usize| ratios[k].max(camera.ratio_min[k]).min(camera.ratio_max[k]);
+        let ratio = [clamp(0), clamp(1)];
+        let free = [0, 1].map(|k| ratio[k].simd_eq(ratios[k]).select(splat(1.0), splat(0.0)));
+        let [w0, w1, w2] = camera.rotation.0;
+        let f = camera.focal.map(|f| f * rz);
         let jw = [
-            (w0 - ratio.x * w2) * (camera.focal.x * rz),
-            (w1 - ratio.y * w2) * (camera.focal.y * rz),
+            (w0 - w2.by(ratio[0])).by(f[0]),
+            (w1 - w2.by(ratio[1])).by(f[1]),
         ];
-        let back = rotation.transpose();
-        let axes = [back * jw[0], back * jw[1]];
-        let rows = [axes[0] * scale, axes[1] * scale];
-        let (aa, cc) = (rows[0].length_squared(), rows[1].length_squared());
+        let axes = jw.map(|j| rotation.back(j));
+        let rows = axes.map(|a| a.times(scale));
+        let (aa, cc) = (rows[0].dot(rows[0]), rows[1].dot(rows[1]));
         let b = rows[0].dot(rows[1]);
-        let det_raw = rows[0].cross(rows[1]).length_squared();
-        let det = det_raw + eps2d * (aa + cc) + eps2d * eps2d;
-        if !(det > 0.0 && det.is_finite() && (p.x * p.y * b).is_finite()) {
-            return None;
-        }
-        let (a, c) = (aa + eps2d, cc + eps2d);
-        Some(Self {
+        let cross = rows[0].cross(rows[1]);
+        let det_raw = cross.dot(cross);
+        let eps = camera.eps2d;
+        let det = det_raw + eps * (aa + cc) + eps * eps;
+        let (a, c) = (aa + eps, cc + eps);
+        let valid = p.z.simd_ge(camera.near)
+            & p.z.simd_le(camera.far)
+            & p.z.simd_gt(splat(0.0))
+            & norm2.simd_ge(splat(QUAT_NORM2_MIN))
+            & norm2.simd_lt(infinity)
+            & det.simd_gt(splat(0.0))
+            & det.simd_lt(infinity)
+            & (p.x * p.y * b).abs().simd_lt(infinity);
+        let factors = [(c / det).sqrt(), b / c, splat(1.0) / c.sqrt()];
+        Self {
             mean,
             quat,
             quat_norm,
             scale,
             rotation,
             p,
+            rz,
+            f,
             ratio,
-            clamped,
+            free,
             jw,
             axes,
             rows,
@@ -150,153 +231,183 @@ impl Geometry {
             c,
             det_raw,
             det,
-        })
+            factors,
+            valid,
+        }
     }
 
     /// Centre in pixels.
-    pub fn mean2d(&self, camera: &Camera) -> DVec2 {
-        camera.focal * DVec2::new(self.p.x, self.p.y) / self.p.z + camera.principal
+    #[inline(always)]
+    pub fn mean2d(&self, camera: &CameraLanes<S>) -> [Wide<S>; 2] {
+        [
+            self.f[0] * self.p.x + camera.principal[0],
+            self.f[1] * self.p.y + camera.principal[1],
+        ]
     }
 
     /// Inverse covariance, entries xx, xy, yy.
-    pub fn conic(&self) -> [f64; 3] {
+    #[inline(always)]
+    pub fn conic(&self) -> [Wide<S>; 3] {
         [self.c / self.det, -self.b / self.det, self.a / self.det]
-    }
-
-    /// Factors (s, m, t) of the conic; see the head of this file.
-    pub fn factors(&self) -> (f64, f64, f64) {
-        (
-            (self.c / self.det).sqrt(),
-            self.b / self.c,
-            1.0 / self.c.sqrt(),
-        )
     }
 
     /// `sqrt(det(cov2d - eps I) / det(cov2d))`: keeps a Gaussian's total energy under the low-pass
     /// (Mip-Splatting, eq. 9).
-    pub fn compensation(&self) -> f64 {
+    #[inline(always)]
+    pub fn compensation(&self) -> Wide<S> {
         (self.det_raw / self.det).sqrt()
     }
 
-    /// Vector-Jacobian product; the camera's part is added to `camera_grad`.
-    #[inline]
+    /// Vector-Jacobian product; the camera's part is added to `camera_grad` if there is one.
+    #[inline(always)]
     pub fn vjp(
         &self,
-        v: &Cotangent,
-        camera: &Camera,
-        camera_grad: &mut CameraGrad,
-    ) -> GeometryGrad {
-        let (s, m, t) = self.factors();
+        simd: S,
+        v: &Cotangent<S>,
+        camera: &CameraLanes<S>,
+        camera_grad: Option<&mut CameraGradLanes<S>>,
+    ) -> GeometryGrad<S> {
+        let splat = |x| Wide::<S>::splat(simd, x);
+        let (zero, two) = (splat(0.0), splat(2.0));
+        let [s, m, t] = self.factors;
         let [euu, euv, evv] = v.whitened;
         // Whitened rows: B = L^T A, on the unscaled axes.
-        let white = [(self.axes[0] - m * self.axes[1]) * s, self.axes[1] * t];
+        let white = [
+            (self.axes[0] - self.axes[1].by(m)).by(s),
+            self.axes[1].by(t),
+        ];
         let half = [
-            white[0] * euu + white[1] * euv,
-            white[0] * euv + white[1] * evv,
+            white[0].by(euu) + white[1].by(euv),
+            white[0].by(euv) + white[1].by(evv),
         ];
         // d cov = L E L^T gives dA = 2 L E B and, along each scale, 2 s_k B_k^T E B_k without cancellation.
-        let mut scale = 2.0 * self.scale * (white[0] * half[0] + white[1] * half[1]);
-        let scale2 = self.scale * self.scale;
+        let inner = white[0].times(half[0]) + white[1].times(half[1]);
+        let mut scale = self.scale.times(inner).by(two);
+        let scale2 = self.scale.times(self.scale).by(two);
         let mut v_axes = [
-            2.0 * s * scale2 * half[0],
-            2.0 * scale2 * (t * half[1] - s * m * half[0]),
+            scale2.times(half[0]).by(s),
+            scale2.times(half[1].by(t) - half[0].by(s * m)),
         ];
-        if v.compensation != 0.0 || v.conic != [0.0; 3] {
-            let direct = self.covariance_cotangent(v);
+        if let Some((conic, compensation)) = &v.direct {
+            let direct = self.covariance_cotangent(simd, conic, *compensation);
             let v_rows = [
-                2.0 * (direct[0] * self.rows[0] + direct[1] * self.rows[1]),
-                2.0 * (direct[1] * self.rows[0] + direct[2] * self.rows[1]),
+                (self.rows[0].by(direct[0]) + self.rows[1].by(direct[1])).by(two),
+                (self.rows[0].by(direct[1]) + self.rows[1].by(direct[2])).by(two),
             ];
-            scale += v_rows[0] * self.axes[0] + v_rows[1] * self.axes[1];
-            v_axes[0] += v_rows[0] * self.scale;
-            v_axes[1] += v_rows[1] * self.scale;
+            scale = scale + v_rows[0].times(self.axes[0]) + v_rows[1].times(self.axes[1]);
+            v_axes[0] = v_axes[0] + v_rows[0].times(self.scale);
+            v_axes[1] = v_axes[1] + v_rows[1].times(self.scale);
         }
         // axes_i = R^T jw_i
-        let v_jw = [self.rotation * v_axes[0], self.rotation * v_axes[1]];
-        let v_rotation = outer(self.jw[0], v_axes[0]) + outer(self.jw[1], v_axes[1]);
+        let v_jw = v_axes.map(|a| self.rotation.times(a));
 
-        let rz = 1.0 / self.p.z;
-        let f = camera.focal * rz;
-        let w2 = camera.rotation.row(2);
-        let mut v_p = DVec3::new(
-            f.x * v.mean2d.x,
-            f.y * v.mean2d.y,
+        let [w0, w1, w2] = camera.rotation.0;
+        let mut v_p = V3::new(
+            self.f[0] * v.mean2d[0],
+            self.f[1] * v.mean2d[1],
             v.depth
-                - rz * (f.x * self.p.x * v.mean2d.x + f.y * self.p.y * v.mean2d.y)
-                - rz * (v_jw[0].dot(self.jw[0]) + v_jw[1].dot(self.jw[1])),
+                - self.rz
+                    * (self.f[0] * self.p.x * v.mean2d[0]
+                        + self.f[1] * self.p.y * v.mean2d[1]
+                        + v_jw[0].dot(self.jw[0])
+                        + v_jw[1].dot(self.jw[1])),
         );
-        for axis in 0..2 {
-            if !self.clamped[axis] {
-                let v_ratio = -f[axis] * v_jw[axis].dot(w2);
-                v_p[axis] += v_ratio * rz;
-                v_p.z -= v_ratio * self.p[axis] * rz * rz;
+        let v_ratio = [0, 1].map(|k| self.free[k] * self.f[k] * v_jw[k].dot(w2) * self.rz);
+        v_p.x -= v_ratio[0];
+        v_p.y -= v_ratio[1];
+        v_p.z += (v_ratio[0] * self.p.x + v_ratio[1] * self.p.y) * self.rz;
+
+        if let Some(grad) = camera_grad {
+            let valid = |v: Wide<S>| self.valid.select(v, zero);
+            let jacobian = [
+                v_jw[0].by(self.f[0]),
+                v_jw[1].by(self.f[1]),
+                v_jw[0].by(zero - self.f[0] * self.ratio[0])
+                    - v_jw[1].by(self.f[1] * self.ratio[1]),
+            ];
+            for (i, (row, v_i)) in grad
+                .rotation
+                .iter_mut()
+                .zip([v_p.x, v_p.y, v_p.z])
+                .enumerate()
+            {
+                let g = self.mean.by(v_i) + jacobian[i];
+                *row = *row + V3::new(valid(g.x), valid(g.y), valid(g.z));
             }
+            grad.translation = grad.translation + V3::new(valid(v_p.x), valid(v_p.y), valid(v_p.z));
         }
-        let w_rows = [
-            f.x * v_jw[0],
-            f.y * v_jw[1],
-            -(f.x * self.ratio.x * v_jw[0] + f.y * self.ratio.y * v_jw[1]),
-        ];
-        camera_grad.rotation +=
-            outer(v_p, self.mean) + DMat3::from_cols(w_rows[0], w_rows[1], w_rows[2]).transpose();
-        camera_grad.translation += v_p;
         GeometryGrad {
-            mean: camera.rotation.transpose() * v_p,
-            quat: self.quat_vjp(&v_rotation),
+            mean: w0.by(v_p.x) + w1.by(v_p.y) + w2.by(v_p.z),
+            quat: self.quat_vjp(simd, &v_axes),
             scale,
         }
     }
 
     /// Gradient of the covariance (xx, xy, yy; symmetric) from the conic and the compensation.
-    fn covariance_cotangent(&self, v: &Cotangent) -> [f64; 3] {
+    #[inline(always)]
+    fn covariance_cotangent(
+        &self,
+        simd: S,
+        conic: &[Wide<S>; 3],
+        compensation: Wide<S>,
+    ) -> [Wide<S>; 3] {
+        let half = Wide::<S>::splat(simd, 0.5);
+        let zero = Wide::<S>::splat(simd, 0.0);
         let [qa, qb, qc] = self.conic();
         // The conic's off-diagonal entry stands for two.
-        let (va, vb, vc) = (v.conic[0], 0.5 * v.conic[1], v.conic[2]);
+        let (va, vb, vc) = (conic[0], half * conic[1], conic[2]);
         let left = [
             qa * va + qb * vb,
             qa * vb + qb * vc,
             qb * va + qc * vb,
             qb * vb + qc * vc,
         ];
-        let mut g = [
-            -(left[0] * qa + left[1] * qb),
-            -(left[0] * qb + left[1] * qc),
-            -(left[2] * qb + left[3] * qc),
-        ];
-        if v.compensation != 0.0 {
-            // d comp = comp/2 (d ln det_raw - d ln det). A compensation near 0 is culled with its opacity,
-            // so det_raw is not 0 here.
-            let k = 0.5 * self.compensation() * v.compensation;
-            let (a0, c0) = (self.rows[0].length_squared(), self.rows[1].length_squared());
-            g[0] += k * (c0 / self.det_raw - qa);
-            g[1] += k * (-self.b / self.det_raw - qb);
-            g[2] += k * (a0 / self.det_raw - qc);
-        }
-        g
+        // d comp = comp/2 (d ln det_raw - d ln det). A compensation near 0 is culled with its opacity, so
+        // that det_raw is not 0 in a valid lane with a cotangent.
+        let used = compensation.simd_eq(zero);
+        let k = used.select(
+            zero,
+            half * self.compensation() * compensation / self.det_raw,
+        );
+        let l = half * self.compensation() * compensation;
+        let (a0, c0) = (
+            self.rows[0].dot(self.rows[0]),
+            self.rows[1].dot(self.rows[1]),
+        );
+        [
+            k * c0 - l * qa - (left[0] * qa + left[1] * qb),
+            zero - k * self.b - l * qb - (left[0] * qb + left[1] * qc),
+            k * a0 - l * qc - (left[2] * qb + left[3] * qc),
+        ]
     }
 
-    /// Gradient of the quaternion (w, x, y, z), its normalisation included.
-    fn quat_vjp(&self, v: &DMat3) -> [f64; 4] {
-        let at = |i: usize, j: usize| v.col(j)[i];
-        let (x, y, z, w) = (self.quat.x, self.quat.y, self.quat.z, self.quat.w);
-        let (s01, s02, s12) = (
-            at(0, 1) + at(1, 0),
-            at(0, 2) + at(2, 0),
-            at(1, 2) + at(2, 1),
-        );
-        let (d21, d02, d10) = (
-            at(2, 1) - at(1, 2),
-            at(0, 2) - at(2, 0),
-            at(1, 0) - at(0, 1),
-        );
-        let g = 2.0
-            * DVec4::new(
-                y * s01 + z * s02 + w * d21 - 2.0 * x * (at(1, 1) + at(2, 2)),
-                x * s01 + z * s12 + w * d02 - 2.0 * y * (at(0, 0) + at(2, 2)),
-                x * s02 + y * s12 + w * d10 - 2.0 * z * (at(0, 0) + at(1, 1)),
-                x * d21 + y * d02 + z * d10,
-            );
-        let g = (g - self.quat * self.quat.dot(g)) / self.quat_norm;
-        [g.w, g.x, g.y, g.z]
+    /// Gradient of the quaternion, its normalisation included; `v_axes` is that of the rows of `J W R`.
+    #[inline(always)]
+    fn quat_vjp(&self, simd: S, v_axes: &[V3<Wide<S>>; 2]) -> [Wide<S>; 4] {
+        let two = Wide::<S>::splat(simd, 2.0);
+        // v_R = sum_i jw_i v_axes_i^T
+        let row = |j0: Wide<S>, j1: Wide<S>| v_axes[0].by(j0) + v_axes[1].by(j1);
+        let [r0, r1, r2] = [
+            row(self.jw[0].x, self.jw[1].x),
+            row(self.jw[0].y, self.jw[1].y),
+            row(self.jw[0].z, self.jw[1].z),
+        ];
+        let [w, x, y, z] = self.quat;
+        let (s01, s02, s12) = (r0.y + r1.x, r0.z + r2.x, r1.z + r2.y);
+        let (d21, d02, d10) = (r2.y - r1.z, r0.z - r2.x, r1.x - r0.y);
+        let g = [
+            two * (x * d21 + y * d02 + z * d10),
+            two * (y * s01 + z * s02 + w * d21 - two * x * (r1.y + r2.z)),
+            two * (x * s01 + z * s12 + w * d02 - two * y * (r0.x + r2.z)),
+            two * (x * s02 + y * s12 + w * d10 - two * z * (r0.x + r1.y)),
+        ];
+        let along = w * g[0] + x * g[1] + y * g[2] + z * g[3];
+        let inverse = Wide::<S>::splat(simd, 1.0) / self.quat_norm;
+        [
+            (g[0] - w * along) * inverse,
+            (g[1] - x * along) * inverse,
+            (g[2] - y * along) * inverse,
+            (g[3] - z * along) * inverse,
+        ]
     }
 }

@@ -11,6 +11,7 @@ pub mod constants;
 pub mod error;
 mod geometry;
 mod kernel;
+mod lanes;
 pub mod project;
 #[cfg(feature = "python")]
 mod python;

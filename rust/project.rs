@@ -5,12 +5,13 @@ use crate::{
     constants::{
         ALPHA_MIN, EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE,
     },
-    geometry::{Cotangent, Geometry},
+    geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry},
+    lanes::{V3, Wide, lanes, load, load3, splat3},
     real::Real,
     scene::{Gaussians, Harmonics},
     sh,
 };
-use glam::{DVec2, DVec3};
+use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdMask, dispatch};
 use rayon::prelude::*;
 
 /// Options of the projection; the defaults are gsplat's.
@@ -89,41 +90,32 @@ pub struct ProjectOut<'a, T> {
     pub colors: &'a mut [T],
 }
 
-fn vec3<T: Real>(data: &[T], i: usize) -> DVec3 {
-    DVec3::new(
-        data[3 * i].to_f64(),
-        data[3 * i + 1].to_f64(),
-        data[3 * i + 2].to_f64(),
-    )
-}
-
-fn geometry<T: Real>(
+/// The geometry of Gaussians `first..` of `g`, one per lane.
+#[inline(always)]
+fn geometry<S: Simd, T: Real>(
+    simd: S,
     g: &Gaussians<T>,
-    i: usize,
-    camera: &Camera,
-    o: &ProjectOptions,
-) -> Option<Geometry> {
-    let quat = std::array::from_fn(|k| g.quats[4 * i + k].to_f64());
+    first: usize,
+    camera: &CameraLanes<S>,
+) -> Geometry<S> {
+    let quat = [0, 1, 2, 3].map(|k| load(simd, g.quats, 4, k, first));
     Geometry::new(
-        vec3(g.means, i),
+        simd,
+        load3(simd, g.means, first),
         quat,
-        vec3(g.scales, i),
+        load3(simd, g.scales, first),
         camera,
-        o.near_plane,
-        o.far_plane,
-        o.eps2d,
     )
 }
 
-/// Direction from the camera centre, its length, and the degree that can be used along it.
-fn direction(mean: DVec3, camera: &Camera, degree: usize) -> (DVec3, f64, usize) {
-    let d = mean - camera.center;
-    let length = d.length();
-    if length > 0.0 {
-        (d / length, length, degree)
-    } else {
-        (DVec3::ZERO, 0.0, 0)
-    }
+/// Unit vectors from the camera centre, and distances. A Gaussian on the centre has no direction: (0, 0, 0).
+#[inline(always)]
+fn direction<S: Simd>(simd: S, mean: V3<Wide<S>>, center: V3<Wide<S>>) -> (V3<Wide<S>>, Wide<S>) {
+    let (zero, one) = (Wide::<S>::splat(simd, 0.0), Wide::<S>::splat(simd, 1.0));
+    let d = mean - center;
+    let length = d.dot(d).sqrt();
+    let inverse = length.simd_gt(zero).select(one / length, zero);
+    (d.by(inverse), length)
 }
 
 /// Range of tiles whose pixel centres lie within `center +- extent`, clipped to `size` pixels.
@@ -140,47 +132,45 @@ fn tile_range(center: f64, extent: f64, size: usize) -> (u16, u16) {
     }
 }
 
-/// Cull and pack one Gaussian. `radii` in pixels, rounded up.
-fn splat(
-    geometry: &Geometry,
+/// One lane of the geometry, as the culling reads it.
+struct Projected {
+    mean: [f64; 2],
+    /// Standard deviations along x and y, pixels.
+    sigma: [f64; 2],
+    factors: [f64; 3],
     opacity: f64,
-    camera: &Camera,
-    o: &ProjectOptions,
-) -> Option<(Splat, [f64; 2])> {
-    let opacity = if o.antialiased {
-        opacity * geometry.compensation()
-    } else {
-        opacity
-    };
-    if !(opacity >= ALPHA_MIN && opacity.is_finite()) {
+}
+
+/// Cull and pack one Gaussian; the radii in pixels, rounded up.
+#[inline(always)]
+fn splat(p: &Projected, camera: &Camera, o: &ProjectOptions) -> Option<(Splat, [f64; 2])> {
+    if !(p.opacity >= ALPHA_MIN && p.opacity.is_finite()) {
         return None;
     }
-    let radius = (2.0 * (opacity / ALPHA_MIN).ln()).sqrt();
-    let sigma = DVec2::new(geometry.a, geometry.c).map(f64::sqrt);
-    let radii = (radius * sigma).map(f64::ceil);
-    let mean = geometry.mean2d(camera);
-    let size = DVec2::new(camera.width as f64, camera.height as f64);
-    let inside = (mean + radii).min_element() > 0.0 && (size - mean + radii).min_element() > 0.0;
-    if !(inside && radii.max_element() > o.radius_clip) {
+    let radius = (2.0 * (p.opacity / ALPHA_MIN).ln()).sqrt();
+    let radii = p.sigma.map(|s| (radius * s).ceil());
+    let size = [camera.width as f64, camera.height as f64];
+    let inside = (0..2).all(|k| p.mean[k] + radii[k] > 0.0 && p.mean[k] - radii[k] < size[k]);
+    if !(inside && radii[0].max(radii[1]) > o.radius_clip) {
         return None;
     }
-    let (s, m, t) = geometry.factors();
+    let [s, m, t] = p.factors;
     let stiffness = s * (1.0 + m.abs()) + t;
     if !(stiffness < FACTOR_MAX) {
         return None;
     }
     let reach = radius + SUPPORT_SLACK * (1.0 + stiffness);
-    let (x0, x1) = tile_range(mean.x, reach * sigma.x, camera.width);
-    let (y0, y1) = tile_range(mean.y, reach * sigma.y, camera.height);
+    let (x0, x1) = tile_range(p.mean[0], reach * p.sigma[0], camera.width);
+    let (y0, y1) = tile_range(p.mean[1], reach * p.sigma[1], camera.height);
     let splat = Splat {
-        mean: mean.to_array(),
-        factors: [s, m, t],
-        opacity,
+        mean: p.mean,
+        factors: p.factors,
+        opacity: p.opacity,
         // f32 rounds to nearest: the slack is far larger than half an ulp of any radius below 10.
         reach: reach as f32,
         tiles: [x0, x1, y0, y1],
     };
-    Some((splat, radii.to_array()))
+    Some((splat, radii))
 }
 
 /// Project all Gaussians into `camera`.
@@ -216,58 +206,116 @@ pub fn forward<T: Real>(
         .zip(out.radii.chunks_mut(2 * PROJECT_CHUNK))
         .zip(out.opacities.chunks_mut(PROJECT_CHUNK))
         .zip(color_chunks)
+        .map(
+            |(((((((splats, keys), means2d), depths), conics), radii), opacities), colors)| {
+                (
+                    splats,
+                    keys,
+                    ProjectOut {
+                        means2d,
+                        depths,
+                        conics,
+                        radii,
+                        opacities,
+                        colors,
+                    },
+                )
+            },
+        )
+        .enumerate()
         .collect();
-    jobs.into_par_iter().enumerate().for_each(
-        |(chunk, (((((((splats, keys), means2d), depths), conics), radii), opacities), colors))| {
-            for j in 0..splats.len() {
-                let i = chunk * PROJECT_CHUNK + j;
-                let projected = geometry(gaussians, i, camera, options).and_then(|g| {
-                    splat(&g, gaussians.opacities[i].to_f64(), camera, options).map(|s| (g, s))
-                });
-                let Some((g, (s, r))) = projected else {
-                    splats[j] = Splat::default();
-                    (depths[j], opacities[j]) = (T::ZERO, T::ZERO);
-                    means2d[2 * j..2 * j + 2].fill(T::ZERO);
-                    conics[3 * j..3 * j + 3].fill(T::ZERO);
-                    radii[2 * j..2 * j + 2].fill(0);
-                    colors
-                        .chunks_mut(3)
-                        .skip(j)
-                        .take(1)
-                        .for_each(|c| c.fill(T::ZERO));
-                    continue;
-                };
-                splats[j] = s;
-                keys[j] = g.p.z;
-                depths[j] = T::from_f64(g.p.z);
-                opacities[j] = T::from_f64(s.opacity);
-                for k in 0..2 {
-                    means2d[2 * j + k] = T::from_f64(s.mean[k]);
-                    radii[2 * j + k] = r[k] as i32; // saturates
-                }
-                for (out, q) in conics[3 * j..].iter_mut().zip(g.conic()) {
-                    *out = T::from_f64(q);
-                }
-                if let Some(h) = harmonics {
-                    let (d, _, degree) = direction(vec3(gaussians.means, i), camera, h.degree);
-                    let rgb = evaluate(h, i, degree, d);
-                    for k in 0..3 {
-                        colors[3 * j + k] = T::from_f64(rgb[k].max(0.0));
-                    }
-                }
-            }
-        },
-    );
+    let level = Level::new();
+    jobs.into_par_iter().for_each(|(chunk, (splats, keys, mut out))| {
+        dispatch!(level, simd => forward_chunk(
+            simd, gaussians, harmonics, camera, options, chunk * PROJECT_CHUNK, splats, keys, &mut out
+        ));
+    });
 }
 
-/// Colour of Gaussian `i` along the unit vector `d`, before the clamp at 0.
-fn evaluate<T: Real>(h: &Harmonics<T>, i: usize, degree: usize, d: DVec3) -> [f64; 3] {
-    let basis = sh::basis(degree, d.to_array());
-    let rows = &h.coefficients[3 * h.stored * i..][..3 * sh::count(degree)];
-    let mut rgb = [0.5; 3];
-    for (y, row) in basis.iter().zip(rows.chunks_exact(3)) {
+/// Project the Gaussians `begin..begin + splats.len()`.
+#[inline(always)]
+fn forward_chunk<S: Simd, T: Real>(
+    simd: S,
+    gaussians: &Gaussians<T>,
+    harmonics: Option<&Harmonics<T>>,
+    camera: &Camera,
+    options: &ProjectOptions,
+    begin: usize,
+    splats: &mut [Splat],
+    keys: &mut [f64],
+    out: &mut ProjectOut<T>,
+) {
+    let lanes_of = CameraLanes::new(
+        simd,
+        camera,
+        options.near_plane,
+        options.far_plane,
+        options.eps2d,
+    );
+    let center = splat3(simd, camera.center);
+    for first in (0..splats.len()).step_by(lanes::<S>()) {
+        let g = geometry(simd, gaussians, begin + first, &lanes_of);
+        let valid = g.valid.to_bitmask();
+        let mean2d = g.mean2d(&lanes_of);
+        let sigma = [g.a.sqrt(), g.c.sqrt()];
+        let conic = g.conic();
+        let mut opacity = load(simd, gaussians.opacities, 1, 0, begin + first);
+        if options.antialiased {
+            opacity *= g.compensation();
+        }
+        let basis = harmonics.map(|h| sh::basis(simd, h.degree, direction(simd, g.mean, center).0));
+        for lane in 0..lanes::<S>().min(splats.len() - first) {
+            let j = first + lane;
+            let projected = Projected {
+                mean: mean2d.map(|m| m[lane]),
+                sigma: sigma.map(|s| s[lane]),
+                factors: g.factors.map(|f| f[lane]),
+                opacity: opacity[lane],
+            };
+            let kept = if valid >> lane & 1 == 1 {
+                splat(&projected, camera, options)
+            } else {
+                None
+            };
+            let (s, r) = kept.unwrap_or_default();
+            splats[j] = s;
+            let depth = if kept.is_some() { g.p.z[lane] } else { 0.0 };
+            keys[j] = depth;
+            out.depths[j] = T::from_f64(depth);
+            out.opacities[j] = T::from_f64(s.opacity);
+            for k in 0..2 {
+                out.means2d[2 * j + k] = T::from_f64(s.mean[k]);
+                out.radii[2 * j + k] = r[k] as i32; // saturates
+            }
+            for (o, q) in out.conics[3 * j..3 * j + 3].iter_mut().zip(conic) {
+                *o = if kept.is_some() {
+                    T::from_f64(q[lane])
+                } else {
+                    T::ZERO
+                };
+            }
+            if let (Some(h), Some(basis)) = (harmonics, &basis) {
+                let rgb = match kept {
+                    Some(_) => evaluate(h, begin + j, |k| T::from_f64(basis[k][lane])),
+                    None => [T::ZERO; 3],
+                };
+                for (o, c) in out.colors[3 * j..3 * j + 3].iter_mut().zip(rgb) {
+                    *o = if c > T::ZERO { c } else { T::ZERO };
+                }
+            }
+        }
+    }
+}
+
+/// Colour of Gaussian `i` before the clamp at 0.
+#[inline(always)]
+fn evaluate<T: Real>(h: &Harmonics<T>, i: usize, basis: impl Fn(usize) -> T) -> [T; 3] {
+    let rows = &h.coefficients[3 * h.stored * i..][..3 * sh::count(h.degree)];
+    let mut rgb = [T::from_f64(0.5); 3];
+    for (k, row) in rows.chunks_exact(3).enumerate() {
+        let y = basis(k);
         for (c, x) in rgb.iter_mut().zip(row) {
-            *c += y * x.to_f64();
+            *c += y * *x;
         }
     }
     rgb
@@ -324,7 +372,8 @@ fn add<T: Real>(out: &mut Option<&mut [T]>, j: usize, values: &[f64]) {
     }
 }
 
-/// Vector-Jacobian product of [`forward`]: adds to `grads` and returns the gradient of the camera.
+/// Vector-Jacobian product of [`forward`]: adds to `grads` and returns the gradient of the camera (of its
+/// centre alone unless `camera_wanted`).
 ///
 /// `projection` must be the one that `forward` filled from the same inputs.
 pub fn backward<T: Real>(
@@ -335,6 +384,7 @@ pub fn backward<T: Real>(
     projection: &Projection,
     v: &ProjectCotangents<T>,
     grads: GaussianGrads<T>,
+    camera_wanted: bool,
 ) -> CameraGrad {
     let n = gaussians.len();
     let harmonics_row = harmonics.map_or(0, |h| 3 * h.stored);
@@ -345,55 +395,16 @@ pub fn backward<T: Real>(
         .zip(chunks(grads.opacities, n, 1))
         .zip(chunks(grads.harmonics, n, harmonics_row))
         .collect();
+    let level = Level::new();
     let parts: Vec<CameraGrad> = jobs
         .into_par_iter()
         .enumerate()
-        .map(
-            |(chunk, ((((mut means, mut quats), mut scales), mut opacities), mut sh_grad))| {
-                let mut camera_grad = CameraGrad::ZERO;
-                let begin = chunk * PROJECT_CHUNK;
-                for j in 0..PROJECT_CHUNK.min(n - begin) {
-                    let i = begin + j;
-                    if !projection.splats[i].visible() {
-                        continue;
-                    }
-                    let Some(g) = geometry(gaussians, i, camera, options) else {
-                        continue;
-                    };
-                    let at = |data: &[T], row: usize, k: usize| data[row * i + k].to_f64();
-                    let v_opacity = at(v.opacities, 1, 0);
-                    let mut cotangent = Cotangent {
-                        mean2d: DVec2::new(at(v.means2d, 2, 0), at(v.means2d, 2, 1)),
-                        whitened: std::array::from_fn(|k| at(v.whitened, 3, k)),
-                        depth: v.depths.map_or(0.0, |d| at(d, 1, 0)),
-                        conic: v
-                            .conics
-                            .map_or([0.0; 3], |c| std::array::from_fn(|k| at(c, 3, k))),
-                        compensation: 0.0,
-                    };
-                    let mut v_input_opacity = v_opacity;
-                    if options.antialiased {
-                        cotangent.compensation = v_opacity * gaussians.opacities[i].to_f64();
-                        v_input_opacity = v_opacity * g.compensation();
-                    }
-                    let mut grad = g.vjp(&cotangent, camera, &mut camera_grad);
-                    if let (Some(h), Some(colors)) = (harmonics, v.colors) {
-                        let v_rgb = std::array::from_fn(|k| at(colors, 3, k));
-                        let out = sh_grad
-                            .as_mut()
-                            .map(|s| &mut s[j * harmonics_row..][..harmonics_row]);
-                        let v_mean = harmonics_vjp(gaussians, h, i, camera, v_rgb, out);
-                        grad.mean += v_mean;
-                        camera_grad.center -= v_mean;
-                    }
-                    add(&mut means, j, &grad.mean.to_array());
-                    add(&mut quats, j, &grad.quat);
-                    add(&mut scales, j, &grad.scale.to_array());
-                    add(&mut opacities, j, &[v_input_opacity]);
-                }
-                camera_grad
-            },
-        )
+        .map(|(chunk, ((((means, quats), scales), opacities), harmonics_grad))| {
+            let grads = GaussianGrads { means, quats, scales, opacities, harmonics: harmonics_grad };
+            dispatch!(level, simd => backward_chunk(
+                simd, gaussians, harmonics, camera, options, projection, v, chunk * PROJECT_CHUNK, grads, camera_wanted
+            ))
+        })
         .collect();
     parts.iter().fold(CameraGrad::ZERO, |mut sum, part| {
         sum.add(part);
@@ -401,42 +412,120 @@ pub fn backward<T: Real>(
     })
 }
 
-/// VJP of the colour of Gaussian `i`: adds to its coefficients, returns the gradient of its mean.
-fn harmonics_vjp<T: Real>(
+/// VJP of the Gaussians of one chunk.
+#[inline(always)]
+fn backward_chunk<S: Simd, T: Real>(
+    simd: S,
     gaussians: &Gaussians<T>,
-    h: &Harmonics<T>,
-    i: usize,
+    harmonics: Option<&Harmonics<T>>,
     camera: &Camera,
-    v_rgb: [f64; 3],
-    out: Option<&mut [T]>,
-) -> DVec3 {
-    let (d, length, degree) = direction(vec3(gaussians.means, i), camera, h.degree);
-    let rgb = evaluate(h, i, degree, d);
-    // Zero gradient where the colour is clamped at 0.
-    let v: [f64; 3] = std::array::from_fn(|k| if rgb[k] >= 0.0 { v_rgb[k] } else { 0.0 });
-    if v == [0.0; 3] {
-        return DVec3::ZERO;
-    }
-    if let Some(out) = out {
-        let basis = sh::basis(degree, d.to_array());
-        for (y, row) in basis
-            .iter()
-            .zip(out.chunks_exact_mut(3))
-            .take(sh::count(degree))
-        {
-            for (o, v) in row.iter_mut().zip(v) {
-                *o = T::from_f64(o.to_f64() + y * v);
+    options: &ProjectOptions,
+    projection: &Projection,
+    v: &ProjectCotangents<T>,
+    begin: usize,
+    mut grads: GaussianGrads<T>,
+    camera_wanted: bool,
+) -> CameraGrad {
+    let zero = Wide::<S>::splat(simd, 0.0);
+    let lanes_of = CameraLanes::new(
+        simd,
+        camera,
+        options.near_plane,
+        options.far_plane,
+        options.eps2d,
+    );
+    let center = splat3(simd, camera.center);
+    let mut camera_grad = CameraGradLanes::zero(simd);
+    let end = gaussians.len().min(begin + PROJECT_CHUNK);
+    for first in (begin..end).step_by(lanes::<S>()) {
+        let rows = lanes::<S>().min(end - first);
+        let visible = |lane: usize| lane < rows && projection.splats[first + lane].visible();
+        if !(0..rows).any(visible) {
+            continue;
+        }
+        let mut g = geometry(simd, gaussians, first, &lanes_of);
+        // Lanes that were culled for another reason, or lie beyond the end, are not valid here.
+        g.valid = Wide::<S>::from_fn(simd, |lane| f64::from(u8::from(visible(lane)))).simd_gt(zero);
+        let v_opacity = load(simd, v.opacities, 1, 0, first);
+        let mut v_input_opacity = v_opacity;
+        let mut direct = None;
+        if options.antialiased || v.conics.is_some() {
+            let conic = [0, 1, 2].map(|k| v.conics.map_or(zero, |c| load(simd, c, 3, k, first)));
+            let mut compensation = zero;
+            if options.antialiased {
+                compensation = v_opacity * load(simd, gaussians.opacities, 1, 0, first);
+                v_input_opacity = v_opacity * g.compensation();
             }
+            direct = Some((conic, compensation));
+        }
+        let cotangent = Cotangent {
+            mean2d: [0, 1].map(|k| load(simd, v.means2d, 2, k, first)),
+            whitened: [0, 1, 2].map(|k| load(simd, v.whitened, 3, k, first)),
+            depth: v.depths.map_or(zero, |d| load(simd, d, 1, 0, first)),
+            direct,
+        };
+        let mut grad = g.vjp(
+            simd,
+            &cotangent,
+            &lanes_of,
+            camera_wanted.then_some(&mut camera_grad),
+        );
+        if let (Some(h), Some(colors)) = (harmonics, v.colors) {
+            let (d, length) = direction(simd, g.mean, center);
+            let basis = sh::basis(simd, h.degree, d);
+            let mut weights = [zero; sh::MAX_COUNT];
+            for lane in (0..rows).filter(|&lane| visible(lane)) {
+                let i = first + lane;
+                let basis = |k: usize| T::from_f64(basis[k][lane]);
+                let rgb = evaluate(h, i, basis);
+                // Zero gradient where the colour is clamped at 0.
+                let v_rgb: [T; 3] = std::array::from_fn(|c| {
+                    if rgb[c] >= T::ZERO {
+                        colors[3 * i + c]
+                    } else {
+                        T::ZERO
+                    }
+                });
+                let rows = 3 * h.stored * i..3 * (h.stored * i + sh::count(h.degree));
+                for (w, row) in weights.iter_mut().zip(h.coefficients[rows].chunks_exact(3)) {
+                    w[lane] = (v_rgb[0] * row[0] + v_rgb[1] * row[1] + v_rgb[2] * row[2]).to_f64();
+                }
+                if let Some(out) = &mut grads.harmonics {
+                    let row = 3 * h.stored * (i - begin);
+                    let out = &mut out[row..row + 3 * sh::count(h.degree)];
+                    for (k, out) in out.chunks_exact_mut(3).enumerate() {
+                        for (o, v) in out.iter_mut().zip(v_rgb) {
+                            *o += basis(k) * v;
+                        }
+                    }
+                }
+            }
+            let v_d = sh::basis_vjp(simd, h.degree, d, &weights);
+            // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
+            let inverse = length
+                .simd_gt(zero)
+                .select(Wide::<S>::splat(simd, 1.0) / length, zero);
+            let v_mean = (v_d - d.by(d.dot(v_d))).by(inverse);
+            grad.mean = grad.mean + v_mean;
+            let part = |x: Wide<S>| g.valid.select(x, zero);
+            camera_grad.center =
+                camera_grad.center - V3::new(part(v_mean.x), part(v_mean.y), part(v_mean.z));
+        }
+        for lane in (0..rows).filter(|&lane| visible(lane)) {
+            let j = first - begin + lane;
+            add(
+                &mut grads.means,
+                j,
+                &[grad.mean.x[lane], grad.mean.y[lane], grad.mean.z[lane]],
+            );
+            add(&mut grads.quats, j, &grad.quat.map(|q| q[lane]));
+            add(
+                &mut grads.scales,
+                j,
+                &[grad.scale.x[lane], grad.scale.y[lane], grad.scale.z[lane]],
+            );
+            add(&mut grads.opacities, j, &[v_input_opacity[lane]]);
         }
     }
-    if degree == 0 {
-        return DVec3::ZERO;
-    }
-    let rows = &h.coefficients[3 * h.stored * i..][..3 * sh::count(degree)];
-    let mut weights = [0.0; sh::MAX_COUNT];
-    for (w, row) in weights.iter_mut().zip(rows.chunks_exact(3)) {
-        *w = v[0] * row[0].to_f64() + v[1] * row[1].to_f64() + v[2] * row[2].to_f64();
-    }
-    let v_d = DVec3::from(sh::basis_vjp(degree, d.to_array(), &weights));
-    (v_d - d * d.dot(v_d)) / length
+    camera_grad.sum()
 }

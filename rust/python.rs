@@ -510,6 +510,7 @@ fn project_backward_as<'py, T: Scalar>(
                     &frame.projections[i],
                     &cotangents,
                     grads,
+                    want_viewmats,
                 );
                 viewmats.extend(camera_grad.viewmat(camera));
             }

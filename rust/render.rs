@@ -164,6 +164,7 @@ pub fn backward<T: Real>(
         &rendered.projection,
         &cotangents,
         grads,
+        true,
     );
     out.viewmat = camera_grad.viewmat(camera);
     Ok(out)

@@ -1,4 +1,8 @@
-//! Real spherical harmonics of degree 0..3 in the basis order and signs of the original 3DGS.
+//! Real spherical harmonics of degree 0..3 in the basis order and signs of the original 3DGS, one direction
+//! per SIMD lane.
+
+use crate::lanes::{V3, Wide};
+use fearless_simd::{Simd, SimdBase};
 
 /// Number of coefficients of all degrees up to `degree`.
 pub const fn count(degree: usize) -> usize {
@@ -22,74 +26,102 @@ const C3C: f64 = 0.457_045_799_464_465_8; // sqrt(21 / 32 pi)
 const C3D: f64 = 0.373_176_332_590_115_4; // sqrt(7 / 16 pi)
 const C3E: f64 = 1.445_305_721_320_277; // sqrt(105 / 16 pi)
 
-/// Basis functions at the unit vector `(x, y, z)`; those above `degree` are 0.
-///
-/// For the zero vector (no direction) only the constant term is used, by passing `degree = 0`.
-#[inline]
-pub fn basis(degree: usize, [x, y, z]: [f64; 3]) -> [f64; MAX_COUNT] {
-    let mut b = [0.0; MAX_COUNT];
-    b[0] = C0;
+/// Basis functions at the unit vector `d`; those above `degree` are 0.
+#[inline(always)]
+pub(crate) fn basis<S: Simd>(simd: S, degree: usize, d: V3<Wide<S>>) -> [Wide<S>; MAX_COUNT] {
+    let V3 { x, y, z } = d;
+    let mut b = [Wide::<S>::splat(simd, 0.0); MAX_COUNT];
+    b[0] = Wide::<S>::splat(simd, C0);
     if degree >= 1 {
-        b[1] = -C1 * y;
-        b[2] = C1 * z;
-        b[3] = -C1 * x;
+        b[1] = y * -C1;
+        b[2] = z * C1;
+        b[3] = x * -C1;
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     if degree >= 2 {
-        b[4] = C2A * x * y;
-        b[5] = -C2A * y * z;
-        b[6] = C2B * (2.0 * zz - xx - yy);
-        b[7] = -C2A * x * z;
-        b[8] = C2C * (xx - yy);
+        b[4] = x * y * C2A;
+        b[5] = y * z * -C2A;
+        b[6] = (zz * 2.0 - xx - yy) * C2B;
+        b[7] = x * z * -C2A;
+        b[8] = (xx - yy) * C2C;
     }
     if degree >= 3 {
-        b[9] = -C3A * y * (3.0 * xx - yy);
-        b[10] = C3B * x * y * z;
-        b[11] = -C3C * y * (4.0 * zz - xx - yy);
-        b[12] = C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
-        b[13] = -C3C * x * (4.0 * zz - xx - yy);
-        b[14] = C3E * z * (xx - yy);
-        b[15] = -C3A * x * (xx - 3.0 * yy);
+        b[9] = y * (xx * 3.0 - yy) * -C3A;
+        b[10] = x * y * z * C3B;
+        b[11] = y * (zz * 4.0 - xx - yy) * -C3C;
+        b[12] = z * (zz * 2.0 - (xx + yy) * 3.0) * C3D;
+        b[13] = x * (zz * 4.0 - xx - yy) * -C3C;
+        b[14] = z * (xx - yy) * C3E;
+        b[15] = x * (xx - yy * 3.0) * -C3A;
     }
     b
 }
 
-/// Gradient of `sum_k weights[k] basis[k]` with respect to `(x, y, z)`, as free variables.
-#[inline]
-pub fn basis_vjp(degree: usize, [x, y, z]: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
-    let mut g = [0.0; 3];
+/// Gradient of `sum_k weights[k] basis[k]` with respect to `d`, as three free variables.
+#[inline(always)]
+pub(crate) fn basis_vjp<S: Simd>(
+    simd: S,
+    degree: usize,
+    d: V3<Wide<S>>,
+    w: &[Wide<S>; MAX_COUNT],
+) -> V3<Wide<S>> {
+    let V3 { x, y, z } = d;
+    let zero = Wide::<S>::splat(simd, 0.0);
+    let mut g = V3::new(zero, zero, zero);
     if degree >= 1 {
-        g = [-C1 * w[3], -C1 * w[1], C1 * w[2]];
+        g = V3::new(w[3] * -C1, w[1] * -C1, w[2] * C1);
     }
     if degree >= 2 {
-        g[0] += C2A * (y * w[4] - z * w[7]) - 2.0 * C2B * x * w[6] + 2.0 * C2C * x * w[8];
-        g[1] += C2A * (x * w[4] - z * w[5]) - 2.0 * C2B * y * w[6] - 2.0 * C2C * y * w[8];
-        g[2] += -C2A * (y * w[5] + x * w[7]) + 4.0 * C2B * z * w[6];
+        g.x += (y * w[4] - z * w[7]) * C2A - x * w[6] * (2.0 * C2B) + x * w[8] * (2.0 * C2C);
+        g.y += (x * w[4] - z * w[5]) * C2A - y * w[6] * (2.0 * C2B) - y * w[8] * (2.0 * C2C);
+        g.z += z * w[6] * (4.0 * C2B) - (y * w[5] + x * w[7]) * C2A;
     }
     if degree >= 3 {
         let (xx, yy, zz) = (x * x, y * y, z * z);
-        g[0] += -6.0 * C3A * x * y * w[9] + C3B * y * z * w[10] + 2.0 * C3C * x * y * w[11]
-            - 6.0 * C3D * x * z * w[12]
-            - C3C * (4.0 * zz - 3.0 * xx - yy) * w[13]
-            + 2.0 * C3E * x * z * w[14]
-            - 3.0 * C3A * (xx - yy) * w[15];
-        g[1] += -3.0 * C3A * (xx - yy) * w[9] + C3B * x * z * w[10]
-            - C3C * (4.0 * zz - xx - 3.0 * yy) * w[11]
-            - 6.0 * C3D * y * z * w[12]
-            + 2.0 * C3C * x * y * w[13]
-            - 2.0 * C3E * y * z * w[14]
-            + 6.0 * C3A * x * y * w[15];
-        g[2] += C3B * x * y * w[10] - 8.0 * C3C * y * z * w[11]
-            + C3D * (6.0 * zz - 3.0 * xx - 3.0 * yy) * w[12]
-            - 8.0 * C3C * x * z * w[13]
-            + C3E * (xx - yy) * w[14];
+        g.x += y * z * w[10] * C3B - x * y * w[9] * (6.0 * C3A) + x * y * w[11] * (2.0 * C3C)
+            - x * z * w[12] * (6.0 * C3D)
+            - (zz * 4.0 - xx * 3.0 - yy) * w[13] * C3C
+            + x * z * w[14] * (2.0 * C3E)
+            - (xx - yy) * w[15] * (3.0 * C3A);
+        g.y += x * z * w[10] * C3B
+            - (xx - yy) * w[9] * (3.0 * C3A)
+            - (zz * 4.0 - xx - yy * 3.0) * w[11] * C3C
+            - y * z * w[12] * (6.0 * C3D)
+            + x * y * w[13] * (2.0 * C3C)
+            - y * z * w[14] * (2.0 * C3E)
+            + x * y * w[15] * (6.0 * C3A);
+        g.z += x * y * w[10] * C3B - y * z * w[11] * (8.0 * C3C)
+            + (zz * 6.0 - (xx + yy) * 3.0) * w[12] * C3D
+            - x * z * w[13] * (8.0 * C3C)
+            + (xx - yy) * w[14] * C3E;
     }
     g
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{basis as lanes_basis, basis_vjp as lanes_vjp, *};
+    use crate::lanes::splat3;
+    use fearless_simd::{Level, dispatch};
+    use glam::DVec3;
+
+    fn basis(degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
+        #[inline(always)]
+        fn run<S: Simd>(simd: S, degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
+            lanes_basis(simd, degree, splat3(simd, DVec3::from(d))).map(|b| b[0])
+        }
+        dispatch!(Level::new(), simd => run(simd, degree, d))
+    }
+
+    fn basis_vjp(degree: usize, d: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
+        #[inline(always)]
+        fn run<S: Simd>(simd: S, degree: usize, d: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
+            let w = w.map(|w| Wide::<S>::splat(simd, w));
+            let g = lanes_vjp(simd, degree, splat3(simd, DVec3::from(d)), &w);
+            [g.x[0], g.y[0], g.z[0]]
+        }
+        dispatch!(Level::new(), simd => run(simd, degree, d, w))
+    }
 
     #[test]
     fn basis_is_orthonormal() {

@@ -114,6 +114,7 @@ fn stages(c: &mut Criterion) {
                     &projection,
                     &cotangents,
                     grads,
+                    false,
                 )
             });
         });
