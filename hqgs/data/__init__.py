@@ -1,0 +1,92 @@
+"""Scene loading: COLMAP, LLFF (with Deblur-NeRF's marker), nerfstudio, instant-ngp and Blender folders."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from hqgs.camera import Scene
+from hqgs.data.capture import Capture, list_photos, photo_folder
+from hqgs.data.colmap import find_models, read_colmap
+from hqgs.data.images import load_views
+from hqgs.data.llff import POSES, hold_marker, read_llff
+from hqgs.data.points import random_points
+from hqgs.data.transforms import SINGLE, TRAIN, read_transforms
+
+__all__ = ["load_scene"]
+
+
+def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) -> Scene:
+    """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
+
+    The format is recognised in this order: a COLMAP model with photos (`sparse/0`, `sparse`, or the folder
+    itself; `images`), `transforms.json` or `transforms_train.json`, `poses_bounds.npy`. Distorted photos are
+    undistorted at their stored size, then scaled down by `downscale` (>= 1) by area; where a COLMAP or LLFF
+    scene has `images_N` for N = `downscale`, those photos are taken as they are.
+
+    Views are sorted by name; every `test_every`-th one (index % test_every == 0) is a test view, 0 means
+    none. A Blender pair of files names its own test views; a marker file `hold=N` stands for test_every = N,
+    counted over the photos in the folder. `Scene.notes` says which rule and which files were used.
+
+    Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
+    """
+    root = Path(path).resolve()
+    if not root.exists():
+        raise FileNotFoundError(f"there is no scene folder {root}")
+    if not root.is_dir():
+        raise ValueError(f"{root} is a file, a scene is a folder")
+    if not (math.isfinite(downscale) and downscale >= 1):
+        raise ValueError(f"downscale must be at least 1, got {downscale}")
+    if test_every < 0:
+        raise ValueError(f"test_every must be at least 0, got {test_every}")
+    capture = _read(root, downscale)
+    views = load_views(capture.photos, capture.downscale)
+    notes = list(capture.notes)
+    test_names = _test_names(root, capture, test_every, notes)
+    train = [v for v in views if v.name not in test_names]
+    test = [v for v in views if v.name in test_names]
+    if not train:
+        raise ValueError(f"{root}: all {len(views)} views are test views, none is left to train on")
+    points, colors = capture.points, capture.point_colors
+    if len(points) == 0:
+        points, colors, note = random_points(train, capture.near_far)
+        notes.append(note)
+    return Scene(root.name, train, test, points, colors, capture.source, notes)
+
+
+def _read(root: Path, downscale: float) -> Capture:
+    has_model, has_photos = bool(find_models(root)), photo_folder(root, downscale) is not None
+    others = [name for name in (SINGLE, TRAIN, POSES) if (root / name).is_file()]
+    if has_model and (has_photos or not others):
+        capture = read_colmap(root, downscale)
+        if others:
+            note = (
+                f"cameras and points are both the COLMAP model's, in its frame; not read: {', '.join(others)}"
+            )
+            capture = replace(capture, notes=[*capture.notes, note])
+        return capture
+    if SINGLE in others or TRAIN in others:
+        return read_transforms(root, downscale)
+    if POSES in others:
+        return read_llff(root, downscale)
+    entries = sorted(p.name for p in root.iterdir())
+    found = ", ".join(entries[:12]) + (" ..." if len(entries) > 12 else "") if entries else "nothing"
+    raise ValueError(
+        f"{root} is no scene: looked for a COLMAP model (cameras, images and points3D as .bin or .txt in "
+        f"sparse/0, sparse or the folder), {SINGLE}, {TRAIN}, {POSES}; found {found}"
+    )
+
+
+def _test_names(root: Path, capture: Capture, test_every: int, notes: list[str]) -> frozenset[str]:
+    """Names of the test views; says in `notes` where the scene itself decides."""
+    if capture.test_names is not None:
+        return capture.test_names
+    hold = hold_marker(root)
+    if hold is not None and capture.folder is not None:
+        # The marker speaks of the photos in the folder: a blurred one that was not registered still counts,
+        # or the sharp views after it would slip into the training set.
+        held = {capture.folder / name for name in list_photos(capture.folder)[::hold]}
+        notes.append(f"hold={hold}: every {hold}th photo is held out, the others are degraded")
+        return frozenset(p.name for p in capture.photos if p.path in held)
+    return frozenset([p.name for p in capture.photos][::test_every]) if test_every else frozenset()

@@ -1,0 +1,108 @@
+"""Points to start from where a scene brings none, and points from a PLY file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import plyfile
+from numpy.typing import NDArray
+
+from hqgs.camera import View
+
+COUNT = 20_000
+SEED = 0
+
+
+def random_points(
+    views: list[View], near_far: dict[str, tuple[float, float]]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
+    """Seeded random points in the frusta of the training `views`, coloured by the pixel they were drawn at.
+
+    Depths are uniform in the logarithm between the view's near and far bound. Where a view has none in
+    `near_far`, it is guessed: 0.3 to 3 times the distance to the point the cameras look at, or, for cameras
+    that look in nearly one direction, 0.5 to 50 times the radius of their positions. Returns points [P, 3]
+    in world units, colours [P, 3], and a note that says what was done.
+    """
+    rng = np.random.default_rng(SEED)
+    guessed = {} if all(v.name in near_far for v in views) else _guess_near_far(views)
+    points, colors = [], []
+    for i, view in enumerate(views):
+        count = COUNT * (i + 1) // len(views) - COUNT * i // len(views)
+        cells = np.arange(view.image.shape[0] * view.image.shape[1])
+        if view.mask is not None:
+            cells = cells[view.mask.ravel()]
+        if len(cells) == 0:
+            continue
+        rows, columns = np.divmod(rng.choice(cells, count), view.camera.width)
+        near, far = near_far.get(view.name) or guessed[view.name]
+        depth = np.exp(rng.uniform(np.log(near), np.log(far), count))
+        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(count)])
+        in_camera = np.linalg.solve(view.camera.K, pixels) * depth
+        R, t = view.camera.viewmat[:3, :3], view.camera.viewmat[:3, 3]
+        points.append((in_camera - t[:, None]).T @ R)
+        colors.append(view.image[rows, columns])
+    if not points:
+        raise ValueError("the masks hide every pixel of every training view")
+    depths = "a guessed depth range" if guessed else "the given depth bounds"
+    note = (
+        f"no points in the scene: {COUNT} random points (seed {SEED}) within {depths} of the training views"
+    )
+    return np.concatenate(points).astype(np.float32), np.concatenate(colors), note
+
+
+def _guess_near_far(views: list[View]) -> dict[str, tuple[float, float]]:
+    centers = np.stack([v.camera.center for v in views])
+    axes = np.stack([v.camera.viewmat[2, :3] for v in views])
+    # The point nearest to all optical axes, by least squares: sum (I - d d^T) (x - c) = 0.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.mean(0)
+    if np.linalg.eigvalsh(normal)[0] > 0.05:  # the axes spread by about 13 degrees or more
+        focus = np.linalg.solve(normal, (across @ centers[:, :, None]).mean(0)[:, 0])
+        depths = ((focus - centers) * axes).sum(1)
+        if (depths > 0).all():
+            return {v.name: (0.3 * d, 3 * d) for v, d in zip(views, depths.tolist(), strict=True)}
+    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
+    return {v.name: (0.5 * radius, 50 * radius) for v in views}
+
+
+def read_ply(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Points [P, 3] and colours [P, 3] of the PLY's `vertex` element; grey where it has no red, green, blue.
+
+    Raises ValueError that names the file.
+    """
+    _check_header(path)
+    try:
+        vertex = plyfile.PlyData.read(path)["vertex"].data
+        points = np.stack([vertex[k].astype(np.float64) for k in ("x", "y", "z")], -1)
+        colors = np.full((len(points), 3), 128, np.uint8)
+        if {"red", "green", "blue"} <= set(vertex.dtype.names or ()):
+            colors = np.stack([vertex[k] for k in ("red", "green", "blue")], -1)
+            if colors.dtype.kind == "f":
+                colors = np.rint(np.nan_to_num(colors) * 255)
+            colors = colors.clip(0, 255).astype(np.uint8)
+    except (plyfile.PlyParseError, ValueError, KeyError, TypeError, OverflowError) as e:
+        raise ValueError(f"cannot read the points in {path}: {e}") from e
+    return points, colors
+
+
+def _check_header(path: Path) -> None:
+    """Refuse a PLY whose header promises more values than it has bytes, before memory is taken for them."""
+    size = path.stat().st_size
+    promised = count = 0
+    with path.open("rb") as f:
+        for line in iter(lambda: f.readline(4096), b""):
+            words = line.split()
+            if words[:1] == [b"end_header"]:
+                return
+            if words[:1] == [b"element"]:
+                if len(words) != 3 or not words[2].isdigit():
+                    raise ValueError(f"{path}: a PLY header has no line {line[:80]!r}")
+                count = int(words[2])
+            elif words[:1] == [b"property"]:
+                promised += count
+            if max(promised, count) > size:
+                raise ValueError(
+                    f"{path} is damaged: its header promises {count} records, it has {size} bytes"
+                )
+    raise ValueError(f"{path} is no PLY file: its header does not end")
