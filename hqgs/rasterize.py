@@ -104,7 +104,7 @@ def rasterization(
         quats,
         scales,
         opacities,
-        colors if sh_degree is not None else None,
+        colors if sh_degree is not None else colors.detach(),
         viewmats.to(torch.float64),
         Ks.detach().to(torch.float64),
         (int(width), int(height), (*options, rasterize_mode == "antialiased"), sh_degree),
@@ -219,25 +219,25 @@ class _Project(torch.autograd.Function):
     covariance in whitened form, which stays of order 1 however thin a Gaussian is."""
 
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, harmonics, viewmats, Ks, config):  # noqa: ANN205
+    def forward(ctx: Any, means, quats, scales, opacities, colors, viewmats, Ks, config):  # noqa: ANN205
         width, height, options, sh_degree = config
         inputs = [_numpy(t) for t in (means, quats, scales, opacities)]
-        sh = _optional(harmonics)
+        harmonics = colors if sh_degree is not None else None
         frame, *arrays = _rust.project_forward(
-            *inputs, sh, _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
+            *inputs, _numpy(colors), _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
         )
         n, c = means.shape[0], viewmats.shape[0]
-        means2d, depths, conics, radii, alphas, colors = map(torch.from_numpy, arrays)
+        means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
         ctx.frame, ctx.shapes = frame, (n, c)
         ctx.save_for_backward(means, quats, scales, opacities, harmonics)
         ctx.set_materialize_grads(False)
         radii = radii.view(c, n, 2)
         ctx.mark_non_differentiable(radii)
         link = means2d.new_zeros(()).expand(c, n, 3)
-        colors = colors.view(c, n, 3) if sh is not None else colors
+        sh_colors = sh_colors.view(c, n, 3) if harmonics is not None else sh_colors
         return (
             frame, means2d.view(c, n, 2), link, depths.view(c, n), conics.view(c, n, 3), radii,
-            alphas.view(c, n), colors,
+            alphas.view(c, n), sh_colors,
         )  # fmt: skip
 
     @staticmethod

@@ -271,10 +271,22 @@ impl<S: Simd> Geometry<S> {
         let (zero, two) = (splat(0.0), splat(2.0));
         let [s, m, t] = self.factors;
         let [euu, euv, evv] = v.whitened;
-        // Whitened rows: B = L^T A, on the unscaled axes.
+        // Whitened rows: B = L^T A, on the unscaled axes. B B^T = I - eps L^T L, so that no entry of B exceeds
+        // 1: the bound takes away what rounding leaves of a cancellation beyond 1 : 1e16.
+        let bound = |w: V3<Wide<S>>| {
+            let bound = |w: Wide<S>, scale: Wide<S>| {
+                let limit = splat(1.0) / scale.abs();
+                w.min(limit).max(zero - limit)
+            };
+            V3::new(
+                bound(w.x, self.scale.x),
+                bound(w.y, self.scale.y),
+                bound(w.z, self.scale.z),
+            )
+        };
         let white = [
-            (self.axes[0] - self.axes[1].by(m)).by(s),
-            self.axes[1].by(t),
+            bound((self.axes[0] - self.axes[1].by(m)).by(s)),
+            bound(self.axes[1].by(t)),
         ];
         let half = [
             white[0].by(euu) + white[1].by(euv),

@@ -8,7 +8,7 @@ use crate::{
     geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry},
     lanes::{V3, Wide, lanes, load, load3, splat3},
     real::Real,
-    scene::{Gaussians, Harmonics},
+    scene::{Colors, Gaussians, Harmonics},
     sh,
 };
 use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdMask, dispatch};
@@ -175,11 +175,11 @@ fn splat(p: &Projected, camera: &Camera, o: &ProjectOptions) -> Option<(Splat, [
 
 /// Project all Gaussians into `camera`.
 ///
-/// Culled: outside the depth range or the image, not finite, without rotation, too transparent, or not
+/// Culled: outside the depth range or the image, not finite (its colour included), without rotation, too transparent, or not
 /// larger than `radius_clip`. The lengths of all slices must already agree (`Gaussians::check`).
 pub fn forward<T: Real>(
     gaussians: &Gaussians<T>,
-    harmonics: Option<&Harmonics<T>>,
+    colors: Colors<T>,
     camera: &Camera,
     options: &ProjectOptions,
     projection: &mut Projection,
@@ -188,12 +188,16 @@ pub fn forward<T: Real>(
     let n = gaussians.len();
     projection.splats.resize(n, Splat::default());
     projection.depths.resize(n, 0.0);
-    let color_channels = if harmonics.is_some() { 3 } else { 0 };
-    let mut colors = out.colors;
+    let color_channels = if matches!(colors, Colors::Harmonics(_)) {
+        3
+    } else {
+        0
+    };
+    let mut out_colors = out.colors;
     let color_chunks = (0..n.div_ceil(PROJECT_CHUNK)).map(|c| {
         let rows = PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
-        let (head, tail) = std::mem::take(&mut colors).split_at_mut(rows * color_channels);
-        colors = tail;
+        let (head, tail) = std::mem::take(&mut out_colors).split_at_mut(rows * color_channels);
+        out_colors = tail;
         head
     });
     let jobs: Vec<_> = projection
@@ -227,7 +231,7 @@ pub fn forward<T: Real>(
     let level = Level::new();
     jobs.into_par_iter().for_each(|(chunk, (splats, keys, mut out))| {
         dispatch!(level, simd => forward_chunk(
-            simd, gaussians, harmonics, camera, options, chunk * PROJECT_CHUNK, splats, keys, &mut out
+            simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, splats, keys, &mut out
         ));
     });
 }
@@ -237,7 +241,7 @@ pub fn forward<T: Real>(
 fn forward_chunk<S: Simd, T: Real>(
     simd: S,
     gaussians: &Gaussians<T>,
-    harmonics: Option<&Harmonics<T>>,
+    colors: Colors<T>,
     camera: &Camera,
     options: &ProjectOptions,
     begin: usize,
@@ -263,7 +267,12 @@ fn forward_chunk<S: Simd, T: Real>(
         if options.antialiased {
             opacity *= g.compensation();
         }
-        let basis = harmonics.map(|h| sh::basis(simd, h.degree, direction(simd, g.mean, center).0));
+        let basis = match colors {
+            Colors::Harmonics(h) => {
+                Some(sh::basis(simd, h.degree, direction(simd, g.mean, center).0))
+            }
+            Colors::Channels(..) => None,
+        };
         for lane in 0..lanes::<S>().min(splats.len() - first) {
             let j = first + lane;
             let projected = Projected {
@@ -272,11 +281,28 @@ fn forward_chunk<S: Simd, T: Real>(
                 factors: g.factors.map(|f| f[lane]),
                 opacity: opacity[lane],
             };
-            let kept = if valid >> lane & 1 == 1 {
+            let mut kept = if valid >> lane & 1 == 1 {
                 splat(&projected, camera, options)
             } else {
                 None
             };
+            match (colors, &basis) {
+                (Colors::Harmonics(h), Some(basis)) => {
+                    let mut rgb = evaluate(h, begin + j, |k| T::from_f64(basis[k][lane]));
+                    if kept.is_none() || !finite(&rgb) {
+                        (kept, rgb) = (None, [T::ZERO; 3]);
+                    }
+                    for (o, c) in out.colors[3 * j..3 * j + 3].iter_mut().zip(rgb) {
+                        *o = if c > T::ZERO { c } else { T::ZERO };
+                    }
+                }
+                (Colors::Channels(data, channels), _) => {
+                    if !finite(&data[(begin + j) * channels..(begin + j + 1) * channels]) {
+                        kept = None;
+                    }
+                }
+                _ => unreachable!("the basis belongs to the harmonics"),
+            }
             let (s, r) = kept.unwrap_or_default();
             splats[j] = s;
             let depth = if kept.is_some() { g.p.z[lane] } else { 0.0 };
@@ -294,17 +320,12 @@ fn forward_chunk<S: Simd, T: Real>(
                     T::ZERO
                 };
             }
-            if let (Some(h), Some(basis)) = (harmonics, &basis) {
-                let rgb = match kept {
-                    Some(_) => evaluate(h, begin + j, |k| T::from_f64(basis[k][lane])),
-                    None => [T::ZERO; 3],
-                };
-                for (o, c) in out.colors[3 * j..3 * j + 3].iter_mut().zip(rgb) {
-                    *o = if c > T::ZERO { c } else { T::ZERO };
-                }
-            }
         }
     }
+}
+
+fn finite<T: Real>(values: &[T]) -> bool {
+    values.iter().all(|x| x.to_f64().is_finite())
 }
 
 /// Colour of Gaussian `i` before the clamp at 0.
@@ -367,7 +388,7 @@ fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T
 fn add<T: Real>(out: &mut Option<&mut [T]>, j: usize, values: &[f64]) {
     if let Some(out) = out {
         for (o, v) in out[j * values.len()..].iter_mut().zip(values) {
-            *o = T::from_f64(o.to_f64() + v);
+            *o = T::saturating(o.to_f64() + v);
         }
     }
 }

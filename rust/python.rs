@@ -9,7 +9,7 @@ use crate::{
     error::Error,
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
     real::Real,
-    scene::{Gaussians, Harmonics},
+    scene::{Colors, Gaussians, Harmonics},
     threads,
     tiles::{self, Tiles},
 };
@@ -197,15 +197,15 @@ fn cameras(
         .collect()
 }
 
-/// Project Gaussians; see `hqgs/rasterize.py` for the shapes.
+/// Project Gaussians; see `hqgs/rasterize.py` for the shapes. `colors` are harmonics if there is a degree.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, harmonics, viewmats, ks, width, height, options, sh_degree))]
+#[pyo3(signature = (means, quats, scales, opacities, colors, viewmats, ks, width, height, options, sh_degree))]
 fn project_forward<'py>(
     means: &Bound<'py, PyAny>,
     quats: &Bound<'py, PyAny>,
     scales: &Bound<'py, PyAny>,
     opacities: &Bound<'py, PyAny>,
-    harmonics: Optional<'_, 'py>,
+    colors: &Bound<'py, PyAny>,
     viewmats: &Bound<'py, PyAny>,
     ks: &Bound<'py, PyAny>,
     width: usize,
@@ -216,7 +216,7 @@ fn project_forward<'py>(
     by_dtype!(
         means,
         project_as(
-            means, quats, scales, opacities, harmonics, viewmats, ks, width, height, options,
+            means, quats, scales, opacities, colors, viewmats, ks, width, height, options,
             sh_degree
         )
     )
@@ -237,7 +237,7 @@ fn project_as<'py, T: Scalar>(
     quats: &Bound<'py, PyAny>,
     scales: &Bound<'py, PyAny>,
     opacities: &Bound<'py, PyAny>,
-    harmonics: Optional<'_, 'py>,
+    colors: &Bound<'py, PyAny>,
     viewmats: &Bound<'py, PyAny>,
     ks: &Bound<'py, PyAny>,
     width: usize,
@@ -246,7 +246,7 @@ fn project_as<'py, T: Scalar>(
     sh_degree: Option<usize>,
 ) -> PyResult<Projected<'py, T>> {
     let py = means.py();
-    let arrays = Arrays::<T>::new(means, quats, scales, opacities, harmonics)?;
+    let arrays = Arrays::<T>::new(means, quats, scales, opacities, Some(colors))?;
     let (viewmats, ks) = (
         Array::<f64>::new("viewmats", viewmats)?,
         Array::<f64>::new("Ks", ks)?,
@@ -262,6 +262,10 @@ fn project_as<'py, T: Scalar>(
     };
     let gaussians = arrays.gaussians()?;
     let harmonics = arrays.harmonics(sh_degree)?;
+    let (channel_data, channels) = match harmonics {
+        Some(_) => (&[][..], 0),
+        None => arrays.channels(gaussians.len(), cameras.len())?,
+    };
     let (n, c) = (gaussians.len(), cameras.len());
     let (projections, out) = py.detach(|| {
         threads::install(|| {
@@ -285,7 +289,10 @@ fn project_as<'py, T: Scalar>(
                 };
                 project::forward(
                     &gaussians,
-                    harmonics.as_ref(),
+                    harmonics.as_ref().map_or_else(
+                        || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
+                        Colors::Harmonics,
+                    ),
                     camera,
                     &options,
                     &mut projection,
@@ -324,7 +331,7 @@ struct Arrays<'py, T: Element> {
     quats: Array<'py, T>,
     scales: Array<'py, T>,
     opacities: Array<'py, T>,
-    harmonics: Option<Array<'py, T>>,
+    colors: Option<Array<'py, T>>,
 }
 
 impl<'py, T: Scalar> Arrays<'py, T> {
@@ -333,14 +340,14 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         quats: &Bound<'py, PyAny>,
         scales: &Bound<'py, PyAny>,
         opacities: &Bound<'py, PyAny>,
-        harmonics: Optional<'_, 'py>,
+        colors: Optional<'_, 'py>,
     ) -> PyResult<Self> {
         Ok(Self {
             means: Array::new("means", means)?,
             quats: Array::new("quats", quats)?,
             scales: Array::new("scales", scales)?,
             opacities: Array::new("opacities", opacities)?,
-            harmonics: optional("colors", harmonics)?,
+            colors: optional("colors", colors)?,
         })
     }
 
@@ -355,8 +362,25 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         Ok(gaussians)
     }
 
+    /// The colours as channels: the data and their number.
+    fn channels(&self, n: usize, cameras: usize) -> PyResult<(&[T], usize)> {
+        let Some(array) = &self.colors else {
+            return Ok((&[], 0));
+        };
+        let (data, channels) = (array.slice()?, array.shape().last().copied().unwrap_or(0));
+        if data.len() != n * channels && data.len() != cameras * n * channels {
+            return Err(Error::shape(
+                "colors",
+                format!("[{n}, D] or [{cameras}, {n}, D]"),
+                format!("{:?}", array.shape()),
+            )
+            .into());
+        }
+        Ok((data, channels))
+    }
+
     fn harmonics(&self, degree: Option<usize>) -> PyResult<Option<Harmonics<'_, T>>> {
-        let (Some(array), Some(degree)) = (&self.harmonics, degree) else {
+        let (Some(array), Some(degree)) = (&self.colors, degree) else {
             return Ok(None);
         };
         let &[n, stored, 3] = array.shape() else {

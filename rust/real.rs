@@ -13,6 +13,8 @@ pub trait Real: SimdFloatElement + Send + Sync + 'static {
     const ONE: Self;
     /// Nearest value of this type.
     fn from_f64(x: f64) -> Self;
+    /// Nearest finite value of this type; NaN stays NaN.
+    fn saturating(x: f64) -> Self;
     /// The value as f64, exactly.
     fn to_f64(self) -> f64;
     /// `2^x` for `x <= 0`, lane by lane. Relative error at most 1.2e-7 (f32), 3e-16 (f64) down to the
@@ -70,6 +72,11 @@ impl Real for f32 {
     }
 
     #[inline(always)]
+    fn saturating(x: f64) -> Self {
+        x.clamp(f64::from(Self::MIN), f64::from(Self::MAX)) as Self
+    }
+
+    #[inline(always)]
     fn to_f64(self) -> f64 {
         f64::from(self)
     }
@@ -87,6 +94,11 @@ impl Real for f64 {
     #[inline(always)]
     fn from_f64(x: f64) -> Self {
         x
+    }
+
+    #[inline(always)]
+    fn saturating(x: f64) -> Self {
+        x.clamp(Self::MIN, Self::MAX)
     }
 
     #[inline(always)]

@@ -8,7 +8,7 @@ use crate::{
     },
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
     real::Real,
-    scene::{Gaussians, Harmonics},
+    scene::{Colors, Gaussians, Harmonics},
     tiles::{self, Tiles},
 };
 
@@ -70,7 +70,7 @@ pub fn forward<T: Real>(
     };
     project::forward(
         gaussians,
-        Some(harmonics),
+        Colors::Harmonics(harmonics),
         camera,
         options,
         &mut projection,

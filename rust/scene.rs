@@ -76,3 +76,12 @@ impl<T: Real> Harmonics<'_, T> {
         check_len("colors", self.coefficients, n * self.stored * 3)
     }
 }
+
+/// Where the colours of N Gaussians come from.
+#[derive(Debug, Clone, Copy)]
+pub enum Colors<'a, T> {
+    /// Spherical harmonics, evaluated by the projection.
+    Harmonics(&'a Harmonics<'a, T>),
+    /// [N, channels], given. The projection only culls what is not finite.
+    Channels(&'a [T], usize),
+}

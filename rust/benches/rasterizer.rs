@@ -4,7 +4,7 @@ use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::{
     composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, GeometryGrads},
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
-    scene::Harmonics,
+    scene::{Colors, Harmonics},
     synthetic::Synthetic,
     tiles,
 };
@@ -38,7 +38,7 @@ fn stages(c: &mut Criterion) {
                 };
                 project::forward(
                     &gaussians,
-                    Some(&harmonics),
+                    Colors::Harmonics(&harmonics),
                     &s.camera,
                     &options,
                     &mut projection,
