@@ -259,6 +259,9 @@ class _Project(torch.autograd.Function):
              _optional(v_colors)),
             needs,
         )  # fmt: skip
+        if v_inputs[5] is not None:  # computed in f64; stay finite in the dtype of the inputs
+            limit = torch.finfo(means.dtype).max
+            v_inputs[5].clip(-limit, limit, out=v_inputs[5])
         shapes = [(n, 3), (n, 4), (n, 3), (n,), tuple(harmonics.shape) if needs[4] else (), (c, 4, 4)]
         return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None)
 
