@@ -1,0 +1,94 @@
+"""The sparse points of the embedded scene: structure from motion, or points cast onto the surfaces."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.camera import View
+from hqgs.synthetic.shading import render_depth
+
+MIN_POINTS = 200  # fewer are no basis for a reconstruction
+
+Points = tuple[NDArray[np.float32], NDArray[np.uint8], str]
+
+
+def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -> Points:
+    """Points [P, 3] (world), colours [P, 3] and a note for the report.
+
+    COLMAP (SIFT, exhaustive matching, triangulation with the known cameras) runs in its own process and is
+    killed after `time_limit` seconds. Where it fails, is late or finds fewer than 200 points, they come from
+    `surface_points`, and the note says why. Points are sorted by x, y, z. Raises ValueError without views.
+    """
+    if not views:
+        raise ValueError("views must not be empty")
+    with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
+        directory = Path(name)
+        (directory / "photos").mkdir()
+        for view in views:
+            Image.fromarray(view.image).save(directory / "photos" / view.name, compress_level=1)
+        np.savez(
+            directory / "cameras.npz",
+            names=np.array([v.name for v in views]),
+            sizes=np.array([(v.camera.width, v.camera.height) for v in views]),
+            Ks=np.stack([v.camera.K for v in views]),
+            viewmats=np.stack([v.camera.viewmat for v in views]),
+        )
+        program = [sys.executable, str(Path(__file__).with_name("sfm.py")), name]
+        try:
+            done = subprocess.run(
+                program, capture_output=True, stdin=subprocess.DEVNULL, timeout=time_limit, check=False
+            )
+        except subprocess.TimeoutExpired:
+            trouble = f"it took more than {time_limit:g} s"
+        else:
+            if done.returncode == 0:
+                with np.load(directory / "points.npz", allow_pickle=False) as data:
+                    points, colors = data["points"], data["colors"]
+                if len(points) >= MIN_POINTS:
+                    note = f"{len(points)} points by COLMAP with the known cameras"
+                    return *_sorted(points, colors), note
+                trouble = f"it found only {len(points)} points"
+            else:
+                last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
+                trouble = f"it ended with status {done.returncode} {' '.join(last)}".strip()
+    points, colors = surface_points(views, seed=seed)
+    return points, colors, f"{len(points)} points cast onto the surfaces, as COLMAP gave none: {trouble}"
+
+
+def surface_points(
+    views: Sequence[View], count: int = 4000, noise: float = 0.005, seed: int = 0
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Points [count, 3] under random pixels of photos of the embedded scene, and their colours [count, 3].
+
+    The depth is off by a normal error of standard deviation `noise` times the depth.
+    """
+    rng = np.random.default_rng(seed)
+    points, colors = [], []
+    for view, share in zip(views, np.array_split(np.arange(count), len(views)), strict=True):
+        camera = view.camera
+        depth = render_depth(camera)
+        rows, cols = np.nonzero(np.isfinite(depth))
+        pick = rng.integers(0, len(rows), len(share))
+        i, j = rows[pick], cols[pick]
+        z = depth[i, j] * (1 + noise * rng.standard_normal(len(pick)))
+        x = (j + 0.5 - camera.K[0, 2]) / camera.K[0, 0] * z
+        y = (i + 0.5 - camera.K[1, 2]) / camera.K[1, 1] * z
+        points.append((np.stack([x, y, z], -1) - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        colors.append(view.image[i, j])
+    return _sorted(np.concatenate(points).astype(np.float32), np.concatenate(colors))
+
+
+def _sorted(
+    points: NDArray[np.float32], colors: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """In ascending order of x, then y, then z."""
+    order = np.lexsort(points.T[::-1])
+    return points[order], colors[order]
