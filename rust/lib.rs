@@ -5,6 +5,7 @@
 //! Each stage has its forward function and its vector-Jacobian product side by side, works on borrowed
 //! slices in f32 or f64, and gives the same bits for any number of threads.
 
+pub mod adam;
 pub mod camera;
 pub mod composite;
 pub mod constants;
@@ -12,9 +13,12 @@ pub mod error;
 mod geometry;
 mod kernel;
 mod lanes;
+pub mod loss;
 pub mod project;
 #[cfg(feature = "python")]
 mod python;
+#[cfg(feature = "python")]
+mod python_loss;
 pub mod real;
 pub mod render;
 pub mod scene;

@@ -833,5 +833,5 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
-    Ok(())
+    crate::python_loss::register(m)
 }

@@ -1,0 +1,8 @@
+"""`python -m hqgs`."""
+
+import sys
+
+from hqgs.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

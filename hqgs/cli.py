@@ -1,0 +1,135 @@
+"""The command line: `hqgs train SCENE --out DIR`.
+
+Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C,
+with everything written unless Ctrl-C was pressed twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import hqgs
+from hqgs.camera import Scene
+from hqgs.checkpoint import FolderBusyError
+from hqgs.data import load_scene
+from hqgs.densify import DensifyConfig
+from hqgs.methods import METHODS
+from hqgs.report import RunResult
+from hqgs.run import CHECKPOINT, open_run, run
+from hqgs.synthetic import embedded_scene
+from hqgs.train import TrainConfig, TrainingError
+
+EMBEDDED = "embedded"
+EMBEDDED_SIZE = (504, 378)  # pixels
+BAD_INPUT = (
+    ValueError,
+    FolderBusyError,
+    FileNotFoundError,
+    FileExistsError,
+    NotADirectoryError,
+    IsADirectoryError,
+    PermissionError,
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code."""
+    args = _parser().parse_args(argv)
+    try:
+        return _train(args)
+    except KeyboardInterrupt:
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="hqgs", description="3D Gaussian Splatting on the CPU for degraded photos."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    add = commands.add_parser("train", help="train a scene and write a report").add_argument
+    config = TrainConfig()
+    add("scene", metavar="SCENE", help=f"scene folder, or {EMBEDDED!r} for the scene that is built in")
+    add("--out", type=Path, required=True, metavar="DIR", help="folder for the checkpoint and the report")
+    add("--method", default=config.method, help=f"one of: {', '.join(METHODS)} (%(default)s)")
+    add("--iterations", type=int, default=config.iterations, metavar="N", help="training steps (%(default)s)")
+    add(
+        "--downscale",
+        type=float,
+        default=1.0,
+        metavar="F",
+        help="divide the photos' sides by F (%(default)s)",
+    )
+    add("--seed", type=int, default=config.seed, metavar="S", help="of everything random (%(default)s)")
+    add("--threads", type=int, metavar="T", help="(all cores; the result does not depend on it)")
+    add(
+        "--max-gaussians",
+        type=int,
+        default=config.densify.max_gaussians,
+        metavar="N",
+        help="bounds the memory (%(default)s)",
+    )
+    add("--eval-every", type=int, metavar="N", help="iterations between evaluations (a tenth of the run)")
+    add("--resume", action="store_true", help="go on from the checkpoint in DIR, if there is one")
+    return parser
+
+
+def _train(args: argparse.Namespace) -> int:
+    with ExitStack() as stack:
+        try:
+            config = _config(args)
+            if (args.out / CHECKPOINT).exists() and not args.resume:
+                raise FileExistsError(
+                    f"{args.out} holds a run; continue it with --resume or choose another --out"
+                )
+            if args.threads is not None:
+                hqgs.set_num_threads(args.threads)
+            trainer = stack.enter_context(open_run(_scene(args), config, args.out, args.resume))
+        except BAD_INPUT as error:
+            return _fail(2, str(error))
+        except OSError as error:
+            return _fail(1, f"{args.out}: {error}")
+        try:
+            result = run(trainer, args.out)
+        except TrainingError as error:
+            return _fail(1, str(error))
+        except OSError as error:
+            return _fail(1, f"{args.out}: {error}")
+    _print_summary(args.out, result)
+    return 0 if result.iterations == config.iterations else 130
+
+
+def _config(args: argparse.Namespace) -> TrainConfig:
+    config = TrainConfig(
+        iterations=args.iterations,
+        method=args.method,
+        seed=args.seed,
+        densify=DensifyConfig(max_gaussians=args.max_gaussians),
+    ).scaled()
+    return config if args.eval_every is None else replace(config, eval_every=args.eval_every)
+
+
+def _scene(args: argparse.Namespace) -> Scene:
+    if args.scene != EMBEDDED:
+        return load_scene(args.scene, downscale=args.downscale)
+    if not args.downscale >= 1:
+        raise ValueError(f"downscale must be at least 1, got {args.downscale}")
+    width, height = (round(size / args.downscale) for size in EMBEDDED_SIZE)
+    return embedded_scene(cache=args.out / "scene", width=width, height=height)
+
+
+def _print_summary(out: Path, result: RunResult) -> None:
+    last = result.history[-1]
+    numbers = [f"{result.iterations} iterations", f"{result.gaussians} Gaussians", f"{result.seconds:.0f} s"]
+    numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
+    numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
+    print(f"{out}: {', '.join(numbers)}")
+
+
+def _fail(code: int, message: str) -> int:
+    print(f"hqgs: {' '.join(message.split())}", file=sys.stderr)
+    return code

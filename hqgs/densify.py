@@ -1,0 +1,223 @@
+"""Adaptive density control of 3DGS: grow where the image gradient is high, prune what is transparent or huge.
+
+Kerbl et al. 2023, section 5.2. Every change of the number of Gaussians is a selection of rows, done by
+`select_rows` on the parameters and on the optimizer's state alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from hqgs.gaussians import Gaussians
+
+SPLIT_CHILDREN = 2
+SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN  # a child's scales are its parent's over this
+SHORT_RUN = 7_000  # shorter runs are the published first 7,000 iterations in compressed form
+PUBLISHED_STOP = 15_000
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When and how densely Gaussians are added and removed. The defaults are those of 3DGS at 30,000.
+
+    Pruning by size on the screen (20 px in the paper's code) is left out: there it tests radii that were
+    just set to zero, so that no published figure contains it.
+    """
+
+    start: int = 500  # iterations before the first round
+    stop: int = PUBLISHED_STOP  # no round and no reset from this iteration on
+    every: int = 100  # iterations between rounds
+    grad_threshold: float = 2e-4  # mean gradient norm of the 2D mean, in half images, that calls for growth
+    percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
+    prune_opacity: float = 0.005  # more transparent Gaussians are removed
+    prune_scale: float = 0.1  # of the scene extent: larger Gaussians are removed, after the first reset
+    reset_every: int = 3_000  # iterations between opacity resets
+    reset_opacity: float = 0.01  # opacities are cut to this
+    max_gaussians: int = 1_000_000  # growth stops here, the highest gradients go first; bounds the memory
+
+    def __post_init__(self) -> None:
+        for name in ("every", "reset_every", "max_gaussians"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        for name in ("start", "stop", "grad_threshold", "percent_dense", "prune_scale"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        for name in ("prune_opacity", "reset_opacity"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted a value between 0 and 1")
+
+    def scaled(self, iterations: int) -> DensifyConfig:
+        """The schedule for a run of another length than 30,000.
+
+        Growth ends at half of the run, at 15,000 at the latest. A run shorter than 7,000 compresses the
+        rest in proportion, so that it still gets about 30 rounds and one opacity reset: resets any denser
+        leave too little time to recover from them.
+        """
+        part = min(1.0, iterations / SHORT_RUN)
+        return replace(
+            self,
+            start=round(self.start * part),
+            stop=min(self.stop, iterations // 2),
+            every=max(1, round(self.every * part)),
+            reset_every=max(1, round(self.reset_every * part)),
+        )
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What one call of `Densifier.update` did."""
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    reset: bool = False
+
+
+class Densifier:
+    """Gathers image gradients and changes the set of Gaussians on schedule.
+
+    The random numbers of a round follow from (seed, iteration) alone, so there is no generator to save.
+    """
+
+    def __init__(self, config: DensifyConfig, extent: float, seed: int, num_gaussians: int) -> None:
+        """`extent`: the scene's, world units. `num_gaussians`: N at the start."""
+        if num_gaussians > config.max_gaussians:
+            raise ValueError(
+                f"max_gaussians is {config.max_gaussians}, but the scene starts with {num_gaussians} points"
+            )
+        self.config = config
+        self.extent = extent
+        self.seed = seed
+        self.grad_sum = torch.zeros(num_gaussians)  # of gradient norms, half images
+        self.count = torch.zeros(num_gaussians)  # views in which the Gaussian was visible
+
+    def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
+        # A pixel is 2 / width of normalised device coordinates, in which the threshold is published.
+        norm = torch.hypot(means2d_grad[:, 0] * (width / 2), means2d_grad[:, 1] * (height / 2))
+        visible = (radii > 0).all(dim=1)
+        self.grad_sum += torch.where(visible, norm, 0.0)
+        self.count += visible
+
+    def update(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> Growth:
+        """Grow, prune and reset, as far as the schedule asks for it after this iteration (1, 2, ...).
+
+        `gaussians` and `optimizer` get new tensors in place of the old ones.
+        """
+        c = self.config
+        if iteration >= c.stop:
+            return Growth()
+        cloned = split = pruned = 0
+        if iteration > c.start and iteration % c.every == 0:
+            cloned, split = self._grow(iteration, gaussians, optimizer)
+            pruned = self._prune(iteration, gaussians, optimizer)
+            self.grad_sum = torch.zeros(len(gaussians))
+            self.count = torch.zeros(len(gaussians))
+        reset = iteration % c.reset_every == 0
+        if reset:
+            reset_opacities(gaussians, optimizer, c.reset_opacity)
+        return Growth(cloned, split, pruned, reset)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"grad_sum": self.grad_sum, "count": self.count}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.grad_sum, self.count = state["grad_sum"], state["count"]
+
+    def _grow(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> tuple[int, int]:
+        """Clone the small and split the large among those with a high mean gradient."""
+        n = len(gaussians)
+        grad = self.grad_sum / self.count.clamp(min=1)
+        # Either way a candidate adds one Gaussian to the total.
+        order = torch.argsort(grad, descending=True, stable=True)[: self.config.max_gaussians - n]
+        grow = torch.zeros(n, dtype=torch.bool)
+        grow[order] = grad[order] >= self.config.grad_threshold
+        large = _largest_scale(gaussians) > self.config.percent_dense * self.extent
+        kept = torch.nonzero(~(grow & large))[:, 0]
+        cloned = torch.nonzero(grow & ~large)[:, 0]
+        split = torch.nonzero(grow & large)[:, 0]
+
+        select_rows(gaussians, optimizer, torch.cat([kept, cloned, *[split] * SPLIT_CHILDREN]), old=len(kept))
+        children = slice(len(kept) + len(cloned), len(gaussians))
+        rng = np.random.default_rng([self.seed, iteration])
+        with torch.no_grad():
+            scales = gaussians.activated_scales()[children]
+            normal = torch.from_numpy(rng.standard_normal(tuple(scales.shape), dtype=np.float32))
+            rotation = quats_to_matrices(gaussians.quats[children])
+            gaussians.means[children] += (rotation @ (scales * normal)[:, :, None])[:, :, 0]
+            gaussians.scales[children] -= math.log(SPLIT_SHRINK)
+        return len(cloned), len(split)
+
+    def _prune(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> int:
+        with torch.no_grad():
+            bad = gaussians.activated_opacities() < self.config.prune_opacity
+            if iteration > self.config.reset_every:
+                bad |= _largest_scale(gaussians) > self.config.prune_scale * self.extent
+        pruned = int(bad.sum())
+        if pruned:
+            kept = torch.nonzero(~bad)[:, 0]
+            select_rows(gaussians, optimizer, kept, old=len(kept))
+        return pruned
+
+
+def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: int) -> None:
+    """Make row i of every tensor the former row `rows[i]`, in the parameters and in the optimizer's state.
+
+    Rows up to `old` keep their moments. Those after it are new Gaussians: their moments start at zero.
+    """
+    for name, tensor in gaussians.named().items():
+        chosen = tensor.detach()[rows].requires_grad_()
+        state = {}
+        for key, value in optimizer.state.pop(tensor, {}).items():
+            if isinstance(value, Tensor) and value.shape == tensor.shape:
+                value = value[rows]
+                value[old:] = 0
+            state[key] = value
+        _replace(gaussians, optimizer, name, chosen, state)
+
+
+def reset_opacities(gaussians: Gaussians, optimizer: Optimizer, highest: float) -> None:
+    """Cut the opacities to `highest` and forget the moments that led to them."""
+    old = gaussians.opacities
+    logit = math.log(highest / (1 - highest))
+    state = {
+        key: torch.zeros_like(value) if isinstance(value, Tensor) and value.shape == old.shape else value
+        for key, value in optimizer.state.pop(old, {}).items()
+    }
+    _replace(gaussians, optimizer, "opacities", old.detach().clamp(max=logit).requires_grad_(), state)
+
+
+def quats_to_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4], w x y z, any non-zero norm."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=1),
+        ],
+        dim=1,
+    )
+
+
+def _replace(
+    gaussians: Gaussians, optimizer: Optimizer, name: str, tensor: Tensor, state: dict[str, Any]
+) -> None:
+    """Put a new leaf in the place of an old one: in the Gaussians, in its parameter group, in the state."""
+    old = getattr(gaussians, name)
+    group = next(g for g in optimizer.param_groups if any(p is old for p in g["params"]))
+    group["params"] = [tensor if p is old else p for p in group["params"]]
+    if state:
+        optimizer.state[tensor] = state
+    setattr(gaussians, name, tensor)
+
+
+def _largest_scale(gaussians: Gaussians) -> Tensor:
+    return gaussians.scales.detach().amax(dim=1).exp()

@@ -1,0 +1,171 @@
+"""The Gaussians as trainable tensors, their activations, and how they start from a point cloud."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+SH_C0 = 0.28209479177387814  # the constant basis function: 1 / (2 sqrt(pi))
+MAX_SH_DEGREE = 3
+MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
+INITIAL_OPACITY = 0.1
+NEIGHBORS = 3  # a point's first scale comes from its 3 nearest neighbours
+LEAF_SIZE = 64  # points in a leaf of the neighbour search; the speed depends on it, the result does not
+
+
+@dataclass
+class Gaussians:
+    """N Gaussians before their activations: exp for the scales, the sigmoid for the opacities.
+
+    The tensors are float32 leaves while they are trained. A method may also hand out a set whose tensors
+    are functions of trained ones.
+    """
+
+    means: Tensor  # [N, 3], world units
+    scales: Tensor  # [N, 3], log of the standard deviations
+    quats: Tensor  # [N, 4], w x y z, any non-zero norm
+    opacities: Tensor  # [N], logits
+    sh0: Tensor  # [N, 1, 3], the SH coefficient of degree 0
+    shN: Tensor  # noqa: N815  [N, K - 1, 3], the higher coefficients; K = (sh_degree + 1)^2
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0] if self.means.ndim else 0
+        wanted = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3)}
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {list(getattr(self, name).shape)}, wanted {list(shape)}")
+        sizes = [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]
+        if self.shN.ndim != 3 or self.shN.shape[::2] != (n, 3) or self.shN.shape[1] not in sizes:
+            raise ValueError(f"shN has shape {list(self.shN.shape)}, wanted [{n}, one of {sizes}, 3]")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree that the coefficients reach, 0..3."""
+        return math.isqrt(self.shN.shape[1] + 1) - 1
+
+    def named(self) -> dict[str, Tensor]:
+        """The tensors by name, in the order of the fields."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def detached(self) -> Gaussians:
+        """The same values (shared memory) without a gradient history."""
+        return Gaussians(**{name: tensor.detach() for name, tensor in self.named().items()})
+
+    def activated_scales(self) -> Tensor:
+        """Standard deviations [N, 3] in world units."""
+        return torch.exp(self.scales)
+
+    def activated_opacities(self) -> Tensor:
+        """Opacities [N] in (0, 1)."""
+        return torch.sigmoid(self.opacities)
+
+    def colors(self) -> Tensor:
+        """SH coefficients [N, K, 3]."""
+        return torch.cat([self.sh0, self.shN], dim=1)
+
+    @classmethod
+    def from_points(
+        cls, points: NDArray[np.float32], colors: NDArray[np.uint8], sh_degree: int = MAX_SH_DEGREE
+    ) -> Gaussians:
+        """One Gaussian for each point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
+
+        Round, with the root of the mean squared distance to the 3 nearest neighbours as its scale, opacity
+        0.1, the point's colour from every direction.
+
+        Args:
+            points: [P, 3], world units, finite, P >= 4.
+            colors: [P, 3], uint8.
+            sh_degree: degree of the coefficients that are allocated, 0..3.
+        """
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) <= NEIGHBORS:
+            raise ValueError(f"points has shape {list(points.shape)}, wanted [P, 3] with P > {NEIGHBORS}")
+        if colors.shape != points.shape or colors.dtype != np.uint8:
+            raise ValueError(
+                f"colors is {colors.dtype} {list(colors.shape)}, wanted uint8 {list(points.shape)}"
+            )
+        if not 0 <= sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree is {sh_degree}, wanted 0..{MAX_SH_DEGREE}")
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        if bad.size:
+            raise ValueError(
+                f"points has {bad.size} rows that are not finite, the first is row {bad[0]}: {points[bad[0]]}"
+            )
+        n = len(points)
+        square = np.maximum(mean_square_distance(points), MIN_SQUARE_DISTANCE)
+        log_scale = torch.from_numpy(0.5 * np.log(square)).float()
+        sh0 = (torch.from_numpy(colors.astype(np.float32)) / 255.0 - 0.5) / SH_C0
+        return cls(
+            means=torch.from_numpy(points.astype(np.float32, copy=True)),
+            scales=log_scale[:, None].repeat(1, 3),
+            quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            opacities=torch.full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
+            sh0=sh0[:, None, :].contiguous(),
+            shN=torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+        )
+
+
+def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]. Exact.
+
+    The cloud is halved at medians into small leaves. A leaf is then compared with those leaves alone whose
+    bounding boxes lie nearer than its third neighbours found so far.
+    """
+    xyz = points.astype(np.float64)
+    leaves = _leaves(xyz)
+    low = np.stack([xyz[leaf].min(axis=0) for leaf in leaves])
+    high = np.stack([xyz[leaf].max(axis=0) for leaf in leaves])
+    result = np.empty(len(xyz))
+    for i, leaf in enumerate(leaves):
+        own = xyz[leaf]
+        nearest = _square_distances(own, own)
+        np.fill_diagonal(nearest, np.inf)
+        nearest = np.partition(nearest, NEIGHBORS - 1, axis=1)[:, :NEIGHBORS]
+        reach = nearest.max()
+        gap = np.maximum(np.maximum(low - high[i], low[i] - high), 0.0)
+        close = np.flatnonzero((gap * gap).sum(axis=1) < reach)
+        others = [xyz[leaves[j]] for j in close if j != i]
+        if others:
+            around = np.concatenate(others)
+            gap = np.maximum(np.maximum(around - high[i], low[i] - around), 0.0)
+            around = around[(gap * gap).sum(axis=1) < reach]
+            rows = max(1, 2**21 // max(1, len(around)))  # an outlier's leaf may reach every point
+            for start in range(0, len(leaf), rows):
+                part = slice(start, start + rows)
+                both = np.concatenate([nearest[part], _square_distances(own[part], around)], axis=1)
+                nearest[part] = np.partition(both, NEIGHBORS - 1, axis=1)[:, :NEIGHBORS]
+        result[leaf] = nearest.mean(axis=1)
+    return result
+
+
+def _square_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[len(a), len(b)], from differences: the expanded square would lose the digits of near points."""
+    total = np.zeros((len(a), len(b)))
+    for axis in range(3):
+        difference = a[:, axis, None] - b[None, :, axis]
+        total += difference * difference
+    return total
+
+
+def _leaves(xyz: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+    """Indices of the points, halved along the widest axis until a part has at most LEAF_SIZE of them."""
+    parts = [np.arange(len(xyz))]
+    leaves = []
+    while parts:
+        part = parts.pop()
+        if len(part) <= LEAF_SIZE:
+            leaves.append(part)
+            continue
+        own = xyz[part]
+        axis = int(np.argmax(own.max(axis=0) - own.min(axis=0)))
+        middle = len(part) // 2
+        order = np.argpartition(own[:, axis], middle)
+        parts += [part[order[:middle]], part[order[middle:]]]
+    return leaves

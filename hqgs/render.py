@@ -1,0 +1,45 @@
+"""One view of the Gaussians as an image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hqgs.camera import Camera
+from hqgs.gaussians import Gaussians
+from hqgs.rasterize import rasterization
+
+
+def render_view(
+    gaussians: Gaussians, camera: Camera, sh_degree: int, background: tuple[float, float, float]
+) -> tuple[Tensor, dict[str, Any]]:
+    """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
+    images, _, meta = rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.activated_scales(),
+        gaussians.activated_opacities(),
+        gaussians.colors(),
+        torch.from_numpy(camera.viewmat[None]),
+        torch.from_numpy(camera.K[None]),
+        camera.width,
+        camera.height,
+        sh_degree=sh_degree,
+        backgrounds=torch.tensor([background]),
+    )
+    return images[0], meta
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch's sums depend on its number of threads. The rasterizer's do not; it keeps all of its threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

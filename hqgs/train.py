@@ -1,0 +1,272 @@
+"""Training: the configuration, one step from top to bottom, and the state that a checkpoint keeps."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hqgs.camera import Camera, Scene, View
+from hqgs.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
+from hqgs.densify import SHORT_RUN, Densifier, DensifyConfig
+from hqgs.gaussians import MAX_SH_DEGREE, Gaussians
+from hqgs.methods import check_method, make_method
+from hqgs.metrics import psnr, ssim
+from hqgs.optim import Adam
+from hqgs.render import one_torch_thread, render_view
+from hqgs.report import RenderedView
+
+MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
+FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
+
+
+class TrainingError(RuntimeError):
+    """The training cannot go on; the message says why and at which iteration."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything but the photos that a result depends on. The defaults are those of 3DGS.
+
+    `scaled()` fits the schedule to a run of another length than 30,000 iterations.
+    """
+
+    iterations: int = 30_000
+    method: str = "3dgs"
+    seed: int = 0
+    sh_degree: int = MAX_SH_DEGREE
+    sh_interval: int = 1_000  # iterations until the next SH degree is trained
+    lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
+    lr_means_final: float = 1.6e-6  # this at the end of the run
+    lr_scales: float = 5e-3
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    lr_sh0: float = 2.5e-3
+    lr_shN: float = 2.5e-3 / 20  # noqa: N815
+    adam_eps: float = 1e-15
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB
+    eval_every: int = 3_000  # iterations between evaluations on the held-out views
+    checkpoint_every: int = 1_000  # iterations; does not change the result
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+
+    def __post_init__(self) -> None:
+        check_method(self.method)
+        for name in ("iterations", "sh_interval", "eval_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}, wanted at least 0")
+        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree is {self.sh_degree}, wanted 0..{MAX_SH_DEGREE}")
+        for name, value in vars(self).items():
+            if name.startswith("lr_") and not 0 < value < math.inf:
+                raise ValueError(f"{name} is {value}, wanted a positive number")
+
+    def scaled(self) -> TrainConfig:
+        """The same run with the schedule fitted to `iterations`; see `DensifyConfig.scaled`.
+
+        Evaluates 10 times; saves every 1,000 iterations, in short runs 10 times.
+        """
+        tenth = math.ceil(self.iterations / 10)
+        return replace(
+            self,
+            sh_interval=max(1, round(self.sh_interval * min(1.0, self.iterations / SHORT_RUN))),
+            eval_every=tenth,
+            checkpoint_every=min(self.checkpoint_every, tenth),
+            densify=self.densify.scaled(self.iterations),
+        )
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a training step has seen."""
+
+    loss: float
+    render: Tensor  # [H, W, 3], detached
+    view: View
+
+
+class Trainer:
+    """The state of a run. The view of a step, its learning rates and its SH degree follow from the
+    configuration and the iteration, so that they need no state."""
+
+    def __init__(self, scene: Scene, config: TrainConfig) -> None:
+        """ValueError if the scene or the configuration cannot be trained."""
+        _check_views(scene)
+        self.scene = scene
+        self.config = config
+        self.extent = scene.extent
+        self.method = make_method(config.method, scene, config.seed)
+        self.gaussians = Gaussians.from_points(scene.points, scene.point_colors, config.sh_degree)
+        self.optimizer = self._make_optimizer()
+        self.densifier = Densifier(config.densify, self.extent, config.seed, len(self.gaussians))
+        self.iteration = 0  # steps done
+        self.seconds = 0.0  # spent in steps
+        self.skipped = 0  # steps without an update because something was not finite
+        self.skipped_in_a_row = 0
+        self.history: list[dict[str, Any]] = []
+
+    def step(self) -> Step:
+        """Train on one view."""
+        started = time.perf_counter()
+        config = self.config
+        self.iteration += 1
+        view = self._view_of(self.iteration)
+        self._set_learning_rate()
+
+        with one_torch_thread():
+            render, meta = self._render(view.camera)
+            means2d = meta["means2d"]  # [1, N, 2]
+            means2d.retain_grad()
+            loss = self.method.loss(render, view)
+            self.optimizer.zero_grad()
+            if self._backward(loss):
+                if self.iteration < config.densify.stop:
+                    self.densifier.observe(
+                        means2d.grad[0], meta["radii"][0], view.camera.width, view.camera.height
+                    )
+                self.optimizer.step()
+            self.densifier.update(self.iteration, self.gaussians, self.optimizer)
+
+        if not len(self.gaussians):
+            raise TrainingError(
+                f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent or too "
+                f"large (scene extent {self.extent:.3g}); are the cameras and points in one frame?"
+            )
+        self.seconds += time.perf_counter() - started
+        return Step(float(loss.detach()), render.detach(), view)
+
+    def render_test_views(self) -> list[RenderedView]:
+        """All held-out views with their renders [H, W, 3]."""
+        views = []
+        with one_torch_thread(), torch.no_grad():
+            for view in self.scene.test:
+                render, _ = self._render(view.camera)
+                views.append(RenderedView(view.name, view.image, render.numpy(), view.mask))
+        return views
+
+    def evaluate(self) -> None:
+        """Add the held-out means at this iteration to the history, once. Takes no training time."""
+        if self.history and self.history[-1]["iteration"] == self.iteration:
+            return
+        views = self.render_test_views()
+        entry: dict[str, Any] = {"iteration": self.iteration, "seconds": self.seconds}
+        for name, metric in {"psnr": psnr, "ssim": ssim}.items():
+            values = [metric(v.render, v.photo, v.mask) for v in views]
+            known = [value for value in values if value is not None]
+            entry[name] = float(np.mean(known)) if known and len(known) == len(values) else None
+        self.history.append(entry)
+
+    def save(self, path: str | Path) -> None:
+        """Write the whole state as one checkpoint, atomically."""
+        tensors = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.named().items()}
+        tensors |= {f"densify.{name}": tensor for name, tensor in self.densifier.state_dict().items()}
+        tensors |= {f"method.{name}": tensor for name, tensor in self.method.state_dict().items()}
+        for group in self.optimizer.param_groups:
+            for i, param in enumerate(group["params"]):
+                for key, value in self.optimizer.state.get(param, {}).items():
+                    tensors[f"adam.{group['name']}.{i}.{key}"] = torch.as_tensor(value)
+        meta = {
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "skipped": self.skipped,
+            "skipped_in_a_row": self.skipped_in_a_row,
+            "history": self.history,
+            "config": asdict(self.config),
+            "scene": scene_fingerprint(self.scene),
+        }
+        save_checkpoint(path, tensors, meta)
+
+    def restore(self, path: str | Path) -> None:
+        """Go on from a checkpoint, bit for bit. ValueError names the field in which the run differs."""
+        tensors, meta = load_checkpoint(path)
+        here = {**asdict(self.config), "background": list(self.config.background)}
+        _check_same(path, "", meta["config"], here)
+        _check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+
+        self.gaussians = Gaussians(**part("gaussians."))
+        self.method.load_state_dict(part("method."))
+        self.optimizer = self._make_optimizer()
+        for group in self.optimizer.param_groups:
+            for i, param in enumerate(group["params"]):
+                if state := part(f"adam.{group['name']}.{i}."):
+                    self.optimizer.state[param] = state
+        self.densifier.load_state_dict(part("densify."))
+        for name in ("iteration", "seconds", "skipped", "skipped_in_a_row", "history"):
+            setattr(self, name, meta[name])
+
+    def _make_optimizer(self) -> Adam:
+        config = self.config
+        groups: list[dict[str, Any]] = [
+            {"name": name, "params": [tensor.requires_grad_()], "lr": getattr(config, f"lr_{name}")}
+            for name, tensor in self.gaussians.named().items()
+        ]
+        return Adam(groups + self.method.param_groups(), lr=0.0, eps=config.adam_eps)
+
+    def _set_learning_rate(self) -> None:
+        """Exponential decay of the means' rate over the run; the others are constant."""
+        config = self.config
+        part = self.iteration / config.iterations
+        rate = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
+        next(g for g in self.optimizer.param_groups if g["name"] == "means")["lr"] = rate
+
+    def _view_of(self, iteration: int) -> View:
+        """Each epoch visits all training views once, in an order of its own."""
+        epoch, index = divmod(iteration - 1, len(self.scene.train))
+        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.scene.train))
+        return self.scene.train[order[index]]
+
+    def _render(self, camera: Camera) -> tuple[Tensor, dict[str, Any]]:
+        degree = min(self.config.sh_degree, self.iteration // self.config.sh_interval)
+        return render_view(self.method.modulate(self.gaussians), camera, degree, self.config.background)
+
+    def _backward(self, loss: Tensor) -> bool:
+        """Compute the gradients; False, counted, where the loss or a gradient is not finite."""
+        finite = math.isfinite(loss)
+        if finite:
+            loss.backward()
+            # shN, three quarters of the numbers, is left out: its gradient is sh0's times a bounded basis.
+            grads = [t.grad for name, t in self.gaussians.named().items() if name != "shN"]
+            finite = all(g is None or math.isfinite(g.sum()) for g in grads)
+        self.skipped += not finite
+        self.skipped_in_a_row = 0 if finite else self.skipped_in_a_row + 1
+        if self.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+            raise TrainingError(
+                f"the loss or a gradient was not finite in {self.skipped_in_a_row} steps in a row, up to "
+                f"iteration {self.iteration}; the last loss is {float(loss.detach())}"
+            )
+        return finite
+
+
+def _check_views(scene: Scene) -> None:
+    if not scene.train:
+        raise ValueError(f"scene {scene.name!r} has no training views")
+    for view in [*scene.train, *scene.test]:
+        wanted = (view.camera.height, view.camera.width, 3)
+        if view.image.dtype != np.uint8 or view.image.shape != wanted:
+            raise ValueError(
+                f"view {view.name!r}: the image is {view.image.dtype} {list(view.image.shape)}, "
+                f"its camera wants uint8 {list(wanted)}"
+            )
+
+
+def _check_same(path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any]) -> None:
+    """ValueError for the first field that differs; nested fields are named with dots."""
+    for name in here | saved:
+        old, new = saved.get(name), here.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            _check_same(path, f"{prefix}{name}.", old, new)
+        elif old != new and name not in FREE_FIELDS:
+            raise ValueError(
+                f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
+                "use the same one, or another folder"
+            )

@@ -1,0 +1,200 @@
+"""The command line: exit codes, one-line errors, and what it leaves in the folder."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_scene import tiny_scene
+
+import hqgs
+from hqgs import cli
+from hqgs.camera import Scene
+from hqgs.methods import ThreeDGS
+from hqgs.ply import read_ply
+from hqgs.run import CHECKPOINT
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """The tiny scene in place of the embedded one; the list gets the arguments that it was asked with."""
+    calls: list[dict[str, Any]] = []
+
+    def embedded(**arguments: Any) -> Scene:
+        calls.append(arguments)
+        return tiny_scene()
+
+    monkeypatch.setattr(cli, "embedded_scene", embedded)
+    return calls
+
+
+def call(*arguments: str | Path) -> int:
+    return cli.main([str(argument) for argument in arguments])
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    """The only line on stderr."""
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+@contextmanager
+def small_disk(limit: int) -> Iterator[None]:
+    """Writing beyond `limit` bytes of a file fails as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_train_the_embedded_scene(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "out"
+    options = ["--iterations", "20", "--seed", "3", "--max-gaussians", "55", "--eval-every", "7"]
+    assert call("train", "embedded", "--out", out, "--downscale", "2", *options) == 0
+    assert asked == [{"cache": out / "scene", "width": 252, "height": 189}]
+    report = json.loads((out / "report.json").read_text())
+    assert (report["iterations"], report["seed"], report["method"]) == (20, 3, "3dgs")
+    assert report["config"]["densify"]["max_gaussians"] == 55
+    assert [h["iteration"] for h in report["history"]] == [7, 14, 20]
+    gaussians = len(read_ply(out / "scene.ply"))
+    assert f"{out}: 20 iterations, {gaussians} Gaussians, " in capsys.readouterr().out
+
+
+def test_threads_are_set(asked: list[dict[str, Any]], tmp_path: Path) -> None:
+    before = hqgs.get_num_threads()
+    try:
+        assert call("train", "embedded", "--out", tmp_path, "--iterations", "2", "--threads", "1") == 0
+        assert hqgs.get_num_threads() == 1
+    finally:
+        hqgs.set_num_threads(before)
+
+
+def test_a_run_goes_on_with_resume_only(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train", "embedded", "--out", str(tmp_path), "--iterations", "20"]
+    assert call(*command, "--resume") == 0  # nothing there yet: starts
+    capsys.readouterr()
+    assert call(*command) == 2
+    assert (
+        one_line(capsys) == f"hqgs: {tmp_path} holds a run; continue it with --resume or choose another --out"
+    )
+    assert call(*command, "--resume") == 0
+    capsys.readouterr()
+    assert call(*command, "--resume", "--seed", "1") == 2
+    assert "another seed: 0 there, 1 in this run" in one_line(capsys)
+    (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
+    assert call(*command, "--resume") == 2
+    assert f"the checkpoint {tmp_path / CHECKPOINT} is damaged" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["/no/such/scene"], "hqgs: there is no scene folder /no/such/scene"),
+        (["embedded", "--method", "4dgs"], "hqgs: unknown method '4dgs'; the methods are: 3dgs"),
+        (["embedded", "--iterations", "0"], "hqgs: iterations is 0, wanted at least 1"),
+        (["embedded", "--eval-every", "0"], "hqgs: eval_every is 0, wanted at least 1"),
+        (["embedded", "--downscale", "0"], "hqgs: downscale must be at least 1, got 0.0"),
+        (
+            ["embedded", "--max-gaussians", "9"],
+            "hqgs: max_gaussians is 9, but the scene starts with 40 points",
+        ),
+        (["embedded", "--seed", "-1"], "hqgs: seed is -1, wanted at least 0"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    asked: list[dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    assert call("train", *arguments, "--out", tmp_path) == 2
+    assert one_line(capsys).startswith(message)
+
+
+def test_no_thread_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("train", "embedded", "--out", tmp_path, "--threads", "0") == 2
+    assert "threads" in one_line(capsys)
+
+
+def test_a_file_in_the_place_of_the_folder_is_bad_input(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert call("train", "embedded", "--out", tmp_path / "file") == 2
+    assert str(tmp_path / "file") in one_line(capsys)
+
+
+def test_unknown_options_are_argparse_errors(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        call("train", "embedded", "--out", tmp_path, "--method")
+    assert exit_info.value.code == 2
+
+
+@pytest.mark.parametrize("limit", [2_000, 40_000])  # too small for the checkpoint; for the report's chart
+def test_a_full_disk_is_exit_code_1_and_names_the_folder(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str], limit: int
+) -> None:
+    with small_disk(limit):
+        code = call("train", "embedded", "--out", tmp_path, "--iterations", "20", "--max-gaussians", "40")
+    assert code == 1
+    assert (tmp_path / CHECKPOINT).exists() == (limit > 30_000)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"hqgs: {tmp_path}: ")
+    assert "File too large" in last
+    assert [p.name for p in tmp_path.rglob(".*") if p.name != ".lock"] == []  # no temporary file is left
+
+
+def test_a_run_that_cannot_go_on_is_exit_code_1(
+    asked: list[dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def broken(self: ThreeDGS, render: Any, view: Any) -> Any:
+        return render.sum() * float("nan")
+
+    monkeypatch.setattr(ThreeDGS, "loss", broken)
+    assert call("train", "embedded", "--out", tmp_path, "--iterations", "300") == 1
+    assert "was not finite in 20 steps in a row" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_ctrl_c_is_exit_code_130_with_a_report(
+    asked: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = ThreeDGS.loss
+    steps = []
+
+    def interrupting(self: ThreeDGS, render: Any, view: Any) -> Any:
+        steps.append(view.name)
+        if len(steps) == 6:
+            signal.raise_signal(signal.SIGINT)
+        return real(self, render, view)
+
+    monkeypatch.setattr(ThreeDGS, "loss", interrupting)
+    assert call("train", "embedded", "--out", tmp_path, "--iterations", "20") == 130
+    assert json.loads((tmp_path / "report.json").read_text())["iterations"] == 6
+    assert (tmp_path / CHECKPOINT).exists()
+
+
+def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupting(**arguments: Any) -> Scene:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "embedded_scene", interrupting)
+    assert call("train", "embedded", "--out", tmp_path) == 130

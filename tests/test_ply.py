@@ -1,0 +1,131 @@
+"""PLY files: exact round trips, the layout byte by byte, and files that lie."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hqgs.gaussians import Gaussians
+from hqgs.ply import read_ply, write_ply
+
+
+def random_gaussians(n: int = 7, sh_degree: int = 3) -> Gaussians:
+    generator = torch.Generator().manual_seed(n + sh_degree)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=generator)
+
+    rest = (sh_degree + 1) ** 2 - 1
+    return Gaussians(normal(n, 3), normal(n, 3), normal(n, 4), normal(n), normal(n, 1, 3), normal(n, rest, 3))
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_round_trip_is_exact(tmp_path: Path, sh_degree: int) -> None:
+    g = random_gaussians(sh_degree=sh_degree)
+    g.means[0] = torch.tensor([1e-42, -0.0, 3e38])  # a denormal, a signed zero, nearly the largest float
+    assert write_ply(tmp_path / "a.ply", g) == 0
+    back = read_ply(tmp_path / "a.ply")
+    for name, tensor in g.named().items():
+        assert torch.equal(back.named()[name].view(torch.int32), tensor.view(torch.int32)), name
+
+
+def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
+    g = random_gaussians(n=2, sh_degree=1)
+    write_ply(tmp_path / "a.ply", g)
+    header, _, data = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(9)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    expected = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    assert header.decode().split("\n")[:-1] == expected + [f"property float {name}" for name in names]
+    rows = np.frombuffer(data, "<f4").reshape(2, len(names))
+    for i, row in enumerate(rows):
+        value = dict(zip(names, row, strict=True))
+        assert [value[n] for n in ("x", "y", "z")] == g.means[i].tolist()
+        assert [value[n] for n in ("nx", "ny", "nz")] == [0, 0, 0]
+        assert [value[f"f_dc_{c}"] for c in range(3)] == g.sh0[i, 0].tolist()
+        for k in range(3):  # coefficient
+            for c in range(3):  # channel: all red coefficients first
+                assert value[f"f_rest_{c * 3 + k}"] == g.shN[i, k, c].item()
+        assert value["opacity"] == g.opacities[i].item()
+        assert [value[f"scale_{c}"] for c in range(3)] == g.scales[i].tolist()
+        assert [value[f"rot_{c}"] for c in range(4)] == g.quats[i].tolist()
+
+
+def test_rows_that_are_not_finite_are_left_out_and_counted(tmp_path: Path) -> None:
+    g = random_gaussians()
+    g.scales[2, 1] = torch.inf
+    g.shN[5, 3, 0] = torch.nan
+    assert write_ply(tmp_path / "a.ply", g) == 2
+    kept = torch.tensor([0, 1, 3, 4, 6])
+    assert torch.equal(read_ply(tmp_path / "a.ply").means, g.means[kept])
+
+
+def test_a_row_that_is_not_finite_is_refused_on_reading(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, random_gaussians())
+    data = bytearray(path.read_bytes())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    data[start + 62 * 4 * 3 : start + 62 * 4 * 3 + 4] = np.float32(np.nan).tobytes()  # row 3, x
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.ply: means is not finite in 1 rows, the first is row 3"):
+        read_ply(path)
+
+
+def test_no_gaussian_at_all(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", random_gaussians(n=0))
+    assert len(read_ply(tmp_path / "a.ply")) == 0
+
+
+def test_text_files_can_be_read(tmp_path: Path) -> None:
+    from plyfile import PlyData
+
+    g = random_gaussians()
+    write_ply(tmp_path / "a.ply", g)
+    ply = PlyData.read(str(tmp_path / "a.ply"))
+    ply.text = True
+    ply.write(str(tmp_path / "b.ply"))
+    assert torch.allclose(read_ply(tmp_path / "b.ply").shN, g.shN, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
+def test_a_count_that_the_file_cannot_hold_is_refused_before_it_is_allocated(
+    tmp_path: Path, kind: str
+) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, random_gaussians())
+    data = path.read_bytes().replace(b"element vertex 7", b"element vertex 70000000000")
+    path.write_bytes(data.replace(b"binary_little_endian", kind.encode()))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"a\.ply: the header promises 4340000000000 values"):
+        read_ply(path)
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+
+
+def test_every_cut_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, random_gaussians(n=2, sh_degree=0))
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 5):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"a\.ply"):
+            read_ply(path)
+
+
+def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    with pytest.raises(FileNotFoundError, match=r"a\.ply"):
+        read_ply(path)
+    write_ply(path, random_gaussians())
+    text = path.read_bytes()
+    path.write_bytes(text.replace(b"float rot_2", b"float xyz_2"))
+    with pytest.raises(ValueError, match=r"a\.ply: not a 3DGS scene, these properties are missing: rot_2"):
+        read_ply(path)
+    path.write_bytes(text.replace(b"f_rest_44", b"fxrest_44"))
+    with pytest.raises(ValueError, match="44 f_rest_"):
+        read_ply(path)

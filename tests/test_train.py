@@ -1,0 +1,329 @@
+"""The training loop: that it learns, its schedules, its guards, and that no thread count changes a bit."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny_scene import tiny_config, tiny_scene
+from torch import Tensor
+
+import hqgs
+import hqgs.train as train_module
+from hqgs.camera import Scene, View
+from hqgs.densify import DensifyConfig
+from hqgs.gaussians import Gaussians
+from hqgs.methods import METHODS, ThreeDGS, make_method
+from hqgs.ply import read_ply
+from hqgs.run import CHECKPOINT, PLY, open_run, run, train
+from hqgs.train import MAX_SKIPPED_IN_A_ROW, TrainConfig, Trainer, TrainingError
+
+ONLY_TRAIN = DensifyConfig(stop=0)
+
+
+class Probe(ThreeDGS):
+    """3DGS whose loss can be replaced at chosen steps, with a trained colour offset of its own."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+        self.offset = torch.zeros(3, requires_grad=True)
+        self.at: dict[int, Any] = {}  # step -> function of the loss
+        self.seen: list[str] = []
+
+    def modulate(self, gaussians: Gaussians) -> Gaussians:
+        return Gaussians(**(gaussians.named() | {"sh0": gaussians.sh0 + self.offset}))
+
+    def loss(self, render: Tensor, view: View) -> Tensor:
+        self.steps += 1
+        self.seen.append(view.name)
+        assert torch.get_num_threads() == 1  # sums in a loss depend on it
+        return self.at.get(self.steps, lambda loss: loss)(super().loss(render, view))
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        return [{"name": "offset", "params": [self.offset], "lr": 0.01}]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"offset": self.offset}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        with torch.no_grad():
+            self.offset.copy_(state["offset"])
+
+
+@pytest.fixture
+def probe(monkeypatch: pytest.MonkeyPatch) -> Probe:
+    method = Probe()
+    monkeypatch.setitem(METHODS, "probe", lambda scene, seed: method)
+    return method
+
+
+def steps(trainer: Trainer, count: int) -> list[float]:
+    """The losses of so many steps."""
+    return [trainer.step().loss for _ in range(count)]
+
+
+def bits(trainer: Trainer) -> dict[str, bytes]:
+    return {name: t.detach().numpy().tobytes() for name, t in trainer.gaussians.named().items()}
+
+
+def test_held_out_views_get_better() -> None:
+    trainer = Trainer(tiny_scene(num_points=80), tiny_config(150, densify=ONLY_TRAIN))
+    trainer.evaluate()
+    losses = steps(trainer, 150)
+    trainer.evaluate()
+    first, last = trainer.history
+    assert last["psnr"] > first["psnr"] + 6
+    assert last["ssim"] > first["ssim"] + 0.2
+    assert np.mean(losses[-10:]) < 0.4 * np.mean(losses[:10])
+
+
+def test_everything_is_written(tmp_path: Path) -> None:
+    result = train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["iterations"] == result.iterations == 30
+    assert report["gaussians"] == len(read_ply(tmp_path / PLY))
+    assert [h["iteration"] for h in report["history"]] == [10, 20, 30]
+    assert report["history"][-1]["psnr"] == pytest.approx(report["metrics"]["mean"]["psnr"], abs=1e-9)
+    assert report["config"]["densify"]["reset_every"] == 12
+    assert report["seconds"] >= report["history"][-1]["seconds"] > 0
+    assert report["left_out"] == []
+    names = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert names == {
+        ".lock", CHECKPOINT, PLY, "report.json", "error_vs_time.png", "comparison/view0.png"
+    }  # fmt: skip
+
+
+def test_a_scene_without_held_out_views(tmp_path: Path) -> None:
+    s = tiny_scene()
+    scene = Scene(s.name, s.train, [], s.points, s.point_colors, s.source)
+    result = train(scene, tiny_config(), tmp_path, progress=False)
+    assert result.history[-1]["psnr"] is None
+    assert "the scene has no held-out view" in [entry["why"] for entry in result.left_out]
+
+
+def test_an_epoch_visits_every_view_once_in_an_order_of_its_own(probe: Probe) -> None:
+    trainer = Trainer(tiny_scene(), tiny_config(method="probe"))
+    steps(trainer, 20)
+    epochs = [probe.seen[i : i + 5] for i in range(0, 20, 5)]
+    assert all(sorted(epoch) == [f"view{i}.png" for i in range(1, 6)] for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 1
+
+
+def test_the_learning_rates_of_3dgs() -> None:
+    scene = tiny_scene()
+    trainer = Trainer(scene, tiny_config(20, densify=ONLY_TRAIN))
+    rates: list[dict[str, float]] = []
+    for _ in range(20):
+        trainer.step()
+        rates.append({g["name"]: g["lr"] for g in trainer.optimizer.param_groups})
+    centers = np.stack([view.camera.center for view in scene.train])
+    extent = 1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    assert rates[-1]["means"] == pytest.approx(1.6e-6 * extent)
+    assert rates[9]["means"] == pytest.approx(1.6e-5 * extent)  # half way in log space
+    assert rates[0]["means"] == pytest.approx(1.6e-4 * extent * 0.01 ** (1 / 20))
+    rest = {name: rate for name, rate in rates[5].items() if name != "means"}
+    assert rest == {"scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+
+
+def test_the_sh_degree_rises_by_one_per_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    degrees = []
+    real = train_module.render_view
+
+    def spy(gaussians: Gaussians, camera: Any, sh_degree: int, background: Any) -> Any:
+        degrees.append(sh_degree)
+        return real(gaussians, camera, sh_degree, background)
+
+    monkeypatch.setattr(train_module, "render_view", spy)
+    trainer = Trainer(tiny_scene(), tiny_config(sh_interval=4, sh_degree=2, densify=ONLY_TRAIN))
+    steps(trainer, 14)
+    assert degrees == [0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 2, 2, 2]
+
+
+def test_evaluation_takes_no_training_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def slow_ssim(*images: Any) -> float:
+        time.sleep(0.3)
+        return 0.5
+
+    monkeypatch.setattr(train_module, "ssim", slow_ssim)
+    trainer = Trainer(tiny_scene(), tiny_config())
+    trainer.step()
+    before = trainer.seconds
+    trainer.evaluate()
+    trainer.evaluate()  # once per iteration
+    assert trainer.seconds == before
+    assert [entry["seconds"] for entry in trainer.history] == [before]
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    found = []
+    before = hqgs.get_num_threads(), torch.get_num_threads()
+    try:
+        for rasterizer, torch_threads in ((1, 1), (2, 2), (3, 1)):
+            hqgs.set_num_threads(rasterizer)
+            torch.set_num_threads(torch_threads)
+            trainer = Trainer(tiny_scene(num_points=300), tiny_config())
+            steps(trainer, 30)
+            found.append(bits(trainer))
+            assert torch.get_num_threads() == torch_threads
+    finally:
+        hqgs.set_num_threads(before[0])
+        torch.set_num_threads(before[1])
+    assert len(trainer.gaussians) > 300
+    assert found[0] == found[1] == found[2]
+
+
+def test_seeds_matter() -> None:
+    found = []
+    for seed in (0, 0, 1):
+        trainer = Trainer(tiny_scene(), tiny_config(seed=seed))
+        steps(trainer, 12)
+        found.append(bits(trainer))
+    assert found[0] == found[1] != found[2]
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+@pytest.mark.parametrize("only_the_gradient", [False, True])
+def test_a_step_that_is_not_finite_is_skipped_and_counted(
+    probe: Probe, bad: float, only_the_gradient: bool
+) -> None:
+    class BadGradient(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, x: Tensor) -> Tensor:  # type: ignore[override]
+            return x.clone()
+
+        @staticmethod
+        def backward(ctx: Any, v: Tensor) -> Tensor:  # type: ignore[override]
+            return v * bad
+
+    probe.at[3] = BadGradient.apply if only_the_gradient else lambda loss: loss * bad
+    trainer = Trainer(tiny_scene(), tiny_config(method="probe"))
+    trainer.step()
+    trainer.step()
+    before = bits(trainer)
+    trainer.step()
+    assert bits(trainer) == before
+    assert trainer.skipped == 1
+    trainer.step()
+    assert bits(trainer) != before
+    assert trainer.skipped == 1
+    assert all(bool(torch.isfinite(t).all()) for t in trainer.gaussians.named().values())
+
+
+def test_a_run_that_stays_not_finite_ends_with_the_reason(probe: Probe) -> None:
+    probe.at = {step: lambda loss: loss * torch.nan for step in range(4, 100)}
+    trainer = Trainer(tiny_scene(), tiny_config(100, method="probe", densify=ONLY_TRAIN))
+    expected = (
+        f"not finite in {MAX_SKIPPED_IN_A_ROW} steps in a row, up to iteration {MAX_SKIPPED_IN_A_ROW + 3}"
+    )
+    with pytest.raises(TrainingError, match=expected):
+        steps(trainer, 100)
+
+
+def test_no_gaussian_left_ends_with_the_reason() -> None:
+    densify = DensifyConfig(start=0, every=5, prune_opacity=0.9)
+    trainer = Trainer(tiny_scene(), tiny_config(densify=densify))
+    with pytest.raises(TrainingError, match="no Gaussians are left at iteration 5"):
+        steps(trainer, 10)
+
+
+def test_a_view_that_sees_nothing_is_no_error() -> None:
+    scene = tiny_scene()
+    behind = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks away from the points
+    cameras = [type(v.camera)(v.camera.width, v.camera.height, v.camera.K, behind) for v in scene.train]
+    views = [View(v.name, c, v.image) for v, c in zip(scene.train, cameras, strict=True)]
+    away = Scene("away", views, [], scene.points, scene.point_colors, "test")
+    trainer = Trainer(away, tiny_config())
+    before = bits(trainer)
+    step = trainer.step()
+    assert not step.render.any()
+    assert bits(trainer) == before
+    assert trainer.densifier.count.sum() == 0
+    assert trainer.skipped == 0
+
+
+def test_a_method_trains_and_keeps_tensors_of_its_own(probe: Probe, tmp_path: Path) -> None:
+    config = tiny_config(method="probe")
+    with open_run(tiny_scene(), config, tmp_path) as trainer:
+        run(trainer, tmp_path, progress=False)
+    trained = probe.offset.detach().clone()
+    assert trained.abs().max() > 0.01
+    # The PLY holds what is rasterized.
+    shown = trainer.gaussians.sh0.detach() + trained
+    assert torch.equal(read_ply(tmp_path / PLY).sh0, shown)
+    moments = trainer.optimizer.state[probe.offset]["exp_avg"].clone()
+    with torch.no_grad():
+        probe.offset.zero_()
+    with open_run(tiny_scene(), config, tmp_path, resume=True) as again:
+        assert torch.equal(probe.offset, trained)
+        assert torch.equal(again.optimizer.state[probe.offset]["exp_avg"], moments)
+
+
+def test_ctrl_c_ends_the_run_with_everything_written(probe: Probe, tmp_path: Path) -> None:
+    def interrupt(loss: Tensor) -> Tensor:
+        signal.raise_signal(signal.SIGINT)
+        return loss
+
+    handler = signal.getsignal(signal.SIGINT)
+    probe.at[17] = interrupt
+    config = tiny_config(method="probe")
+    result = train(tiny_scene(), config, tmp_path, progress=False)
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert result.iterations == 17
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["left_out"] == [{"what": "iterations 18 to 30", "why": "the run was stopped"}]
+    assert [h["iteration"] for h in report["history"]] == [10, 17]
+    assert (tmp_path / PLY).exists()
+    assert train(tiny_scene(), config, tmp_path, resume=True, progress=False).iterations == 30
+
+
+def test_a_second_ctrl_c_stops_at_once(probe: Probe, tmp_path: Path) -> None:
+    def interrupt_twice(loss: Tensor) -> Tensor:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        return loss
+
+    probe.at[17] = interrupt_twice
+    with pytest.raises(KeyboardInterrupt):
+        train(tiny_scene(), tiny_config(method="probe"), tmp_path, progress=False)
+    assert not (tmp_path / "report.json").exists()
+    with open_run(tiny_scene(), tiny_config(method="probe"), tmp_path, resume=True) as trainer:
+        assert trainer.iteration == 15  # the last regular checkpoint
+
+
+def test_scenes_that_cannot_be_trained_are_refused() -> None:
+    s = tiny_scene()
+    with pytest.raises(ValueError, match="scene 'tiny' has no training views"):
+        Trainer(Scene(s.name, [], s.test, s.points, s.point_colors, s.source), tiny_config())
+    view = View("odd.png", s.train[0].camera, s.train[0].image[:-1])
+    with pytest.raises(ValueError, match=r"view 'odd.png': the image is uint8 \[15, 24, 3\].*\[16, 24, 3\]"):
+        Trainer(Scene(s.name, [view], [], s.points, s.point_colors, s.source), tiny_config())
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("iterations", 0), ("seed", -1), ("sh_degree", 4), ("lr_means", 0.0), ("lr_shN", torch.nan)],
+)
+def test_bad_settings_are_refused_by_name(field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{field} is {value}"):
+        TrainConfig(**{field: value})  # type: ignore[arg-type]
+
+
+def test_an_unknown_method_is_refused_with_the_names() -> None:
+    with pytest.raises(ValueError, match="unknown method '4dgs'; the methods are: 3dgs"):
+        TrainConfig(method="4dgs")
+    with pytest.raises(ValueError, match="unknown method '4dgs'"):
+        make_method("4dgs", tiny_scene(), 0)
+
+
+def test_scaled_schedules() -> None:
+    long = TrainConfig().scaled()
+    assert (long.sh_interval, long.eval_every, long.checkpoint_every) == (1_000, 3_000, 1_000)
+    short = TrainConfig(iterations=2_100).scaled()
+    assert (short.sh_interval, short.eval_every, short.checkpoint_every) == (300, 210, 210)
+    assert short.densify == DensifyConfig().scaled(2_100)
