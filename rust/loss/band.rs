@@ -3,6 +3,8 @@
 //! Two rows at a time pass through all stages: filter horizontally, filter vertically and compare, filter the
 //! gradients horizontally, then vertically. Between the stages lie ring buffers of 12 rows, which stay in the
 //! cache. The images are interleaved, so the horizontal filter steps by the number of channels.
+//!
+//! No closure holds SIMD code here: one that the compiler does not inline loses the instruction set.
 
 use super::{Images, Plan, Sample, Sums};
 use crate::real::{Lanes, Real};
@@ -260,16 +262,23 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         let moments = moments
             .each_ref()
             .map(|ring| ring.rows(row - REACH as isize));
-        let [zero, one, two] = [0.0, 1.0, 2.0].map(|v| Lanes::<T, S>::splat(simd, T::from_f64(v)));
+        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+        let one = Lanes::<T, S>::splat(simd, T::ONE);
+        let two = one + one;
         let (c1, c2) = (two * T::from_f64(C1), two * T::from_f64(C2));
         for j in (0..n).step_by(Lanes::<T, S>::LEN) {
-            let [p, q, pp, qq] = moments
-                .each_ref()
-                .map(|rows| filter_rows(simd, kernel, rows, j));
+            let p = filter_rows(simd, kernel, &moments[0], j);
+            let q = filter_rows(simd, kernel, &moments[1], j);
+            let pp = filter_rows(simd, kernel, &moments[2], j);
+            let qq = filter_rows(simd, kernel, &moments[3], j);
             for i in 0..PAIR {
                 let (p, q, mean) = (p[i], q[i], p[i] + one);
-                let variance = |v: Lanes<T, S>| v.simd_lt(zero).select(zero, v); // rounding; NaN stays
-                let (vp, vq) = (variance(pp[i] - p * p), variance(qq[i] - q * q));
+                let (vp, vq) = (pp[i] - p * p, qq[i] - q * q);
+                // Rounding may make a variance negative; NaN stays.
+                let (vp, vq) = (
+                    vp.simd_lt(zero).select(zero, vp),
+                    vq.simd_lt(zero).select(zero, vq),
+                );
                 let a1 = one / (mean.mul_add(mean, q.mul_add(q, c1)));
                 let b1 = one / (vp + vq + c2);
                 let (a, b) = (two * q * q * a1, two * vq * b1);
@@ -384,7 +393,11 @@ fn window<T: Real, S: Simd>(simd: S) -> Kernel<T, S> {
     let taps: [f64; REACH + 1] =
         std::array::from_fn(|k| (-((k * k) as f64) / (2.0 * SIGMA * SIGMA)).exp());
     let total = taps[0] + 2.0 * taps[1..].iter().sum::<f64>();
-    taps.map(|tap| Lanes::<T, S>::splat(simd, T::from_f64(tap / total)))
+    let mut kernel = [Lanes::<T, S>::splat(simd, T::ZERO); REACH + 1];
+    for (lanes, tap) in kernel.iter_mut().zip(taps) {
+        *lanes = Lanes::<T, S>::splat(simd, T::from_f64(tap / total));
+    }
+    kernel
 }
 
 /// Filter vertically at column `j`: the pair of rows in the middle of `rows`.
