@@ -6,8 +6,9 @@ pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 /// Largest alpha: keeps `1 - alpha` away from 0, so that no layer hides everything behind it exactly.
 pub const ALPHA_MAX: f64 = 0.99;
 
-/// Compositing stops before the layer that would bring the transmittance to this value or below.
-pub const TRANSMITTANCE_MIN: f64 = 1e-4;
+/// Compositing stops before the layer that would bring the transmittance to this value or below. The field
+/// uses 1e-4, which is what two capped layers leave, (1 - 0.99)^2: rounding would decide about the second one.
+pub const TRANSMITTANCE_MIN: f64 = 0.999e-4;
 
 /// Default 2D low-pass filter, added to the diagonal of the projected covariance, px^2.
 pub const EPS2D: f64 = 0.3;

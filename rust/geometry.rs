@@ -16,10 +16,10 @@
 use crate::{
     camera::{Camera, CameraGrad},
     constants::QUAT_NORM2_MIN,
-    lanes::{M3, V3, Wide, splat3},
+    lanes::{M3, V3, Wide, splat, splat3},
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 
 type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
 
@@ -39,19 +39,17 @@ pub(crate) struct CameraLanes<S: Simd> {
 impl<S: Simd> CameraLanes<S> {
     #[inline(always)]
     pub fn new(simd: S, camera: &Camera, near: f64, far: f64, eps2d: f64) -> Self {
-        let splat = |x| Wide::<S>::splat(simd, x);
-        let pair = |v: glam::DVec2| [splat(v.x), splat(v.y)];
-        let row = |i| splat3(simd, camera.rotation.row(i));
+        let [r0, r1, r2] = [0, 1, 2].map(|i| camera.rotation.row(i));
         Self {
-            rotation: M3([row(0), row(1), row(2)]),
+            rotation: M3([splat3(simd, r0), splat3(simd, r1), splat3(simd, r2)]),
             translation: splat3(simd, camera.translation),
-            focal: pair(camera.focal),
-            principal: pair(camera.principal),
-            ratio_min: pair(camera.ratio_min),
-            ratio_max: pair(camera.ratio_max),
-            near: splat(near),
-            far: splat(far),
-            eps2d: splat(eps2d),
+            focal: pair(simd, camera.focal),
+            principal: pair(simd, camera.principal),
+            ratio_min: pair(simd, camera.ratio_min),
+            ratio_max: pair(simd, camera.ratio_max),
+            near: splat(simd, near),
+            far: splat(simd, far),
+            eps2d: splat(simd, eps2d),
         }
     }
 }
@@ -132,20 +130,45 @@ impl<S: Simd> CameraGradLanes<S> {
     /// Sum of the lanes.
     #[inline(always)]
     pub fn sum(&self) -> CameraGrad {
-        let sum = |v: V3<Wide<S>>| DVec3::new(v.x.reduce_sum(), v.y.reduce_sum(), v.z.reduce_sum());
-        let [r0, r1, r2] = self.rotation.map(sum);
+        let [r0, r1, r2] = self.rotation;
         CameraGrad {
-            rotation: DMat3::from_cols(r0, r1, r2).transpose(),
-            translation: sum(self.translation),
-            center: sum(self.center),
+            rotation: DMat3::from_cols(sum::<S>(r0), sum::<S>(r1), sum::<S>(r2)).transpose(),
+            translation: sum::<S>(self.translation),
+            center: sum::<S>(self.center),
         }
     }
+}
+
+#[inline(always)]
+fn sum<S: Simd>(v: V3<Wide<S>>) -> DVec3 {
+    DVec3::new(v.x.reduce_sum(), v.y.reduce_sum(), v.z.reduce_sum())
+}
+
+#[inline(always)]
+fn pair<S: Simd>(simd: S, v: DVec2) -> [Wide<S>; 2] {
+    [splat(simd, v.x), splat(simd, v.y)]
+}
+
+/// Each element of `w` at most 1 / |scale|.
+#[inline(always)]
+fn bound<S: Simd>(simd: S, w: V3<Wide<S>>, scale: V3<Wide<S>>) -> V3<Wide<S>> {
+    let (one, zero) = (splat(simd, 1.0), splat(simd, 0.0));
+    let (x, y, z) = (
+        one / scale.x.abs(),
+        one / scale.y.abs(),
+        one / scale.z.abs(),
+    );
+    V3::new(
+        w.x.min(x).max(zero - x),
+        w.y.min(y).max(zero - y),
+        w.z.min(z).max(zero - z),
+    )
 }
 
 /// Rotation matrix of a unit quaternion.
 #[inline(always)]
 fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4]) -> M3<Wide<S>> {
-    let (one, two) = (Wide::<S>::splat(simd, 1.0), Wide::<S>::splat(simd, 2.0));
+    let (one, two) = (splat(simd, 1.0), splat(simd, 2.0));
     M3([
         V3::new(
             one - two * (y * y + z * z),
@@ -175,27 +198,37 @@ impl<S: Simd> Geometry<S> {
         scale: V3<Wide<S>>,
         camera: &CameraLanes<S>,
     ) -> Self {
-        let splat = |x| Wide::<S>::splat(simd, x);
-        let infinity = splat(f64::INFINITY);
+        let infinity = splat(simd, f64::INFINITY);
         let p = camera.rotation.times(mean) + camera.translation;
         let norm2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
         let quat_norm = norm2.sqrt();
-        let inverse_norm = splat(1.0) / quat_norm;
-        let quat = quat.map(|q| q * inverse_norm);
+        let inverse_norm = splat(simd, 1.0) / quat_norm;
+        let quat = [
+            quat[0] * inverse_norm,
+            quat[1] * inverse_norm,
+            quat[2] * inverse_norm,
+            quat[3] * inverse_norm,
+        ];
         let rotation = rotation_matrix(simd, quat);
-        let rz = splat(1.0) / p.z;
+        let rz = splat(simd, 1.0) / p.z;
         let ratios = [p.x * rz, p.y * rz];
-        let clamp = |k: usize| ratios[k].max(camera.ratio_min[k]).min(camera.ratio_max[k]);
-        let ratio = [clamp(0), clamp(1)];
-        let free = [0, 1].map(|k| ratio[k].simd_eq(ratios[k]).select(splat(1.0), splat(0.0)));
+        let ratio = [
+            ratios[0].max(camera.ratio_min[0]).min(camera.ratio_max[0]),
+            ratios[1].max(camera.ratio_min[1]).min(camera.ratio_max[1]),
+        ];
+        let (one, zero) = (splat(simd, 1.0), splat(simd, 0.0));
+        let free = [
+            ratio[0].simd_eq(ratios[0]).select(one, zero),
+            ratio[1].simd_eq(ratios[1]).select(one, zero),
+        ];
         let [w0, w1, w2] = camera.rotation.0;
-        let f = camera.focal.map(|f| f * rz);
+        let f = [camera.focal[0] * rz, camera.focal[1] * rz];
         let jw = [
             (w0 - w2.by(ratio[0])).by(f[0]),
             (w1 - w2.by(ratio[1])).by(f[1]),
         ];
-        let axes = jw.map(|j| rotation.back(j));
-        let rows = axes.map(|a| a.times(scale));
+        let axes = [rotation.back(jw[0]), rotation.back(jw[1])];
+        let rows = [axes[0].times(scale), axes[1].times(scale)];
         let (aa, cc) = (rows[0].dot(rows[0]), rows[1].dot(rows[1]));
         let b = rows[0].dot(rows[1]);
         let cross = rows[0].cross(rows[1]);
@@ -205,13 +238,13 @@ impl<S: Simd> Geometry<S> {
         let (a, c) = (aa + eps, cc + eps);
         let valid = p.z.simd_ge(camera.near)
             & p.z.simd_le(camera.far)
-            & p.z.simd_gt(splat(0.0))
-            & norm2.simd_ge(splat(QUAT_NORM2_MIN))
+            & p.z.simd_gt(splat(simd, 0.0))
+            & norm2.simd_ge(splat(simd, QUAT_NORM2_MIN))
             & norm2.simd_lt(infinity)
-            & det.simd_gt(splat(0.0))
+            & det.simd_gt(splat(simd, 0.0))
             & det.simd_lt(infinity)
             & (p.x * p.y * b).abs().simd_lt(infinity);
-        let factors = [(c / det).sqrt(), b / c, splat(1.0) / c.sqrt()];
+        let factors = [(c / det).sqrt(), b / c, splat(simd, 1.0) / c.sqrt()];
         Self {
             mean,
             quat,
@@ -267,26 +300,14 @@ impl<S: Simd> Geometry<S> {
         camera: &CameraLanes<S>,
         camera_grad: Option<&mut CameraGradLanes<S>>,
     ) -> GeometryGrad<S> {
-        let splat = |x| Wide::<S>::splat(simd, x);
-        let (zero, two) = (splat(0.0), splat(2.0));
+        let (zero, two) = (splat(simd, 0.0), splat(simd, 2.0));
         let [s, m, t] = self.factors;
         let [euu, euv, evv] = v.whitened;
         // Whitened rows: B = L^T A, on the unscaled axes. B B^T = I - eps L^T L, so that no entry of B exceeds
         // 1: the bound takes away what rounding leaves of a cancellation beyond 1 : 1e16.
-        let bound = |w: V3<Wide<S>>| {
-            let bound = |w: Wide<S>, scale: Wide<S>| {
-                let limit = splat(1.0) / scale.abs();
-                w.min(limit).max(zero - limit)
-            };
-            V3::new(
-                bound(w.x, self.scale.x),
-                bound(w.y, self.scale.y),
-                bound(w.z, self.scale.z),
-            )
-        };
         let white = [
-            bound((self.axes[0] - self.axes[1].by(m)).by(s)),
-            bound(self.axes[1].by(t)),
+            bound(simd, (self.axes[0] - self.axes[1].by(m)).by(s), self.scale),
+            bound(simd, self.axes[1].by(t), self.scale),
         ];
         let half = [
             white[0].by(euu) + white[1].by(euv),
@@ -311,7 +332,10 @@ impl<S: Simd> Geometry<S> {
             v_axes[1] = v_axes[1] + v_rows[1].times(self.scale);
         }
         // axes_i = R^T jw_i
-        let v_jw = v_axes.map(|a| self.rotation.times(a));
+        let v_jw = [
+            self.rotation.times(v_axes[0]),
+            self.rotation.times(v_axes[1]),
+        ];
 
         let [w0, w1, w2] = camera.rotation.0;
         let mut v_p = V3::new(
@@ -324,29 +348,27 @@ impl<S: Simd> Geometry<S> {
                         + v_jw[0].dot(self.jw[0])
                         + v_jw[1].dot(self.jw[1])),
         );
-        let v_ratio = [0, 1].map(|k| self.free[k] * self.f[k] * v_jw[k].dot(w2) * self.rz);
+        let v_ratio = [
+            self.free[0] * self.f[0] * v_jw[0].dot(w2) * self.rz,
+            self.free[1] * self.f[1] * v_jw[1].dot(w2) * self.rz,
+        ];
         v_p.x -= v_ratio[0];
         v_p.y -= v_ratio[1];
         v_p.z += (v_ratio[0] * self.p.x + v_ratio[1] * self.p.y) * self.rz;
 
         if let Some(grad) = camera_grad {
-            let valid = |v: Wide<S>| self.valid.select(v, zero);
             let jacobian = [
                 v_jw[0].by(self.f[0]),
                 v_jw[1].by(self.f[1]),
                 v_jw[0].by(zero - self.f[0] * self.ratio[0])
                     - v_jw[1].by(self.f[1] * self.ratio[1]),
             ];
-            for (i, (row, v_i)) in grad
-                .rotation
-                .iter_mut()
-                .zip([v_p.x, v_p.y, v_p.z])
-                .enumerate()
-            {
-                let g = self.mean.by(v_i) + jacobian[i];
-                *row = *row + V3::new(valid(g.x), valid(g.y), valid(g.z));
+            let v_view = [v_p.x, v_p.y, v_p.z];
+            for i in 0..3 {
+                let g = self.mean.by(v_view[i]) + jacobian[i];
+                grad.rotation[i] = grad.rotation[i] + g.only(self.valid, zero);
             }
-            grad.translation = grad.translation + V3::new(valid(v_p.x), valid(v_p.y), valid(v_p.z));
+            grad.translation = grad.translation + v_p.only(self.valid, zero);
         }
         GeometryGrad {
             mean: w0.by(v_p.x) + w1.by(v_p.y) + w2.by(v_p.z),
@@ -363,8 +385,8 @@ impl<S: Simd> Geometry<S> {
         conic: &[Wide<S>; 3],
         compensation: Wide<S>,
     ) -> [Wide<S>; 3] {
-        let half = Wide::<S>::splat(simd, 0.5);
-        let zero = Wide::<S>::splat(simd, 0.0);
+        let half = splat(simd, 0.5);
+        let zero = splat(simd, 0.0);
         let [qa, qb, qc] = self.conic();
         // The conic's off-diagonal entry stands for two.
         let (va, vb, vc) = (conic[0], half * conic[1], conic[2]);
@@ -396,14 +418,12 @@ impl<S: Simd> Geometry<S> {
     /// Gradient of the quaternion, its normalisation included; `v_axes` is that of the rows of `J W R`.
     #[inline(always)]
     fn quat_vjp(&self, simd: S, v_axes: &[V3<Wide<S>>; 2]) -> [Wide<S>; 4] {
-        let two = Wide::<S>::splat(simd, 2.0);
+        let two = splat(simd, 2.0);
         // v_R = sum_i jw_i v_axes_i^T
-        let row = |j0: Wide<S>, j1: Wide<S>| v_axes[0].by(j0) + v_axes[1].by(j1);
-        let [r0, r1, r2] = [
-            row(self.jw[0].x, self.jw[1].x),
-            row(self.jw[0].y, self.jw[1].y),
-            row(self.jw[0].z, self.jw[1].z),
-        ];
+        let [j0, j1] = self.jw;
+        let r0 = v_axes[0].by(j0.x) + v_axes[1].by(j1.x);
+        let r1 = v_axes[0].by(j0.y) + v_axes[1].by(j1.y);
+        let r2 = v_axes[0].by(j0.z) + v_axes[1].by(j1.z);
         let [w, x, y, z] = self.quat;
         let (s01, s02, s12) = (r0.y + r1.x, r0.z + r2.x, r1.z + r2.y);
         let (d21, d02, d10) = (r2.y - r1.z, r0.z - r2.x, r1.x - r0.y);
@@ -414,7 +434,7 @@ impl<S: Simd> Geometry<S> {
             two * (x * s02 + y * s12 + w * d10 - two * z * (r0.x + r1.y)),
         ];
         let along = w * g[0] + x * g[1] + y * g[2] + z * g[3];
-        let inverse = Wide::<S>::splat(simd, 1.0) / self.quat_norm;
+        let inverse = splat(simd, 1.0) / self.quat_norm;
         [
             (g[0] - w * along) * inverse,
             (g[1] - x * along) * inverse,

@@ -1,11 +1,20 @@
 //! Small vectors of SIMD lanes: each lane is one Gaussian.
 
 use crate::real::{Lanes, Real};
-use fearless_simd::{Simd, SimdBase};
+use fearless_simd::{Select, Simd, SimdBase};
 use std::ops::{Add, Mul, Sub};
 
 /// f64 lanes: the projection is computed in f64 for either input type.
 pub(crate) type Wide<S> = Lanes<f64, S>;
+
+/// The same number in each lane.
+///
+/// A function, as all SIMD code here: what sits in a closure that is passed on (to `map`, say) may not be
+/// inlined into the dispatched function, and then runs without its instruction set, many times slower.
+#[inline(always)]
+pub(crate) fn splat<S: Simd>(simd: S, x: f64) -> Wide<S> {
+    Wide::<S>::splat(simd, x)
+}
 
 /// Number of f64 lanes.
 #[inline(always)]
@@ -53,6 +62,19 @@ impl<V: Number> V3<V> {
     #[inline(always)]
     pub fn by(self, k: V) -> Self {
         Self::new(self.x * k, self.y * k, self.z * k)
+    }
+
+    /// The lanes of `mask`, 0 elsewhere.
+    #[inline(always)]
+    pub fn only<S: Simd>(self, mask: <V as SimdBase<S>>::Mask, zero: V) -> Self
+    where
+        V: SimdBase<S>,
+    {
+        Self::new(
+            mask.select(self.x, zero),
+            mask.select(self.y, zero),
+            mask.select(self.z, zero),
+        )
     }
 
     /// Element by element.
@@ -125,9 +147,5 @@ pub(crate) fn load3<S: Simd, T: Real>(simd: S, data: &[T], first: usize) -> V3<W
 /// The same numbers in each lane.
 #[inline(always)]
 pub(crate) fn splat3<S: Simd>(simd: S, v: glam::DVec3) -> V3<Wide<S>> {
-    V3::new(
-        Wide::<S>::splat(simd, v.x),
-        Wide::<S>::splat(simd, v.y),
-        Wide::<S>::splat(simd, v.z),
-    )
+    V3::new(splat(simd, v.x), splat(simd, v.y), splat(simd, v.z))
 }

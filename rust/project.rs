@@ -6,7 +6,7 @@ use crate::{
         ALPHA_MIN, EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE,
     },
     geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry},
-    lanes::{V3, Wide, lanes, load, load3, splat3},
+    lanes::{V3, Wide, lanes, load, load3, splat as splat_lanes, splat3},
     real::Real,
     scene::{Colors, Gaussians, Harmonics},
     sh,
@@ -98,7 +98,12 @@ fn geometry<S: Simd, T: Real>(
     first: usize,
     camera: &CameraLanes<S>,
 ) -> Geometry<S> {
-    let quat = [0, 1, 2, 3].map(|k| load(simd, g.quats, 4, k, first));
+    let quat = [
+        load(simd, g.quats, 4, 0, first),
+        load(simd, g.quats, 4, 1, first),
+        load(simd, g.quats, 4, 2, first),
+        load(simd, g.quats, 4, 3, first),
+    ];
     Geometry::new(
         simd,
         load3(simd, g.means, first),
@@ -108,10 +113,19 @@ fn geometry<S: Simd, T: Real>(
     )
 }
 
+#[inline(always)]
+fn columns3<S: Simd, T: Real>(simd: S, data: &[T], first: usize) -> [Wide<S>; 3] {
+    [
+        load(simd, data, 3, 0, first),
+        load(simd, data, 3, 1, first),
+        load(simd, data, 3, 2, first),
+    ]
+}
+
 /// Unit vectors from the camera centre, and distances. A Gaussian on the centre has no direction: (0, 0, 0).
 #[inline(always)]
 fn direction<S: Simd>(simd: S, mean: V3<Wide<S>>, center: V3<Wide<S>>) -> (V3<Wide<S>>, Wide<S>) {
-    let (zero, one) = (Wide::<S>::splat(simd, 0.0), Wide::<S>::splat(simd, 1.0));
+    let (zero, one) = (splat_lanes(simd, 0.0), splat_lanes(simd, 1.0));
     let d = mean - center;
     let length = d.dot(d).sqrt();
     let inverse = length.simd_gt(zero).select(one / length, zero);
@@ -447,7 +461,7 @@ fn backward_chunk<S: Simd, T: Real>(
     mut grads: GaussianGrads<T>,
     camera_wanted: bool,
 ) -> CameraGrad {
-    let zero = Wide::<S>::splat(simd, 0.0);
+    let zero = splat_lanes(simd, 0.0);
     let lanes_of = CameraLanes::new(
         simd,
         camera,
@@ -471,7 +485,10 @@ fn backward_chunk<S: Simd, T: Real>(
         let mut v_input_opacity = v_opacity;
         let mut direct = None;
         if options.antialiased || v.conics.is_some() {
-            let conic = [0, 1, 2].map(|k| v.conics.map_or(zero, |c| load(simd, c, 3, k, first)));
+            let conic = match v.conics {
+                Some(c) => columns3(simd, c, first),
+                None => [zero; 3],
+            };
             let mut compensation = zero;
             if options.antialiased {
                 compensation = v_opacity * load(simd, gaussians.opacities, 1, 0, first);
@@ -480,9 +497,15 @@ fn backward_chunk<S: Simd, T: Real>(
             direct = Some((conic, compensation));
         }
         let cotangent = Cotangent {
-            mean2d: [0, 1].map(|k| load(simd, v.means2d, 2, k, first)),
-            whitened: [0, 1, 2].map(|k| load(simd, v.whitened, 3, k, first)),
-            depth: v.depths.map_or(zero, |d| load(simd, d, 1, 0, first)),
+            mean2d: [
+                load(simd, v.means2d, 2, 0, first),
+                load(simd, v.means2d, 2, 1, first),
+            ],
+            whitened: columns3(simd, v.whitened, first),
+            depth: match v.depths {
+                Some(d) => load(simd, d, 1, 0, first),
+                None => zero,
+            },
             direct,
         };
         let mut grad = g.vjp(
@@ -525,12 +548,10 @@ fn backward_chunk<S: Simd, T: Real>(
             // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
             let inverse = length
                 .simd_gt(zero)
-                .select(Wide::<S>::splat(simd, 1.0) / length, zero);
+                .select(splat_lanes(simd, 1.0) / length, zero);
             let v_mean = (v_d - d.by(d.dot(v_d))).by(inverse);
             grad.mean = grad.mean + v_mean;
-            let part = |x: Wide<S>| g.valid.select(x, zero);
-            camera_grad.center =
-                camera_grad.center - V3::new(part(v_mean.x), part(v_mean.y), part(v_mean.z));
+            camera_grad.center = camera_grad.center - v_mean.only(g.valid, zero);
         }
         for lane in (0..rows).filter(|&lane| visible(lane)) {
             let j = first - begin + lane;

@@ -262,7 +262,7 @@ mod tests {
                     if alpha < ALPHA_MIN {
                         continue;
                     }
-                    if t * (1.0 - alpha) <= 1e-4 {
+                    if t * (1.0 - alpha) <= 0.999e-4 {
                         break;
                     }
                     for (c, k) in rgb.iter_mut().zip(colors[i]) {
