@@ -20,7 +20,7 @@ class Camera:
     @property
     def center(self) -> NDArray[np.float64]:
         """Camera centre in world coordinates, [3]."""
-        return -np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3])
+        return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from hqgs.gaussians import Gaussians
 
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN  # a child's scales are its parent's over this
-SHORT_RUN = 7_000  # shorter runs are the published first 7,000 iterations in compressed form
-PUBLISHED_STOP = 15_000
+SHORT_RUN = 7_000  # iterations; the schedule of shorter runs is compressed
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class DensifyConfig:
     """
 
     start: int = 500  # iterations before the first round
-    stop: int = PUBLISHED_STOP  # no round and no reset from this iteration on
+    stop: int = 15_000  # no round and no reset from this iteration on
     every: int = 100  # iterations between rounds
     grad_threshold: float = 2e-4  # mean gradient norm of the 2D mean, in half images, that calls for growth
     percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
@@ -56,16 +55,16 @@ class DensifyConfig:
     def scaled(self, iterations: int) -> DensifyConfig:
         """The schedule for a run of another length than 30,000.
 
-        Growth ends at half of the run, at 15,000 at the latest. A run shorter than 7,000 compresses the
-        rest in proportion, so that it still gets about 30 rounds and one opacity reset: resets any denser
-        leave too little time to recover from them.
+        Growth ends at half of the run, at 15,000 at the latest, in rounds of 100 iterations, or of a
+        twentieth of the run where that is less. A run shorter than 7,000 starts growth and resets in
+        proportion to a run of 7,000, which has one reset: more would leave too little time to recover.
         """
         part = min(1.0, iterations / SHORT_RUN)
         return replace(
             self,
             start=round(self.start * part),
             stop=min(self.stop, iterations // 2),
-            every=max(1, round(self.every * part)),
+            every=min(self.every, max(1, iterations // 20)),
             reset_every=max(1, round(self.reset_every * part)),
         )
 

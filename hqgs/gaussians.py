@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from torch import Tensor
 
 SH_C0 = 0.28209479177387814  # the constant basis function: 1 / (2 sqrt(pi))
@@ -15,7 +16,6 @@ MAX_SH_DEGREE = 3
 MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
 INITIAL_OPACITY = 0.1
 NEIGHBORS = 3  # a point's first scale comes from its 3 nearest neighbours
-LEAF_SIZE = 64  # points in a leaf of the neighbour search; the speed depends on it, the result does not
 
 
 @dataclass
@@ -113,59 +113,7 @@ class Gaussians:
 
 
 def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]. Exact.
-
-    The cloud is halved at medians into small leaves. A leaf is then compared with those leaves alone whose
-    bounding boxes lie nearer than its third neighbours found so far.
-    """
+    """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]."""
     xyz = points.astype(np.float64)
-    leaves = _leaves(xyz)
-    low = np.stack([xyz[leaf].min(axis=0) for leaf in leaves])
-    high = np.stack([xyz[leaf].max(axis=0) for leaf in leaves])
-    result = np.empty(len(xyz))
-    for i, leaf in enumerate(leaves):
-        own = xyz[leaf]
-        nearest = _square_distances(own, own)
-        np.fill_diagonal(nearest, np.inf)
-        nearest = np.partition(nearest, NEIGHBORS - 1, axis=1)[:, :NEIGHBORS]
-        reach = nearest.max()
-        gap = np.maximum(np.maximum(low - high[i], low[i] - high), 0.0)
-        close = np.flatnonzero((gap * gap).sum(axis=1) < reach)
-        others = [xyz[leaves[j]] for j in close if j != i]
-        if others:
-            around = np.concatenate(others)
-            gap = np.maximum(np.maximum(around - high[i], low[i] - around), 0.0)
-            around = around[(gap * gap).sum(axis=1) < reach]
-            rows = max(1, 2**21 // max(1, len(around)))  # an outlier's leaf may reach every point
-            for start in range(0, len(leaf), rows):
-                part = slice(start, start + rows)
-                both = np.concatenate([nearest[part], _square_distances(own[part], around)], axis=1)
-                nearest[part] = np.partition(both, NEIGHBORS - 1, axis=1)[:, :NEIGHBORS]
-        result[leaf] = nearest.mean(axis=1)
-    return result
-
-
-def _square_distances(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[len(a), len(b)], from differences: the expanded square would lose the digits of near points."""
-    total = np.zeros((len(a), len(b)))
-    for axis in range(3):
-        difference = a[:, axis, None] - b[None, :, axis]
-        total += difference * difference
-    return total
-
-
-def _leaves(xyz: NDArray[np.float64]) -> list[NDArray[np.intp]]:
-    """Indices of the points, halved along the widest axis until a part has at most LEAF_SIZE of them."""
-    parts = [np.arange(len(xyz))]
-    leaves = []
-    while parts:
-        part = parts.pop()
-        if len(part) <= LEAF_SIZE:
-            leaves.append(part)
-            continue
-        own = xyz[part]
-        axis = int(np.argmax(own.max(axis=0) - own.min(axis=0)))
-        middle = len(part) // 2
-        order = np.argpartition(own[:, axis], middle)
-        parts += [part[order[:middle]], part[order[middle:]]]
-    return leaves
+    distances, _ = KDTree(xyz).query(xyz, k=NEIGHBORS + 1)  # the first is the point itself
+    return np.square(distances[:, 1:]).mean(axis=1)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.camera import Scene, View
@@ -79,5 +81,9 @@ def make_method(name: str, scene: Scene, seed: int) -> Method:
 
 
 def photo_tensors(view: View) -> tuple[Tensor, Tensor | None]:
-    """A view's photo [H, W, 3] uint8 and mask [H, W] bool as tensors, which share the arrays' memory."""
-    return torch.from_numpy(view.image), None if view.mask is None else torch.from_numpy(view.mask)
+    """A view's photo [H, W, 3] uint8 and mask [H, W] bool. They share the arrays' memory where torch can."""
+
+    def tensor(array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(np.require(array, requirements=["C", "W"]))  # torch warns of read-only memory
+
+    return tensor(view.image), None if view.mask is None else tensor(view.mask)

@@ -85,10 +85,11 @@ class Adam(torch.optim.Optimizer):
             state["exp_avg"] = torch.zeros_like(param)
             state["exp_avg_sq"] = torch.zeros_like(param)
         moments = state["exp_avg"], state["exp_avg_sq"]
-        arrays = [t.detach().numpy() for t in (param, grad.contiguous(), *moments)]
-        options = (float(group["lr"]), *group["betas"], group["eps"])
+        values, first, second = (t.detach().numpy() for t in (param, *moments))
+        beta1, beta2 = group["betas"]
+        options = (float(group["lr"]), beta1, beta2, group["eps"])
         step = state["step"] + 1
-        _rust.adam_step(*arrays, int(step), options, rows)
+        _rust.adam_step(values, grad.contiguous().numpy(), first, second, int(step), options, rows)
         state["step"] = step  # a new tensor: a loaded state dict may share the old one
         for tensor in (param, *moments):
             increment_version(tensor)  # written behind torch's back

@@ -40,6 +40,8 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
     **unsupported: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras; code written for `gsplat.rasterization` runs unchanged.
@@ -48,7 +50,8 @@ def rasterization(
     units and formulas: docs/conventions.md. Same inputs, same bits, for any number of threads.
 
     Args:
-        means: centres in the world, [N, 3]. float32 or float64; the other tensors have the same dtype.
+        means: centres in the world, [N, 3], float32 or float64; all other tensors but `viewmats` and `Ks`,
+            which may be either, have the same dtype.
         quats: rotations w, x, y, z, [N, 4], of any norm that is not 0.
         scales: standard deviations, world units, [N, 3].
         opacities: [N].
@@ -78,7 +81,7 @@ def rasterization(
         NotImplementedError: an argument of gsplat that hqgs leaves out (other camera models, distortion,
             rolling shutter, distributed rendering, gradients of Ks).
     """
-    _refuse(unsupported)
+    _refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
@@ -109,9 +112,11 @@ def rasterization(
         Ks.detach().to(torch.float64),
         (int(width), int(height), (*options, rasterize_mode == "antialiased"), sh_degree),
     )
-    channels = sh_colors if sh_degree is not None else colors
+    channels: Tensor = sh_colors if sh_degree is not None else colors
     if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
-        raise ValueError(f"backgrounds: expected shape {(c, channels.shape[-1])}, got {tuple(backgrounds.shape)}")
+        raise ValueError(
+            f"backgrounds: expected shape {(c, channels.shape[-1])}, got {tuple(backgrounds.shape)}"
+        )
     if render_mode in ("D", "ED"):
         channels, backgrounds = depths[..., None], None
     elif render_mode != "RGB":
@@ -198,7 +203,9 @@ def _check_colors(colors: Tensor, n: int, c: int, sh_degree: int | None) -> None
         raise ValueError(f"sh_degree: must be 0, 1, 2 or 3, got {sh_degree!r}")
     needed = (sh_degree + 1) ** 2
     if len(shape) != 3 or shape[0] != n or shape[1] < needed or shape[2] != 3:
-        raise ValueError(f"colors: expected shape [{n}, K >= {needed}, 3] for sh_degree {sh_degree}, got {list(shape)}")
+        raise ValueError(
+            f"colors: expected shape [{n}, K >= {needed}, 3] for sh_degree {sh_degree}, got {list(shape)}"
+        )
 
 
 def _numpy(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -219,12 +226,12 @@ class _Project(torch.autograd.Function):
     covariance in whitened form, which stays of order 1 however thin a Gaussian is."""
 
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, colors, viewmats, Ks, config):  # noqa: ANN205
+    def forward(ctx: Any, means, quats, scales, opacities, colors, viewmats, Ks, config):
         width, height, options, sh_degree = config
-        inputs = [_numpy(t) for t in (means, quats, scales, opacities)]
         harmonics = colors if sh_degree is not None else None
+        inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
         frame, *arrays = _rust.project_forward(
-            *inputs, _numpy(colors), _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
+            *inputs, _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
         )
         n, c = means.shape[0], viewmats.shape[0]
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
@@ -241,7 +248,7 @@ class _Project(torch.autograd.Function):
         )  # fmt: skip
 
     @staticmethod
-    def backward(ctx: Any, *grads):  # noqa: ANN205
+    def backward(ctx: Any, *grads):
         _, v_means2d, v_link, v_depths, v_conics, _, v_alphas, v_colors = grads
         means, quats, scales, opacities, harmonics = ctx.saved_tensors
         n, c = ctx.shapes
@@ -255,14 +262,27 @@ class _Project(torch.autograd.Function):
         v_inputs = _rust.project_backward(
             ctx.frame,
             (_numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _optional(harmonics)),
-            (dense(v_means2d, 2), dense(v_link, 3), dense(v_alphas, 1), _optional(v_depths), _optional(v_conics),
-             _optional(v_colors)),
+            (
+                dense(v_means2d, 2),
+                dense(v_link, 3),
+                dense(v_alphas, 1),
+                _optional(v_depths),
+                _optional(v_conics),
+                _optional(v_colors),
+            ),
             needs,
-        )  # fmt: skip
+        )
         if v_inputs[5] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[5].clip(-limit, limit, out=v_inputs[5])
-        shapes = [(n, 3), (n, 4), (n, 3), (n,), tuple(harmonics.shape) if needs[4] else (), (c, 4, 4)]
+        shapes = [
+            (n, 3),
+            (n, 4),
+            (n, 3),
+            (n,),
+            () if harmonics is None else tuple(harmonics.shape),
+            (c, 4, 4),
+        ]
         return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None)
 
 
@@ -270,9 +290,11 @@ class _Composite(torch.autograd.Function):
     """Splats to pixels."""
 
     @staticmethod
-    def forward(ctx: Any, frame, means2d, link, alphas_in, colors, backgrounds, absgrad):  # noqa: ANN205
+    def forward(ctx: Any, frame, means2d, link, alphas_in, colors, backgrounds, absgrad):
         channels = colors.shape[-1]
-        state, image, alphas = _rust.composite_forward(frame, _numpy(colors), _optional(backgrounds), channels)
+        state, image, alphas = _rust.composite_forward(
+            frame, _numpy(colors), _optional(backgrounds), channels
+        )
         c = means2d.shape[0]
         width, height = frame.width, frame.height
         image = torch.from_numpy(image).view(c, height, width, channels)
@@ -284,7 +306,8 @@ class _Composite(torch.autograd.Function):
         return image, alphas, state.work
 
     @staticmethod
-    def backward(ctx: Any, v_image, v_alphas, _):  # noqa: ANN205
+    def backward(ctx: Any, *grads):
+        v_image, v_alphas, _ = grads
         means2d, colors, backgrounds = ctx.saved_tensors
         _, need_means2d, need_link, need_alphas, need_colors, need_backgrounds, _ = ctx.needs_input_grad
         geometry = need_means2d or need_link or need_alphas
@@ -298,15 +321,15 @@ class _Composite(torch.autograd.Function):
         )  # fmt: skip
         if v_abs is not None:
             means2d.absgrad = _tensor(v_abs, c, n, 2)
-        v_colors = _tensor(v_colors, c, n, channels)
-        if v_colors is not None and colors.dim() == 2:
-            v_colors = v_colors[0] if c == 1 else v_colors.sum(0)
+        v_color = _tensor(v_colors, c, n, channels)
+        if v_color is not None and colors.dim() == 2:
+            v_color = v_color[0] if c == 1 else v_color.sum(0)
         return (
             None,
             _tensor(v_means2d, c, n, 2),
             _tensor(v_link, c, n, 3),
             _tensor(v_alphas_in, c, n),
-            v_colors,
+            v_color,
             _tensor(v_backgrounds, c, channels),
             None,
         )

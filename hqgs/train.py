@@ -231,7 +231,7 @@ class Trainer:
 
     def _backward(self, loss: Tensor) -> bool:
         """Compute the gradients; False, counted, where the loss or a gradient is not finite."""
-        finite = math.isfinite(loss)
+        finite = math.isfinite(loss.detach())
         if finite:
             loss.backward()
             # shN, three quarters of the numbers, is left out: its gradient is sh0's times a bounded basis.

@@ -19,6 +19,11 @@ use numpy::{
 };
 use pyo3::{exceptions::PyValueError, prelude::*};
 
+/// The buffers of an iteration are as large as those of the last one: an allocator that keeps them saves the
+/// page faults, which cost more than the arithmetic of the gradients.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 impl From<Error> for PyErr {
     fn from(error: Error) -> Self {
         PyValueError::new_err(error.to_string())

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hqgs.densify import DensifyConfig, Densifier, Growth, quats_to_matrices
+from hqgs.densify import Densifier, DensifyConfig, Growth, quats_to_matrices
 from hqgs.gaussians import Gaussians
 from hqgs.optim import Adam
 
@@ -261,7 +261,8 @@ def test_schedules_of_other_lengths() -> None:
     at_7000 = DensifyConfig().scaled(7_000)
     assert (at_7000.start, at_7000.stop, at_7000.every, at_7000.reset_every) == (500, 3_500, 100, 3_000)
     short = DensifyConfig().scaled(2_100)
-    assert (short.start, short.stop, short.every, short.reset_every) == (150, 1_050, 30, 900)
+    assert (short.start, short.stop, short.every, short.reset_every) == (150, 1_050, 100, 900)
+    assert DensifyConfig().scaled(400).every == 20
     assert DensifyConfig().scaled(1).every == 1
 
 

@@ -1,0 +1,179 @@
+"""The signature of `hqgs.rasterization`, and what it refuses."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from scenes import random_scene
+
+import hqgs
+
+F32, F64 = torch.float32, torch.float64
+
+GSPLAT_DEFAULTS: dict[str, Any] = {
+    "near_plane": 0.01,
+    "far_plane": 1e10,
+    "radius_clip": 0.0,
+    "eps2d": 0.3,
+    "sh_degree": None,
+    "packed": True,
+    "tile_size": 16,
+    "backgrounds": None,
+    "render_mode": "RGB",
+    "sparse_grad": False,
+    "absgrad": False,
+    "rasterize_mode": "classic",
+    "channel_chunk": 32,
+    "distributed": False,
+    "camera_model": "pinhole",
+}
+
+
+def test_signature_is_that_of_gsplat() -> None:
+    parameters = inspect.signature(hqgs.rasterization).parameters
+    required = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height"]
+    names = required + list(GSPLAT_DEFAULTS)
+    assert list(parameters)[: len(names)] == names
+    assert all(parameters[name].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for name in names)
+    assert all(parameters[name].default is inspect.Parameter.empty for name in required)
+    assert {name: parameters[name].default for name in GSPLAT_DEFAULTS} == GSPLAT_DEFAULTS
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("distributed", True),
+        ("camera_model", "fisheye"),
+        ("camera_model", "ortho"),
+        ("camera_model", "ftheta"),
+        ("covars", torch.zeros(8, 3, 3)),
+        ("with_ut", True),
+        ("with_eval3d", True),
+        ("radial_coeffs", torch.zeros(1, 4)),
+        ("tangential_coeffs", torch.zeros(1, 2)),
+        ("thin_prism_coeffs", torch.zeros(1, 4)),
+        ("ftheta_coeffs", object()),
+        ("rolling_shutter", 1),
+        ("viewmats_rs", torch.eye(4)[None]),
+        ("Ks", torch.eye(3)[None].requires_grad_()),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_unsupported_arguments_say_so(name: str, value: object) -> None:
+    scene = random_scene(8, 10, 7, seed=0, dtype=F32)
+    with pytest.raises(NotImplementedError, match=name):
+        hqgs.rasterization(**scene.arguments(**{name: value}))
+
+
+def test_unsupported_arguments_may_be_passed_as_absent() -> None:
+    scene = random_scene(8, 10, 7, seed=0, dtype=F32)
+    absent = {
+        "covars": None,
+        "with_ut": False,
+        "with_eval3d": False,
+        "radial_coeffs": None,
+        "viewmats_rs": None,
+    }
+    render = hqgs.rasterization(**scene.arguments(), **absent)[0]
+    assert torch.equal(render, hqgs.rasterization(**scene.arguments())[0])
+
+
+def numbers(shape: tuple[int, ...]) -> str:
+    """A pattern for a shape in any brackets."""
+    return ",? ?".join(str(size) for size in shape)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (8, 2)),
+        ("means", (2, 8, 3)),
+        ("quats", (8, 3)),
+        ("quats", (7, 4)),
+        ("scales", (8, 1)),
+        ("opacities", (8, 1)),
+        ("opacities", (9,)),
+        ("colors", (7, 3)),
+        ("colors", (8,)),
+        ("colors", (3, 8, 3)),
+        ("viewmats", (4, 4)),
+        ("viewmats", (2, 3, 4)),
+        ("Ks", (1, 3, 3)),
+        ("Ks", (2, 4, 4)),
+        ("backgrounds", (3,)),
+        ("backgrounds", (2, 4)),
+        ("backgrounds", (1, 3)),
+    ],
+)
+def test_wrong_shapes(name: str, shape: tuple[int, ...]) -> None:
+    scene = random_scene(8, 10, 7, cameras=2, seed=0)
+    with pytest.raises(ValueError, match=rf"(?s){name}.*{numbers(shape)}"):
+        hqgs.rasterization(**scene.arguments(**{name: torch.ones(shape, dtype=F64)}))
+
+
+@pytest.mark.parametrize("shape", [(8, 8, 3), (8, 9, 4), (8, 9), (7, 9, 3)])
+def test_wrong_sh_shapes(shape: tuple[int, ...]) -> None:
+    """Degree 2 needs [8, K >= 9, 3]."""
+    scene = random_scene(8, 10, 7, seed=0, sh_degree=2)
+    with pytest.raises(ValueError, match=rf"(?s)colors.*{numbers(shape)}"):
+        hqgs.rasterization(**scene.arguments(colors=torch.ones(shape, dtype=F64)))
+
+
+@pytest.mark.parametrize("name", ["viewmats", "Ks"])
+def test_cameras_of_either_dtype(name: str) -> None:
+    scene = random_scene(8, 10, 7, seed=0)
+    rounded = getattr(scene, name).float()
+    expected, _, _ = hqgs.rasterization(**scene.arguments(**{name: rounded.double()}))
+    render, _, _ = hqgs.rasterization(**scene.arguments(**{name: rounded}))
+    assert torch.equal(render, expected)
+
+
+@pytest.mark.parametrize("name", ["quats", "scales", "opacities", "colors", "backgrounds"])
+def test_mixed_dtypes(name: str) -> None:
+    scene = random_scene(8, 10, 7, seed=0)
+    with pytest.raises(ValueError, match=rf"(?s){name}.*float32"):
+        hqgs.rasterization(**scene.arguments(**{name: getattr(scene, name).float()}))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int64])
+def test_unsupported_dtypes(dtype: torch.dtype) -> None:
+    scene = random_scene(8, 10, 7, seed=0).to(dtype)
+    with pytest.raises(ValueError, match=rf"(?s)means.*{str(dtype).removeprefix('torch.')}"):
+        hqgs.rasterization(**scene.arguments())
+
+
+@pytest.mark.parametrize("name", ["means", "colors", "Ks", "backgrounds"])
+def test_other_devices(name: str) -> None:
+    scene = random_scene(8, 10, 7, seed=0)
+    with pytest.raises(ValueError, match=rf"(?s){name}.*meta"):
+        hqgs.rasterization(**scene.arguments(**{name: getattr(scene, name).to("meta")}))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("width", 0),
+        ("height", -3),
+        ("sh_degree", 4),
+        ("sh_degree", -1),
+        ("eps2d", -0.5),
+        ("render_mode", "depth"),
+        ("rasterize_mode", "smooth"),
+    ],
+)
+def test_wrong_values(name: str, value: object) -> None:
+    scene = random_scene(8, 10, 7, seed=0, sh_degree=3)
+    with pytest.raises(ValueError, match=rf"(?s){name}.*{value}"):
+        hqgs.rasterization(**scene.arguments(**{name: value}))
+
+
+def test_skew_is_refused() -> None:
+    scene = random_scene(8, 10, 7, seed=0)
+    Ks = scene.Ks.clone()
+    Ks[0, 0, 1] = 0.5
+    with pytest.raises(ValueError, match=r"(?s)Ks.*0\.5"):
+        hqgs.rasterization(**replace(scene, Ks=Ks).arguments())
