@@ -1,0 +1,81 @@
+"""The border between Python and the crate: arrays are borrowed as they are, or refused."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+import hqgs
+from hqgs import _rust
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_arrays_are_borrowed_not_copied(dtype: torch.dtype) -> None:
+    tensor = torch.rand(50, 3, dtype=dtype)
+    assert _rust.data_pointer(tensor.numpy()) == tensor.data_ptr()
+
+
+@pytest.mark.parametrize(
+    "array",
+    [np.zeros((3, 5)).T, np.asfortranarray(np.zeros((5, 3))), np.zeros((5, 6))[:, ::2], np.zeros((5, 6))[:, :3]],
+    ids=["transposed", "fortran", "strided", "sliced"],
+)
+def test_other_layouts_are_refused(array: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"array: must be C-contiguous, got shape \[5, 3\]"):
+        _rust.data_pointer(array)
+
+
+def test_a_transposed_tensor_is_not_misread() -> None:
+    torch.manual_seed(0)
+    n = 40
+    means = torch.rand(3, n) * 2 - 1 + torch.tensor([[0.0], [0.0], [4.0]])
+    rest = (torch.rand(n, 4), torch.full((n, 3), 0.2), torch.rand(n), torch.rand(n, 3))
+    camera = (torch.eye(4)[None], torch.tensor([[[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]]), 32, 24)
+    image, _, _ = hqgs.rasterization(means.T, *rest, *camera)
+    expected, _, _ = hqgs.rasterization(means.T.contiguous(), *rest, *camera)
+    assert torch.equal(image, expected)
+    assert image.max() > 0.1
+
+
+def test_the_gil_is_released() -> None:
+    """Another Python thread goes on while the crate works."""
+    torch.manual_seed(0)
+    n = 60_000
+    means = torch.rand(n, 3) * 4 - 2 + torch.tensor([0.0, 0.0, 5.0])
+    rest = (torch.rand(n, 4) + 0.1, torch.full((n, 3), 0.3), torch.rand(n) * 0.01 + 0.005, torch.rand(n, 3))
+    camera = (torch.eye(4)[None], torch.tensor([[[300.0, 0, 256], [0, 300, 256], [0, 0, 1]]]), 512, 512)
+    ticks: list[float] = []
+    done = threading.Event()
+
+    def tick() -> None:
+        while not done.is_set():
+            ticks.append(time.perf_counter())
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=tick)
+    thread.start()
+    try:
+        started = time.perf_counter()
+        hqgs.rasterization(means, *rest, *camera)
+        ended = time.perf_counter()
+    finally:
+        done.set()
+        thread.join()
+    assert ended - started > 0.05, "too fast to tell"
+    assert sum(started < t < ended for t in ticks) >= 5
+
+
+def test_threads_can_be_set_and_zero_is_refused() -> None:
+    before = hqgs.get_num_threads()
+    try:
+        hqgs.set_num_threads(3)
+        assert hqgs.get_num_threads() == 3
+        with pytest.raises(ValueError, match="threads: must be at least 1, got 0"):
+            hqgs.set_num_threads(0)
+        assert hqgs.get_num_threads() == 3
+    finally:
+        hqgs.set_num_threads(before)
