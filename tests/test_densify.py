@@ -259,9 +259,9 @@ def test_schedules_of_other_lengths() -> None:
     assert DensifyConfig().scaled(30_000) == DensifyConfig()
     assert DensifyConfig().scaled(50_000) == DensifyConfig()
     at_7000 = DensifyConfig().scaled(7_000)
-    assert (at_7000.start, at_7000.stop, at_7000.every, at_7000.reset_every) == (500, 3_500, 100, 3_000)
-    short = DensifyConfig().scaled(2_100)
-    assert (short.start, short.stop, short.every, short.reset_every) == (150, 1_050, 100, 900)
+    assert (at_7000.start, at_7000.stop, at_7000.every, at_7000.reset_every) == (500, 4_666, 100, 3_000)
+    short = DensifyConfig().scaled(1_400)
+    assert (short.start, short.stop, short.every, short.reset_every) == (100, 933, 70, 3_000)
     assert DensifyConfig().scaled(400).every == 20
     assert DensifyConfig().scaled(1).every == 1
 
