@@ -23,6 +23,7 @@ def project_forward(
     scales: Array,
     opacities: Array,
     colors: Array,
+    rest: Array | None,
     viewmats: Array,
     ks: Array,
     width: int,
@@ -32,7 +33,7 @@ def project_forward(
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
 def project_backward(
     frame: Frame,
-    inputs: tuple[Array, Array, Array, Array, Array | None],
+    inputs: tuple[Array, Array, Array, Array, Array | None, Array | None],
     cotangents: tuple[Array, Array, Array, Array | None, Array | None, Array | None],
     wanted: list[bool],
 ) -> tuple[Array | None, ...]: ...

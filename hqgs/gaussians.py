@@ -67,10 +67,6 @@ class Gaussians:
         """Opacities [N] in (0, 1)."""
         return torch.sigmoid(self.opacities)
 
-    def colors(self) -> Tensor:
-        """SH coefficients [N, K, 3]."""
-        return torch.cat([self.sh0, self.shN], dim=1)
-
     @classmethod
     def from_points(
         cls, points: NDArray[np.float32], colors: NDArray[np.uint8], sh_degree: int = MAX_SH_DEGREE

@@ -16,8 +16,6 @@ import hashlib
 import importlib.util
 import math
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -27,6 +25,8 @@ import numpy as np
 import piq
 import torch
 from numpy.typing import NDArray
+
+from hqgs.torch_threads import one_torch_thread
 
 METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg")
 
@@ -70,7 +70,7 @@ def ssim(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | No
     out or mirrors it, kornia mirrors it), so their values differ a little.
     """
     x, y = _masked_pair(render, photo, mask)
-    with _one_thread():
+    with one_torch_thread(), torch.no_grad():
         maps = _blur(torch.cat([x, y, x * x, y * y, x * y]))
         mu_x, mu_y, xx, yy, xy = maps
         luminance = (2 * mu_x * mu_y + SSIM_C1) / (mu_x**2 + mu_y**2 + SSIM_C1)
@@ -88,7 +88,7 @@ def haarpsi(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] |
         return None
     if torch.equal(x, y):
         return 1.0  # the limit; the formula divides 0 by 0 for two black images
-    with _one_thread():
+    with one_torch_thread(), torch.no_grad():
         return float(piq.haarpsi(x, y, data_range=1.0))
 
 
@@ -103,7 +103,7 @@ def lpips(
     network = _lpips_network(net)
     if isinstance(network, str) or min(x.shape[2:]) < LPIPS_MIN_SIZE:
         return None
-    with _one_thread():
+    with one_torch_thread(), torch.no_grad():
         return float(network(2 * x.float() - 1, 2 * y.float() - 1))
 
 
@@ -209,18 +209,6 @@ def _blur(images: torch.Tensor) -> torch.Tensor:
     planes = torch.nn.functional.conv2d(planes, window, padding=(SSIM_WINDOW // 2, 0))
     planes = torch.nn.functional.conv2d(planes, window.transpose(2, 3), padding=(0, SSIM_WINDOW // 2))
     return planes.reshape(images.shape)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One torch thread and no autograd: sums of convolutions and means then have one order."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @cache

@@ -22,7 +22,7 @@ def rasterization(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | tuple[Tensor, Tensor],
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -55,7 +55,8 @@ def rasterization(
         quats: rotations w, x, y, z, [N, 4], of any norm that is not 0.
         scales: standard deviations, world units, [N, 3].
         opacities: [N].
-        colors: [N, D] or [C, N, D] channels; with `sh_degree` spherical harmonics, [N, K, 3].
+        colors: [N, D] or [C, N, D] channels; with `sh_degree` spherical harmonics, [N, K, 3], or a pair of
+            them, [N, 1, 3] and [N, K - 1, 3], which saves joining what is trained apart.
         viewmats: world to camera, [C, 4, 4].
         Ks: intrinsics in pixels, [C, 3, 3].
         width, height: image size in pixels.
@@ -82,9 +83,12 @@ def rasterization(
             rolling shutter, distributed rendering, gradients of Ks).
     """
     _refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
+    colors, rest = colors if isinstance(colors, tuple) else (colors, None)
     tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     if backgrounds is not None:
         tensors["backgrounds"] = backgrounds
+    if rest is not None:
+        tensors["colors[1]"] = rest
     _check_tensors(tensors, viewmats, Ks)
     n, c = means.shape[0], viewmats.shape[0]
     if render_mode not in RENDER_MODES:
@@ -99,7 +103,7 @@ def rasterization(
             raise ValueError(f"{name}: must be finite and not negative, got {value!r}")
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
-    _check_colors(colors, n, c, sh_degree)
+    _check_colors(colors, rest, n, c, sh_degree)
 
     options = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
     frame, means2d, link, depths, conics, radii, alphas_in, sh_colors = _Project.apply(
@@ -108,6 +112,7 @@ def rasterization(
         scales,
         opacities,
         colors if sh_degree is not None else colors.detach(),
+        rest,
         viewmats.to(torch.float64),
         Ks.detach().to(torch.float64),
         (int(width), int(height), (*options, rasterize_mode == "antialiased"), sh_degree),
@@ -193,19 +198,27 @@ def _check_tensors(tensors: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> 
         raise NotImplementedError("Ks: no gradient with respect to the intrinsics; pass Ks.detach()")
 
 
-def _check_colors(colors: Tensor, n: int, c: int, sh_degree: int | None) -> None:
-    shape = tuple(colors.shape)
+def _check_colors(colors: Tensor, rest: Tensor | None, n: int, c: int, sh_degree: int | None) -> None:
+    shape = list(colors.shape)
     if sh_degree is None:
-        if shape[:-1] not in ((n,), (c, n)) or shape[-1] == 0:
-            raise ValueError(f"colors: expected shape [{n}, D] or [{c}, {n}, D], got {list(shape)}")
+        if rest is not None:
+            raise ValueError("colors: a pair of tensors is for spherical harmonics, which need sh_degree")
+        if shape[:-1] not in ([n], [c, n]) or shape[-1] == 0:
+            raise ValueError(f"colors: expected shape [{n}, D] or [{c}, {n}, D], got {shape}")
         return
     if sh_degree not in (0, 1, 2, 3):
         raise ValueError(f"sh_degree: must be 0, 1, 2 or 3, got {sh_degree!r}")
     needed = (sh_degree + 1) ** 2
-    if len(shape) != 3 or shape[0] != n or shape[1] < needed or shape[2] != 3:
-        raise ValueError(
-            f"colors: expected shape [{n}, K >= {needed}, 3] for sh_degree {sh_degree}, got {list(shape)}"
-        )
+    if rest is not None:
+        if shape != [n, 1, 3]:
+            raise ValueError(f"colors[0]: expected shape [{n}, 1, 3], got {shape}")
+        shape = list(rest.shape)
+        if len(shape) != 3 or shape[0] != n or shape[1] < needed - 1 or shape[2] != 3:
+            wanted = f"[{n}, K >= {needed - 1}, 3] for sh_degree {sh_degree}"
+            raise ValueError(f"colors[1]: expected shape {wanted}, got {shape}")
+    elif len(shape) != 3 or shape[0] != n or shape[1] < needed or shape[2] != 3:
+        wanted = f"[{n}, K >= {needed}, 3] for sh_degree {sh_degree}"
+        raise ValueError(f"colors: expected shape {wanted}, got {shape}")
 
 
 def _numpy(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -226,17 +239,17 @@ class _Project(torch.autograd.Function):
     covariance in whitened form, which stays of order 1 however thin a Gaussian is."""
 
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, colors, viewmats, Ks, config):
+    def forward(ctx: Any, means, quats, scales, opacities, colors, rest, viewmats, Ks, config):
         width, height, options, sh_degree = config
         harmonics = colors if sh_degree is not None else None
         inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
         frame, *arrays = _rust.project_forward(
-            *inputs, _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
+            *inputs, _optional(rest), _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
         )
         n, c = means.shape[0], viewmats.shape[0]
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
         ctx.frame, ctx.shapes = frame, (n, c)
-        ctx.save_for_backward(means, quats, scales, opacities, harmonics)
+        ctx.save_for_backward(means, quats, scales, opacities, harmonics, rest)
         ctx.set_materialize_grads(False)
         radii = radii.view(c, n, 2)
         ctx.mark_non_differentiable(radii)
@@ -250,9 +263,9 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads):
         _, v_means2d, v_link, v_depths, v_conics, _, v_alphas, v_colors = grads
-        means, quats, scales, opacities, harmonics = ctx.saved_tensors
+        means, quats, scales, opacities, harmonics, rest = ctx.saved_tensors
         n, c = ctx.shapes
-        needs = list(ctx.needs_input_grad[:6])
+        needs = list(ctx.needs_input_grad[:7])
         if harmonics is None:
             v_colors = None
 
@@ -261,7 +274,14 @@ class _Project(torch.autograd.Function):
 
         v_inputs = _rust.project_backward(
             ctx.frame,
-            (_numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _optional(harmonics)),
+            (
+                _numpy(means),
+                _numpy(quats),
+                _numpy(scales),
+                _numpy(opacities),
+                _optional(harmonics),
+                _optional(rest),
+            ),
             (
                 dense(v_means2d, 2),
                 dense(v_link, 3),
@@ -272,17 +292,11 @@ class _Project(torch.autograd.Function):
             ),
             needs,
         )
-        if v_inputs[5] is not None:  # computed in f64; stay finite in the dtype of the inputs
+        if v_inputs[6] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
-            v_inputs[5].clip(-limit, limit, out=v_inputs[5])
-        shapes = [
-            (n, 3),
-            (n, 4),
-            (n, 3),
-            (n,),
-            () if harmonics is None else tuple(harmonics.shape),
-            (c, 4, 4),
-        ]
+            v_inputs[6].clip(-limit, limit, out=v_inputs[6])
+        sh_shapes = [() if t is None else tuple(t.shape) for t in (harmonics, rest)]
+        shapes = [(n, 3), (n, 4), (n, 3), (n,), *sh_shapes, (c, 4, 4)]
         return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -23,7 +21,7 @@ def render_view(
         gaussians.quats,
         gaussians.activated_scales(),
         gaussians.activated_opacities(),
-        gaussians.colors(),
+        (gaussians.sh0, gaussians.shN),
         torch.tensor(camera.viewmat[None]),
         torch.tensor(camera.K[None]),
         camera.width,
@@ -32,14 +30,3 @@ def render_view(
         backgrounds=torch.tensor([background]),
     )
     return images[0], meta
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Torch's sums depend on its number of threads. The rasterizer's do not; it keeps all of its threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -19,8 +19,9 @@ from hqgs.gaussians import MAX_SH_DEGREE, Gaussians
 from hqgs.methods import check_method, make_method
 from hqgs.metrics import psnr, ssim
 from hqgs.optim import Adam
-from hqgs.render import one_torch_thread, render_view
+from hqgs.render import render_view
 from hqgs.report import RenderedView
+from hqgs.torch_threads import one_torch_thread
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result

@@ -345,10 +345,14 @@ fn finite<T: Real>(values: &[T]) -> bool {
 /// Colour of Gaussian `i` before the clamp at 0.
 #[inline(always)]
 fn evaluate<T: Real>(h: &Harmonics<T>, i: usize, basis: impl Fn(usize) -> T) -> [T; 3] {
-    let rows = &h.coefficients[3 * h.stored * i..][..3 * sh::count(h.degree)];
-    let mut rgb = [T::from_f64(0.5); 3];
-    for (k, row) in rows.chunks_exact(3).enumerate() {
-        let y = basis(k);
+    let (first, rest) = h.of(i);
+    let y = basis(0);
+    let mut rgb = [T::ZERO; 3];
+    for (c, x) in rgb.iter_mut().zip(first) {
+        *c = T::from_f64(0.5) + y * *x;
+    }
+    for (k, row) in rest.chunks_exact(3).enumerate() {
+        let y = basis(k + 1);
         for (c, x) in rgb.iter_mut().zip(row) {
             *c += y * *x;
         }
@@ -384,8 +388,10 @@ pub struct GaussianGrads<'a, T> {
     pub scales: Option<&'a mut [T]>,
     /// [N]
     pub opacities: Option<&'a mut [T]>,
-    /// [N, K, 3]
+    /// As `Harmonics::coefficients`.
     pub harmonics: Option<&'a mut [T]>,
+    /// As `Harmonics::rest`.
+    pub harmonics_rest: Option<&'a mut [T]>,
 }
 
 /// Split an optional array of `n` rows into chunks of `PROJECT_CHUNK` rows.
@@ -407,6 +413,13 @@ fn add<T: Real>(out: &mut Option<&mut [T]>, j: usize, values: &[f64]) {
     }
 }
 
+#[inline(always)]
+fn add_scaled<T: Real>(out: &mut [T], y: T, v: &[T; 3]) {
+    for (o, v) in out.iter_mut().zip(v) {
+        *o += y * *v;
+    }
+}
+
 /// Vector-Jacobian product of [`forward`]: adds to `grads` and returns the gradient of the camera (of its
 /// centre alone unless `camera_wanted`).
 ///
@@ -422,20 +435,21 @@ pub fn backward<T: Real>(
     camera_wanted: bool,
 ) -> CameraGrad {
     let n = gaussians.len();
-    let harmonics_row = harmonics.map_or(0, |h| 3 * h.stored);
+    let (row, rest_row) = harmonics.map_or((0, 0), Harmonics::rows);
     let jobs: Vec<_> = chunks(grads.means, n, 3)
         .into_iter()
         .zip(chunks(grads.quats, n, 4))
         .zip(chunks(grads.scales, n, 3))
         .zip(chunks(grads.opacities, n, 1))
-        .zip(chunks(grads.harmonics, n, harmonics_row))
+        .zip(chunks(grads.harmonics, n, row))
+        .zip(chunks(grads.harmonics_rest, n, rest_row))
         .collect();
     let level = Level::new();
     let parts: Vec<CameraGrad> = jobs
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, ((((means, quats), scales), opacities), harmonics_grad))| {
-            let grads = GaussianGrads { means, quats, scales, opacities, harmonics: harmonics_grad };
+        .map(|(chunk, (((((means, quats), scales), opacities), harmonics_grad), harmonics_rest))| {
+            let grads = GaussianGrads { means, quats, scales, opacities, harmonics: harmonics_grad, harmonics_rest };
             dispatch!(level, simd => backward_chunk(
                 simd, gaussians, harmonics, camera, options, projection, v, chunk * PROJECT_CHUNK, grads, camera_wanted
             ))
@@ -530,17 +544,30 @@ fn backward_chunk<S: Simd, T: Real>(
                         T::ZERO
                     }
                 });
-                let rows = 3 * h.stored * i..3 * (h.stored * i + sh::count(h.degree));
-                for (w, row) in weights.iter_mut().zip(h.coefficients[rows].chunks_exact(3)) {
-                    w[lane] = (v_rgb[0] * row[0] + v_rgb[1] * row[1] + v_rgb[2] * row[2]).to_f64();
+                let (first, rest) = h.of(i);
+                let along = |row: &[T]| v_rgb[0] * row[0] + v_rgb[1] * row[1] + v_rgb[2] * row[2];
+                weights[0][lane] = along(first).to_f64();
+                for (w, row) in weights[1..].iter_mut().zip(rest.chunks_exact(3)) {
+                    w[lane] = along(row).to_f64();
                 }
+                let (row, rest_row) = h.rows();
+                let j = i - begin;
+                let (mut first_grad, mut rest_grad) = (None, None);
                 if let Some(out) = &mut grads.harmonics {
-                    let row = 3 * h.stored * (i - begin);
-                    let out = &mut out[row..row + 3 * sh::count(h.degree)];
-                    for (k, out) in out.chunks_exact_mut(3).enumerate() {
-                        for (o, v) in out.iter_mut().zip(v_rgb) {
-                            *o += basis(k) * v;
-                        }
+                    let (first, rest) = out[j * row..(j + 1) * row].split_at_mut(3);
+                    (first_grad, rest_grad) = (Some(first), Some(rest));
+                }
+                if h.rest.is_some() {
+                    let out = grads.harmonics_rest.as_mut();
+                    rest_grad = out.map(|out| &mut out[j * rest_row..(j + 1) * rest_row]);
+                }
+                if let Some(out) = first_grad {
+                    add_scaled(out, basis(0), &v_rgb);
+                }
+                if let Some(out) = rest_grad {
+                    let rows = out.chunks_exact_mut(3).take(sh::count(h.degree) - 1);
+                    for (k, out) in rows.enumerate() {
+                        add_scaled(out, basis(k + 1), &v_rgb);
                     }
                 }
             }

@@ -204,13 +204,14 @@ fn cameras(
 
 /// Project Gaussians; see `hqgs/rasterize.py` for the shapes. `colors` are harmonics if there is a degree.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, colors, viewmats, ks, width, height, options, sh_degree))]
+#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree))]
 fn project_forward<'py>(
     means: &Bound<'py, PyAny>,
     quats: &Bound<'py, PyAny>,
     scales: &Bound<'py, PyAny>,
     opacities: &Bound<'py, PyAny>,
     colors: &Bound<'py, PyAny>,
+    rest: Optional<'_, 'py>,
     viewmats: &Bound<'py, PyAny>,
     ks: &Bound<'py, PyAny>,
     width: usize,
@@ -221,7 +222,7 @@ fn project_forward<'py>(
     by_dtype!(
         means,
         project_as(
-            means, quats, scales, opacities, colors, viewmats, ks, width, height, options,
+            means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options,
             sh_degree
         )
     )
@@ -243,6 +244,7 @@ fn project_as<'py, T: Scalar>(
     scales: &Bound<'py, PyAny>,
     opacities: &Bound<'py, PyAny>,
     colors: &Bound<'py, PyAny>,
+    rest: Optional<'_, 'py>,
     viewmats: &Bound<'py, PyAny>,
     ks: &Bound<'py, PyAny>,
     width: usize,
@@ -251,7 +253,7 @@ fn project_as<'py, T: Scalar>(
     sh_degree: Option<usize>,
 ) -> PyResult<Projected<'py, T>> {
     let py = means.py();
-    let arrays = Arrays::<T>::new(means, quats, scales, opacities, Some(colors))?;
+    let arrays = Arrays::<T>::new(means, quats, scales, opacities, Some(colors), rest)?;
     let (viewmats, ks) = (
         Array::<f64>::new("viewmats", viewmats)?,
         Array::<f64>::new("Ks", ks)?,
@@ -337,6 +339,7 @@ struct Arrays<'py, T: Element> {
     scales: Array<'py, T>,
     opacities: Array<'py, T>,
     colors: Option<Array<'py, T>>,
+    rest: Option<Array<'py, T>>,
 }
 
 impl<'py, T: Scalar> Arrays<'py, T> {
@@ -346,6 +349,7 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         scales: &Bound<'py, PyAny>,
         opacities: &Bound<'py, PyAny>,
         colors: Optional<'_, 'py>,
+        rest: Optional<'_, 'py>,
     ) -> PyResult<Self> {
         Ok(Self {
             means: Array::new("means", means)?,
@@ -353,6 +357,7 @@ impl<'py, T: Scalar> Arrays<'py, T> {
             scales: Array::new("scales", scales)?,
             opacities: Array::new("opacities", opacities)?,
             colors: optional("colors", colors)?,
+            rest: optional("colors", rest)?,
         })
     }
 
@@ -388,15 +393,18 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         let (Some(array), Some(degree)) = (&self.colors, degree) else {
             return Ok(None);
         };
-        let &[n, stored, 3] = array.shape() else {
-            return Err(Error::shape("colors", "[N, K, 3]", format!("{:?}", array.shape())).into());
+        let count = |array: &Array<'py, T>| match array.shape() {
+            &[_, k, 3] => Ok(k),
+            other => Err(Error::shape("colors", "[N, K, 3]", format!("{other:?}"))),
         };
+        let higher = self.rest.as_ref().map_or(Ok(0), count)?;
         let harmonics = Harmonics {
             coefficients: array.slice()?,
-            stored,
+            rest: self.rest.as_ref().map(Array::slice).transpose()?,
+            stored: count(array)? + higher,
             degree,
         };
-        harmonics.check(self.opacities.slice()?.len().max(n))?;
+        harmonics.check(self.opacities.slice()?.len())?;
         Ok(Some(harmonics))
     }
 }
@@ -411,9 +419,10 @@ fn project_backward<'py>(
         Bound<'py, PyAny>,
         Bound<'py, PyAny>,
         Option<Bound<'py, PyAny>>,
+        Option<Bound<'py, PyAny>>,
     ),
     cotangents: Cotangents<'py>,
-    wanted: [bool; 6],
+    wanted: [bool; 7],
 ) -> PyResult<Bound<'py, PyAny>> {
     by_dtype!(
         &inputs.0,
@@ -437,6 +446,7 @@ type ProjectGrads<'py, T> = (
     Out<'py, T>,
     Out<'py, T>,
     Out<'py, T>,
+    Out<'py, T>,
     Out<'py, f64>,
 );
 
@@ -448,9 +458,10 @@ fn project_backward_as<'py, T: Scalar>(
         Bound<'py, PyAny>,
         Bound<'py, PyAny>,
         Option<Bound<'py, PyAny>>,
+        Option<Bound<'py, PyAny>>,
     ),
     v: Cotangents<'py>,
-    wanted: [bool; 6],
+    wanted: [bool; 7],
 ) -> PyResult<ProjectGrads<'py, T>> {
     let py = frame.py();
     let frame = frame.get();
@@ -460,6 +471,7 @@ fn project_backward_as<'py, T: Scalar>(
         &inputs.2,
         &inputs.3,
         inputs.4.as_ref(),
+        inputs.5.as_ref(),
     )?;
     let gaussians = arrays.gaussians()?;
     let harmonics = arrays.harmonics(frame.sh_degree)?;
@@ -504,16 +516,18 @@ fn project_backward_as<'py, T: Scalar>(
         want_scales,
         want_opacities,
         want_harmonics,
+        want_rest,
         want_viewmats,
     ] = wanted;
-    let harmonics_row = harmonics.as_ref().map_or(0, |h| 3 * h.stored);
+    let (row, rest_row) = harmonics.as_ref().map_or((0, 0), Harmonics::rows);
     let out = py.detach(|| {
         threads::install(|| {
             let mut means = zeros::<T>(want_means, 3 * n);
             let mut quats = zeros::<T>(want_quats, 4 * n);
             let mut scales = zeros::<T>(want_scales, 3 * n);
             let mut opacities = zeros::<T>(want_opacities, n);
-            let mut sh = zeros::<T>(want_harmonics, harmonics_row * n);
+            let mut sh = zeros::<T>(want_harmonics, row * n);
+            let mut rest = zeros::<T>(want_rest, rest_row * n);
             let mut viewmats = Vec::with_capacity(16 * c);
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let cotangents = ProjectCotangents {
@@ -530,6 +544,7 @@ fn project_backward_as<'py, T: Scalar>(
                     scales: some(want_scales, &mut scales),
                     opacities: some(want_opacities, &mut opacities),
                     harmonics: some(want_harmonics, &mut sh),
+                    harmonics_rest: some(want_rest, &mut rest),
                 };
                 let camera_grad = project::backward(
                     &gaussians,
@@ -543,16 +558,17 @@ fn project_backward_as<'py, T: Scalar>(
                 );
                 viewmats.extend(camera_grad.viewmat(camera));
             }
-            (means, quats, scales, opacities, sh, viewmats)
+            (means, quats, scales, opacities, sh, rest, viewmats)
         })
     });
-    let (means, quats, scales, opacities, sh, viewmats) = out;
+    let (means, quats, scales, opacities, sh, rest, viewmats) = out;
     Ok((
         want_means.then(|| means.into_pyarray(py)),
         want_quats.then(|| quats.into_pyarray(py)),
         want_scales.then(|| scales.into_pyarray(py)),
         want_opacities.then(|| opacities.into_pyarray(py)),
         want_harmonics.then(|| sh.into_pyarray(py)),
+        want_rest.then(|| rest.into_pyarray(py)),
         want_viewmats.then(|| viewmats.into_pyarray(py)),
     ))
 }

@@ -155,6 +155,7 @@ pub fn backward<T: Real>(
         scales: Some(&mut out.scales),
         opacities: Some(&mut out.opacities),
         harmonics: Some(&mut out.harmonics),
+        harmonics_rest: None,
     };
     let camera_grad = project::backward(
         gaussians,
@@ -179,6 +180,7 @@ mod tests {
     fn harmonics<T: Real>(s: &Synthetic<T>) -> Harmonics<'_, T> {
         Harmonics {
             coefficients: &s.harmonics,
+            rest: None,
             stored: 16,
             degree: 3,
         }

@@ -42,18 +42,40 @@ impl<T: Real> Gaussians<'_, T> {
     }
 }
 
-/// Spherical harmonics of N Gaussians.
+/// Spherical harmonics of N Gaussians, K coefficients per channel.
 #[derive(Debug, Clone, Copy)]
 pub struct Harmonics<'a, T> {
-    /// Coefficients, [N, K, 3].
+    /// All coefficients, [N, K, 3]; with `rest` the constant ones alone, [N, 1, 3].
     pub coefficients: &'a [T],
-    /// K, the number of coefficients stored per channel.
+    /// The coefficients of degree 1 and more, [N, K - 1, 3], where they are kept apart.
+    pub rest: Option<&'a [T]>,
+    /// K.
     pub stored: usize,
     /// The highest degree in use, 0..=3; coefficients above it are neither read nor differentiated.
     pub degree: usize,
 }
 
-impl<T: Real> Harmonics<'_, T> {
+impl<'a, T: Real> Harmonics<'a, T> {
+    /// Numbers per Gaussian in `coefficients` and in `rest`.
+    pub fn rows(&self) -> (usize, usize) {
+        if self.rest.is_some() {
+            (3, 3 * (self.stored - 1))
+        } else {
+            (3 * self.stored, 0)
+        }
+    }
+
+    /// The constant coefficients of Gaussian `i`, and those of higher degrees in use.
+    pub(crate) fn of(&self, i: usize) -> (&'a [T], &'a [T]) {
+        let used = 3 * (sh::count(self.degree) - 1);
+        let (row, rest_row) = self.rows();
+        let first = &self.coefficients[i * row..(i + 1) * row];
+        match self.rest {
+            Some(rest) => (first, &rest[i * rest_row..i * rest_row + used]),
+            None => (&first[..3], &first[3..3 + used]),
+        }
+    }
+
     /// Check the number of coefficients and the degree.
     ///
     /// # Errors
@@ -73,7 +95,10 @@ impl<T: Real> Harmonics<'_, T> {
                 format!("K = {}", self.stored),
             ));
         }
-        check_len("colors", self.coefficients, n * self.stored * 3)
+        let (row, rest_row) = self.rows();
+        check_len("colors", self.coefficients, n * row)?;
+        self.rest
+            .map_or(Ok(()), |rest| check_len("colors", rest, n * rest_row))
     }
 }
 

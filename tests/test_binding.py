@@ -21,7 +21,12 @@ def test_arrays_are_borrowed_not_copied(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize(
     "array",
-    [np.zeros((3, 5)).T, np.asfortranarray(np.zeros((5, 3))), np.zeros((5, 6))[:, ::2], np.zeros((5, 6))[:, :3]],
+    [
+        np.zeros((3, 5)).T,
+        np.asfortranarray(np.zeros((5, 3))),
+        np.zeros((5, 6))[:, ::2],
+        np.zeros((5, 6))[:, :3],
+    ],
     ids=["transposed", "fortran", "strided", "sliced"],
 )
 def test_other_layouts_are_refused(array: np.ndarray) -> None:

@@ -52,7 +52,7 @@ def test_from_points_activates_to_the_published_start() -> None:
     g = Gaussians.from_points(points, colors, sh_degree=2)
     assert len(g) == 50
     assert g.sh_degree == 2
-    assert g.colors().shape == (50, 9, 3)
+    assert (g.sh0.shape, g.shN.shape) == ((50, 1, 3), (50, 8, 3))
     assert all(tensor.dtype == torch.float32 for tensor in g.named().values())
     np.testing.assert_array_equal(g.means.numpy(), points)
     np.testing.assert_array_equal(g.quats.numpy(), np.tile([1.0, 0.0, 0.0, 0.0], (50, 1)))

@@ -15,6 +15,7 @@ fn stages(c: &mut Criterion) {
         let gaussians = s.gaussians();
         let harmonics = Harmonics {
             coefficients: &s.harmonics,
+            rest: None,
             stored: 16,
             degree: 3,
         };
@@ -105,6 +106,7 @@ fn stages(c: &mut Criterion) {
                     scales: Some(&mut g_scales),
                     opacities: Some(&mut g_opacities),
                     harmonics: Some(&mut g_harmonics),
+                    harmonics_rest: None,
                 };
                 project::backward(
                     &gaussians,
