@@ -6,7 +6,7 @@ import os
 # that the next iteration finds them mapped (a quarter of its time otherwise goes into page faults).
 os.environ.setdefault("MIMALLOC_PURGE_DELAY", "1000")
 
-from hqgs.rasterize import get_num_threads, rasterization, set_num_threads  # noqa: E402
+from hqgs.rasterize import get_num_threads, rasterization, set_num_threads
 
 __version__ = "0.1.0"
 
