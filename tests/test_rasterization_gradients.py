@@ -254,3 +254,21 @@ def test_no_grad() -> None:
     assert not meta["means2d"].requires_grad
     assert torch.equal(render, expected)
     assert torch.equal(alphas, expected_alphas)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_harmonics_in_two_tensors_are_those_in_one(dtype: torch.dtype) -> None:
+    scene = random_scene(60, 33, 21, seed=4, dtype=dtype, sh_degree=3)
+    joined = scene.colors.clone().requires_grad_()
+    first = scene.colors[:, :1].clone().requires_grad_()
+    rest = scene.colors[:, 1:].clone().requires_grad_()
+    expected, _, _ = hqgs.rasterization(**scene.arguments(colors=joined))
+    render, _, _ = hqgs.rasterization(**scene.arguments(colors=(first, rest)))
+    assert torch.equal(render, expected)
+    weights = torch.rand(render.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    (expected * weights).sum().backward()
+    (render * weights).sum().backward()
+    assert joined.grad is not None
+    assert first.grad is not None
+    assert rest.grad is not None
+    assert torch.equal(torch.cat([first.grad, rest.grad], dim=1), joined.grad)

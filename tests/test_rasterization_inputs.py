@@ -250,3 +250,25 @@ def test_inputs_are_not_modified(dtype: torch.dtype) -> None:
     for name, tensor in leaves.tensors().items():
         assert torch.equal(tensor.detach(), getattr(before, name)), name
     assert (cotangent == 1).all()
+
+
+def test_two_capped_layers_blend_in_either_precision() -> None:
+    """(1 - 0.99)^2 is 1e-4, the field's stop: there rounding would decide about the second layer."""
+    alphas = []
+    for dtype in (torch.float32, torch.float64):
+        means = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]], dtype=dtype)
+        quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2, dtype=dtype)
+        K = torch.tensor([[[50.0, 0.0, 8.5], [0.0, 50.0, 8.5], [0.0, 0.0, 1.0]]], dtype=dtype)
+        _, alpha, _ = hqgs.rasterization(
+            means,
+            quats,
+            torch.ones(2, 3, dtype=dtype),
+            torch.ones(2, dtype=dtype),
+            torch.ones(2, 3, dtype=dtype),
+            torch.eye(4, dtype=dtype)[None],
+            K,
+            17,
+            17,
+        )
+        alphas.append(alpha[0, 8, 8, 0].item())
+    assert alphas == pytest.approx([0.9999, 0.9999], abs=1e-6)

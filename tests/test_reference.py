@@ -104,8 +104,8 @@ def test_cap_stop_and_permanence() -> None:
 
 def test_min_margin_sees_both_jumps() -> None:
     floor = frontal([[0.0, 0.0, 2.0]], [(1 + 1e-6) / 255], [[1.0, 1.0, 1.0]])
-    layers = [[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 4.0]]  # 0.05^2 * 0.04 = 1e-4
-    stop = frontal(layers, [0.95, 0.95, 1 - 0.04 * (1 + 1e-6)], [[1.0, 1.0, 1.0]] * 3)
+    layers = [[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [0.0, 0.0, 4.0]]  # 0.05^2 * 0.03996 = 0.999e-4
+    stop = frontal(layers, [0.95, 0.95, 1 - 0.03996 * (1 + 1e-6)], [[1.0, 1.0, 1.0]] * 3)
     for scene in (floor, stop):
         margin = reference_rasterization(**scene.arguments())[2]["min_margin"]
         assert margin[0, 3, 4].item() == pytest.approx(1e-6, rel=1e-6)
