@@ -9,7 +9,7 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "kornia", "piq", "lpips", "pillow", "matplotlib")
+PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
 def machine_facts() -> dict[str, str | int | float | None]:

@@ -175,7 +175,7 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     let mut alive = 0u16;
     for block in 0..TILE_BLOCKS {
         let pixels = &transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
-        alive |= u16::from(pixels.iter().any(|t| *t == T::ONE)) << block;
+        alive |= u16::from(pixels.contains(&T::ONE)) << block;
     }
     let mut finished = [T::ZERO; TILE_PIXELS];
     let mut layers = Layers {

@@ -170,7 +170,7 @@ fn splat(p: &Projected, camera: &Camera, o: &ProjectOptions) -> Option<(Splat, [
     }
     let [s, m, t] = p.factors;
     let stiffness = s * (1.0 + m.abs()) + t;
-    if !(stiffness < FACTOR_MAX) {
+    if !stiffness.is_finite() || stiffness >= FACTOR_MAX {
         return None;
     }
     let reach = radius + SUPPORT_SLACK * (1.0 + stiffness);
@@ -323,9 +323,11 @@ fn forward_chunk<S: Simd, T: Real>(
             keys[j] = depth;
             out.depths[j] = T::from_f64(depth);
             out.opacities[j] = T::from_f64(s.opacity);
-            for k in 0..2 {
-                out.means2d[2 * j + k] = T::from_f64(s.mean[k]);
-                out.radii[2 * j + k] = r[k] as i32; // saturates
+            for (o, m) in out.means2d[2 * j..2 * j + 2].iter_mut().zip(s.mean) {
+                *o = T::from_f64(m);
+            }
+            for (o, r) in out.radii[2 * j..2 * j + 2].iter_mut().zip(r) {
+                *o = r as i32; // saturates
             }
             for (o, q) in out.conics[3 * j..3 * j + 3].iter_mut().zip(conic) {
                 *o = if kept.is_some() {

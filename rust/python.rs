@@ -186,14 +186,11 @@ fn cameras(
     width: usize,
     height: usize,
 ) -> Result<Vec<Camera>, Error> {
-    if viewmats.len() % 16 != 0 || viewmats.len() / 16 * 9 != ks.len() {
-        return Err(Error::shape(
-            "viewmats, Ks",
-            "[C, 4, 4] and [C, 3, 3]",
-            format!("{} and {} elements", viewmats.len(), ks.len()),
-        ));
+    let (views, left_over) = viewmats.as_chunks::<16>();
+    if !left_over.is_empty() || views.len() * 9 != ks.len() {
+        let got = format!("{} and {} elements", viewmats.len(), ks.len());
+        return Err(Error::shape("viewmats, Ks", "[C, 4, 4] and [C, 3, 3]", got));
     }
-    let (views, _) = viewmats.as_chunks::<16>();
     let (ks, _) = ks.as_chunks::<9>();
     views
         .iter()
@@ -413,14 +410,7 @@ impl<'py, T: Scalar> Arrays<'py, T> {
 #[pyfunction]
 fn project_backward<'py>(
     frame: &Bound<'py, Frame>,
-    inputs: (
-        Bound<'py, PyAny>,
-        Bound<'py, PyAny>,
-        Bound<'py, PyAny>,
-        Bound<'py, PyAny>,
-        Option<Bound<'py, PyAny>>,
-        Option<Bound<'py, PyAny>>,
-    ),
+    inputs: Inputs<'py>,
     cotangents: Cotangents<'py>,
     wanted: [bool; 7],
 ) -> PyResult<Bound<'py, PyAny>> {
@@ -429,6 +419,16 @@ fn project_backward<'py>(
         project_backward_as(frame, &inputs, cotangents, wanted)
     )
 }
+
+/// means, quats, scales, opacities, colors, rest
+type Inputs<'py> = (
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Option<Bound<'py, PyAny>>,
+    Option<Bound<'py, PyAny>>,
+);
 
 /// means2d, whitened, opacities, depths, conics, colors
 type Cotangents<'py> = (
@@ -452,14 +452,7 @@ type ProjectGrads<'py, T> = (
 
 fn project_backward_as<'py, T: Scalar>(
     frame: &Bound<'py, Frame>,
-    inputs: &(
-        Bound<'py, PyAny>,
-        Bound<'py, PyAny>,
-        Bound<'py, PyAny>,
-        Bound<'py, PyAny>,
-        Option<Bound<'py, PyAny>>,
-        Option<Bound<'py, PyAny>>,
-    ),
+    inputs: &Inputs<'py>,
     v: Cotangents<'py>,
     wanted: [bool; 7],
 ) -> PyResult<ProjectGrads<'py, T>> {
@@ -603,6 +596,9 @@ fn check_colors<T>(
     Ok(())
 }
 
+/// What the backward pass needs, the image and the alphas.
+type Image<'py, T> = (Composite, Bound<'py, PyArray1<T>>, Bound<'py, PyArray1<T>>);
+
 /// Bin and composite a frame.
 #[pyfunction]
 #[pyo3(signature = (frame, colors, backgrounds, channels))]
@@ -620,7 +616,7 @@ fn composite_as<'py, T: Scalar>(
     colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
     channels: usize,
-) -> PyResult<(Composite, Bound<'py, PyArray1<T>>, Bound<'py, PyArray1<T>>)> {
+) -> PyResult<Image<'py, T>> {
     let py = colors.py();
     let frame = frame.get();
     let colors = Array::<T>::new("colors", colors)?;

@@ -25,7 +25,7 @@ pub trait Real: SimdFloatElement + Send + Sync + 'static {
 /// Coefficients of `2^f` on [-0.5, 0.5], constant term first: minimax in the relative error (1.9e-9).
 const EXP2_F32: [f32; 7] = [
     1.0,
-    0.693_147_2,
+    std::f32::consts::LN_2, // to the last bit
     0.240_226_47,
     0.055_503_29,
     0.009_618_489,

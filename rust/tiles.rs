@@ -309,9 +309,11 @@ impl<T: Real> Source<'_, T> {
                 let splat = &self.projection.splats[i];
                 // Positive floats order like their bits; the low half keeps the order of the indices.
                 let key = u64::from((self.projection.depths[i] as f32).to_bits()) << 32;
-                for x in usize::from(span.begin)..usize::from(span.end) {
-                    let at = next[x] as usize - base;
-                    next[x] += 1;
+                let begin = usize::from(span.begin);
+                for (x, next) in next[begin..usize::from(span.end)].iter_mut().enumerate() {
+                    let x = begin + x;
+                    let at = *next as usize - base;
+                    *next += 1;
                     by_index[at] = Local::new(splat, span.gaussian, [middle(x), middle(row)]);
                     keys[at] = key | (at - (self.offsets[tiles.start + x] - base)) as u64;
                 }
