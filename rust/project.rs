@@ -45,7 +45,7 @@ impl Default for ProjectOptions {
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub struct Splat {
-    /// Centre, pixels. f64, because f32 would shift small Gaussians by up to 3e-5 px at 500 px.
+    /// Centre, pixels. f64, because f32 would shift small Gaussians visibly: half an ulp at 500 px is 1.5e-5 px.
     pub mean: [f64; 2],
     /// Factors (s, m, t) of the conic; see `geometry.rs`.
     pub factors: [f64; 3],

@@ -272,3 +272,35 @@ def test_two_capped_layers_blend_in_either_precision() -> None:
         )
         alphas.append(alpha[0, 8, 8, 0].item())
     assert alphas == pytest.approx([0.9999, 0.9999], abs=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [1e2, 1e4, 1e6])
+def test_needles_are_right_in_single_precision(ratio: float) -> None:
+    """Across the image at 37 degrees; the naive determinant is wrong by a factor of 7 at 1e4."""
+    half = math.radians(37.0) / 2
+    numbers = {
+        "means": [[0.01, -0.02, 2.0], [0.3, 0.1, 3.0]],
+        "quats": [[math.cos(half), 0.0, 0.0, math.sin(half)], [1.0, 0.2, -0.3, 0.4]],
+        "scales": [[0.002 * ratio, 0.002, 0.002], [0.2, 0.1, 0.3]],
+        "opacities": [0.9, 0.7],
+        "colors": [[0.9, 0.4, 0.2], [0.1, 0.6, 0.8]],
+        "viewmats": torch.eye(4)[None].tolist(),
+        "Ks": [[[500.0, 0.0, 100.0], [0.0, 500.0, 80.0], [0.0, 0.0, 1.0]]],
+    }
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        # The same numbers in both precisions.
+        inputs = {name: torch.tensor(value).to(dtype).requires_grad_() for name, value in numbers.items()}
+        inputs["Ks"] = inputs["Ks"].detach()
+        render, _, meta = hqgs.rasterization(**inputs, width=200, height=160)
+        weights = torch.rand(render.shape, generator=torch.Generator().manual_seed(3)).to(dtype)
+        (render * weights).sum().backward()
+        gradients = {name: t.grad.double() for name, t in inputs.items() if t.grad is not None}
+        results.append((render.detach().double(), meta["conics"].detach().double(), gradients))
+    (render, conics, gradients), (expected_render, expected_conics, expected_gradients) = results
+    assert (render - expected_render).abs().max() < 2e-5
+    assert expected_render.amax() > 0.5
+    torch.testing.assert_close(conics, expected_conics, rtol=1e-6, atol=0.0)
+    for name, expected in expected_gradients.items():
+        error = (gradients[name] - expected).norm() / expected.norm()
+        assert error < 1e-5, f"{name}: {error}"
