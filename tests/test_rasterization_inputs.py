@@ -278,7 +278,7 @@ def test_two_capped_layers_blend_in_either_precision() -> None:
 def test_needles_are_right_in_single_precision(ratio: float) -> None:
     """Across the image at 37 degrees; the naive determinant is wrong by a factor of 7 at 1e4."""
     half = math.radians(37.0) / 2
-    numbers = {
+    numbers: dict[str, Any] = {
         "means": [[0.01, -0.02, 2.0], [0.3, 0.1, 3.0]],
         "quats": [[math.cos(half), 0.0, 0.0, math.sin(half)], [1.0, 0.2, -0.3, 0.4]],
         "scales": [[0.002 * ratio, 0.002, 0.002], [0.2, 0.1, 0.3]],
@@ -290,7 +290,9 @@ def test_needles_are_right_in_single_precision(ratio: float) -> None:
     results = []
     for dtype in (torch.float32, torch.float64):
         # The same numbers in both precisions.
-        inputs = {name: torch.tensor(value).to(dtype).requires_grad_() for name, value in numbers.items()}
+        inputs: dict[str, Any] = {
+            name: torch.tensor(value).to(dtype).requires_grad_() for name, value in numbers.items()
+        }
         inputs["Ks"] = inputs["Ks"].detach()
         render, _, meta = hqgs.rasterization(**inputs, width=200, height=160)
         weights = torch.rand(render.shape, generator=torch.Generator().manual_seed(3)).to(dtype)
