@@ -7,7 +7,7 @@ What every metric here shares:
 - A mask is bool [H, W], True where the photo counts. PSNR leaves the other pixels out. The other metrics
   look at neighbourhoods, so there the photo's pixels are copied into the render before they run.
 - A value that does not exist is None, never a stand-in number; `ViewMetrics.reasons` says why.
-- The numbers do not depend on the number of threads: everything runs on one.
+- The numbers do not depend on the number of threads: torch runs on one, the crate's sums have one order.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import piq
 import torch
 from numpy.typing import NDArray
 
+from hqgs import _rust
 from hqgs.torch_threads import one_torch_thread
 
 METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg")
@@ -33,8 +34,6 @@ METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg")
 # The files that torchvision keeps its ImageNet weights in; the name ends in the start of the file's SHA-256.
 LPIPS_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
-SSIM_WINDOW, SSIM_SIGMA = 11, 1.5  # Wang et al. 2004, section III-B
-SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 there, with data range L = 1
 HAARPSI_MIN_SIZE = 16  # pixels; the coarsest Haar filter
 LPIPS_MIN_SIZE = 63  # pixels; AlexNet's smallest input
 
@@ -65,17 +64,13 @@ def psnr(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | No
 def ssim(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
     """Structural similarity (Wang et al. 2004), per channel, mean over all pixels and channels.
 
-    Gaussian window of 11 x 11 with sigma 1.5, zero padding to the image's own size: the convention of
-    the 3D Gaussian Splatting literature. Libraries treat the border differently (scikit-image leaves it
-    out or mirrors it, kornia mirrors it), so their values differ a little.
+    The crate's, as in the loss: Gaussian window of 11 x 11 with sigma 1.5, zero padding to the image's own
+    size, the convention of the 3D Gaussian Splatting literature. Libraries treat the border differently
+    (scikit-image leaves it out or mirrors it, kornia mirrors it), so their values differ a little.
     """
     x, y = _masked_pair(render, photo, mask)
-    with one_torch_thread(), torch.no_grad():
-        maps = _blur(torch.cat([x, y, x * x, y * y, x * y]))
-        mu_x, mu_y, xx, yy, xy = maps
-        luminance = (2 * mu_x * mu_y + SSIM_C1) / (mu_x**2 + mu_y**2 + SSIM_C1)
-        structure = (2 * (xy - mu_x * mu_y) + SSIM_C2) / (xx - mu_x**2 + yy - mu_y**2 + SSIM_C2)
-        return float((luminance * structure).mean())
+    first, second = (image[0].permute(1, 2, 0).contiguous().numpy() for image in (x, y))
+    return _rust.ssim(first, second)
 
 
 def haarpsi(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float | None:
@@ -198,17 +193,6 @@ def _masked_pair(
         x = np.where(mask[..., None], x, y)
     as_batch = [torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None] for image in (x, y)]
     return as_batch[0], as_batch[1]
-
-
-def _blur(images: torch.Tensor) -> torch.Tensor:
-    """SSIM's Gaussian window over [B, C, H, W] with zero padding, one axis after the other."""
-    offsets = torch.arange(SSIM_WINDOW, dtype=images.dtype) - SSIM_WINDOW // 2
-    window = torch.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
-    window = (window / window.sum()).reshape(1, 1, -1, 1)
-    planes = images.flatten(0, 1)[:, None]
-    planes = torch.nn.functional.conv2d(planes, window, padding=(SSIM_WINDOW // 2, 0))
-    planes = torch.nn.functional.conv2d(planes, window.transpose(2, 3), padding=(0, SSIM_WINDOW // 2))
-    return planes.reshape(images.shape)
 
 
 @cache
