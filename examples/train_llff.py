@@ -10,11 +10,11 @@ and scene.ply for any 3DGS viewer.
 import argparse
 from pathlib import Path
 
+from hqgs.config import TrainConfig
 from hqgs.data import load_scene
 from hqgs.report import read_report
 from hqgs.run import train
 from hqgs.synthetic import embedded_scene
-from hqgs.train import TrainConfig
 
 
 def main() -> None:

@@ -25,12 +25,17 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """A photo with its camera. The photo stays uint8 in memory."""
+    """A photo with its camera.
+
+    A photo from a file stays uint8 in memory. One that was degraded in memory is float32, where 1 is white
+    and noise may leave [0, 1].
+    """
 
     name: str
     camera: Camera
-    image: NDArray[np.uint8]  # [H, W, 3] sRGB
+    image: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3] sRGB, the camera's size
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts; None: everywhere
+    low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
 
 
 @dataclass(frozen=True)

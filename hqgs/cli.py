@@ -16,13 +16,14 @@ from pathlib import Path
 import hqgs
 from hqgs.camera import Scene
 from hqgs.checkpoint import FolderBusyError
+from hqgs.config import TrainConfig
 from hqgs.data import load_scene
 from hqgs.densify import DensifyConfig
 from hqgs.methods import METHODS
 from hqgs.report import RunResult
 from hqgs.run import CHECKPOINT, open_run, run
 from hqgs.synthetic import embedded_scene
-from hqgs.train import TrainConfig, TrainingError
+from hqgs.train import TrainingError
 
 EMBEDDED = "embedded"
 EMBEDDED_SIZE = (504, 378)  # pixels

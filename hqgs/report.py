@@ -36,7 +36,7 @@ class RenderedView:
     """A held-out view: the photo it is judged by and the trained scene's render."""
 
     name: str
-    photo: NDArray[np.uint8]  # [H, W, 3]
+    photo: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3]
     render: NDArray[np.float32]  # [H, W, 3], clamped to [0, 1] by the report, never rounded for the metrics
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts
 
@@ -126,7 +126,7 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
 
     The size is 3 W + 16 by H plus the height of the caption.
     """
-    photo = view.photo / 255.0
+    photo = view.photo / 255.0 if view.photo.dtype == np.uint8 else view.photo.clip(0, 1)
     render = np.clip(view.render.astype(np.float64), 0.0, 1.0)
     difference = np.minimum(AMPLIFICATION * np.abs(render - photo), 1.0)
     panels = [np.round(panel * 255).astype(np.uint8) for panel in (photo, render, difference)]

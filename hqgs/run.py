@@ -15,11 +15,12 @@ from tqdm import tqdm
 
 from hqgs.camera import Scene
 from hqgs.checkpoint import lock_folder, remove_leftovers
+from hqgs.config import TrainConfig
 from hqgs.machine import peak_rss_mb
 from hqgs.metrics import psnr
 from hqgs.ply import write_ply
 from hqgs.report import RunResult, write_report
-from hqgs.train import Step, TrainConfig, Trainer
+from hqgs.train import Step, Trainer
 
 CHECKPOINT, PLY = "checkpoint.safetensors", "scene.ply"
 BAR_EVERY = 10  # steps between updates of the numbers in the progress bar

@@ -20,9 +20,10 @@ from torch import Tensor
 
 from hqgs.camera import Scene, View
 from hqgs.checkpoint import FolderBusyError, load_checkpoint, save_checkpoint
+from hqgs.config import TrainConfig
 from hqgs.densify import DensifyConfig
 from hqgs.run import CHECKPOINT, open_run, train
-from hqgs.train import TrainConfig, Trainer
+from hqgs.train import Trainer
 
 
 def whole_state(trainer: Trainer, path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -46,7 +47,7 @@ def dots(at: NDArray[np.float64], width: int, height: int, sigma: float = 1.0) -
     return np.repeat(grey[..., None], 3, -1)
 
 
-def centroid(image: NDArray[np.uint8], at: NDArray[np.float64], reach: float = 4.0) -> NDArray[np.float64]:
+def centroid(image: NDArray[Any], at: NDArray[np.float64], reach: float = 4.0) -> NDArray[np.float64]:
     """Centre of brightness within `reach` of `at`."""
     x, y = np.meshgrid(np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0]) + 0.5)
     weight = np.where((x - at[0]) ** 2 + (y - at[1]) ** 2 < reach**2, image[..., 0].astype(float), 0)

@@ -17,12 +17,13 @@ from torch import Tensor
 import hqgs
 import hqgs.train as train_module
 from hqgs.camera import Scene, View
+from hqgs.config import TrainConfig
 from hqgs.densify import DensifyConfig
 from hqgs.gaussians import Gaussians
-from hqgs.methods import METHODS, ThreeDGS, make_method
+from hqgs.methods import METHODS, ThreeDGS, check_method
 from hqgs.ply import read_ply
 from hqgs.run import CHECKPOINT, PLY, open_run, run, train
-from hqgs.train import MAX_SKIPPED_IN_A_ROW, TrainConfig, Trainer, TrainingError
+from hqgs.train import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
 
 ONLY_TRAIN = DensifyConfig(stop=0)
 
@@ -59,7 +60,7 @@ class Probe(ThreeDGS):
 @pytest.fixture
 def probe(monkeypatch: pytest.MonkeyPatch) -> Probe:
     method = Probe()
-    monkeypatch.setitem(METHODS, "probe", lambda scene, seed: method)
+    monkeypatch.setitem(METHODS, "probe", lambda scene, config: method)
     return method
 
 
@@ -318,7 +319,7 @@ def test_an_unknown_method_is_refused_with_the_names() -> None:
     with pytest.raises(ValueError, match="unknown method '4dgs'; the methods are: 3dgs"):
         TrainConfig(method="4dgs")
     with pytest.raises(ValueError, match="unknown method '4dgs'"):
-        make_method("4dgs", tiny_scene(), 0)
+        check_method("4dgs")
 
 
 def test_scaled_schedules() -> None:

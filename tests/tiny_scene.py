@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.camera import Camera, Scene, View
+from hqgs.config import TrainConfig
 from hqgs.densify import DensifyConfig
-from hqgs.train import TrainConfig
 
 WIDTH, HEIGHT, DEPTH = 24, 16, 3.0
 

@@ -1,8 +1,7 @@
-"""Methods: what is rasterized and which loss judges it. The training loop is the same for all of them."""
+"""What a method is: what is rasterized and which loss judges it. The training loop is the same for all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.camera import Scene, View
+from hqgs.camera import View
 from hqgs.gaussians import Gaussians
-from hqgs.losses import photometric_loss
 
 
 class Method(Protocol):
@@ -40,44 +38,6 @@ class Method(Protocol):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take the values of `state_dict` over, into the tensors that `param_groups` gave out."""
         ...
-
-
-class ThreeDGS:
-    """3D Gaussian Splatting (Kerbl et al. 2023, equation 7): 0.8 L1 + 0.2 D-SSIM on the Gaussians as is."""
-
-    LAMBDA_DSSIM = 0.2
-
-    def modulate(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians
-
-    def loss(self, render: Tensor, view: View) -> Tensor:
-        image, mask = photo_tensors(view)
-        return photometric_loss(render, image, mask=mask, lambda_dssim=self.LAMBDA_DSSIM)
-
-    def param_groups(self) -> list[dict[str, Any]]:
-        return []
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        if state:
-            raise ValueError(f"3dgs has no state of its own, the checkpoint has {sorted(state)}")
-
-
-METHODS: dict[str, Callable[[Scene, int], Method]] = {"3dgs": lambda scene, seed: ThreeDGS()}
-
-
-def check_method(name: str) -> None:
-    """ValueError, which lists the methods there are, for an unknown name."""
-    if name not in METHODS:
-        raise ValueError(f"unknown method {name!r}; the methods are: {', '.join(METHODS)}")
-
-
-def make_method(name: str, scene: Scene, seed: int) -> Method:
-    """The method of this name for a scene; ValueError for an unknown name."""
-    check_method(name)
-    return METHODS[name](scene, seed)
 
 
 def photo_tensors(view: View) -> tuple[Tensor, Tensor | None]:
