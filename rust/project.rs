@@ -399,11 +399,9 @@ pub struct GaussianGrads<'a, T> {
 /// Split an optional array of `n` rows into chunks of `PROJECT_CHUNK` rows.
 fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T]>> {
     match data {
-        Some(d) => d
-            .chunks_mut((PROJECT_CHUNK * row).max(1))
-            .map(Some)
-            .collect(),
-        None => (0..n.div_ceil(PROJECT_CHUNK)).map(|_| None).collect(),
+        Some(d) if row > 0 => d.chunks_mut(PROJECT_CHUNK * row).map(Some).collect(),
+        // No rows of the higher degrees still means one part for each chunk.
+        _ => (0..n.div_ceil(PROJECT_CHUNK)).map(|_| None).collect(),
     }
 }
 

@@ -256,14 +256,17 @@ def test_no_grad() -> None:
     assert torch.equal(alphas, expected_alphas)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_harmonics_in_two_tensors_are_those_in_one(dtype: torch.dtype) -> None:
-    scene = random_scene(60, 33, 21, seed=4, dtype=dtype, sh_degree=3)
-    joined = scene.colors.clone().requires_grad_()
+@both_dtypes
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_harmonics_in_two_tensors_are_those_in_one(sh_degree: int, dtype: torch.dtype) -> None:
+    scene = random_scene(60, 33, 21, seed=4, dtype=dtype, sh_degree=sh_degree)
+    one, two = scene.with_grad("means"), scene.with_grad("means")
+    bands = (sh_degree + 1) ** 2  # at degree 0 the second tensor is empty
+    joined = scene.colors[:, :bands].clone().requires_grad_()
     first = scene.colors[:, :1].clone().requires_grad_()
-    rest = scene.colors[:, 1:].clone().requires_grad_()
-    expected, _, _ = hqgs.rasterization(**scene.arguments(colors=joined))
-    render, _, _ = hqgs.rasterization(**scene.arguments(colors=(first, rest)))
+    rest = scene.colors[:, 1:bands].clone().requires_grad_()
+    expected, _, _ = hqgs.rasterization(**one.arguments(colors=joined))
+    render, _, _ = hqgs.rasterization(**two.arguments(colors=(first, rest)))
     assert torch.equal(render, expected)
     weights = torch.rand(render.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
     (expected * weights).sum().backward()
@@ -272,3 +275,7 @@ def test_harmonics_in_two_tensors_are_those_in_one(dtype: torch.dtype) -> None:
     assert first.grad is not None
     assert rest.grad is not None
     assert torch.equal(torch.cat([first.grad, rest.grad], dim=1), joined.grad)
+    assert one.means.grad is not None
+    assert one.means.grad.abs().sum() > 0
+    assert two.means.grad is not None
+    assert torch.equal(one.means.grad, two.means.grad)
