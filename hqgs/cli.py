@@ -1,7 +1,7 @@
-"""The command line: `hqgs train SCENE --out DIR`.
+"""The command line: `hqgs train SCENE --out DIR` and `hqgs degrade SCENE --kind KIND --out DIR`.
 
-Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C,
-with everything written unless Ctrl-C was pressed twice.
+Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C.
+Then a training run has written everything, unless Ctrl-C was pressed twice, and degrading nothing.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from hqgs.camera import Scene
 from hqgs.checkpoint import FolderBusyError
 from hqgs.config import TrainConfig
 from hqgs.data import load_scene
+from hqgs.degradations import parse_degradation
+from hqgs.degrade import check_new_folder, degrade_scene, write_degraded_scene
 from hqgs.densify import DensifyConfig
 from hqgs.methods import METHODS
 from hqgs.report import RunResult
@@ -27,6 +29,10 @@ from hqgs.train import TrainingError
 
 EMBEDDED = "embedded"
 EMBEDDED_SIZE = (504, 378)  # pixels
+KINDS_HELP = (
+    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], "
+    "several joined by + in their order, mixed, or none"
+)
 BAD_INPUT = (
     ValueError,
     FolderBusyError,
@@ -42,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code."""
     args = _parser().parse_args(argv)
     try:
-        return _train(args)
+        return args.run(args)
     except KeyboardInterrupt:
         return 130
 
@@ -52,20 +58,17 @@ def _parser() -> argparse.ArgumentParser:
         prog="hqgs", description="3D Gaussian Splatting on the CPU for degraded photos."
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    add = commands.add_parser("train", help="train a scene and write a report").add_argument
     config = TrainConfig()
-    add("scene", metavar="SCENE", help=f"scene folder, or {EMBEDDED!r} for the scene that is built in")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for the checkpoint and the report")
+
+    train = commands.add_parser("train", help="train a scene and write a report")
+    train.set_defaults(run=_train)
+    _add_scene(train, "folder for the checkpoint and the report", config.seed)
+    add = train.add_argument
     add("--method", default=config.method, help=f"one of: {', '.join(METHODS)} (%(default)s)")
     add("--iterations", type=int, default=config.iterations, metavar="N", help="training steps (%(default)s)")
     add(
-        "--downscale",
-        type=float,
-        default=1.0,
-        metavar="F",
-        help="divide the photos' sides by F (%(default)s)",
+        "--degrade", default="none", metavar="KIND", help=f"what happens to the training photos: {KINDS_HELP}"
     )
-    add("--seed", type=int, default=config.seed, metavar="S", help="of everything random (%(default)s)")
     add("--threads", type=int, metavar="T", help="(all cores; the result does not depend on it)")
     add(
         "--max-gaussians",
@@ -76,20 +79,44 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--eval-every", type=int, metavar="N", help="iterations between evaluations (a tenth of the run)")
     add("--resume", action="store_true", help="go on from the checkpoint in DIR, if there is one")
+
+    degrade = commands.add_parser("degrade", help="write a scene with degraded training photos")
+    degrade.set_defaults(run=_degrade)
+    _add_scene(degrade, "folder for the new scene; missing or empty", config.seed)
+    degrade.add_argument("--kind", required=True, help=KINDS_HELP)
     return parser
+
+
+def _add_scene(parser: argparse.ArgumentParser, out: str, seed: int) -> None:
+    """What every command takes."""
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help=f"scene folder, or {EMBEDDED!r} for the scene that is built in")
+    add("--out", type=Path, required=True, metavar="DIR", help=out)
+    add("--seed", type=int, default=seed, metavar="S", help="of everything random (%(default)s)")
+    add(
+        "--downscale",
+        type=float,
+        default=1.0,
+        metavar="F",
+        help="divide the photos' sides by F (%(default)s)",
+    )
 
 
 def _train(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         try:
             config = _config(args)
+            degradation = parse_degradation(args.degrade)
             if (args.out / CHECKPOINT).exists() and not args.resume:
                 raise FileExistsError(
                     f"{args.out} holds a run; continue it with --resume or choose another --out"
                 )
             if args.threads is not None:
                 hqgs.set_num_threads(args.threads)
-            trainer = stack.enter_context(open_run(_scene(args), config, args.out, args.resume))
+            scene = _scene(args, cache=args.out / "scene")
+            if degradation.steps:
+                scene = degrade_scene(scene, degradation, config.seed)
+            trainer = stack.enter_context(open_run(scene, config, args.out, args.resume))
         except BAD_INPUT as error:
             return _fail(2, str(error))
         except OSError as error:
@@ -104,6 +131,20 @@ def _train(args: argparse.Namespace) -> int:
     return 0 if result.iterations == config.iterations else 130
 
 
+def _degrade(args: argparse.Namespace) -> int:
+    try:
+        degradation = parse_degradation(args.kind)
+        check_new_folder(args.out)
+        scene = _scene(args, cache=None)
+        write_degraded_scene(scene, args.out, degradation, args.seed)
+    except BAD_INPUT as error:
+        return _fail(2, str(error))
+    except OSError as error:
+        return _fail(1, f"{args.out}: {error}")
+    print(f"{args.out}: {len(scene.train)} training photos with {degradation}, {len(scene.test)} held out")
+    return 0
+
+
 def _config(args: argparse.Namespace) -> TrainConfig:
     config = TrainConfig(
         iterations=args.iterations,
@@ -114,13 +155,13 @@ def _config(args: argparse.Namespace) -> TrainConfig:
     return config if args.eval_every is None else replace(config, eval_every=args.eval_every)
 
 
-def _scene(args: argparse.Namespace) -> Scene:
+def _scene(args: argparse.Namespace, cache: Path | None) -> Scene:
     if args.scene != EMBEDDED:
         return load_scene(args.scene, downscale=args.downscale)
     if not args.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {args.downscale}")
     width, height = (round(size / args.downscale) for size in EMBEDDED_SIZE)
-    return embedded_scene(cache=args.out / "scene", width=width, height=height)
+    return embedded_scene(cache=cache, width=width, height=height)
 
 
 def _print_summary(out: Path, result: RunResult) -> None:

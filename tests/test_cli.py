@@ -71,6 +71,62 @@ def test_train_the_embedded_scene(
     assert f"{out}: 20 iterations, {gaussians} Gaussians, " in capsys.readouterr().out
 
 
+def test_train_on_degraded_photos(asked: list[dict[str, Any]], tmp_path: Path) -> None:
+    options = ["--iterations", "2", "--seed", "3", "--degrade", "noise:25"]
+    assert call("train", "embedded", "--out", tmp_path, *options) == 0
+    (note,) = json.loads((tmp_path / "report.json").read_text())["notes"]
+    assert note.startswith("degradation noise:25, seed 3: all training photos (5), ")
+    assert call("train", "embedded", "--out", tmp_path, *options, "--resume") == 0
+    assert call("train", "embedded", "--out", tmp_path, *options[:-1], "noise:24", "--resume") == 2
+
+
+def test_degrade_writes_a_scene_that_trains(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = tmp_path / "bad"
+    command = ["degrade", "embedded", "--kind", "lowres:2+jpeg:30", "--out", bad, "--downscale", "2"]
+    assert call(*command, "--seed", "4") == 0
+    assert asked == [{"cache": None, "width": 252, "height": 189}]
+    assert capsys.readouterr().out == f"{bad}: 5 training photos with lowres:2+jpeg:30, 1 held out\n"
+    assert json.loads((bad / "degradation.json").read_text())["seed"] == 4
+    assert call("train", bad, "--iterations", "2", "--out", tmp_path / "run") == 0
+    (note,) = json.loads((tmp_path / "run" / "report.json").read_text())["notes"]
+    assert note.startswith("degradation lowres:2+jpeg:30, seed 4: ")
+    capsys.readouterr()
+    assert call(*command) == 2
+    assert one_line(capsys) == f"hqgs: {bad} exists and is not an empty folder"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["/no/such/scene", "--kind", "blur"], "hqgs: there is no scene folder /no/such/scene"),
+        (["embedded", "--kind", "jpeg:0"], "hqgs: jpeg is 0, wanted a quality, an integer in 1..95"),
+        (["embedded", "--kind", "noise:9", "--seed", "-1"], "hqgs: seed is -1, wanted at least 0"),
+        (["embedded", "--kind", "blur:20"], "hqgs: photo 'view1.png': a blur of sigma 20 px reaches 80 px"),
+    ],
+)
+def test_bad_input_of_degrade_is_exit_code_2(
+    asked: list[dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    assert call("degrade", *arguments, "--out", tmp_path / "out") == 2
+    assert one_line(capsys).startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_degrade_on_a_full_disk_leaves_nothing(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with small_disk(300):
+        assert call("degrade", "embedded", "--kind", "noise:9", "--out", tmp_path / "out") == 1
+    assert one_line(capsys).startswith(f"hqgs: {tmp_path / 'out'}: ")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_threads_are_set(asked: list[dict[str, Any]], tmp_path: Path) -> None:
     before = hqgs.get_num_threads()
     try:
@@ -112,6 +168,7 @@ def test_a_run_goes_on_with_resume_only(
             "hqgs: max_gaussians is 9, but the scene starts with 40 points",
         ),
         (["embedded", "--seed", "-1"], "hqgs: seed is -1, wanted at least 0"),
+        (["embedded", "--degrade", "fog"], "hqgs: unknown degradation 'fog'; there are: jpeg, noise, "),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

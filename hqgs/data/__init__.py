@@ -9,6 +9,7 @@ from pathlib import Path
 from hqgs.camera import Scene
 from hqgs.data.capture import Capture, list_photos, photo_folder
 from hqgs.data.colmap import find_models, read_colmap
+from hqgs.data.degraded import read_degraded_folder, with_low
 from hqgs.data.images import load_views
 from hqgs.data.llff import POSES, hold_marker, read_llff
 from hqgs.data.points import random_points
@@ -29,6 +30,9 @@ def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) ->
     none. A Blender pair of files names its own test views; a marker file `hold=N` stands for test_every = N,
     counted over the photos in the folder. `Scene.notes` says which rule and which files were used.
 
+    A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
+    at downscale 1, the only one at which they stand for `View.image`.
+
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
     root = Path(path).resolve()
@@ -41,7 +45,13 @@ def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) ->
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
     capture = _read(root, downscale)
+    degraded = read_degraded_folder(root)
+    if degraded is not None:
+        notes = [*degraded.notes, *capture.notes]
+        capture = replace(capture, test_names=frozenset(degraded.held_out), notes=notes)
     views = load_views(capture.photos, capture.downscale)
+    if degraded is not None and downscale == 1:
+        views = [with_low(view, degraded, root) for view in views]
     notes = list(capture.notes)
     test_names = _test_names(root, capture, test_every, notes)
     train = [v for v in views if v.name not in test_names]
