@@ -88,7 +88,7 @@ class Degradation:
                 value = (kind.at_504 or 0.0) * width / 504
                 step = replace(step, value=min(max(value, kind.lowest), kind.highest))
             elif step.kind == "lowres":
-                width = _small_side(width, int(step.value))
+                width = small_side(width, int(step.value))
             steps.append(step)
         return Degradation(tuple(steps))
 
@@ -193,7 +193,7 @@ def shrink(image: Float32, factor: int) -> Float32:
     the step and the kernel, so that both borders stay where they are and the way back moves nothing.
     """
     height, width = image.shape[:2]
-    return resize(image, _small_side(height, factor), _small_side(width, factor))
+    return resize(image, small_side(height, factor), small_side(width, factor))
 
 
 def gaussian_blur(image: Float32, sigma: float) -> Float32:
@@ -280,7 +280,8 @@ _OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], Float32]] 
 }
 
 
-def _small_side(side: int, factor: int) -> int:
+def small_side(side: int, factor: int) -> int:
+    """The side of a photo that was shrunk by `factor`, px."""
     return math.ceil(side / factor)
 
 
