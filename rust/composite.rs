@@ -4,12 +4,12 @@ use crate::{
     camera::Camera,
     constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
-    kernel::{self, ABSOLUTE, Adjoint, Grid, Layers, MOMENTS, Pixels, UNIT},
+    kernel::{self, ABSOLUTE, Adjoint, Grid, LAYER, Layers, MOMENTS, Pixels, Sums, UNIT},
     project::Projection,
-    real::Real,
-    tiles::{Chunk, Tiles, split},
+    real::{Lanes, Real},
+    tiles::{Chunk, Tiles},
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
 
 /// Everything that both passes read.
@@ -43,6 +43,17 @@ impl<T: Real> CompositeInput<'_, T> {
         self.camera.width * self.camera.height
     }
 
+    /// What reaches one block.
+    fn layers(&self, tile: usize, block: usize) -> Layers<'_, T> {
+        let list = &self.tiles.lists[tile];
+        Layers {
+            list: &list.blocks[list.begins[block] as usize..list.begins[block + 1] as usize],
+            records: &list.records,
+            colors: &list.colors,
+            channels: self.channels(),
+        }
+    }
+
     /// The image's pixels in tile `tile`: (index in block order, index in the image).
     fn tile_pixels(&self, tile: usize) -> impl Iterator<Item = (usize, usize)> + use<'_, T> {
         let (top, left) = (
@@ -61,8 +72,8 @@ impl<T: Real> CompositeInput<'_, T> {
 /// What the backward pass replays.
 #[derive(Debug, Default)]
 pub struct Composited<T> {
-    /// For each record the blocks in which it changed a pixel.
-    hits: Vec<u16>,
+    /// For each block of each tile how many of its layers were evaluated before it was finished.
+    depths: Vec<[u32; TILE_BLOCKS]>,
     /// Transmittance after the last layer, tile by tile in block order.
     transmittance: Vec<T>,
 }
@@ -72,19 +83,47 @@ pub struct Composited<T> {
 pub struct Work {
     /// (Gaussian, tile) pairs.
     pub pairs: u64,
-    /// Blocks evaluated by the forward pass.
+    /// Blocks evaluated by the forward pass, and again by the backward pass.
     pub blocks: u64,
-    /// Blocks in which a pixel changed: what the backward pass evaluates.
+    /// Blocks in which a pixel changed.
     pub hit_blocks: u64,
+    /// (Gaussian, pixel) pairs that were blended.
+    pub pixels: u64,
 }
 
-/// Call a kernel for the number of channels: the common ones are compiled for it.
+impl Work {
+    /// The sum.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            pairs: self.pairs + other.pairs,
+            blocks: self.blocks + other.blocks,
+            hit_blocks: self.hit_blocks + other.hit_blocks,
+            pixels: self.pixels + other.pixels,
+        }
+    }
+}
+
+/// Call a function for the number of channels: the common ones are compiled for it.
 macro_rules! for_channels {
     ($channels:expr, $function:ident, $simd:expr, $types:ty, ($($argument:expr),*)) => {
         match $channels {
             3 => $function::<_, $types, 3>($simd, $($argument),*),
             4 => $function::<_, $types, 4>($simd, $($argument),*),
             _ => $function::<_, $types, 0>($simd, $($argument),*),
+        }
+    };
+}
+
+/// Call a kernel for the number of vectors that a block has on this machine.
+macro_rules! for_vectors {
+    ($simd:ident: $S:ty, $T:ty, $D:ident, $function:ident($($argument:expr),*)) => {
+        match BLOCK_PIXELS / <Lanes<$T, $S> as SimdBase<$S>>::LEN {
+            1 => kernel::$function::<$S, $T, $D, 1>($simd, $($argument),*),
+            2 => kernel::$function::<$S, $T, $D, 2>($simd, $($argument),*),
+            4 => kernel::$function::<$S, $T, $D, 4>($simd, $($argument),*),
+            8 => kernel::$function::<$S, $T, $D, 8>($simd, $($argument),*),
+            _ => unreachable!("vectors have 2 to 16 lanes"),
         }
     };
 }
@@ -103,32 +142,22 @@ pub fn forward<T: Real>(
     check_len("render_alphas", alphas, input.pixels())?;
     let (tiles, channels) = (input.tiles, input.channels());
     let count = tiles.columns * tiles.rows;
-    let mut hits = vec![0u16; tiles.pairs()];
+    let mut depths = vec![[0; TILE_BLOCKS]; count];
     let mut transmittance = vec![T::ZERO; count * TILE_PIXELS];
     let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * channels];
     let grid = Grid::new();
     let level = Level::new();
-    let jobs: Vec<_> = split(&mut hits, tiles.lengths())
-        .into_iter()
-        .zip(transmittance.chunks_mut(TILE_PIXELS))
-        .zip(colors.chunks_mut(channels))
+    let work = depths
+        .par_iter_mut()
+        .zip(transmittance.par_chunks_mut(TILE_PIXELS))
+        .zip(colors.par_chunks_mut(channels))
         .enumerate()
-        .collect();
-    let work = jobs
-        .into_par_iter()
-        .map(|(tile, ((hits, transmittance), colors))| {
-            let Ok(transmittance) = transmittance.try_into() else {
-                unreachable!("chunks of a tile")
-            };
+        .map(|(tile, ((depths, transmittance), colors))| {
             dispatch!(level, simd => for_channels!(
-                channels, forward_tile, simd, T, (input, &grid, tile, hits, transmittance, colors)
+                channels, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
             ))
         })
-        .reduce(Work::default, |a, b| Work {
-            pairs: a.pairs + b.pairs,
-            blocks: a.blocks + b.blocks,
-            hit_blocks: a.hit_blocks + b.hit_blocks,
-        });
+        .reduce(Work::default, Work::plus);
     let width = input.camera.width;
     image
         .par_chunks_mut(TILE * width * channels)
@@ -152,7 +181,7 @@ pub fn forward<T: Real>(
         });
     Ok((
         Composited {
-            hits,
+            depths,
             transmittance,
         },
         work,
@@ -165,47 +194,25 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     input: &CompositeInput<T>,
     grid: &Grid<T>,
     tile: usize,
-    hits: &mut [u16],
-    transmittance: &mut Pixels<T>,
+    depths: &mut [u32; TILE_BLOCKS],
+    transmittance: &mut [T],
     colors: &mut [Pixels<T>],
 ) -> Work {
+    let mut work = Work {
+        pairs: input.tiles.lists[tile].records.len() as u64,
+        ..Work::default()
+    };
     for (p, _) in input.tile_pixels(tile) {
         transmittance[p] = T::ONE;
     }
-    let mut alive = 0u16;
-    for block in 0..TILE_BLOCKS {
-        let pixels = &transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
-        alive |= u16::from(pixels.contains(&T::ONE)) << block;
-    }
-    let mut finished = [T::ZERO; TILE_PIXELS];
-    let mut layers = Layers {
-        transmittance,
-        finished: &mut finished,
-        alive,
-    };
-    let list = input.tiles.tile(tile);
-    let channels = input.channels();
-    let mut work = Work {
-        pairs: hits.len() as u64,
-        ..Work::default()
-    };
-    let pairs = list.records.iter().zip(list.colors.chunks_exact(channels));
-    for ((local, color), hit) in pairs.zip(hits) {
-        let mask = kernel::reached(simd, local, grid) & layers.alive;
-        if mask == 0 {
-            continue;
-        }
-        *hit = kernel::blend::<S, T, D>(simd, grid, local, color, mask, &mut layers, colors);
-        work.blocks += u64::from(mask.count_ones());
-        work.hit_blocks += u64::from(hit.count_ones());
-        if layers.alive == 0 {
-            break;
-        }
-    }
-    for (t, finished) in transmittance.iter_mut().zip(finished) {
-        if finished > T::ZERO {
-            *t = finished;
-        }
+    for (block, depth) in depths.iter_mut().enumerate() {
+        let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
+        let layers = input.layers(tile, block);
+        let blended = for_vectors!(simd: S, T, D, blend(grid, block, layers, pixels, colors));
+        *depth = blended.layers as u32;
+        work.blocks += blended.layers as u64;
+        work.hit_blocks += blended.changed;
+        work.pixels += blended.pixels;
     }
     work
 }
@@ -275,26 +282,26 @@ pub fn backward<T: Real>(
         absolute,
         channels,
     };
-    let row = columns.row();
-    let mut pair_grads = vec![T::ZERO; tiles.pairs() * row];
     let grid = Grid::new();
     let level = Level::new();
-    let jobs: Vec<_> = split(&mut pair_grads, tiles.lengths().map(|n| n * row))
-        .into_iter()
-        .enumerate()
+    let pair_grads: Vec<_> = (0..tiles.lists.len())
+        .into_par_iter()
+        .map_init(
+            || Scratch {
+                v_colors: vec![[T::ZERO; TILE_PIXELS]; channels],
+                layers: Vec::new(),
+            },
+            |scratch, tile| {
+                dispatch!(level, simd => for_channels!(
+                    channels, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch)
+                ))
+            },
+        )
         .collect();
-    jobs.into_par_iter().for_each_init(
-        || Scratch { v_colors: vec![[T::ZERO; TILE_PIXELS]; channels], layers: Vec::new() },
-        |scratch, (tile, out)| {
-            dispatch!(level, simd => for_channels!(
-                channels, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch, out)
-            ));
-        },
-    );
     gather(input, &pair_grads, columns, n, grads.geometry, grads.colors)
 }
 
-/// Layout of one pair's gradients.
+/// Layout of one pair's gradients: moments, colours, absolute gradients.
 #[derive(Debug, Clone, Copy)]
 struct Columns {
     geometry: bool,
@@ -303,12 +310,12 @@ struct Columns {
 }
 
 impl Columns {
-    const fn colors(self) -> usize {
-        MOMENTS + if self.absolute { ABSOLUTE } else { 0 }
+    const fn absolute(self) -> usize {
+        MOMENTS + self.channels
     }
 
     const fn row(self) -> usize {
-        self.colors() + self.channels
+        self.absolute() + if self.absolute { ABSOLUTE } else { 0 }
     }
 }
 
@@ -316,10 +323,11 @@ impl Columns {
 struct Scratch<T> {
     /// Cotangents of a tile's pixels, by channel.
     v_colors: Vec<Pixels<T>>,
-    /// What `kernel::replay` stores.
+    /// What `kernel::unblend` stores.
     layers: Vec<T>,
 }
 
+/// Gradients of a tile's pairs, by index; empty if all are zero.
 #[inline(always)]
 fn backward_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
@@ -330,8 +338,7 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     tile: usize,
     columns: Columns,
     scratch: &mut Scratch<T>,
-    out: &mut [T],
-) {
+) -> Vec<T> {
     let channels = columns.channels;
     let mut transmittance = [T::ZERO; TILE_PIXELS];
     let mut behind = [T::ZERO; TILE_PIXELS];
@@ -352,49 +359,61 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
         behind[p] = T::from_f64(sum);
     }
     if !any {
-        return; // the gradients are already zero
+        return Vec::new();
     }
-    let list = input.tiles.tile(tile);
-    let hits = &composited.hits[input.tiles.offsets[tile]..][..list.records.len()];
-    let size = |hit: u16| hit.count_ones() as usize * kernel::LAYER;
-    scratch
-        .layers
-        .resize(hits.iter().map(|&hit| size(hit)).sum(), T::ZERO);
-    let mut rest = &mut scratch.layers[..];
-    for (local, &hit) in list.records.iter().zip(hits) {
-        let (layer, tail) = rest.split_at_mut(size(hit));
-        rest = tail;
-        kernel::replay(simd, grid, local, hit, &mut transmittance, layer);
+    // Block by block: what each layer contributes.
+    let depths = &composited.depths[tile];
+    let total: u32 = depths.iter().sum();
+    if scratch.layers.len() < total as usize * LAYER {
+        scratch.layers.resize(total as usize * LAYER, T::ZERO);
     }
-    let mut adjoint = Adjoint {
-        behind: &mut behind,
-        v_colors: &scratch.v_colors,
-        geometry: columns.geometry,
-        absolute: columns.absolute,
-    };
-    let mut rest = &scratch.layers[..];
-    let colors = list.colors.chunks_exact(channels);
-    for (((local, color), &hit), &place) in list
-        .records
-        .iter()
-        .zip(colors)
-        .zip(hits)
-        .zip(list.places)
-        .rev()
-    {
-        if hit != 0 {
-            let (head, layers) = rest.split_at(rest.len() - size(hit));
-            rest = head;
-            let out = &mut out[place as usize * columns.row()..][..columns.row()];
-            kernel::unblend::<S, T, D>(simd, grid, local, color, hit, layers, &mut adjoint, out);
+    let mut next = [0; TILE_BLOCKS];
+    let mut ends = [0; TILE_BLOCKS];
+    let mut sum = 0;
+    for block in 0..TILE_BLOCKS {
+        let depth = depths[block] as usize;
+        let mut layers = input.layers(tile, block);
+        layers.list = &layers.list[..depth];
+        let pixels = block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS;
+        let adjoint = Adjoint {
+            transmittance: &transmittance[pixels.clone()],
+            behind: &behind[pixels],
+            v_colors: &scratch.v_colors,
+        };
+        let out = &mut scratch.layers[sum * LAYER..(sum + depth) * LAYER];
+        for_vectors!(simd: S, T, D, unblend(grid, block, layers, &adjoint, out));
+        next[block] = sum;
+        sum += depth;
+        ends[block] = sum;
+    }
+    // Gaussian by Gaussian: the sums over its blocks.
+    let list = &input.tiles.lists[tile];
+    let row = columns.row();
+    let mut out = vec![T::ZERO; list.records.len() * row];
+    for ((local, &mask), &place) in list.records.iter().zip(&list.masks).zip(&list.places) {
+        let mut sums = Sums::<S, T>::new(simd, local);
+        let out = &mut out[place as usize * row..(place as usize + 1) * row];
+        let mut rest = mask;
+        while rest != 0 {
+            let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
+            rest &= rest - 1;
+            let k = next[block];
+            if k < ends[block] {
+                next[block] = k + 1;
+                let layer = &scratch.layers[k * LAYER..(k + 1) * LAYER];
+                let v_colors = &scratch.v_colors;
+                sums.add::<D>(simd, grid, block, layer, v_colors, columns.absolute, out);
+            }
         }
+        sums.finish::<D>(columns.absolute, out);
     }
+    out
 }
 
 /// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.
 fn gather<T: Real>(
     input: &CompositeInput<T>,
-    pair_grads: &[T],
+    pair_grads: &[Vec<T>],
     columns: Columns,
     n: usize,
     geometry: Option<GeometryGrads<T>>,
@@ -438,7 +457,7 @@ fn gather<T: Real>(
                         }
                     }
                 };
-                write(&mut colors, &sums[columns.colors()..]);
+                write(&mut colors, &sums[MOMENTS..columns.absolute()]);
                 let [s, m, t] = splat.factors;
                 // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
                 let (wu, wv) = (sums[1] / UNIT, sums[2] / UNIT);
@@ -449,20 +468,24 @@ fn gather<T: Real>(
                 // sigma enters as opacity exp(-sigma)
                 write(&mut opacities, &[-sums[0] / splat.opacity]);
                 if columns.absolute {
+                    let at = columns.absolute();
                     write(
                         &mut absolute,
-                        &[s * sums[MOMENTS] / UNIT, sums[MOMENTS + 1] / (UNIT * UNIT)],
+                        &[s * sums[at] / UNIT, sums[at + 1] / (UNIT * UNIT)],
                     );
                 }
             };
             let mut current = None;
-            chunk.pairs(input.tiles.columns, |i, position| {
+            chunk.pairs(input.tiles.columns, |i, tile, place| {
                 if let Some(last) = current.filter(|&last| last != i) {
                     finish(last, &sums);
                     sums.fill(0.0);
                 }
                 current = Some(i);
-                let row = &pair_grads[position * columns.row()..][..columns.row()];
+                if pair_grads[tile].is_empty() {
+                    return;
+                }
+                let row = &pair_grads[tile][place * columns.row()..][..columns.row()];
                 sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
             });
             if let Some(last) = current {
@@ -471,6 +494,17 @@ fn gather<T: Real>(
         },
     );
     Ok(())
+}
+
+/// Split `data` into consecutive pieces of the given lengths.
+fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+    lengths
+        .map(|n| {
+            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
+            data = tail;
+            head
+        })
+        .collect()
 }
 
 /// Split an optional array of `row` numbers per Gaussian into the ranges of `chunks`.

@@ -650,9 +650,7 @@ fn composite_as<'py, T: Scalar>(
                     &mut image[i * pixels * channels..(i + 1) * pixels * channels],
                     &mut alphas[i * pixels..(i + 1) * pixels],
                 )?;
-                total.pairs += work.pairs;
-                total.blocks += work.blocks;
-                total.hit_blocks += work.hit_blocks;
+                total = total.plus(work);
                 views.push(View { tiles, composited });
             }
             Ok((

@@ -7,13 +7,15 @@
 
 use crate::{
     camera::Camera,
-    constants::{MAX_PAIRS, TILE},
+    constants::{MAX_PAIRS, TILE, TILE_BLOCKS},
     error::Error,
-    kernel::Local,
+    kernel::{self, Local, Shapes},
     project::{Projection, Splat},
     real::Real,
 };
+use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// A run of tiles in one row that one Gaussian reaches.
 #[derive(Debug, Clone, Copy)]
@@ -24,82 +26,82 @@ struct Span {
     end: u16,
 }
 
-/// The spans of a range of consecutive Gaussians.
+impl Span {
+    fn tiles(&self, columns: usize) -> Range<usize> {
+        let row = usize::from(self.row) * columns;
+        row + usize::from(self.begin)..row + usize::from(self.end)
+    }
+}
+
+/// The spans of a range of consecutive Gaussians, in their order.
 #[derive(Debug)]
 pub(crate) struct Chunk {
     /// First Gaussian.
     pub begin: usize,
     /// End of the range.
     pub end: usize,
-    /// By (Gaussian, row).
     spans: Vec<Span>,
-    /// The same spans by (row, Gaussian): indices into `spans`.
-    by_row: Vec<u32>,
-    /// Begin of each row in `by_row`, and the end.
-    row_begins: Vec<u32>,
-    /// For each tile where this chunk's records begin, in the order of all records.
+    /// Number of this chunk's pairs in each tile; once all chunks are known, their first place in the tile.
     starts: Vec<u32>,
+    pairs: u64,
 }
 
 impl Chunk {
-    /// Call `f(gaussian, position of its record)` for each pair: by Gaussian, then by tile.
-    pub fn pairs(&self, columns: usize, mut f: impl FnMut(usize, usize)) {
+    /// Call `f(gaussian, tile, place)` for each pair: by Gaussian, then by tile.
+    #[inline(always)]
+    pub fn pairs(&self, columns: usize, mut f: impl FnMut(usize, usize, usize)) {
         let mut next = self.starts.clone();
         for span in &self.spans {
-            let row = usize::from(span.row) * columns;
-            for position in &mut next[row + usize::from(span.begin)..row + usize::from(span.end)] {
-                f(span.gaussian as usize, *position as usize);
-                *position += 1;
+            let tiles = span.tiles(columns);
+            let first = tiles.start;
+            for (k, place) in next[tiles].iter_mut().enumerate() {
+                f(span.gaussian as usize, first + k, *place as usize);
+                *place += 1;
             }
         }
     }
 }
 
-/// For each tile the Gaussians whose support reaches one of its pixel centres.
+/// The Gaussians whose support reaches a pixel centre of one tile.
+#[derive(Debug, Default)]
+pub(crate) struct List<T> {
+    /// What the kernels need of each pair, by (depth, index), so that they read a stream.
+    pub records: Vec<Local<T>>,
+    /// Colours of the records, [pairs, channels].
+    pub colors: Vec<T>,
+    /// For each record its place by index among the tile's records.
+    pub places: Vec<u32>,
+    /// For each record the blocks that it reaches: bit b for block b.
+    pub masks: Vec<u16>,
+    /// For each block, one after the other, the records that reach it, front to back.
+    pub blocks: Vec<u32>,
+    /// Begin of each block in `blocks`, and the end.
+    pub begins: [u32; TILE_BLOCKS + 1],
+}
+
+/// The tile lists of one view.
 #[derive(Debug, Default)]
 pub struct Tiles<T> {
     /// Tiles per row.
     pub columns: usize,
     /// Tiles per column.
     pub rows: usize,
-    /// Begin of each tile's records, row-major, and the total at the end.
-    pub offsets: Vec<usize>,
-    /// What the kernels need of each pair; in a tile by (depth, index), so that they read a stream.
-    pub(crate) records: Vec<Local<T>>,
-    /// Colours of the records, [pairs, channels].
-    pub(crate) colors: Vec<T>,
+    /// Row-major.
+    pub(crate) lists: Vec<List<T>>,
     /// Number of channels.
     pub(crate) channels: usize,
-    /// For each record its place by index among the tile's records.
-    places: Vec<u32>,
     pub(crate) chunks: Vec<Chunk>,
-}
-
-/// One tile's part of [`Tiles`].
-pub(crate) struct Tile<'a, T> {
-    pub records: &'a [Local<T>],
-    pub colors: &'a [T],
-    pub places: &'a [u32],
 }
 
 impl<T> Tiles<T> {
     /// Number of (Gaussian, tile) pairs.
     pub fn pairs(&self) -> usize {
-        self.places.len()
+        self.lengths().sum()
     }
 
     /// Number of pairs of each tile.
     pub fn lengths(&self) -> impl Iterator<Item = usize> {
-        self.offsets.windows(2).map(|w| w[1] - w[0])
-    }
-
-    pub(crate) fn tile(&self, tile: usize) -> Tile<'_, T> {
-        let range = self.offsets[tile]..self.offsets[tile + 1];
-        Tile {
-            records: &self.records[range.clone()],
-            colors: &self.colors[range.start * self.channels..range.end * self.channels],
-            places: &self.places[range],
-        }
+        self.lists.iter().map(|list| list.records.len())
     }
 }
 
@@ -149,62 +151,69 @@ fn find_spans(
     end: usize,
     columns: usize,
     rows: usize,
-) -> (Chunk, u64) {
+) -> Chunk {
     let mut spans = Vec::with_capacity(end - begin);
     let mut counts = vec![0u32; columns * rows];
-    let mut row_begins = vec![0u32; rows + 1];
     let mut pairs = 0;
-    for i in begin..end {
-        let splat = &projection.splats[i];
+    for (i, splat) in projection.splats[begin..end].iter().enumerate() {
         if !splat.visible() {
             continue;
         }
         tile_spans(splat, |row, x0, x1| {
-            spans.push(Span {
-                gaussian: i as u32,
+            let span = Span {
+                gaussian: (begin + i) as u32,
                 row: row as u16,
                 begin: x0 as u16,
                 end: x1 as u16,
-            });
-            row_begins[row + 1] += 1;
-            counts[row * columns + x0..row * columns + x1]
-                .iter_mut()
-                .for_each(|n| *n += 1);
+            };
+            counts[span.tiles(columns)].iter_mut().for_each(|n| *n += 1);
             pairs += (x1 - x0) as u64;
+            spans.push(span);
         });
     }
-    for row in 0..rows {
-        row_begins[row + 1] += row_begins[row];
-    }
-    let mut next = row_begins.clone();
-    let mut by_row = vec![0u32; spans.len()];
-    for (k, span) in spans.iter().enumerate() {
-        let slot = &mut next[usize::from(span.row)];
-        by_row[*slot as usize] = k as u32;
-        *slot += 1;
-    }
-    (
-        Chunk {
-            begin,
-            end,
-            spans,
-            by_row,
-            row_begins,
-            starts: counts,
-        },
+    Chunk {
+        begin,
+        end,
+        spans,
+        starts: counts,
         pairs,
-    )
+    }
 }
 
-/// Split `data` into consecutive pieces of the given lengths.
-pub(crate) fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
-    lengths
-        .map(|n| {
-            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
-            data = tail;
-            head
-        })
-        .collect()
+/// The pairs of one chunk, tile by tile and in a tile by index: (bits of the depth as f32, Gaussian).
+struct Keys {
+    keys: Vec<u64>,
+    /// Begin of each tile in `keys`, and the end.
+    begins: Vec<u32>,
+}
+
+impl Keys {
+    /// Reads `chunk.starts` as counts.
+    fn new(chunk: &Chunk, projection: &Projection, columns: usize) -> Self {
+        let mut begins = Vec::with_capacity(chunk.starts.len() + 1);
+        let mut sum = 0;
+        for count in &chunk.starts {
+            begins.push(sum);
+            sum += count;
+        }
+        let mut next = begins.clone();
+        begins.push(sum);
+        let mut keys = vec![0; sum as usize];
+        for span in &chunk.spans {
+            // Positive floats order like their bits.
+            let depth = (projection.depths[span.gaussian as usize] as f32).to_bits();
+            let key = u64::from(depth) << 32 | u64::from(span.gaussian);
+            for slot in &mut next[span.tiles(columns)] {
+                keys[*slot as usize] = key;
+                *slot += 1;
+            }
+        }
+        Self { keys, begins }
+    }
+
+    fn tile(&self, tile: usize) -> &[u64] {
+        &self.keys[self.begins[tile] as usize..self.begins[tile + 1] as usize]
+    }
 }
 
 /// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry.
@@ -221,11 +230,11 @@ pub fn bin<T: Real>(
     let (columns, rows) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
     // Several chunks per thread balance the load; the number of chunks changes no result.
     let size = n.div_ceil(4 * rayon::current_num_threads()).max(1024);
-    let (mut chunks, pairs): (Vec<_>, Vec<_>) = (0..n.div_ceil(size))
+    let mut chunks: Vec<_> = (0..n.div_ceil(size))
         .into_par_iter()
         .map(|k| find_spans(projection, k * size, n.min((k + 1) * size), columns, rows))
-        .unzip();
-    let total: u64 = pairs.iter().sum();
+        .collect();
+    let total: u64 = chunks.iter().map(|chunk| chunk.pairs).sum();
     if total > MAX_PAIRS {
         return Err(Error::new(
             "means",
@@ -235,117 +244,121 @@ pub fn bin<T: Real>(
             ),
         ));
     }
-    // Counts to positions: tile by tile, within a tile chunk by chunk.
-    let mut offsets = Vec::with_capacity(columns * rows + 1);
-    let mut sum = 0;
-    for tile in 0..columns * rows {
-        offsets.push(sum as usize);
-        for chunk in &mut chunks {
-            sum += std::mem::replace(&mut chunk.starts[tile], sum);
+    let keys: Vec<_> = chunks
+        .par_iter()
+        .map(|chunk| Keys::new(chunk, projection, columns))
+        .collect();
+    // Counts to places: in a tile chunk by chunk.
+    let mut sums = vec![0u32; columns * rows];
+    for chunk in &mut chunks {
+        for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
+            *sum += std::mem::replace(start, *sum);
         }
     }
-    offsets.push(sum as usize);
-
-    let mut records = vec![Local::default(); sum as usize];
-    let mut pair_colors = vec![T::ZERO; sum as usize * channels];
-    let mut places = vec![0u32; sum as usize];
-    let row_lengths = || (0..rows).map(|y| offsets[(y + 1) * columns] - offsets[y * columns]);
-    let jobs: Vec<_> = split(&mut records, row_lengths())
-        .into_iter()
-        .zip(split(&mut pair_colors, row_lengths().map(|n| n * channels)))
-        .zip(split(&mut places, row_lengths()))
-        .enumerate()
-        .collect();
     let source = Source {
         projection,
         colors,
         channels,
         columns,
-        chunks: &chunks,
-        offsets: &offsets,
+        keys: &keys,
     };
-    jobs.into_par_iter()
-        .for_each(|(row, ((records, colors), places))| {
-            source.fill_row(row, records, colors, places);
-        });
+    let level = Level::new();
+    let lists = (0..columns * rows)
+        .into_par_iter()
+        .map_init(
+            Scratch::default,
+            |scratch, tile| dispatch!(level, simd => source.list(simd, tile, scratch)),
+        )
+        .collect();
     Ok(Tiles {
         columns,
         rows,
-        offsets,
-        records,
-        colors: pair_colors,
+        lists,
         channels,
-        places,
         chunks,
     })
 }
 
-/// What the rows are filled from.
+/// What the lists are made from.
 struct Source<'a, T> {
     projection: &'a Projection,
     colors: &'a [T],
     channels: usize,
     columns: usize,
-    chunks: &'a [Chunk],
-    offsets: &'a [usize],
+    keys: &'a [Keys],
+}
+
+/// Buffers of one thread, reused from tile to tile.
+#[derive(Default)]
+struct Scratch {
+    keys: Vec<u64>,
+    /// The tile's Gaussians by index.
+    gaussians: Vec<u32>,
+    shapes: Shapes,
+    reached: [Vec<u32>; TILE_BLOCKS],
 }
 
 impl<T: Real> Source<'_, T> {
-    /// Write the records, colours and places of one row of tiles.
-    fn fill_row(&self, row: usize, records: &mut [Local<T>], colors: &mut [T], places: &mut [u32]) {
-        let tiles = row * self.columns..(row + 1) * self.columns;
-        let base = self.offsets[tiles.start];
-        let d = self.channels;
+    #[inline(always)]
+    fn list<S: Simd>(&self, simd: S, tile: usize, scratch: &mut Scratch) -> List<T> {
+        let Scratch {
+            keys,
+            gaussians,
+            shapes,
+            reached,
+        } = scratch;
+        keys.clear();
+        gaussians.clear();
+        for chunk in self.keys {
+            for key in chunk.tile(tile) {
+                // The low half becomes the place by index.
+                keys.push(key >> 32 << 32 | gaussians.len() as u64);
+                gaussians.push(*key as u32);
+            }
+        }
+        let n = keys.len();
+        let mut list = List {
+            records: Vec::with_capacity(n),
+            colors: Vec::with_capacity(n * self.channels),
+            places: Vec::with_capacity(n),
+            ..List::default()
+        };
+        if n == 0 {
+            return list;
+        }
+        keys.sort_unstable();
+        for key in keys.iter() {
+            list.places.push(*key as u32);
+        }
+        self.order_ties(keys, gaussians, &mut list.places);
         let middle = |k: usize| (k * TILE + TILE / 2) as f64;
-        // By index first.
-        let mut keys = vec![0u64; records.len()];
-        let mut by_index = vec![Local::default(); records.len()];
-        for chunk in self.chunks {
-            let mut next = chunk.starts[tiles.clone()].to_vec();
-            let spans =
-                &chunk.by_row[chunk.row_begins[row] as usize..chunk.row_begins[row + 1] as usize];
-            for span in spans.iter().map(|&k| &chunk.spans[k as usize]) {
-                let i = span.gaussian as usize;
-                let splat = &self.projection.splats[i];
-                // Positive floats order like their bits; the low half keeps the order of the indices.
-                let key = u64::from((self.projection.depths[i] as f32).to_bits()) << 32;
-                let begin = usize::from(span.begin);
-                for (x, next) in next[begin..usize::from(span.end)].iter_mut().enumerate() {
-                    let x = begin + x;
-                    let at = *next as usize - base;
-                    *next += 1;
-                    by_index[at] = Local::new(splat, span.gaussian, [middle(x), middle(row)]);
-                    keys[at] = key | (at - (self.offsets[tiles.start + x] - base)) as u64;
-                }
+        let center = [middle(tile % self.columns), middle(tile / self.columns)];
+        shapes.resize(n);
+        for (k, place) in list.places.iter().enumerate() {
+            let gaussian = gaussians[*place as usize];
+            let i = gaussian as usize;
+            let splat = &self.projection.splats[i];
+            list.records.push(shapes.set(k, splat, gaussian, center));
+            let color = &self.colors[i * self.channels..(i + 1) * self.channels];
+            if let &[r, g, b] = color {
+                list.colors.extend([r, g, b]);
+            } else {
+                list.colors.extend_from_slice(color);
             }
         }
-        for tile in tiles {
-            let range = self.offsets[tile] - base..self.offsets[tile + 1] - base;
-            let keys = &mut keys[range.clone()];
-            let by_index = &by_index[range.clone()];
-            let places = &mut places[range.clone()];
-            keys.sort_unstable();
-            for (place, key) in places.iter_mut().zip(keys.iter()) {
-                *place = *key as u32;
-            }
-            self.order_ties(keys, by_index, places);
-            let colors = &mut colors[range.start * d..range.end * d];
-            for ((record, color), place) in records[range]
-                .iter_mut()
-                .zip(colors.chunks_exact_mut(d))
-                .zip(places.iter())
-            {
-                *record = by_index[*place as usize];
-                let i = record.gaussian as usize;
-                color.copy_from_slice(&self.colors[i * d..(i + 1) * d]);
-            }
+        kernel::reached(simd, shapes, n, &mut list.masks, reached);
+        list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
+        for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
+            list.blocks.extend_from_slice(records);
+            *begin = list.blocks.len() as u32;
         }
+        list
     }
 
     /// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
     /// equal ones stay in the order of their indices.
-    fn order_ties(&self, keys: &[u64], records: &[Local<T>], order: &mut [u32]) {
-        let depth = |o: &u32| self.projection.depths[records[*o as usize].gaussian as usize];
+    fn order_ties(&self, keys: &[u64], gaussians: &[u32], order: &mut [u32]) {
+        let depth = |o: &u32| self.projection.depths[gaussians[*o as usize] as usize];
         let mut begin = 0;
         for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
             if run.len() > 1 {
