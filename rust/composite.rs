@@ -5,7 +5,7 @@ use crate::{
     constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
     kernel::{self, ABSOLUTE, Adjoint, Grid, LAYER, Layers, MOMENTS, Pixels, Sums, UNIT},
-    project::Projection,
+    project::{Projection, Splat},
     real::{Lanes, Real},
     tiles::{Chunk, Tiles},
 };
@@ -277,11 +277,7 @@ pub fn backward<T: Real>(
         .geometry
         .as_ref()
         .is_some_and(|g| g.absolute.is_some());
-    let columns = Columns {
-        geometry: grads.geometry.is_some(),
-        absolute,
-        channels,
-    };
+    let columns = Columns { absolute, channels };
     let grid = Grid::new();
     let level = Level::new();
     let pair_grads: Vec<_> = (0..tiles.lists.len())
@@ -304,18 +300,13 @@ pub fn backward<T: Real>(
 /// Layout of one pair's gradients: moments, colours, absolute gradients.
 #[derive(Debug, Clone, Copy)]
 struct Columns {
-    geometry: bool,
     absolute: bool,
     channels: usize,
 }
 
 impl Columns {
-    const fn absolute(self) -> usize {
-        MOMENTS + self.channels
-    }
-
     const fn row(self) -> usize {
-        self.absolute() + if self.absolute { ABSOLUTE } else { 0 }
+        MOMENTS + self.channels + if self.absolute { ABSOLUTE } else { 0 }
     }
 }
 
@@ -436,6 +427,7 @@ fn gather<T: Real>(
         check_len("v_colors", colors, channels * n)?;
     }
     let chunks = &input.tiles.chunks;
+    let level = Level::new();
     let jobs: Vec<_> = chunks
         .iter()
         .zip(rows(means2d, chunks, 2))
@@ -443,57 +435,133 @@ fn gather<T: Real>(
         .zip(rows(opacities, chunks, 1))
         .zip(rows(absolute, chunks, 2))
         .zip(rows(colors, chunks, channels))
+        .map(
+            |(((((chunk, means2d), whitened), opacities), absolute), colors)| Gather {
+                chunk,
+                means2d,
+                whitened,
+                opacities,
+                absolute,
+                colors,
+            },
+        )
         .collect();
-    jobs.into_par_iter().for_each(
-        |(((((chunk, mut means2d), mut whitened), mut opacities), mut absolute), mut colors)| {
-            let mut sums = vec![0.0f64; columns.row()];
-            let mut finish = |i: usize, sums: &[f64]| {
-                let j = i - chunk.begin;
-                let splat = &input.projection.splats[i];
-                let write = |out: &mut Option<&mut [T]>, values: &[f64]| {
-                    if let Some(out) = out {
-                        for (o, v) in out[j * values.len()..].iter_mut().zip(values) {
-                            *o = T::from_f64(*v);
-                        }
-                    }
-                };
-                write(&mut colors, &sums[MOMENTS..columns.absolute()]);
-                let [s, m, t] = splat.factors;
-                // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
-                let (wu, wv) = (sums[1] / UNIT, sums[2] / UNIT);
-                write(&mut means2d, &[-s * wu, s * m * wu - t * wv]);
-                // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
-                let k = -0.5 / (UNIT * UNIT);
-                write(&mut whitened, &[k * sums[3], k * sums[4], k * sums[5]]);
-                // sigma enters as opacity exp(-sigma)
-                write(&mut opacities, &[-sums[0] / splat.opacity]);
-                if columns.absolute {
-                    let at = columns.absolute();
-                    write(
-                        &mut absolute,
-                        &[s * sums[at] / UNIT, sums[at + 1] / (UNIT * UNIT)],
-                    );
-                }
-            };
-            let mut current = None;
-            chunk.pairs(input.tiles.columns, |i, tile, place| {
-                if let Some(last) = current.filter(|&last| last != i) {
-                    finish(last, &sums);
-                    sums.fill(0.0);
-                }
-                current = Some(i);
-                if pair_grads[tile].is_empty() {
-                    return;
-                }
-                let row = &pair_grads[tile][place * columns.row()..][..columns.row()];
-                sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
-            });
-            if let Some(last) = current {
-                finish(last, &sums);
-            }
-        },
-    );
+    jobs.into_par_iter().for_each(|job| {
+        dispatch!(level, simd => for_channels!(
+            channels, gather_chunk, simd, T, (input, pair_grads, columns, job)
+        ));
+    });
     Ok(())
+}
+
+/// The outputs of one chunk.
+struct Gather<'a, T> {
+    chunk: &'a Chunk,
+    means2d: Option<&'a mut [T]>,
+    whitened: Option<&'a mut [T]>,
+    opacities: Option<&'a mut [T]>,
+    absolute: Option<&'a mut [T]>,
+    colors: Option<&'a mut [T]>,
+}
+
+impl<T: Real> Gather<'_, T> {
+    /// Write the gradients of Gaussian `i` from the sums over its pairs.
+    #[inline(always)]
+    fn write(
+        &mut self,
+        i: usize,
+        splat: &Splat,
+        moments: &[f64],
+        colors: &[f64],
+        absolute: &[f64],
+    ) {
+        let i = i - self.chunk.begin;
+        write(&mut self.colors, i, colors);
+        let [s, m, t] = splat.factors;
+        // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
+        let (wu, wv) = (moments[1] / UNIT, moments[2] / UNIT);
+        write(&mut self.means2d, i, &[-s * wu, s * m * wu - t * wv]);
+        // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
+        let k = -0.5 / (UNIT * UNIT);
+        write(
+            &mut self.whitened,
+            i,
+            &[k * moments[3], k * moments[4], k * moments[5]],
+        );
+        // sigma enters as opacity exp(-sigma)
+        write(&mut self.opacities, i, &[-moments[0] / splat.opacity]);
+        write(
+            &mut self.absolute,
+            i,
+            &[s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)],
+        );
+    }
+}
+
+/// Row `i` of an output, if it is wanted.
+#[inline(always)]
+fn write<T: Real>(out: &mut Option<&mut [T]>, i: usize, values: &[f64]) {
+    if let Some(out) = out {
+        for (o, v) in out[i * values.len()..].iter_mut().zip(values) {
+            *o = T::from_f64(*v);
+        }
+    }
+}
+
+/// `gather` for one chunk of Gaussians.
+#[inline(always)]
+fn gather_chunk<S: Simd, T: Real, const D: usize>(
+    _: S,
+    input: &CompositeInput<T>,
+    pair_grads: &[Vec<T>],
+    columns: Columns,
+    mut out: Gather<T>,
+) {
+    let channels = if D > 0 { D } else { columns.channels };
+    let row = Columns {
+        channels,
+        ..columns
+    }
+    .row();
+    let mut next = out.chunk.starts.clone();
+    let mut moments = [0.0; MOMENTS];
+    let mut absolute = [0.0; ABSOLUTE];
+    let mut colors = vec![0.0; channels];
+    let mut current = None;
+    for span in &out.chunk.spans {
+        let i = span.gaussian as usize;
+        if let Some(last) = current.filter(|&last| last != i) {
+            let splat = &input.projection.splats[last];
+            out.write(last, splat, &moments, &colors, &absolute);
+            moments.fill(0.0);
+            colors.fill(0.0);
+            absolute.fill(0.0);
+        }
+        current = Some(i);
+        for tile in span.tiles(input.tiles.columns) {
+            let place = next[tile] as usize;
+            next[tile] += 1;
+            if let Some(grads) = pair_grads[tile].get(place * row..(place + 1) * row) {
+                add(&mut moments, grads);
+                add(&mut colors[..channels], &grads[MOMENTS..]);
+                if columns.absolute {
+                    add(&mut absolute, &grads[MOMENTS + channels..]);
+                }
+            }
+        }
+    }
+    if let Some(last) = current {
+        let splat = &input.projection.splats[last];
+        out.write(last, splat, &moments, &colors, &absolute);
+    }
+}
+
+#[inline(always)]
+fn add<T: Real>(sums: &mut [f64], grads: &[T]) {
+    let grads = &grads[..sums.len()];
+    for (sum, grad) in sums.iter_mut().zip(grads) {
+        *sum += grad.to_f64();
+    }
 }
 
 /// Split `data` into consecutive pieces of the given lengths.

@@ -63,6 +63,8 @@ pub(crate) struct Local<T> {
     pub n: T,
     pub t: T,
     pub opacity: T,
+    /// Radius of the support in (u, v).
+    reach: T,
     /// Index of the Gaussian.
     pub gaussian: u32,
 }
@@ -70,46 +72,44 @@ pub(crate) struct Local<T> {
 /// `sqrt(log2(e) / 2)`: with it `2^-(u^2 + v^2) = exp(-sigma)`.
 pub(crate) const UNIT: f64 = 0.849_321_800_288_019_1;
 
+impl<T: Real> Local<T> {
+    #[inline(always)]
+    pub fn new(splat: &Splat, gaussian: u32, center: [f64; 2]) -> Self {
+        let [s, m, t] = splat.factors;
+        let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
+        let (s, t) = (UNIT * s, UNIT * t);
+        Self {
+            u0: T::from_f64(s * (m * y - x)),
+            v0: T::from_f64(-t * y),
+            s: T::from_f64(s),
+            n: T::from_f64(-s * m),
+            t: T::from_f64(t),
+            opacity: T::from_f64(splat.opacity),
+            reach: T::from_f64(UNIT * f64::from(splat.reach)),
+            gaussian,
+        }
+    }
+}
+
 /// Gaussians side by side in `Shapes`: the most lanes of f32 that a vector has.
 const GROUP: usize = 16;
 
-/// What the test of the blocks reads, one Gaussian per lane: u0, v0, s, n, t, radius of the support in
-/// (u, v), y of the centre. In f32 for either type: `SUPPORT_SLACK` covers its rounding.
+/// What the test of the blocks reads, one Gaussian per lane: u0, v0, s, n, t and the radius of the support
+/// in (u, v). In f32 for either type: `SUPPORT_SLACK` covers its rounding.
 #[derive(Default)]
-pub(crate) struct Shapes(Vec<[[f32; GROUP]; 7]>);
+pub(crate) struct Shapes(Vec<[[f32; GROUP]; 6]>);
 
 impl Shapes {
     /// Make room for `n` Gaussians.
     pub fn resize(&mut self, n: usize) {
-        self.0.resize(n.div_ceil(GROUP), [[0.0; GROUP]; 7]);
+        self.0.resize(n.div_ceil(GROUP), [[0.0; GROUP]; 6]);
     }
 
-    /// Put a Gaussian at `k`, and return it as the kernels read it.
     #[inline(always)]
-    pub fn set<T: Real>(
-        &mut self,
-        k: usize,
-        splat: &Splat,
-        gaussian: u32,
-        center: [f64; 2],
-    ) -> Local<T> {
-        let [s, m, t] = splat.factors;
-        let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
-        let (s, t) = (UNIT * s, UNIT * t);
-        let (u0, v0, n) = (s * (m * y - x), -t * y, -s * m);
-        let reach = UNIT * f64::from(splat.reach);
+    pub fn set<T: Real>(&mut self, k: usize, g: &Local<T>) {
         let group = &mut self.0[k / GROUP];
-        for (row, value) in group.iter_mut().zip([u0, v0, s, n, t, reach, y]) {
-            row[k % GROUP] = value as f32;
-        }
-        Local {
-            u0: T::from_f64(u0),
-            v0: T::from_f64(v0),
-            s: T::from_f64(s),
-            n: T::from_f64(n),
-            t: T::from_f64(t),
-            opacity: T::from_f64(splat.opacity),
-            gaussian,
+        for (row, value) in group.iter_mut().zip([g.u0, g.v0, g.s, g.n, g.t, g.reach]) {
+            row[k % GROUP] = value.to_f64() as f32;
         }
     }
 }
@@ -144,12 +144,12 @@ pub(crate) fn reached<S: Simd>(
         let at = first % GROUP..first % GROUP + lanes;
         let load = |k: usize| S::f32s::from_slice(simd, &group[k][at.clone()]);
         let (u0, v0, s, n, t) = (load(0), load(1), load(2), load(3), load(4));
-        let (reach, center) = (load(5), load(6));
+        let reach = load(5);
         let limit = reach * reach;
         let inverse = one / s;
-        // The rightmost point of the ellipse lies at y = center - top, the leftmost at center + top.
-        let top = reach * n / (t * n.mul_add(n, t * t).sqrt());
-        let (y_right, y_left) = (center - top, center + top);
+        // The rightmost point of the ellipse lies at v = -top, the leftmost at v = top.
+        let top = reach * n / n.mul_add(n, t * t).sqrt();
+        let (y_right, y_left) = ((zero - top - v0) / t, (top - v0) / t);
         let index = ramp + S::u32s::splat(simd, first as u32);
         let valid = index.simd_lt(end);
         let mut bits = zero;

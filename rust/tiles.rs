@@ -15,19 +15,22 @@ use crate::{
 };
 use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
-use std::ops::Range;
+use std::{
+    ops::Range,
+    sync::atomic::{AtomicU64, Ordering},
+};
 
 /// A run of tiles in one row that one Gaussian reaches.
 #[derive(Debug, Clone, Copy)]
-struct Span {
-    gaussian: u32,
+pub(crate) struct Span {
+    pub gaussian: u32,
     row: u16,
     begin: u16,
     end: u16,
 }
 
 impl Span {
-    fn tiles(&self, columns: usize) -> Range<usize> {
+    pub fn tiles(&self, columns: usize) -> Range<usize> {
         let row = usize::from(self.row) * columns;
         row + usize::from(self.begin)..row + usize::from(self.end)
     }
@@ -40,25 +43,26 @@ pub(crate) struct Chunk {
     pub begin: usize,
     /// End of the range.
     pub end: usize,
-    spans: Vec<Span>,
-    /// Number of this chunk's pairs in each tile; once all chunks are known, their first place in the tile.
-    starts: Vec<u32>,
-    pairs: u64,
+    pub spans: Vec<Span>,
+    /// For each tile the place, by index among the tile's records, of this chunk's first one.
+    pub starts: Vec<u32>,
 }
 
-impl Chunk {
-    /// Call `f(gaussian, tile, place)` for each pair: by Gaussian, then by tile.
-    #[inline(always)]
-    pub fn pairs(&self, columns: usize, mut f: impl FnMut(usize, usize, usize)) {
-        let mut next = self.starts.clone();
-        for span in &self.spans {
-            let tiles = span.tiles(columns);
-            let first = tiles.start;
-            for (k, place) in next[tiles].iter_mut().enumerate() {
-                f(span.gaussian as usize, first + k, *place as usize);
-                *place += 1;
-            }
-        }
+/// The pairs of one chunk, tile by tile and in a tile by index. A chunk is so small that they are written
+/// in cache, wherever its Gaussians lie.
+struct Pairs<T> {
+    /// Begin of each tile, and the end.
+    begins: Vec<u32>,
+    /// Bits of the depth as f32: positive floats order like their bits.
+    depths: Vec<u32>,
+    records: Vec<Local<T>>,
+    /// [pairs, channels]
+    colors: Vec<T>,
+}
+
+impl<T> Pairs<T> {
+    fn tile(&self, tile: usize) -> Range<usize> {
+        self.begins[tile] as usize..self.begins[tile + 1] as usize
     }
 }
 
@@ -109,6 +113,7 @@ impl<T> Tiles<T> {
 /// those rows of tiles whose band of pixel centres meets the ellipse, each with the ellipse's extent in it.
 ///
 /// Counting and filling both go through here, so that they cannot disagree.
+#[inline(always)]
 pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
     let [x0, x1, y0, y1] = splat.tiles.map(usize::from);
     if x1 - x0 <= 1 || y1 - y0 <= 1 {
@@ -144,78 +149,6 @@ pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
     }
 }
 
-/// The spans of the Gaussians `begin..end`, and the number of pairs of each tile.
-fn find_spans(
-    projection: &Projection,
-    begin: usize,
-    end: usize,
-    columns: usize,
-    rows: usize,
-) -> Chunk {
-    let mut spans = Vec::with_capacity(end - begin);
-    let mut counts = vec![0u32; columns * rows];
-    let mut pairs = 0;
-    for (i, splat) in projection.splats[begin..end].iter().enumerate() {
-        if !splat.visible() {
-            continue;
-        }
-        tile_spans(splat, |row, x0, x1| {
-            let span = Span {
-                gaussian: (begin + i) as u32,
-                row: row as u16,
-                begin: x0 as u16,
-                end: x1 as u16,
-            };
-            counts[span.tiles(columns)].iter_mut().for_each(|n| *n += 1);
-            pairs += (x1 - x0) as u64;
-            spans.push(span);
-        });
-    }
-    Chunk {
-        begin,
-        end,
-        spans,
-        starts: counts,
-        pairs,
-    }
-}
-
-/// The pairs of one chunk, tile by tile and in a tile by index: (bits of the depth as f32, Gaussian).
-struct Keys {
-    keys: Vec<u64>,
-    /// Begin of each tile in `keys`, and the end.
-    begins: Vec<u32>,
-}
-
-impl Keys {
-    /// Reads `chunk.starts` as counts.
-    fn new(chunk: &Chunk, projection: &Projection, columns: usize) -> Self {
-        let mut begins = Vec::with_capacity(chunk.starts.len() + 1);
-        let mut sum = 0;
-        for count in &chunk.starts {
-            begins.push(sum);
-            sum += count;
-        }
-        let mut next = begins.clone();
-        begins.push(sum);
-        let mut keys = vec![0; sum as usize];
-        for span in &chunk.spans {
-            // Positive floats order like their bits.
-            let depth = (projection.depths[span.gaussian as usize] as f32).to_bits();
-            let key = u64::from(depth) << 32 | u64::from(span.gaussian);
-            for slot in &mut next[span.tiles(columns)] {
-                keys[*slot as usize] = key;
-                *slot += 1;
-            }
-        }
-        Self { keys, begins }
-    }
-
-    fn tile(&self, tile: usize) -> &[u64] {
-        &self.keys[self.begins[tile] as usize..self.begins[tile + 1] as usize]
-    }
-}
-
 /// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry.
 ///
 /// # Errors
@@ -228,13 +161,27 @@ pub fn bin<T: Real>(
 ) -> Result<Tiles<T>, Error> {
     let n = projection.splats.len();
     let (columns, rows) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
-    // Several chunks per thread balance the load; the number of chunks changes no result.
-    let size = n.div_ceil(4 * rayon::current_num_threads()).max(1024);
-    let mut chunks: Vec<_> = (0..n.div_ceil(size))
+    // Small chunks stay in cache and balance the load; their number changes no result.
+    let size = n
+        .div_ceil(4 * rayon::current_num_threads())
+        .clamp(1024, CHUNK.max(8 * columns * rows));
+    let source = Source {
+        projection,
+        colors,
+        channels,
+        columns,
+        rows,
+        total: AtomicU64::new(0),
+    };
+    let level = Level::new();
+    let (mut chunks, pairs): (Vec<_>, Vec<_>) = (0..n.div_ceil(size))
         .into_par_iter()
-        .map(|k| find_spans(projection, k * size, n.min((k + 1) * size), columns, rows))
-        .collect();
-    let total: u64 = chunks.iter().map(|chunk| chunk.pairs).sum();
+        .map(|k| {
+            let range = k * size..n.min((k + 1) * size);
+            dispatch!(level, simd => source.chunk(simd, range))
+        })
+        .unzip();
+    let total = source.total.into_inner();
     if total > MAX_PAIRS {
         return Err(Error::new(
             "means",
@@ -244,10 +191,6 @@ pub fn bin<T: Real>(
             ),
         ));
     }
-    let keys: Vec<_> = chunks
-        .par_iter()
-        .map(|chunk| Keys::new(chunk, projection, columns))
-        .collect();
     // Counts to places: in a tile chunk by chunk.
     let mut sums = vec![0u32; columns * rows];
     for chunk in &mut chunks {
@@ -255,20 +198,11 @@ pub fn bin<T: Real>(
             *sum += std::mem::replace(start, *sum);
         }
     }
-    let source = Source {
-        projection,
-        colors,
-        channels,
-        columns,
-        keys: &keys,
-    };
-    let level = Level::new();
     let lists = (0..columns * rows)
         .into_par_iter()
-        .map_init(
-            Scratch::default,
-            |scratch, tile| dispatch!(level, simd => source.list(simd, tile, scratch)),
-        )
+        .map_init(Scratch::default, |scratch, tile| {
+            dispatch!(level, simd => list(simd, projection, &pairs, channels, tile, scratch))
+        })
         .collect();
     Ok(Tiles {
         columns,
@@ -279,92 +213,211 @@ pub fn bin<T: Real>(
     })
 }
 
-/// What the lists are made from.
+/// Gaussians per chunk where there are many.
+const CHUNK: usize = 8192;
+
+/// What the chunks are made from.
 struct Source<'a, T> {
     projection: &'a Projection,
     colors: &'a [T],
     channels: usize,
     columns: usize,
-    keys: &'a [Keys],
+    rows: usize,
+    /// Pairs so far.
+    total: AtomicU64,
+}
+
+impl<T: Real> Source<'_, T> {
+    /// The spans of the Gaussians `range`, and their pairs; not the pairs if they are too many. The chunk's
+    /// `starts` are counts.
+    #[inline(always)]
+    fn chunk<S: Simd>(&self, _: S, range: Range<usize>) -> (Chunk, Pairs<T>) {
+        let mut spans = Vec::with_capacity(range.len());
+        let mut counts = vec![0u32; self.columns * self.rows];
+        for i in range.clone() {
+            let splat = &self.projection.splats[i];
+            if splat.visible() {
+                tile_spans(splat, |row, x0, x1| {
+                    let span = Span {
+                        gaussian: i as u32,
+                        row: row as u16,
+                        begin: x0 as u16,
+                        end: x1 as u16,
+                    };
+                    for count in &mut counts[span.tiles(self.columns)] {
+                        *count += 1;
+                    }
+                    spans.push(span);
+                });
+            }
+        }
+        let total: u64 = spans
+            .iter()
+            .map(|span| u64::from(span.end - span.begin))
+            .sum();
+        let chunk = Chunk {
+            begin: range.start,
+            end: range.end,
+            spans,
+            starts: counts,
+        };
+        let before = self.total.fetch_add(total, Ordering::Relaxed);
+        let spans = if before + total <= MAX_PAIRS {
+            &chunk.spans[..]
+        } else {
+            &[]
+        };
+        let pairs = self.pairs(spans, &chunk.starts);
+        (chunk, pairs)
+    }
+
+    #[inline(always)]
+    fn pairs(&self, spans: &[Span], counts: &[u32]) -> Pairs<T> {
+        let d = self.channels;
+        let mut begins = Vec::with_capacity(counts.len() + 1);
+        let mut sum = 0usize;
+        for count in counts {
+            begins.push(sum as u32);
+            sum += *count as usize;
+        }
+        begins.push(sum as u32);
+        if spans.is_empty() {
+            sum = 0;
+        }
+        let mut next = begins.clone();
+        let mut depths = vec![0; sum];
+        let mut records = vec![Local::default(); sum];
+        let mut colors = vec![T::ZERO; sum * d];
+        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
+        for span in spans {
+            let i = span.gaussian as usize;
+            let splat = &self.projection.splats[i];
+            let depth = (self.projection.depths[i] as f32).to_bits();
+            let color = &self.colors[i * d..(i + 1) * d];
+            for x in span.begin..span.end {
+                let slot = &mut next[usize::from(span.row) * self.columns + usize::from(x)];
+                let at = *slot as usize;
+                *slot += 1;
+                let center = [middle(usize::from(x)), middle(usize::from(span.row))];
+                depths[at] = depth;
+                records[at] = Local::new(splat, span.gaussian, center);
+                copy_color(&mut colors[at * d..(at + 1) * d], color);
+            }
+        }
+        Pairs {
+            begins,
+            depths,
+            records,
+            colors,
+        }
+    }
+}
+
+/// Three channels are worth their own path: a call to copy a dozen bytes costs more than the copy.
+#[inline(always)]
+fn copy_color<T: Copy>(out: &mut [T], color: &[T]) {
+    match (out, color) {
+        ([r, g, b], &[x, y, z]) => (*r, *g, *b) = (x, y, z),
+        (out, color) => out.copy_from_slice(color),
+    }
 }
 
 /// Buffers of one thread, reused from tile to tile.
-#[derive(Default)]
-struct Scratch {
+struct Scratch<T> {
+    /// (bits of the depth as f32, place by index).
     keys: Vec<u64>,
-    /// The tile's Gaussians by index.
-    gaussians: Vec<u32>,
+    /// Records and colours by index.
+    records: Vec<Local<T>>,
+    colors: Vec<T>,
     shapes: Shapes,
     reached: [Vec<u32>; TILE_BLOCKS],
 }
 
-impl<T: Real> Source<'_, T> {
-    #[inline(always)]
-    fn list<S: Simd>(&self, simd: S, tile: usize, scratch: &mut Scratch) -> List<T> {
-        let Scratch {
-            keys,
-            gaussians,
-            shapes,
-            reached,
-        } = scratch;
-        keys.clear();
-        gaussians.clear();
-        for chunk in self.keys {
-            for key in chunk.tile(tile) {
-                // The low half becomes the place by index.
-                keys.push(key >> 32 << 32 | gaussians.len() as u64);
-                gaussians.push(*key as u32);
-            }
+impl<T> Default for Scratch<T> {
+    fn default() -> Self {
+        Self {
+            keys: Vec::new(),
+            records: Vec::new(),
+            colors: Vec::new(),
+            shapes: Shapes::default(),
+            reached: Default::default(),
         }
-        let n = keys.len();
-        let mut list = List {
-            records: Vec::with_capacity(n),
-            colors: Vec::with_capacity(n * self.channels),
-            places: Vec::with_capacity(n),
-            ..List::default()
-        };
-        if n == 0 {
-            return list;
-        }
-        keys.sort_unstable();
-        for key in keys.iter() {
-            list.places.push(*key as u32);
-        }
-        self.order_ties(keys, gaussians, &mut list.places);
-        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
-        let center = [middle(tile % self.columns), middle(tile / self.columns)];
-        shapes.resize(n);
-        for (k, place) in list.places.iter().enumerate() {
-            let gaussian = gaussians[*place as usize];
-            let i = gaussian as usize;
-            let splat = &self.projection.splats[i];
-            list.records.push(shapes.set(k, splat, gaussian, center));
-            let color = &self.colors[i * self.channels..(i + 1) * self.channels];
-            if let &[r, g, b] = color {
-                list.colors.extend([r, g, b]);
-            } else {
-                list.colors.extend_from_slice(color);
-            }
-        }
-        kernel::reached(simd, shapes, n, &mut list.masks, reached);
-        list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
-        for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
-            list.blocks.extend_from_slice(records);
-            *begin = list.blocks.len() as u32;
-        }
-        list
     }
+}
 
-    /// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
-    /// equal ones stay in the order of their indices.
-    fn order_ties(&self, keys: &[u64], gaussians: &[u32], order: &mut [u32]) {
-        let depth = |o: &u32| self.projection.depths[gaussians[*o as usize] as usize];
-        let mut begin = 0;
-        for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
-            if run.len() > 1 {
-                order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
-            }
-            begin += run.len();
+/// Collect a tile's pairs and order them.
+#[inline(always)]
+fn list<S: Simd, T: Real>(
+    simd: S,
+    projection: &Projection,
+    chunks: &[Pairs<T>],
+    channels: usize,
+    tile: usize,
+    scratch: &mut Scratch<T>,
+) -> List<T> {
+    let Scratch {
+        keys,
+        records,
+        colors,
+        shapes,
+        reached,
+    } = scratch;
+    keys.clear();
+    records.clear();
+    colors.clear();
+    for pairs in chunks {
+        let range = pairs.tile(tile);
+        for depth in &pairs.depths[range.clone()] {
+            keys.push(u64::from(*depth) << 32 | keys.len() as u64);
         }
+        colors.extend_from_slice(&pairs.colors[range.start * channels..range.end * channels]);
+        records.extend_from_slice(&pairs.records[range]);
+    }
+    let n = keys.len();
+    let mut list = List {
+        records: Vec::with_capacity(n),
+        colors: vec![T::ZERO; n * channels],
+        places: Vec::with_capacity(n),
+        ..List::default()
+    };
+    if n == 0 {
+        return list;
+    }
+    keys.sort_unstable();
+    for key in keys.iter() {
+        list.places.push(*key as u32);
+    }
+    order_ties(projection, keys, records, &mut list.places);
+    shapes.resize(n);
+    for (k, (place, out)) in list
+        .places
+        .iter()
+        .zip(list.colors.chunks_exact_mut(channels))
+        .enumerate()
+    {
+        let place = *place as usize;
+        copy_color(out, &colors[place * channels..(place + 1) * channels]);
+        shapes.set(k, &records[place]);
+        list.records.push(records[place]);
+    }
+    kernel::reached(simd, shapes, n, &mut list.masks, reached);
+    list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
+    for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
+        list.blocks.extend_from_slice(records);
+        *begin = list.blocks.len() as u32;
+    }
+    list
+}
+
+/// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
+/// equal ones stay in the order of their indices.
+fn order_ties<T>(projection: &Projection, keys: &[u64], records: &[Local<T>], order: &mut [u32]) {
+    let depth = |o: &u32| projection.depths[records[*o as usize].gaussian as usize];
+    let mut begin = 0;
+    for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
+        if run.len() > 1 {
+            order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
+        }
+        begin += run.len();
     }
 }
