@@ -11,6 +11,7 @@ use crate::{
 };
 use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
+use std::hint::black_box;
 
 /// Everything that both passes read.
 #[derive(Debug, Clone, Copy)]
@@ -198,8 +199,10 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
 ) -> Work {
+    let list = &input.tiles.lists[tile];
+    list.fetch();
     let mut work = Work {
-        pairs: input.tiles.lists[tile].records.len() as u64,
+        pairs: list.records.len() as u64,
         ..Work::default()
     };
     for (p, _) in input.tile_pixels(tile) {
@@ -352,6 +355,8 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     if !any {
         return Vec::new();
     }
+    let list = &input.tiles.lists[tile];
+    list.fetch();
     // Block by block: what each layer contributes.
     let depths = &composited.depths[tile];
     let total: u32 = depths.iter().sum();
@@ -378,7 +383,6 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
         ends[block] = sum;
     }
     // Gaussian by Gaussian: the sums over its blocks.
-    let list = &input.tiles.lists[tile];
     let row = columns.row();
     let mut out = vec![T::ZERO; list.records.len() * row];
     for ((local, &mask), &place) in list.records.iter().zip(&list.masks).zip(&list.places) {
@@ -508,6 +512,9 @@ fn write<T: Real>(out: &mut Option<&mut [T]>, i: usize, values: &[f64]) {
     }
 }
 
+/// Spans whose rows are looked up together.
+const FETCH: usize = 64;
+
 /// `gather` for one chunk of Gaussians.
 #[inline(always)]
 fn gather_chunk<S: Simd, T: Real, const D: usize>(
@@ -524,24 +531,39 @@ fn gather_chunk<S: Simd, T: Real, const D: usize>(
     }
     .row();
     let mut next = out.chunk.starts.clone();
+    let zeros = vec![T::ZERO; row];
     let mut moments = [0.0; MOMENTS];
     let mut absolute = [0.0; ABSOLUTE];
     let mut colors = vec![0.0; channels];
     let mut current = None;
-    for span in &out.chunk.spans {
-        let i = span.gaussian as usize;
-        if let Some(last) = current.filter(|&last| last != i) {
-            let splat = &input.projection.splats[last];
-            out.write(last, splat, &moments, &colors, &absolute);
-            moments.fill(0.0);
-            colors.fill(0.0);
-            absolute.fill(0.0);
+    let mut rows: Vec<&[T]> = Vec::new();
+    for spans in out.chunk.spans.chunks(FETCH) {
+        // A short loop that only looks the rows up: its many misses overlap.
+        rows.clear();
+        for span in spans {
+            for tile in span.tiles(input.tiles.columns) {
+                let place = next[tile] as usize;
+                next[tile] += 1;
+                let grads = pair_grads[tile]
+                    .get(place * row..(place + 1) * row)
+                    .unwrap_or(&zeros);
+                black_box(grads[0]);
+                black_box(grads[row - 1]);
+                rows.push(grads);
+            }
         }
-        current = Some(i);
-        for tile in span.tiles(input.tiles.columns) {
-            let place = next[tile] as usize;
-            next[tile] += 1;
-            if let Some(grads) = pair_grads[tile].get(place * row..(place + 1) * row) {
+        let mut rows = rows.iter();
+        for span in spans {
+            let i = span.gaussian as usize;
+            if let Some(last) = current.filter(|&last| last != i) {
+                let splat = &input.projection.splats[last];
+                out.write(last, splat, &moments, &colors, &absolute);
+                moments.fill(0.0);
+                colors.fill(0.0);
+                absolute.fill(0.0);
+            }
+            current = Some(i);
+            for grads in rows.by_ref().take(span.tiles(input.tiles.columns).len()) {
                 add(&mut moments, grads);
                 add(&mut colors[..channels], &grads[MOMENTS..]);
                 if columns.absolute {

@@ -16,6 +16,7 @@ use crate::{
 use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
 use std::{
+    hint::black_box,
     ops::Range,
     sync::atomic::{AtomicU64, Ordering},
 };
@@ -81,6 +82,23 @@ pub(crate) struct List<T> {
     pub blocks: Vec<u32>,
     /// Begin of each block in `blocks`, and the end.
     pub begins: [u32; TILE_BLOCKS + 1],
+}
+
+impl<T: Copy> List<T> {
+    /// Bring the records and colours into cache, before the blocks ask for them one by one.
+    #[inline(always)]
+    pub fn fetch(&self) {
+        fetch(&self.records);
+        fetch(&self.colors);
+    }
+}
+
+/// Read one element of each cache line: in so short a loop many misses overlap.
+#[inline(always)]
+fn fetch<T: Copy>(data: &[T]) {
+    for element in data.iter().step_by((64 / size_of::<T>()).max(1)) {
+        black_box(*element);
+    }
 }
 
 /// The tile lists of one view.
