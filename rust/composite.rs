@@ -2,7 +2,7 @@
 
 use crate::{
     camera::Camera,
-    constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
+    constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
     kernel::{self, ABSOLUTE, Adjoint, Grid, LAYER, Layers, MOMENTS, Pixels, Sums, UNIT},
     project::{Projection, Splat},
@@ -51,21 +51,24 @@ impl<T: Real> CompositeInput<'_, T> {
             list: &list.blocks[list.begins[block] as usize..list.begins[block + 1] as usize],
             records: &list.records,
             colors: &list.colors,
+            background: self.background,
             channels: self.channels(),
         }
     }
 
-    /// The image's pixels in tile `tile`: (index in block order, index in the image).
-    fn tile_pixels(&self, tile: usize) -> impl Iterator<Item = (usize, usize)> + use<'_, T> {
+    /// The image's pixels in tile `tile`, up to four neighbours at a time: (index in block order, index in
+    /// the image, number).
+    #[inline(always)]
+    fn runs(&self, tile: usize) -> impl Iterator<Item = (usize, usize, usize)> + use<T> {
         let (top, left) = (
             tile / self.tiles.columns * TILE,
             tile % self.tiles.columns * TILE,
         );
         let (width, height) = (self.camera.width, self.camera.height);
-        (0..TILE_PIXELS).filter_map(move |p| {
+        (0..TILE_PIXELS).step_by(BLOCK).filter_map(move |p| {
             let (row, column) = kernel::position(p);
             let (y, x) = (top + row, left + column);
-            (y < height && x < width).then_some((p, y * width + x))
+            (y < height && x < width).then(|| (p, y * width + x, BLOCK.min(width - x)))
         })
     }
 }
@@ -169,13 +172,16 @@ pub fn forward<T: Real>(
             for tile in row * tiles.columns..(row + 1) * tiles.columns {
                 let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
                 let colors = &colors[tile * channels..(tile + 1) * channels];
-                for (p, pixel) in input.tile_pixels(tile) {
+                for (p, pixel, n) in input.runs(tile) {
                     let pixel = pixel - base;
-                    alphas[pixel] = T::from_f64(1.0 - t[p].to_f64());
-                    let out = &mut image[pixel * channels..(pixel + 1) * channels];
-                    for (c, (o, color)) in out.iter_mut().zip(colors).enumerate() {
-                        let behind = input.background.map_or(0.0, |b| b[c].to_f64());
-                        *o = T::from_f64(color[p].to_f64() + t[p].to_f64() * behind);
+                    for (alpha, t) in alphas[pixel..pixel + n].iter_mut().zip(&t[p..p + n]) {
+                        *alpha = T::from_f64(1.0 - t.to_f64());
+                    }
+                    let out = &mut image[pixel * channels..(pixel + n) * channels];
+                    for (c, color) in colors.iter().enumerate() {
+                        for (k, color) in color[p..p + n].iter().enumerate() {
+                            out[k * channels + c] = *color;
+                        }
                     }
                 }
             }
@@ -205,8 +211,8 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
         pairs: list.records.len() as u64,
         ..Work::default()
     };
-    for (p, _) in input.tile_pixels(tile) {
-        transmittance[p] = T::ONE;
+    for (p, _, n) in input.runs(tile) {
+        transmittance[p..p + n].fill(T::ONE);
     }
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
@@ -333,24 +339,33 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     columns: Columns,
     scratch: &mut Scratch<T>,
 ) -> Vec<T> {
-    let channels = columns.channels;
+    let channels = if D > 0 { D } else { columns.channels };
     let mut transmittance = [T::ZERO; TILE_PIXELS];
     let mut behind = [T::ZERO; TILE_PIXELS];
     scratch.v_colors.iter_mut().for_each(|c| c.fill(T::ZERO));
     let mut any = false;
-    for (p, pixel) in input.tile_pixels(tile) {
-        transmittance[p] = T::ONE;
-        // Behind the last layer: the background, and the alpha, which is 1 - T.
-        let v_alpha = v.alphas.map_or(0.0, |a| a[pixel].to_f64());
-        any |= v_alpha != 0.0;
-        let mut sum = -v_alpha;
-        for (c, v_color) in scratch.v_colors.iter_mut().enumerate() {
-            let v_c = v.image[pixel * channels + c];
-            any |= v_c != T::ZERO;
-            v_color[p] = v_c;
-            sum += v_c.to_f64() * input.background.map_or(0.0, |b| b[c].to_f64());
+    for (p, pixel, n) in input.runs(tile) {
+        transmittance[p..p + n].fill(T::ONE);
+        let image = &v.image[pixel * channels..(pixel + n) * channels];
+        for (c, v_color) in scratch.v_colors[..channels].iter_mut().enumerate() {
+            for (k, v_color) in v_color[p..p + n].iter_mut().enumerate() {
+                *v_color = image[k * channels + c];
+                any |= *v_color != T::ZERO;
+            }
         }
-        behind[p] = T::from_f64(sum);
+        if input.background.is_none() && v.alphas.is_none() {
+            continue;
+        }
+        // Behind the last layer: the background, and the alpha, which is 1 - T.
+        for k in 0..n {
+            let v_alpha = v.alphas.map_or(0.0, |a| a[pixel + k].to_f64());
+            any |= v_alpha != 0.0;
+            let mut sum = -v_alpha;
+            for (v_color, b) in scratch.v_colors.iter().zip(input.background.unwrap_or(&[])) {
+                sum += v_color[p + k].to_f64() * b.to_f64();
+            }
+            behind[p + k] = T::from_f64(sum);
+        }
     }
     if !any {
         return Vec::new();
@@ -626,9 +641,11 @@ fn background_vjp<T: Real>(
         .enumerate()
         .map(|(tile, t)| {
             let mut sums = vec![0.0; channels];
-            for (p, pixel) in input.tile_pixels(tile) {
-                for (c, sum) in sums.iter_mut().enumerate() {
-                    *sum += t[p].to_f64() * v.image[pixel * channels + c].to_f64();
+            for (p, pixel, n) in input.runs(tile) {
+                for k in 0..n {
+                    for (c, sum) in sums.iter_mut().enumerate() {
+                        *sum += t[p + k].to_f64() * v.image[(pixel + k) * channels + c].to_f64();
+                    }
                 }
             }
             sums

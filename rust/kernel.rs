@@ -259,6 +259,8 @@ pub(crate) struct Layers<'a, T> {
     pub records: &'a [Local<T>],
     /// Colours of the records, [records, channels].
     pub colors: &'a [T],
+    /// Colour behind the last layer.
+    pub background: Option<&'a [T]>,
     pub channels: usize,
 }
 
@@ -346,7 +348,17 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
         }
     }
     store::<S, T, V>(transmittance, after);
-    for (color, sum) in colors.iter_mut().zip(sums) {
+    for (c, color) in colors[..channels].iter_mut().enumerate() {
+        let mut sum = if D > 0 {
+            sums[c]
+        } else {
+            load::<S, T, V>(simd, &color[at..])
+        };
+        if let Some(background) = layers.background {
+            for j in 0..V {
+                sum[j] = after[j].mul_add(splat(background[c]), sum[j]);
+            }
+        }
         store::<S, T, V>(&mut color[at..], sum);
     }
     counts

@@ -141,6 +141,12 @@ impl Composite {
     fn work(&self) -> (u64, u64, u64) {
         (self.work.pairs, self.work.blocks, self.work.hit_blocks)
     }
+
+    /// (Gaussian, pixel) pairs that were blended.
+    #[getter]
+    fn blended(&self) -> u64 {
+        self.work.pixels
+    }
 }
 
 /// A scalar type that the binding offers.
