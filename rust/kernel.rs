@@ -164,14 +164,14 @@ pub(crate) fn reached<S: Simd>(
             let y = y_left.max(low).min(high);
             let v = t.mul_add(y, v0);
             let width = limit - v * v;
-            outside = outside & width.simd_lt(zero);
+            outside &= width.simd_lt(zero);
             let left = (zero - width.max(zero).sqrt() - n.mul_add(y, u0)) * inverse;
             for column in 0..BLOCKS_PER_SIDE {
                 let block = row * BLOCKS_PER_SIDE + column;
                 let low = (column * BLOCK) as f32 + 0.5 - half;
                 let (low, high) = (splat(low), splat(low + (BLOCK - 1) as f32));
                 let inside = valid & !(outside | right.simd_lt(low) | left.simd_gt(high));
-                bits = bits + inside.select(splat((1u32 << block) as f32), zero);
+                bits += inside.select(splat((1u32 << block) as f32), zero);
                 let length = &mut lengths[block];
                 index
                     .compress(inside)
