@@ -2,15 +2,16 @@
 
 use crate::{
     camera::Camera,
-    constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
+    constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
-    kernel::{self, ABSOLUTE, Adjoint, Grid, Layers, MOMENTS, Pixels, UNIT},
-    project::Projection,
-    real::Real,
-    tiles::{Chunk, Tiles, split},
+    kernel::{self, ABSOLUTE, Adjoint, Grid, LAYER, Layers, MOMENTS, Pixels, Sums, UNIT},
+    project::{Projection, Splat},
+    real::{Lanes, Real},
+    tiles::{Chunk, Tiles},
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
+use std::hint::black_box;
 
 /// Everything that both passes read.
 #[derive(Debug, Clone, Copy)]
@@ -43,17 +44,31 @@ impl<T: Real> CompositeInput<'_, T> {
         self.camera.width * self.camera.height
     }
 
-    /// The image's pixels in tile `tile`: (index in block order, index in the image).
-    fn tile_pixels(&self, tile: usize) -> impl Iterator<Item = (usize, usize)> + use<'_, T> {
+    /// What reaches one block.
+    fn layers(&self, tile: usize, block: usize) -> Layers<'_, T> {
+        let list = &self.tiles.lists[tile];
+        Layers {
+            list: &list.blocks[list.begins[block] as usize..list.begins[block + 1] as usize],
+            records: &list.records,
+            colors: &list.colors,
+            background: self.background,
+            channels: self.channels(),
+        }
+    }
+
+    /// The image's pixels in tile `tile`, up to four neighbours at a time: (index in block order, index in
+    /// the image, number).
+    #[inline(always)]
+    fn runs(&self, tile: usize) -> impl Iterator<Item = (usize, usize, usize)> + use<T> {
         let (top, left) = (
             tile / self.tiles.columns * TILE,
             tile % self.tiles.columns * TILE,
         );
         let (width, height) = (self.camera.width, self.camera.height);
-        (0..TILE_PIXELS).filter_map(move |p| {
+        (0..TILE_PIXELS).step_by(BLOCK).filter_map(move |p| {
             let (row, column) = kernel::position(p);
             let (y, x) = (top + row, left + column);
-            (y < height && x < width).then_some((p, y * width + x))
+            (y < height && x < width).then(|| (p, y * width + x, BLOCK.min(width - x)))
         })
     }
 }
@@ -61,8 +76,8 @@ impl<T: Real> CompositeInput<'_, T> {
 /// What the backward pass replays.
 #[derive(Debug, Default)]
 pub struct Composited<T> {
-    /// For each record the blocks in which it changed a pixel.
-    hits: Vec<u16>,
+    /// For each block of each tile how many of its layers were evaluated before it was finished.
+    depths: Vec<[u32; TILE_BLOCKS]>,
     /// Transmittance after the last layer, tile by tile in block order.
     transmittance: Vec<T>,
 }
@@ -72,19 +87,47 @@ pub struct Composited<T> {
 pub struct Work {
     /// (Gaussian, tile) pairs.
     pub pairs: u64,
-    /// Blocks evaluated by the forward pass.
+    /// Blocks evaluated by the forward pass, and again by the backward pass.
     pub blocks: u64,
-    /// Blocks in which a pixel changed: what the backward pass evaluates.
+    /// Blocks in which a pixel changed.
     pub hit_blocks: u64,
+    /// (Gaussian, pixel) pairs that were blended.
+    pub pixels: u64,
 }
 
-/// Call a kernel for the number of channels: the common ones are compiled for it.
+impl Work {
+    /// The sum.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            pairs: self.pairs + other.pairs,
+            blocks: self.blocks + other.blocks,
+            hit_blocks: self.hit_blocks + other.hit_blocks,
+            pixels: self.pixels + other.pixels,
+        }
+    }
+}
+
+/// Call a function for the number of channels: the common ones are compiled for it.
 macro_rules! for_channels {
     ($channels:expr, $function:ident, $simd:expr, $types:ty, ($($argument:expr),*)) => {
         match $channels {
             3 => $function::<_, $types, 3>($simd, $($argument),*),
             4 => $function::<_, $types, 4>($simd, $($argument),*),
             _ => $function::<_, $types, 0>($simd, $($argument),*),
+        }
+    };
+}
+
+/// Call a kernel for the number of vectors that a block has on this machine.
+macro_rules! for_vectors {
+    ($simd:ident: $S:ty, $T:ty, $D:ident, $function:ident($($argument:expr),*)) => {
+        match BLOCK_PIXELS / <Lanes<$T, $S> as SimdBase<$S>>::LEN {
+            1 => kernel::$function::<$S, $T, $D, 1>($simd, $($argument),*),
+            2 => kernel::$function::<$S, $T, $D, 2>($simd, $($argument),*),
+            4 => kernel::$function::<$S, $T, $D, 4>($simd, $($argument),*),
+            8 => kernel::$function::<$S, $T, $D, 8>($simd, $($argument),*),
+            _ => unreachable!("vectors have 2 to 16 lanes"),
         }
     };
 }
@@ -103,32 +146,22 @@ pub fn forward<T: Real>(
     check_len("render_alphas", alphas, input.pixels())?;
     let (tiles, channels) = (input.tiles, input.channels());
     let count = tiles.columns * tiles.rows;
-    let mut hits = vec![0u16; tiles.pairs()];
+    let mut depths = vec![[0; TILE_BLOCKS]; count];
     let mut transmittance = vec![T::ZERO; count * TILE_PIXELS];
     let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * channels];
     let grid = Grid::new();
     let level = Level::new();
-    let jobs: Vec<_> = split(&mut hits, tiles.lengths())
-        .into_iter()
-        .zip(transmittance.chunks_mut(TILE_PIXELS))
-        .zip(colors.chunks_mut(channels))
+    let work = depths
+        .par_iter_mut()
+        .zip(transmittance.par_chunks_mut(TILE_PIXELS))
+        .zip(colors.par_chunks_mut(channels))
         .enumerate()
-        .collect();
-    let work = jobs
-        .into_par_iter()
-        .map(|(tile, ((hits, transmittance), colors))| {
-            let Ok(transmittance) = transmittance.try_into() else {
-                unreachable!("chunks of a tile")
-            };
+        .map(|(tile, ((depths, transmittance), colors))| {
             dispatch!(level, simd => for_channels!(
-                channels, forward_tile, simd, T, (input, &grid, tile, hits, transmittance, colors)
+                channels, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
             ))
         })
-        .reduce(Work::default, |a, b| Work {
-            pairs: a.pairs + b.pairs,
-            blocks: a.blocks + b.blocks,
-            hit_blocks: a.hit_blocks + b.hit_blocks,
-        });
+        .reduce(Work::default, Work::plus);
     let width = input.camera.width;
     image
         .par_chunks_mut(TILE * width * channels)
@@ -139,20 +172,23 @@ pub fn forward<T: Real>(
             for tile in row * tiles.columns..(row + 1) * tiles.columns {
                 let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
                 let colors = &colors[tile * channels..(tile + 1) * channels];
-                for (p, pixel) in input.tile_pixels(tile) {
+                for (p, pixel, n) in input.runs(tile) {
                     let pixel = pixel - base;
-                    alphas[pixel] = T::from_f64(1.0 - t[p].to_f64());
-                    let out = &mut image[pixel * channels..(pixel + 1) * channels];
-                    for (c, (o, color)) in out.iter_mut().zip(colors).enumerate() {
-                        let behind = input.background.map_or(0.0, |b| b[c].to_f64());
-                        *o = T::from_f64(color[p].to_f64() + t[p].to_f64() * behind);
+                    for (alpha, t) in alphas[pixel..pixel + n].iter_mut().zip(&t[p..p + n]) {
+                        *alpha = T::from_f64(1.0 - t.to_f64());
+                    }
+                    let out = &mut image[pixel * channels..(pixel + n) * channels];
+                    for (c, color) in colors.iter().enumerate() {
+                        for (k, color) in color[p..p + n].iter().enumerate() {
+                            out[k * channels + c] = *color;
+                        }
                     }
                 }
             }
         });
     Ok((
         Composited {
-            hits,
+            depths,
             transmittance,
         },
         work,
@@ -165,47 +201,27 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     input: &CompositeInput<T>,
     grid: &Grid<T>,
     tile: usize,
-    hits: &mut [u16],
-    transmittance: &mut Pixels<T>,
+    depths: &mut [u32; TILE_BLOCKS],
+    transmittance: &mut [T],
     colors: &mut [Pixels<T>],
 ) -> Work {
-    for (p, _) in input.tile_pixels(tile) {
-        transmittance[p] = T::ONE;
-    }
-    let mut alive = 0u16;
-    for block in 0..TILE_BLOCKS {
-        let pixels = &transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
-        alive |= u16::from(pixels.contains(&T::ONE)) << block;
-    }
-    let mut finished = [T::ZERO; TILE_PIXELS];
-    let mut layers = Layers {
-        transmittance,
-        finished: &mut finished,
-        alive,
-    };
-    let list = input.tiles.tile(tile);
-    let channels = input.channels();
+    let list = &input.tiles.lists[tile];
+    list.fetch();
     let mut work = Work {
-        pairs: hits.len() as u64,
+        pairs: list.records.len() as u64,
         ..Work::default()
     };
-    let pairs = list.records.iter().zip(list.colors.chunks_exact(channels));
-    for ((local, color), hit) in pairs.zip(hits) {
-        let mask = kernel::reached(simd, local, grid) & layers.alive;
-        if mask == 0 {
-            continue;
-        }
-        *hit = kernel::blend::<S, T, D>(simd, grid, local, color, mask, &mut layers, colors);
-        work.blocks += u64::from(mask.count_ones());
-        work.hit_blocks += u64::from(hit.count_ones());
-        if layers.alive == 0 {
-            break;
-        }
+    for (p, _, n) in input.runs(tile) {
+        transmittance[p..p + n].fill(T::ONE);
     }
-    for (t, finished) in transmittance.iter_mut().zip(finished) {
-        if finished > T::ZERO {
-            *t = finished;
-        }
+    for (block, depth) in depths.iter_mut().enumerate() {
+        let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
+        let layers = input.layers(tile, block);
+        let blended = for_vectors!(simd: S, T, D, blend(grid, block, layers, pixels, colors));
+        *depth = blended.layers as u32;
+        work.blocks += blended.layers as u64;
+        work.hit_blocks += blended.changed;
+        work.pixels += blended.pixels;
     }
     work
 }
@@ -270,45 +286,36 @@ pub fn backward<T: Real>(
         .geometry
         .as_ref()
         .is_some_and(|g| g.absolute.is_some());
-    let columns = Columns {
-        geometry: grads.geometry.is_some(),
-        absolute,
-        channels,
-    };
-    let row = columns.row();
-    let mut pair_grads = vec![T::ZERO; tiles.pairs() * row];
+    let columns = Columns { absolute, channels };
     let grid = Grid::new();
     let level = Level::new();
-    let jobs: Vec<_> = split(&mut pair_grads, tiles.lengths().map(|n| n * row))
-        .into_iter()
-        .enumerate()
+    let pair_grads: Vec<_> = (0..tiles.lists.len())
+        .into_par_iter()
+        .map_init(
+            || Scratch {
+                v_colors: vec![[T::ZERO; TILE_PIXELS]; channels],
+                layers: Vec::new(),
+            },
+            |scratch, tile| {
+                dispatch!(level, simd => for_channels!(
+                    channels, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch)
+                ))
+            },
+        )
         .collect();
-    jobs.into_par_iter().for_each_init(
-        || Scratch { v_colors: vec![[T::ZERO; TILE_PIXELS]; channels], layers: Vec::new() },
-        |scratch, (tile, out)| {
-            dispatch!(level, simd => for_channels!(
-                channels, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch, out)
-            ));
-        },
-    );
     gather(input, &pair_grads, columns, n, grads.geometry, grads.colors)
 }
 
-/// Layout of one pair's gradients.
+/// Layout of one pair's gradients: moments, colours, absolute gradients.
 #[derive(Debug, Clone, Copy)]
 struct Columns {
-    geometry: bool,
     absolute: bool,
     channels: usize,
 }
 
 impl Columns {
-    const fn colors(self) -> usize {
-        MOMENTS + if self.absolute { ABSOLUTE } else { 0 }
-    }
-
     const fn row(self) -> usize {
-        self.colors() + self.channels
+        MOMENTS + self.channels + if self.absolute { ABSOLUTE } else { 0 }
     }
 }
 
@@ -316,10 +323,11 @@ impl Columns {
 struct Scratch<T> {
     /// Cotangents of a tile's pixels, by channel.
     v_colors: Vec<Pixels<T>>,
-    /// What `kernel::replay` stores.
+    /// What `kernel::unblend` stores.
     layers: Vec<T>,
 }
 
+/// Gradients of a tile's pairs, by index; empty if all are zero.
 #[inline(always)]
 fn backward_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
@@ -330,71 +338,92 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     tile: usize,
     columns: Columns,
     scratch: &mut Scratch<T>,
-    out: &mut [T],
-) {
-    let channels = columns.channels;
+) -> Vec<T> {
+    let channels = if D > 0 { D } else { columns.channels };
     let mut transmittance = [T::ZERO; TILE_PIXELS];
     let mut behind = [T::ZERO; TILE_PIXELS];
     scratch.v_colors.iter_mut().for_each(|c| c.fill(T::ZERO));
     let mut any = false;
-    for (p, pixel) in input.tile_pixels(tile) {
-        transmittance[p] = T::ONE;
-        // Behind the last layer: the background, and the alpha, which is 1 - T.
-        let v_alpha = v.alphas.map_or(0.0, |a| a[pixel].to_f64());
-        any |= v_alpha != 0.0;
-        let mut sum = -v_alpha;
-        for (c, v_color) in scratch.v_colors.iter_mut().enumerate() {
-            let v_c = v.image[pixel * channels + c];
-            any |= v_c != T::ZERO;
-            v_color[p] = v_c;
-            sum += v_c.to_f64() * input.background.map_or(0.0, |b| b[c].to_f64());
+    for (p, pixel, n) in input.runs(tile) {
+        transmittance[p..p + n].fill(T::ONE);
+        let image = &v.image[pixel * channels..(pixel + n) * channels];
+        for (c, v_color) in scratch.v_colors[..channels].iter_mut().enumerate() {
+            for (k, v_color) in v_color[p..p + n].iter_mut().enumerate() {
+                *v_color = image[k * channels + c];
+                any |= *v_color != T::ZERO;
+            }
         }
-        behind[p] = T::from_f64(sum);
+        if input.background.is_none() && v.alphas.is_none() {
+            continue;
+        }
+        // Behind the last layer: the background, and the alpha, which is 1 - T.
+        for k in 0..n {
+            let v_alpha = v.alphas.map_or(0.0, |a| a[pixel + k].to_f64());
+            any |= v_alpha != 0.0;
+            let mut sum = -v_alpha;
+            for (v_color, b) in scratch.v_colors.iter().zip(input.background.unwrap_or(&[])) {
+                sum += v_color[p + k].to_f64() * b.to_f64();
+            }
+            behind[p + k] = T::from_f64(sum);
+        }
     }
     if !any {
-        return; // the gradients are already zero
+        return Vec::new();
     }
-    let list = input.tiles.tile(tile);
-    let hits = &composited.hits[input.tiles.offsets[tile]..][..list.records.len()];
-    let size = |hit: u16| hit.count_ones() as usize * kernel::LAYER;
-    scratch
-        .layers
-        .resize(hits.iter().map(|&hit| size(hit)).sum(), T::ZERO);
-    let mut rest = &mut scratch.layers[..];
-    for (local, &hit) in list.records.iter().zip(hits) {
-        let (layer, tail) = rest.split_at_mut(size(hit));
-        rest = tail;
-        kernel::replay(simd, grid, local, hit, &mut transmittance, layer);
+    let list = &input.tiles.lists[tile];
+    list.fetch();
+    // Block by block: what each layer contributes.
+    let depths = &composited.depths[tile];
+    let total: u32 = depths.iter().sum();
+    if scratch.layers.len() < total as usize * LAYER {
+        scratch.layers.resize(total as usize * LAYER, T::ZERO);
     }
-    let mut adjoint = Adjoint {
-        behind: &mut behind,
-        v_colors: &scratch.v_colors,
-        geometry: columns.geometry,
-        absolute: columns.absolute,
-    };
-    let mut rest = &scratch.layers[..];
-    let colors = list.colors.chunks_exact(channels);
-    for (((local, color), &hit), &place) in list
-        .records
-        .iter()
-        .zip(colors)
-        .zip(hits)
-        .zip(list.places)
-        .rev()
-    {
-        if hit != 0 {
-            let (head, layers) = rest.split_at(rest.len() - size(hit));
-            rest = head;
-            let out = &mut out[place as usize * columns.row()..][..columns.row()];
-            kernel::unblend::<S, T, D>(simd, grid, local, color, hit, layers, &mut adjoint, out);
+    let mut next = [0; TILE_BLOCKS];
+    let mut ends = [0; TILE_BLOCKS];
+    let mut sum = 0;
+    for block in 0..TILE_BLOCKS {
+        let depth = depths[block] as usize;
+        let mut layers = input.layers(tile, block);
+        layers.list = &layers.list[..depth];
+        let pixels = block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS;
+        let adjoint = Adjoint {
+            transmittance: &transmittance[pixels.clone()],
+            behind: &behind[pixels],
+            v_colors: &scratch.v_colors,
+        };
+        let out = &mut scratch.layers[sum * LAYER..(sum + depth) * LAYER];
+        for_vectors!(simd: S, T, D, unblend(grid, block, layers, &adjoint, out));
+        next[block] = sum;
+        sum += depth;
+        ends[block] = sum;
+    }
+    // Gaussian by Gaussian: the sums over its blocks.
+    let row = columns.row();
+    let mut out = vec![T::ZERO; list.records.len() * row];
+    for ((local, &mask), &place) in list.records.iter().zip(&list.masks).zip(&list.places) {
+        let mut sums = Sums::<S, T>::new(simd, local);
+        let out = &mut out[place as usize * row..(place as usize + 1) * row];
+        let mut rest = mask;
+        while rest != 0 {
+            let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
+            rest &= rest - 1;
+            let k = next[block];
+            if k < ends[block] {
+                next[block] = k + 1;
+                let layer = &scratch.layers[k * LAYER..(k + 1) * LAYER];
+                let v_colors = &scratch.v_colors;
+                sums.add::<D>(simd, grid, block, layer, v_colors, columns.absolute, out);
+            }
         }
+        sums.finish::<D>(columns.absolute, out);
     }
+    out
 }
 
 /// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.
 fn gather<T: Real>(
     input: &CompositeInput<T>,
-    pair_grads: &[T],
+    pair_grads: &[Vec<T>],
     columns: Columns,
     n: usize,
     geometry: Option<GeometryGrads<T>>,
@@ -417,6 +446,7 @@ fn gather<T: Real>(
         check_len("v_colors", colors, channels * n)?;
     }
     let chunks = &input.tiles.chunks;
+    let level = Level::new();
     let jobs: Vec<_> = chunks
         .iter()
         .zip(rows(means2d, chunks, 2))
@@ -424,53 +454,162 @@ fn gather<T: Real>(
         .zip(rows(opacities, chunks, 1))
         .zip(rows(absolute, chunks, 2))
         .zip(rows(colors, chunks, channels))
+        .map(
+            |(((((chunk, means2d), whitened), opacities), absolute), colors)| Gather {
+                chunk,
+                means2d,
+                whitened,
+                opacities,
+                absolute,
+                colors,
+            },
+        )
         .collect();
-    jobs.into_par_iter().for_each(
-        |(((((chunk, mut means2d), mut whitened), mut opacities), mut absolute), mut colors)| {
-            let mut sums = vec![0.0f64; columns.row()];
-            let mut finish = |i: usize, sums: &[f64]| {
-                let j = i - chunk.begin;
-                let splat = &input.projection.splats[i];
-                let write = |out: &mut Option<&mut [T]>, values: &[f64]| {
-                    if let Some(out) = out {
-                        for (o, v) in out[j * values.len()..].iter_mut().zip(values) {
-                            *o = T::from_f64(*v);
-                        }
-                    }
-                };
-                write(&mut colors, &sums[columns.colors()..]);
-                let [s, m, t] = splat.factors;
-                // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
-                let (wu, wv) = (sums[1] / UNIT, sums[2] / UNIT);
-                write(&mut means2d, &[-s * wu, s * m * wu - t * wv]);
-                // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
-                let k = -0.5 / (UNIT * UNIT);
-                write(&mut whitened, &[k * sums[3], k * sums[4], k * sums[5]]);
-                // sigma enters as opacity exp(-sigma)
-                write(&mut opacities, &[-sums[0] / splat.opacity]);
-                if columns.absolute {
-                    write(
-                        &mut absolute,
-                        &[s * sums[MOMENTS] / UNIT, sums[MOMENTS + 1] / (UNIT * UNIT)],
-                    );
-                }
-            };
-            let mut current = None;
-            chunk.pairs(input.tiles.columns, |i, position| {
-                if let Some(last) = current.filter(|&last| last != i) {
-                    finish(last, &sums);
-                    sums.fill(0.0);
-                }
-                current = Some(i);
-                let row = &pair_grads[position * columns.row()..][..columns.row()];
-                sums.iter_mut().zip(row).for_each(|(s, g)| *s += g.to_f64());
-            });
-            if let Some(last) = current {
-                finish(last, &sums);
-            }
-        },
-    );
+    jobs.into_par_iter().for_each(|job| {
+        dispatch!(level, simd => for_channels!(
+            channels, gather_chunk, simd, T, (input, pair_grads, columns, job)
+        ));
+    });
     Ok(())
+}
+
+/// The outputs of one chunk.
+struct Gather<'a, T> {
+    chunk: &'a Chunk,
+    means2d: Option<&'a mut [T]>,
+    whitened: Option<&'a mut [T]>,
+    opacities: Option<&'a mut [T]>,
+    absolute: Option<&'a mut [T]>,
+    colors: Option<&'a mut [T]>,
+}
+
+impl<T: Real> Gather<'_, T> {
+    /// Write the gradients of Gaussian `i` from the sums over its pairs.
+    #[inline(always)]
+    fn write(
+        &mut self,
+        i: usize,
+        splat: &Splat,
+        moments: &[f64],
+        colors: &[f64],
+        absolute: &[f64],
+    ) {
+        let i = i - self.chunk.begin;
+        write(&mut self.colors, i, colors);
+        let [s, m, t] = splat.factors;
+        // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
+        let (wu, wv) = (moments[1] / UNIT, moments[2] / UNIT);
+        write(&mut self.means2d, i, &[-s * wu, s * m * wu - t * wv]);
+        // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
+        let k = -0.5 / (UNIT * UNIT);
+        write(
+            &mut self.whitened,
+            i,
+            &[k * moments[3], k * moments[4], k * moments[5]],
+        );
+        // sigma enters as opacity exp(-sigma)
+        write(&mut self.opacities, i, &[-moments[0] / splat.opacity]);
+        write(
+            &mut self.absolute,
+            i,
+            &[s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)],
+        );
+    }
+}
+
+/// Row `i` of an output, if it is wanted.
+#[inline(always)]
+fn write<T: Real>(out: &mut Option<&mut [T]>, i: usize, values: &[f64]) {
+    if let Some(out) = out {
+        for (o, v) in out[i * values.len()..].iter_mut().zip(values) {
+            *o = T::from_f64(*v);
+        }
+    }
+}
+
+/// Spans whose rows are looked up together.
+const FETCH: usize = 64;
+
+/// `gather` for one chunk of Gaussians.
+#[inline(always)]
+fn gather_chunk<S: Simd, T: Real, const D: usize>(
+    _: S,
+    input: &CompositeInput<T>,
+    pair_grads: &[Vec<T>],
+    columns: Columns,
+    mut out: Gather<T>,
+) {
+    let channels = if D > 0 { D } else { columns.channels };
+    let row = Columns {
+        channels,
+        ..columns
+    }
+    .row();
+    let mut next = out.chunk.starts.clone();
+    let zeros = vec![T::ZERO; row];
+    let mut moments = [0.0; MOMENTS];
+    let mut absolute = [0.0; ABSOLUTE];
+    let mut colors = vec![0.0; channels];
+    let mut current = None;
+    let mut rows: Vec<&[T]> = Vec::new();
+    for spans in out.chunk.spans.chunks(FETCH) {
+        // A short loop that only looks the rows up: its many misses overlap.
+        rows.clear();
+        for span in spans {
+            for tile in span.tiles(input.tiles.columns) {
+                let place = next[tile] as usize;
+                next[tile] += 1;
+                let grads = pair_grads[tile]
+                    .get(place * row..(place + 1) * row)
+                    .unwrap_or(&zeros);
+                black_box(grads[0]);
+                black_box(grads[row - 1]);
+                rows.push(grads);
+            }
+        }
+        let mut rows = rows.iter();
+        for span in spans {
+            let i = span.gaussian as usize;
+            if let Some(last) = current.filter(|&last| last != i) {
+                let splat = &input.projection.splats[last];
+                out.write(last, splat, &moments, &colors, &absolute);
+                moments.fill(0.0);
+                colors.fill(0.0);
+                absolute.fill(0.0);
+            }
+            current = Some(i);
+            for grads in rows.by_ref().take(span.tiles(input.tiles.columns).len()) {
+                add(&mut moments, grads);
+                add(&mut colors[..channels], &grads[MOMENTS..]);
+                if columns.absolute {
+                    add(&mut absolute, &grads[MOMENTS + channels..]);
+                }
+            }
+        }
+    }
+    if let Some(last) = current {
+        let splat = &input.projection.splats[last];
+        out.write(last, splat, &moments, &colors, &absolute);
+    }
+}
+
+#[inline(always)]
+fn add<T: Real>(sums: &mut [f64], grads: &[T]) {
+    let grads = &grads[..sums.len()];
+    for (sum, grad) in sums.iter_mut().zip(grads) {
+        *sum += grad.to_f64();
+    }
+}
+
+/// Split `data` into consecutive pieces of the given lengths.
+fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
+    lengths
+        .map(|n| {
+            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
+            data = tail;
+            head
+        })
+        .collect()
 }
 
 /// Split an optional array of `row` numbers per Gaussian into the ranges of `chunks`.
@@ -502,9 +641,11 @@ fn background_vjp<T: Real>(
         .enumerate()
         .map(|(tile, t)| {
             let mut sums = vec![0.0; channels];
-            for (p, pixel) in input.tile_pixels(tile) {
-                for (c, sum) in sums.iter_mut().enumerate() {
-                    *sum += t[p].to_f64() * v.image[pixel * channels + c].to_f64();
+            for (p, pixel, n) in input.runs(tile) {
+                for k in 0..n {
+                    for (c, sum) in sums.iter_mut().enumerate() {
+                        *sum += t[p + k].to_f64() * v.image[(pixel + k) * channels + c].to_f64();
+                    }
                 }
             }
             sums

@@ -1,8 +1,9 @@
 //! The inner loops of compositing: one Gaussian against the 4 x 4 pixel blocks of one tile.
 //!
 //! A tile keeps its pixels block by block (`block * 16 + row in block * 4 + column in block`), so that a
-//! block is one or a few SIMD vectors. For each Gaussian of the tile's list, `reached` finds the blocks
-//! that its ellipse touches, 16 at once; only those are evaluated. A finished pixel has transmittance 0.
+//! block is one or a few SIMD vectors. `reached` finds for each block the Gaussians that touch it, one per
+//! lane. A block then goes through its own list with its pixels in registers. A finished pixel has
+//! transmittance 0.
 
 use crate::{
     constants::{
@@ -37,21 +38,15 @@ pub(crate) struct Grid<T> {
     /// Pixel centres.
     x: Pixels<T>,
     y: Pixels<T>,
-    /// Centres of the blocks.
-    block_x: [T; TILE_BLOCKS],
-    block_y: [T; TILE_BLOCKS],
 }
 
 impl<T: Real> Grid<T> {
     pub fn new() -> Self {
         let half = (TILE / 2) as f64;
         let pixel = |k: usize| T::from_f64(k as f64 + 0.5 - half);
-        let block = |k: usize| T::from_f64((k * BLOCK + BLOCK / 2) as f64 - half);
         Self {
             x: std::array::from_fn(|p| pixel(position(p).1)),
             y: std::array::from_fn(|p| pixel(position(p).0)),
-            block_x: std::array::from_fn(|b| block(b % BLOCKS_PER_SIDE)),
-            block_y: std::array::from_fn(|b| block(b / BLOCKS_PER_SIDE)),
         }
     }
 }
@@ -60,6 +55,7 @@ impl<T: Real> Grid<T> {
 /// `v = v0 + t y` and (x, y) relative to the tile's centre. u0 and v0 are computed in f64 before they are
 /// rounded, so that nothing cancels in f32, however long the Gaussian is.
 #[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(32))]
 pub(crate) struct Local<T> {
     pub u0: T,
     pub v0: T,
@@ -67,11 +63,8 @@ pub(crate) struct Local<T> {
     pub n: T,
     pub t: T,
     pub opacity: T,
-    /// Square of the support's radius in (u, v).
-    limit: T,
-    /// Centre, relative to the tile's centre.
-    x: T,
-    y: T,
+    /// Radius of the support in (u, v).
+    reach: T,
     /// Index of the Gaussian.
     pub gaussian: u32,
 }
@@ -85,7 +78,6 @@ impl<T: Real> Local<T> {
         let [s, m, t] = splat.factors;
         let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
         let (s, t) = (UNIT * s, UNIT * t);
-        let reach = UNIT * f64::from(splat.reach);
         Self {
             u0: T::from_f64(s * (m * y - x)),
             v0: T::from_f64(-t * y),
@@ -93,53 +85,111 @@ impl<T: Real> Local<T> {
             n: T::from_f64(-s * m),
             t: T::from_f64(t),
             opacity: T::from_f64(splat.opacity),
-            limit: T::from_f64(reach * reach),
-            x: T::from_f64(x),
-            y: T::from_f64(y),
+            reach: T::from_f64(UNIT * f64::from(splat.reach)),
             gaussian,
         }
     }
 }
 
-/// The blocks of which a pixel centre can lie in the support: bit b for block b.
-///
-/// Exact up to rounding: the minimum of the convex `u^2 + v^2` over the rectangle of a block's pixel
-/// centres is on one of two lines, the vertical and the horizontal one nearest to the Gaussian's centre.
-/// Written so that NaN (an overflow far outside) keeps the block.
-#[inline(always)]
-pub(crate) fn reached<S: Simd, T: Real>(simd: S, g: &Local<T>, grid: &Grid<T>) -> u16 {
-    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
-    let half = splat(T::from_f64((BLOCK - 1) as f64 * 0.5));
-    let (u0, v0, s, n, t) = (splat(g.u0), splat(g.v0), splat(g.s), splat(g.n), splat(g.t));
-    let scale_y = splat(T::ONE) / n.mul_add(n, t * t);
-    let scale_x = splat(T::ONE) / s;
-    let (center_x, center_y, limit) = (splat(g.x), splat(g.y), splat(g.limit));
-    let mut bits = 0;
-    for i in (0..TILE_BLOCKS).step_by(width::<S, T>()) {
-        let bx = Lanes::<T, S>::from_slice(simd, &grid.block_x[i..i + width::<S, T>()]);
-        let by = Lanes::<T, S>::from_slice(simd, &grid.block_y[i..i + width::<S, T>()]);
-        let (x_min, x_max) = (bx - half, bx + half);
-        let (y_min, y_max) = (by - half, by + half);
-        // On the vertical line nearest to the centre.
-        let x = center_x.max(x_min).min(x_max);
-        let u = s.mul_add(x, u0);
-        let y = (splat(T::ZERO) - n.mul_add(u, t * v0)) * scale_y;
-        let y = y.max(y_min).min(y_max);
-        let (u, v) = (n.mul_add(y, u), t.mul_add(y, v0));
-        let vertical = u.mul_add(u, v * v);
-        // On the horizontal line nearest to the centre.
-        let y = center_y.max(y_min).min(y_max);
-        let (u, v) = (n.mul_add(y, u0), t.mul_add(y, v0));
-        let x = (splat(T::ZERO) - u * scale_x).max(x_min).min(x_max);
-        let u = s.mul_add(x, u);
-        let horizontal = u.mul_add(u, v * v);
-        let outside = vertical.simd_gt(limit) & horizontal.simd_gt(limit);
-        bits |= (!outside).to_bitmask() << i;
+/// Gaussians side by side in `Shapes`: the most lanes of f32 that a vector has.
+const GROUP: usize = 16;
+
+/// What the test of the blocks reads, one Gaussian per lane: u0, v0, s, n, t and the radius of the support
+/// in (u, v). In f32 for either type: `SUPPORT_SLACK` covers its rounding.
+#[derive(Default)]
+pub(crate) struct Shapes(Vec<[[f32; GROUP]; 6]>);
+
+impl Shapes {
+    /// Make room for `n` Gaussians.
+    pub fn resize(&mut self, n: usize) {
+        self.0.resize(n.div_ceil(GROUP), [[0.0; GROUP]; 6]);
     }
-    bits as u16
+
+    #[inline(always)]
+    pub fn set<T: Real>(&mut self, k: usize, g: &Local<T>) {
+        let group = &mut self.0[k / GROUP];
+        for (row, value) in group.iter_mut().zip([g.u0, g.v0, g.s, g.n, g.t, g.reach]) {
+            row[k % GROUP] = value.to_f64() as f32;
+        }
+    }
 }
 
-/// `Local` in vectors, and the constants of the loop.
+/// For each of `count` Gaussians the blocks of which a pixel centre can lie in the support (bit b for block
+/// b), and for each block the Gaussians, in order.
+///
+/// Row of blocks by row, the extent of the ellipse in the band of the row's pixel centres. The right border
+/// is concave in y and the left one convex, so in a band each is extreme at the y nearest to its top.
+/// Exact up to rounding. Written so that NaN (an overflow far outside) keeps the block.
+#[inline(always)]
+pub(crate) fn reached<S: Simd>(
+    simd: S,
+    shapes: &Shapes,
+    count: usize,
+    masks: &mut Vec<u16>,
+    lists: &mut [Vec<u32>; TILE_BLOCKS],
+) {
+    let lanes = S::f32s::LEN;
+    let splat = |x: f32| S::f32s::splat(simd, x);
+    let (zero, one) = (splat(0.0), splat(1.0));
+    for list in lists.iter_mut() {
+        list.resize(count.next_multiple_of(lanes) + lanes, 0);
+    }
+    let mut lengths = [0; TILE_BLOCKS];
+    let ramp = S::u32s::from_fn(simd, |lane| lane as u32);
+    let end = S::u32s::splat(simd, count as u32);
+    let half = (TILE / 2) as f32;
+    masks.resize(count.next_multiple_of(lanes), 0);
+    for first in (0..count).step_by(lanes) {
+        let group = &shapes.0[first / GROUP];
+        let at = first % GROUP..first % GROUP + lanes;
+        let load = |k: usize| S::f32s::from_slice(simd, &group[k][at.clone()]);
+        let (u0, v0, s, n, t) = (load(0), load(1), load(2), load(3), load(4));
+        let reach = load(5);
+        let limit = reach * reach;
+        let inverse = one / s;
+        // The rightmost point of the ellipse lies at v = -top, the leftmost at v = top.
+        let top = reach * n / n.mul_add(n, t * t).sqrt();
+        let (y_right, y_left) = ((zero - top - v0) / t, (top - v0) / t);
+        let index = ramp + S::u32s::splat(simd, first as u32);
+        let valid = index.simd_lt(end);
+        let mut bits = zero;
+        for row in 0..BLOCKS_PER_SIDE {
+            let low = (row * BLOCK) as f32 + 0.5 - half;
+            let (low, high) = (splat(low), splat(low + (BLOCK - 1) as f32));
+            let y = y_right.max(low).min(high);
+            let v = t.mul_add(y, v0);
+            let width = limit - v * v;
+            let mut outside = width.simd_lt(zero);
+            let right = (width.max(zero).sqrt() - n.mul_add(y, u0)) * inverse;
+            let y = y_left.max(low).min(high);
+            let v = t.mul_add(y, v0);
+            let width = limit - v * v;
+            outside &= width.simd_lt(zero);
+            let left = (zero - width.max(zero).sqrt() - n.mul_add(y, u0)) * inverse;
+            for column in 0..BLOCKS_PER_SIDE {
+                let block = row * BLOCKS_PER_SIDE + column;
+                let low = (column * BLOCK) as f32 + 0.5 - half;
+                let (low, high) = (splat(low), splat(low + (BLOCK - 1) as f32));
+                let inside = valid & !(outside | right.simd_lt(low) | left.simd_gt(high));
+                bits += inside.select(splat((1u32 << block) as f32), zero);
+                let length = &mut lengths[block];
+                index
+                    .compress(inside)
+                    .store_slice(&mut lists[block][*length..*length + lanes]);
+                *length += inside.to_bitmask().count_ones() as usize;
+            }
+        }
+        for (mask, bits) in masks[first..].iter_mut().zip(bits.as_slice()) {
+            *mask = *bits as u16;
+        }
+    }
+    masks.truncate(count);
+    for (list, length) in lists.iter_mut().zip(lengths) {
+        list.truncate(length);
+    }
+}
+
+/// `Local` in vectors.
 struct Wide<S: Simd, T: Real> {
     u0: Lanes<T, S>,
     v0: Lanes<T, S>,
@@ -163,106 +213,155 @@ impl<S: Simd, T: Real> Wide<S, T> {
         }
     }
 
-    /// (u, v) at pixels `at..`.
+    /// (u, v) at the pixels (x, y).
     #[inline(always)]
-    fn position(&self, simd: S, grid: &Grid<T>, at: usize) -> (Lanes<T, S>, Lanes<T, S>) {
-        let x = Lanes::<T, S>::from_slice(simd, &grid.x[at..at + width::<S, T>()]);
-        let y = Lanes::<T, S>::from_slice(simd, &grid.y[at..at + width::<S, T>()]);
+    fn position(&self, x: Lanes<T, S>, y: Lanes<T, S>) -> (Lanes<T, S>, Lanes<T, S>) {
         (
             self.s.mul_add(x, self.n.mul_add(y, self.u0)),
             self.t.mul_add(y, self.v0),
         )
     }
 
-    /// alpha before the cap at pixels `at..`: the one function that both passes use.
+    /// alpha at the pixels (x, y): the one function that both passes use.
     #[inline(always)]
-    fn alpha(&self, simd: S, grid: &Grid<T>, at: usize) -> Lanes<T, S> {
-        let (u, v) = self.position(simd, grid, at);
+    fn alpha(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
+        let (u, v) = self.position(x, y);
         let power = u.mul_add(u, v * v);
-        self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power)
+        let alpha = self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
+        alpha.min(Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX)))
     }
 }
 
-/// State of the pixels of one tile while it is composited front to back.
-pub(crate) struct Layers<'a, T> {
-    /// Transmittance; 0 once the pixel is finished (or lies outside the image).
-    pub transmittance: &'a mut Pixels<T>,
-    /// Transmittance at which a pixel was finished, else 0.
-    pub finished: &'a mut Pixels<T>,
-    /// Blocks with an unfinished pixel.
-    pub alive: u16,
+/// A block's pixels of `data`, as V vectors.
+#[inline(always)]
+fn load<S: Simd, T: Real, const V: usize>(simd: S, data: &[T]) -> [Lanes<T, S>; V] {
+    let mut out = [Lanes::<T, S>::splat(simd, T::ZERO); V];
+    for (j, out) in out.iter_mut().enumerate() {
+        *out = Lanes::<T, S>::from_slice(simd, &data[j * width::<S, T>()..][..width::<S, T>()]);
+    }
+    out
 }
 
-/// Blend one Gaussian over the blocks `mask`; the colour of channel c goes to `colors[c]`.
-/// Returns the blocks in which it changed a pixel.
+/// The other way round.
 #[inline(always)]
-pub(crate) fn blend<S: Simd, T: Real, const D: usize>(
+fn store<S: Simd, T: Real, const V: usize>(data: &mut [T], vectors: [Lanes<T, S>; V]) {
+    for (j, vector) in vectors.into_iter().enumerate() {
+        vector.store_slice(&mut data[j * width::<S, T>()..][..width::<S, T>()]);
+    }
+}
+
+/// The Gaussians of one block, front to back.
+#[derive(Clone, Copy)]
+pub(crate) struct Layers<'a, T> {
+    /// Indices into `records`.
+    pub list: &'a [u32],
+    /// Of the whole tile.
+    pub records: &'a [Local<T>],
+    /// Colours of the records, [records, channels].
+    pub colors: &'a [T],
+    /// Colour behind the last layer.
+    pub background: Option<&'a [T]>,
+    pub channels: usize,
+}
+
+/// Counts of one block.
+#[derive(Default)]
+pub(crate) struct Blended {
+    /// Layers evaluated.
+    pub layers: usize,
+    /// Layers that changed a pixel.
+    pub changed: u64,
+    /// Pairs of a layer and a pixel that were blended.
+    pub pixels: u64,
+}
+
+/// Layers between two tests whether all pixels are finished.
+const STRIDE: usize = 4;
+
+/// Blend the layers over one block (V vectors). `transmittance` is 1 inside the image and 0 outside before,
+/// and what the last layer leaves after. The colours go to `colors[channel]`, block by block.
+#[inline(always)]
+pub(crate) fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
-    g: &Local<T>,
-    rgb: &[T],
-    mask: u16,
-    layers: &mut Layers<T>,
+    block: usize,
+    layers: Layers<T>,
+    transmittance: &mut [T],
     colors: &mut [Pixels<T>],
-) -> u16 {
+) -> Blended {
     let splat = |x: T| Lanes::<T, S>::splat(simd, x);
-    let channels = if D > 0 { D } else { rgb.len() };
-    let (rgb, colors) = (&rgb[..channels], &mut colors[..channels]);
-    let wide = Wide::<S, T>::new(simd, g);
-    let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(T::from_f64(ALPHA_MIN)));
+    let channels = if D > 0 { D } else { layers.channels };
+    let at = block * BLOCK_PIXELS;
+    let (x, y) = (
+        load::<S, T, V>(simd, &grid.x[at..]),
+        load::<S, T, V>(simd, &grid.y[at..]),
+    );
+    let floor = splat(T::from_f64(ALPHA_MIN));
     let (least, one, zero) = (
         splat(T::from_f64(TRANSMITTANCE_MIN)),
         splat(T::ONE),
         splat(T::ZERO),
     );
-    let mut rest = mask;
-    let mut hits = 0;
-    while rest != 0 {
-        let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
-        rest &= rest - 1;
-        let mut changed = 0;
-        let mut stopped = false;
-        for at in (block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS).step_by(width::<S, T>()) {
-            let alpha = wide.alpha(simd, grid, at);
-            let alpha = alpha.min(cap);
-            let opaque = alpha.simd_ge(floor);
-            let t =
-                Lanes::<T, S>::from_slice(simd, &layers.transmittance[at..at + width::<S, T>()]);
-            let next = t * (one - alpha);
-            let blended = opaque & next.simd_gt(least);
-            let weight = blended.select(t * alpha, zero);
-            for (c, color) in rgb.iter().zip(colors.iter_mut()) {
-                let out = &mut color[at..at + width::<S, T>()];
-                weight
-                    .mul_add(splat(*c), Lanes::<T, S>::from_slice(simd, out))
-                    .store_slice(out);
-            }
-            let mut next = blended.select(next, t);
-            let bits = blended.to_bitmask();
-            changed |= bits;
-            if opaque.to_bitmask() != bits {
-                let stop = opaque & !blended & t.simd_gt(zero);
-                let bits = stop.to_bitmask();
-                if bits != 0 {
-                    let out = &mut layers.finished[at..at + width::<S, T>()];
-                    stop.select(t, Lanes::<T, S>::from_slice(simd, out))
-                        .store_slice(out);
-                    next = stop.select(zero, next);
-                    changed |= bits;
-                    stopped = true;
+    // What the last layer leaves, and the same with 0 where the pixel is finished.
+    let mut after = load::<S, T, V>(simd, transmittance);
+    let mut open = after;
+    let mut sums = [[zero; V]; D];
+    let mut counts = Blended::default();
+    for part in layers.list.chunks(STRIDE) {
+        for &k in part {
+            let k = k as usize;
+            let wide = Wide::<S, T>::new(simd, &layers.records[k]);
+            let rgb = &layers.colors[k * channels..(k + 1) * channels];
+            let mut changed = 0;
+            for j in 0..V {
+                let alpha = wide.alpha(simd, x[j], y[j]);
+                let opaque = alpha.simd_ge(floor);
+                let next = open[j] * (one - alpha);
+                let blended = opaque & next.simd_gt(least);
+                let weight = blended.select(open[j] * alpha, zero);
+                for (c, color) in rgb.iter().enumerate() {
+                    if D > 0 {
+                        sums[c][j] = weight.mul_add(splat(*color), sums[c][j]);
+                    } else {
+                        let out = &mut colors[c][at + j * width::<S, T>()..][..width::<S, T>()];
+                        weight
+                            .mul_add(splat(*color), Lanes::<T, S>::from_slice(simd, out))
+                            .store_slice(out);
+                    }
                 }
+                after[j] = blended.select(next, after[j]);
+                // An opaque lane that does not blend is finished.
+                open[j] = opaque.select(blended.select(next, zero), open[j]);
+                let bits = blended.to_bitmask().count_ones();
+                changed |= bits;
+                counts.pixels += u64::from(bits);
             }
-            next.store_slice(&mut layers.transmittance[at..at + width::<S, T>()]);
+            counts.changed += u64::from(changed != 0);
         }
-        hits |= u16::from(changed != 0) << block;
-        if stopped {
-            let pixels = &layers.transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
-            if pixels.iter().all(|t| *t == T::ZERO) {
-                layers.alive &= !(1 << block);
-            }
+        counts.layers += part.len();
+        let mut unfinished = 0;
+        for open in open {
+            unfinished |= open.simd_gt(zero).to_bitmask();
+        }
+        if unfinished == 0 {
+            break;
         }
     }
-    hits
+    store::<S, T, V>(transmittance, after);
+    for (c, color) in colors[..channels].iter_mut().enumerate() {
+        let mut sum = if D > 0 {
+            sums[c]
+        } else {
+            load::<S, T, V>(simd, &color[at..])
+        };
+        if let Some(background) = layers.background {
+            for j in 0..V {
+                sum[j] = after[j].mul_add(splat(background[c]), sum[j]);
+            }
+        }
+        store::<S, T, V>(&mut color[at..], sum);
+    }
+    counts
 }
 
 /// Sums over the pixels of a tile for one Gaussian; the order of the fields is the order in memory.
@@ -272,152 +371,191 @@ pub(crate) const MOMENTS: usize = 6;
 /// |d loss / d mean2d| summed pixel by pixel, x and y, where asked for.
 pub(crate) const ABSOLUTE: usize = 2;
 
-/// Replay one Gaussian over the blocks `mask` (those that `blend` reported), front to back, and store for
-/// each the transmittance before it and its alpha (0 where it does not blend): one block of each in `out`.
+/// Numbers that `unblend` stores per layer of a block.
+pub(crate) const LAYER: usize = 2 * BLOCK_PIXELS;
+
+/// One block in the backward pass.
+pub(crate) struct Adjoint<'a, T> {
+    /// 1 inside the image, 0 outside.
+    pub transmittance: &'a [T],
+    /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance.
+    pub behind: &'a [T],
+    /// Cotangent of each channel, of the whole tile.
+    pub v_colors: &'a [Pixels<T>],
+}
+
+/// Gradients of the layers of one block (V vectors). For each layer `out` receives w, the gradient with
+/// respect to sigma, and the weight of its colour.
+///
+/// Front to back once more for transmittance and alpha of each layer, then back to front. There `behind` is
+/// a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however deep
+/// the layer.
 #[inline(always)]
-pub(crate) fn replay<S: Simd, T: Real>(
+pub(crate) fn unblend<S: Simd, T: Real, const D: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
-    g: &Local<T>,
-    mask: u16,
-    transmittance: &mut Pixels<T>,
+    block: usize,
+    layers: Layers<T>,
+    adjoint: &Adjoint<T>,
     out: &mut [T],
 ) {
     let splat = |x: T| Lanes::<T, S>::splat(simd, x);
-    let wide = Wide::<S, T>::new(simd, g);
+    let channels = if D > 0 { D } else { layers.channels };
+    let at = block * BLOCK_PIXELS;
+    let (x, y) = (
+        load::<S, T, V>(simd, &grid.x[at..]),
+        load::<S, T, V>(simd, &grid.y[at..]),
+    );
     let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(T::from_f64(ALPHA_MIN)));
     let (least, one, zero) = (
         splat(T::from_f64(TRANSMITTANCE_MIN)),
         splat(T::ONE),
         splat(T::ZERO),
     );
-    let mut rest = mask;
-    for out in out.chunks_exact_mut(LAYER) {
-        let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
-        rest &= rest.wrapping_sub(1);
-        for i in (0..BLOCK_PIXELS).step_by(width::<S, T>()) {
-            let at = block * BLOCK_PIXELS + i;
-            let alpha = wide.alpha(simd, grid, at);
-            let alpha = alpha.min(cap);
+    let mut open = load::<S, T, V>(simd, adjoint.transmittance);
+    for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)) {
+        let wide = Wide::<S, T>::new(simd, &layers.records[k as usize]);
+        let (mut before, mut alphas) = (open, [zero; V]);
+        for j in 0..V {
+            let alpha = wide.alpha(simd, x[j], y[j]);
             let opaque = alpha.simd_ge(floor);
-            let state = &mut transmittance[at..at + width::<S, T>()];
-            let t = Lanes::<T, S>::from_slice(simd, state);
-            let next = t * (one - alpha);
+            let next = open[j] * (one - alpha);
             let blended = opaque & next.simd_gt(least);
-            t.store_slice(&mut out[i..i + width::<S, T>()]);
-            let stored = blended.select(alpha, zero);
-            stored.store_slice(&mut out[BLOCK_PIXELS + i..BLOCK_PIXELS + i + width::<S, T>()]);
-            // A lane that stops here is finished: transmittance 0.
-            blended
-                .select(next, opaque.select(zero, t))
-                .store_slice(state);
+            before[j] = open[j];
+            alphas[j] = blended.select(alpha, zero);
+            open[j] = opaque.select(blended.select(next, zero), open[j]);
+        }
+        store::<S, T, V>(out, before);
+        store::<S, T, V>(&mut out[BLOCK_PIXELS..], alphas);
+    }
+    let mut behind = load::<S, T, V>(simd, adjoint.behind);
+    let mut v_colors = [[zero; V]; D];
+    for (v, color) in v_colors.iter_mut().zip(adjoint.v_colors) {
+        *v = load::<S, T, V>(simd, &color[at..]);
+    }
+    for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)).rev() {
+        let k = k as usize;
+        let rgb = &layers.colors[k * channels..(k + 1) * channels];
+        let before = load::<S, T, V>(simd, out);
+        let alpha = load::<S, T, V>(simd, &out[BLOCK_PIXELS..]);
+        let (mut ws, mut weights) = ([zero; V], [zero; V]);
+        for j in 0..V {
+            let weight = before[j] * alpha[j];
+            let mut q = zero;
+            for (c, color) in rgb.iter().enumerate() {
+                let v = if D > 0 {
+                    v_colors[c][j]
+                } else {
+                    let v = &adjoint.v_colors[c][at + j * width::<S, T>()..];
+                    Lanes::<T, S>::from_slice(simd, &v[..width::<S, T>()])
+                };
+                q = v.mul_add(splat(*color), q);
+            }
+            let difference = q - behind[j];
+            // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
+            ws[j] = alpha[j].simd_lt(cap).select(weight * (behind[j] - q), zero);
+            behind[j] = alpha[j].mul_add(difference, behind[j]);
+            weights[j] = weight;
+        }
+        store::<S, T, V>(out, ws);
+        store::<S, T, V>(&mut out[BLOCK_PIXELS..], weights);
+    }
+}
+
+/// Running sums of one Gaussian over its blocks.
+pub(crate) struct Sums<S: Simd, T: Real> {
+    wide: Wide<S, T>,
+    /// The moments, the colours (at most 4 channels), the absolute gradients.
+    lanes: [Lanes<T, S>; MOMENTS + 4 + ABSOLUTE],
+}
+
+impl<S: Simd, T: Real> Sums<S, T> {
+    #[inline(always)]
+    pub fn new(simd: S, g: &Local<T>) -> Self {
+        Self {
+            wide: Wide::new(simd, g),
+            lanes: [Lanes::<T, S>::splat(simd, T::ZERO); MOMENTS + 4 + ABSOLUTE],
         }
     }
-}
 
-/// Numbers that `replay` stores per block.
-pub(crate) const LAYER: usize = 2 * BLOCK_PIXELS;
-
-/// State of the backward pass of one tile.
-pub(crate) struct Adjoint<'a, T> {
-    /// `sum_c v_c color_c` of all that lies behind the current layer, as seen through full transmittance.
-    /// Going back to front it is a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided,
-    /// nothing cancels, however deep the layer.
-    pub behind: &'a mut Pixels<T>,
-    /// Cotangent of each channel.
-    pub v_colors: &'a [Pixels<T>],
-    /// Whether gradients of the geometry and the opacity are wanted.
-    pub geometry: bool,
-    /// Whether the absolute gradients are wanted.
-    pub absolute: bool,
-}
-
-/// Gradient of one Gaussian over the blocks `mask` from what `replay` stored for them in `layers`, into
-/// `out`: the moments, the absolute gradients if asked for, and the gradient of its colour. Back to front.
-#[inline(always)]
-pub(crate) fn unblend<S: Simd, T: Real, const D: usize>(
-    simd: S,
-    grid: &Grid<T>,
-    g: &Local<T>,
-    rgb: &[T],
-    mask: u16,
-    layers: &[T],
-    adjoint: &mut Adjoint<T>,
-    out: &mut [T],
-) {
-    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
-    let channels = if D > 0 { D } else { rgb.len() };
-    let (rgb, v_colors) = (&rgb[..channels], &adjoint.v_colors[..channels]);
-    let wide = Wide::<S, T>::new(simd, g);
-    let (cap, zero) = (splat(T::from_f64(ALPHA_MAX)), splat(T::ZERO));
-    let mut moments = [zero; MOMENTS];
-    let mut absolute = [zero; ABSOLUTE];
-    let mut v_rgb = [zero; 4];
-    let colors_at = MOMENTS + if adjoint.absolute { ABSOLUTE } else { 0 };
-    if D == 0 {
-        out[colors_at..].fill(T::ZERO);
-    }
-    let mut rest = mask;
-    for layer in layers.chunks_exact(LAYER) {
-        let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
-        rest &= rest.wrapping_sub(1);
+    /// Add one block of what `unblend` stored. With D = 0 the gradient of the colour goes straight to `out`.
+    #[inline(always)]
+    pub fn add<const D: usize>(
+        &mut self,
+        simd: S,
+        grid: &Grid<T>,
+        block: usize,
+        layer: &[T],
+        v_colors: &[Pixels<T>],
+        absolute: bool,
+        out: &mut [T],
+    ) {
+        let (ws, weights) = layer.split_at(BLOCK_PIXELS);
         for i in (0..BLOCK_PIXELS).step_by(width::<S, T>()) {
-            let at = block * BLOCK_PIXELS + i;
-            let range = at..at + width::<S, T>();
-            let t = Lanes::<T, S>::from_slice(simd, &layer[i..i + width::<S, T>()]);
-            let alpha = &layer[BLOCK_PIXELS + i..BLOCK_PIXELS + i + width::<S, T>()];
-            let alpha = Lanes::<T, S>::from_slice(simd, alpha);
-            let weight = t * alpha;
-            let mut q = zero;
-            for (k, (c, v_color)) in rgb.iter().zip(v_colors).enumerate() {
-                let v_c = Lanes::<T, S>::from_slice(simd, &v_color[range.clone()]);
-                q = v_c.mul_add(splat(*c), q);
-                if D > 0 {
-                    v_rgb[k] = weight.mul_add(v_c, v_rgb[k]);
-                } else {
-                    out[colors_at + k] += sum(weight * v_c);
+            let at = block * BLOCK_PIXELS + i..block * BLOCK_PIXELS + i + width::<S, T>();
+            let w = Lanes::<T, S>::from_slice(simd, &ws[i..i + width::<S, T>()]);
+            let weight = Lanes::<T, S>::from_slice(simd, &weights[i..i + width::<S, T>()]);
+            let x = Lanes::<T, S>::from_slice(simd, &grid.x[at.clone()]);
+            let y = Lanes::<T, S>::from_slice(simd, &grid.y[at.clone()]);
+            let (u, v) = self.wide.position(x, y);
+            let (wu, wv) = (w * u, w * v);
+            let lanes = &mut self.lanes;
+            lanes[0] += w;
+            lanes[1] += wu;
+            lanes[2] += wv;
+            lanes[3] = wu.mul_add(u, lanes[3]);
+            lanes[4] = wu.mul_add(v, lanes[4]);
+            lanes[5] = wv.mul_add(v, lanes[5]);
+            if D > 0 {
+                for (c, v) in v_colors[..D].iter().enumerate() {
+                    let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
+                    lanes[MOMENTS + c] = weight.mul_add(v, lanes[MOMENTS + c]);
+                }
+            } else {
+                for (c, v) in v_colors.iter().enumerate() {
+                    let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
+                    out[MOMENTS + c] += (weight * v).reduce_sum();
                 }
             }
-            if !adjoint.geometry {
-                continue;
-            }
-            let state = &mut adjoint.behind[range];
-            let behind = Lanes::<T, S>::from_slice(simd, state);
-            let difference = q - behind;
-            alpha.mul_add(difference, behind).store_slice(state);
-            // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
-            let w = alpha.simd_lt(cap).select(weight * (behind - q), zero);
-            let (u, v) = wide.position(simd, grid, at);
-            let (wu, wv) = (w * u, w * v);
-            moments[0] += w;
-            moments[1] += wu;
-            moments[2] += wv;
-            moments[3] = wu.mul_add(u, moments[3]);
-            moments[4] = wu.mul_add(v, moments[4]);
-            moments[5] = wv.mul_add(v, moments[5]);
-            if adjoint.absolute {
-                absolute[0] += wu.abs();
-                absolute[1] += wide.n.mul_add(wu, wide.t * wv).abs();
+            if absolute {
+                lanes[MOMENTS + D] += wu.abs();
+                lanes[MOMENTS + D + 1] += self.wide.n.mul_add(wu, self.wide.t * wv).abs();
             }
         }
     }
-    for (o, m) in out.iter_mut().zip(moments) {
-        *o = sum(m);
-    }
-    if adjoint.absolute {
-        for (o, m) in out[MOMENTS..].iter_mut().zip(absolute) {
-            *o = sum(m);
-        }
-    }
-    if D > 0 {
-        for (o, m) in out[colors_at..].iter_mut().zip(v_rgb) {
-            *o = sum(m);
-        }
-    }
-}
 
-/// Sum of the lanes.
-#[inline(always)]
-fn sum<S: Simd, V: SimdFloat<S>>(v: V) -> V::Element {
-    v.reduce_sum()
+    /// Write the sums: moments, colours, absolute gradients.
+    #[inline(always)]
+    pub fn finish<const D: usize>(mut self, absolute: bool, out: &mut [T]) {
+        if absolute {
+            self.reduce::<D>(MOMENTS + D + ABSOLUTE, out);
+        } else {
+            self.reduce::<D>(MOMENTS + D, out);
+        }
+    }
+
+    /// Sum the lanes of the first `count` vectors, all together: each step adds neighbours and halves the
+    /// number of vectors.
+    #[inline(always)]
+    fn reduce<const D: usize>(&mut self, count: usize, out: &mut [T]) {
+        let (mut lanes, mut vectors) = (width::<S, T>(), count);
+        while lanes > 1 {
+            for k in 0..vectors.div_ceil(2) {
+                let (a, b) = (self.lanes[2 * k], self.lanes[(2 * k + 1).min(vectors - 1)]);
+                self.lanes[k] = a.unzip_low(b) + a.unzip_high(b);
+            }
+            vectors = vectors.div_ceil(2);
+            lanes /= 2;
+        }
+        for k in 0..count {
+            let sum = self.lanes[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
+            // Without compiled channels the colours lie between the moments and the absolute gradients.
+            let place = if D == 0 && k >= MOMENTS {
+                out.len() - count + k
+            } else {
+                k
+            };
+            out[place] = sum;
+        }
+    }
 }

@@ -141,6 +141,12 @@ impl Composite {
     fn work(&self) -> (u64, u64, u64) {
         (self.work.pairs, self.work.blocks, self.work.hit_blocks)
     }
+
+    /// (Gaussian, pixel) pairs that were blended.
+    #[getter]
+    fn blended(&self) -> u64 {
+        self.work.pixels
+    }
 }
 
 /// A scalar type that the binding offers.
@@ -650,9 +656,7 @@ fn composite_as<'py, T: Scalar>(
                     &mut image[i * pixels * channels..(i + 1) * pixels * channels],
                     &mut alphas[i * pixels..(i + 1) * pixels],
                 )?;
-                total.pairs += work.pairs;
-                total.blocks += work.blocks;
-                total.hit_blocks += work.hit_blocks;
+                total = total.plus(work);
                 views.push(View { tiles, composited });
             }
             Ok((

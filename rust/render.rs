@@ -245,8 +245,10 @@ mod tests {
         order.sort_by(|&a, &b| r.projection.depths[a].total_cmp(&r.projection.depths[b]));
         // The colours are tested elsewhere: take them from the records.
         let mut colors = vec![[0.0; 3]; n];
-        for (record, color) in r.tiles.records.iter().zip(r.tiles.colors.chunks_exact(3)) {
-            colors[record.gaussian as usize].copy_from_slice(color);
+        for list in &r.tiles.lists {
+            for (record, color) in list.records.iter().zip(list.colors.chunks_exact(3)) {
+                colors[record.gaussian as usize].copy_from_slice(color);
+            }
         }
         let mut image = Vec::new();
         for y in 0..s.camera.height {

@@ -7,99 +7,123 @@
 
 use crate::{
     camera::Camera,
-    constants::{MAX_PAIRS, TILE},
+    constants::{MAX_PAIRS, TILE, TILE_BLOCKS},
     error::Error,
-    kernel::Local,
+    kernel::{self, Local, Shapes},
     project::{Projection, Splat},
     real::Real,
 };
+use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
+use std::{
+    hint::black_box,
+    ops::Range,
+    sync::atomic::{AtomicU64, Ordering},
+};
 
 /// A run of tiles in one row that one Gaussian reaches.
 #[derive(Debug, Clone, Copy)]
-struct Span {
-    gaussian: u32,
+pub(crate) struct Span {
+    pub gaussian: u32,
     row: u16,
     begin: u16,
     end: u16,
 }
 
-/// The spans of a range of consecutive Gaussians.
+impl Span {
+    pub fn tiles(&self, columns: usize) -> Range<usize> {
+        let row = usize::from(self.row) * columns;
+        row + usize::from(self.begin)..row + usize::from(self.end)
+    }
+}
+
+/// The spans of a range of consecutive Gaussians, in their order.
 #[derive(Debug)]
 pub(crate) struct Chunk {
     /// First Gaussian.
     pub begin: usize,
     /// End of the range.
     pub end: usize,
-    /// By (Gaussian, row).
-    spans: Vec<Span>,
-    /// The same spans by (row, Gaussian): indices into `spans`.
-    by_row: Vec<u32>,
-    /// Begin of each row in `by_row`, and the end.
-    row_begins: Vec<u32>,
-    /// For each tile where this chunk's records begin, in the order of all records.
-    starts: Vec<u32>,
+    pub spans: Vec<Span>,
+    /// For each tile the place, by index among the tile's records, of this chunk's first one.
+    pub starts: Vec<u32>,
 }
 
-impl Chunk {
-    /// Call `f(gaussian, position of its record)` for each pair: by Gaussian, then by tile.
-    pub fn pairs(&self, columns: usize, mut f: impl FnMut(usize, usize)) {
-        let mut next = self.starts.clone();
-        for span in &self.spans {
-            let row = usize::from(span.row) * columns;
-            for position in &mut next[row + usize::from(span.begin)..row + usize::from(span.end)] {
-                f(span.gaussian as usize, *position as usize);
-                *position += 1;
-            }
-        }
+/// The pairs of one chunk, tile by tile and in a tile by index. A chunk is so small that they are written
+/// in cache, wherever its Gaussians lie.
+struct Pairs<T> {
+    /// Begin of each tile, and the end.
+    begins: Vec<u32>,
+    /// Bits of the depth as f32: positive floats order like their bits.
+    depths: Vec<u32>,
+    records: Vec<Local<T>>,
+    /// [pairs, channels]
+    colors: Vec<T>,
+}
+
+impl<T> Pairs<T> {
+    fn tile(&self, tile: usize) -> Range<usize> {
+        self.begins[tile] as usize..self.begins[tile + 1] as usize
     }
 }
 
-/// For each tile the Gaussians whose support reaches one of its pixel centres.
+/// The Gaussians whose support reaches a pixel centre of one tile.
+#[derive(Debug, Default)]
+pub(crate) struct List<T> {
+    /// What the kernels need of each pair, by (depth, index), so that they read a stream.
+    pub records: Vec<Local<T>>,
+    /// Colours of the records, [pairs, channels].
+    pub colors: Vec<T>,
+    /// For each record its place by index among the tile's records.
+    pub places: Vec<u32>,
+    /// For each record the blocks that it reaches: bit b for block b.
+    pub masks: Vec<u16>,
+    /// For each block, one after the other, the records that reach it, front to back.
+    pub blocks: Vec<u32>,
+    /// Begin of each block in `blocks`, and the end.
+    pub begins: [u32; TILE_BLOCKS + 1],
+}
+
+impl<T: Copy> List<T> {
+    /// Bring the records and colours into cache, before the blocks ask for them one by one.
+    #[inline(always)]
+    pub fn fetch(&self) {
+        fetch(&self.records);
+        fetch(&self.colors);
+    }
+}
+
+/// Read one element of each cache line: in so short a loop many misses overlap.
+#[inline(always)]
+fn fetch<T: Copy>(data: &[T]) {
+    for element in data.iter().step_by((64 / size_of::<T>()).max(1)) {
+        black_box(*element);
+    }
+}
+
+/// The tile lists of one view.
 #[derive(Debug, Default)]
 pub struct Tiles<T> {
     /// Tiles per row.
     pub columns: usize,
     /// Tiles per column.
     pub rows: usize,
-    /// Begin of each tile's records, row-major, and the total at the end.
-    pub offsets: Vec<usize>,
-    /// What the kernels need of each pair; in a tile by (depth, index), so that they read a stream.
-    pub(crate) records: Vec<Local<T>>,
-    /// Colours of the records, [pairs, channels].
-    pub(crate) colors: Vec<T>,
+    /// Row-major.
+    pub(crate) lists: Vec<List<T>>,
     /// Number of channels.
     pub(crate) channels: usize,
-    /// For each record its place by index among the tile's records.
-    places: Vec<u32>,
     pub(crate) chunks: Vec<Chunk>,
-}
-
-/// One tile's part of [`Tiles`].
-pub(crate) struct Tile<'a, T> {
-    pub records: &'a [Local<T>],
-    pub colors: &'a [T],
-    pub places: &'a [u32],
 }
 
 impl<T> Tiles<T> {
     /// Number of (Gaussian, tile) pairs.
     pub fn pairs(&self) -> usize {
-        self.places.len()
+        self.lengths().sum()
     }
 
     /// Number of pairs of each tile.
     pub fn lengths(&self) -> impl Iterator<Item = usize> {
-        self.offsets.windows(2).map(|w| w[1] - w[0])
-    }
-
-    pub(crate) fn tile(&self, tile: usize) -> Tile<'_, T> {
-        let range = self.offsets[tile]..self.offsets[tile + 1];
-        Tile {
-            records: &self.records[range.clone()],
-            colors: &self.colors[range.start * self.channels..range.end * self.channels],
-            places: &self.places[range],
-        }
+        self.lists.iter().map(|list| list.records.len())
     }
 }
 
@@ -107,6 +131,7 @@ impl<T> Tiles<T> {
 /// those rows of tiles whose band of pixel centres meets the ellipse, each with the ellipse's extent in it.
 ///
 /// Counting and filling both go through here, so that they cannot disagree.
+#[inline(always)]
 pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
     let [x0, x1, y0, y1] = splat.tiles.map(usize::from);
     if x1 - x0 <= 1 || y1 - y0 <= 1 {
@@ -142,71 +167,6 @@ pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
     }
 }
 
-/// The spans of the Gaussians `begin..end`, and the number of pairs of each tile.
-fn find_spans(
-    projection: &Projection,
-    begin: usize,
-    end: usize,
-    columns: usize,
-    rows: usize,
-) -> (Chunk, u64) {
-    let mut spans = Vec::with_capacity(end - begin);
-    let mut counts = vec![0u32; columns * rows];
-    let mut row_begins = vec![0u32; rows + 1];
-    let mut pairs = 0;
-    for i in begin..end {
-        let splat = &projection.splats[i];
-        if !splat.visible() {
-            continue;
-        }
-        tile_spans(splat, |row, x0, x1| {
-            spans.push(Span {
-                gaussian: i as u32,
-                row: row as u16,
-                begin: x0 as u16,
-                end: x1 as u16,
-            });
-            row_begins[row + 1] += 1;
-            counts[row * columns + x0..row * columns + x1]
-                .iter_mut()
-                .for_each(|n| *n += 1);
-            pairs += (x1 - x0) as u64;
-        });
-    }
-    for row in 0..rows {
-        row_begins[row + 1] += row_begins[row];
-    }
-    let mut next = row_begins.clone();
-    let mut by_row = vec![0u32; spans.len()];
-    for (k, span) in spans.iter().enumerate() {
-        let slot = &mut next[usize::from(span.row)];
-        by_row[*slot as usize] = k as u32;
-        *slot += 1;
-    }
-    (
-        Chunk {
-            begin,
-            end,
-            spans,
-            by_row,
-            row_begins,
-            starts: counts,
-        },
-        pairs,
-    )
-}
-
-/// Split `data` into consecutive pieces of the given lengths.
-pub(crate) fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
-    lengths
-        .map(|n| {
-            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
-            data = tail;
-            head
-        })
-        .collect()
-}
-
 /// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry.
 ///
 /// # Errors
@@ -219,13 +179,27 @@ pub fn bin<T: Real>(
 ) -> Result<Tiles<T>, Error> {
     let n = projection.splats.len();
     let (columns, rows) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
-    // Several chunks per thread balance the load; the number of chunks changes no result.
-    let size = n.div_ceil(4 * rayon::current_num_threads()).max(1024);
+    // Small chunks stay in cache and balance the load; their number changes no result.
+    let size = n
+        .div_ceil(4 * rayon::current_num_threads())
+        .clamp(1024, CHUNK.max(8 * columns * rows));
+    let source = Source {
+        projection,
+        colors,
+        channels,
+        columns,
+        rows,
+        total: AtomicU64::new(0),
+    };
+    let level = Level::new();
     let (mut chunks, pairs): (Vec<_>, Vec<_>) = (0..n.div_ceil(size))
         .into_par_iter()
-        .map(|k| find_spans(projection, k * size, n.min((k + 1) * size), columns, rows))
+        .map(|k| {
+            let range = k * size..n.min((k + 1) * size);
+            dispatch!(level, simd => source.chunk(simd, range))
+        })
         .unzip();
-    let total: u64 = pairs.iter().sum();
+    let total = source.total.into_inner();
     if total > MAX_PAIRS {
         return Err(Error::new(
             "means",
@@ -235,123 +209,233 @@ pub fn bin<T: Real>(
             ),
         ));
     }
-    // Counts to positions: tile by tile, within a tile chunk by chunk.
-    let mut offsets = Vec::with_capacity(columns * rows + 1);
-    let mut sum = 0;
-    for tile in 0..columns * rows {
-        offsets.push(sum as usize);
-        for chunk in &mut chunks {
-            sum += std::mem::replace(&mut chunk.starts[tile], sum);
+    // Counts to places: in a tile chunk by chunk.
+    let mut sums = vec![0u32; columns * rows];
+    for chunk in &mut chunks {
+        for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
+            *sum += std::mem::replace(start, *sum);
         }
     }
-    offsets.push(sum as usize);
-
-    let mut records = vec![Local::default(); sum as usize];
-    let mut pair_colors = vec![T::ZERO; sum as usize * channels];
-    let mut places = vec![0u32; sum as usize];
-    let row_lengths = || (0..rows).map(|y| offsets[(y + 1) * columns] - offsets[y * columns]);
-    let jobs: Vec<_> = split(&mut records, row_lengths())
-        .into_iter()
-        .zip(split(&mut pair_colors, row_lengths().map(|n| n * channels)))
-        .zip(split(&mut places, row_lengths()))
-        .enumerate()
+    let lists = (0..columns * rows)
+        .into_par_iter()
+        .map_init(Scratch::default, |scratch, tile| {
+            dispatch!(level, simd => list(simd, projection, &pairs, channels, tile, scratch))
+        })
         .collect();
-    let source = Source {
-        projection,
-        colors,
-        channels,
-        columns,
-        chunks: &chunks,
-        offsets: &offsets,
-    };
-    jobs.into_par_iter()
-        .for_each(|(row, ((records, colors), places))| {
-            source.fill_row(row, records, colors, places);
-        });
     Ok(Tiles {
         columns,
         rows,
-        offsets,
-        records,
-        colors: pair_colors,
+        lists,
         channels,
-        places,
         chunks,
     })
 }
 
-/// What the rows are filled from.
+/// Gaussians per chunk where there are many.
+const CHUNK: usize = 8192;
+
+/// What the chunks are made from.
 struct Source<'a, T> {
     projection: &'a Projection,
     colors: &'a [T],
     channels: usize,
     columns: usize,
-    chunks: &'a [Chunk],
-    offsets: &'a [usize],
+    rows: usize,
+    /// Pairs so far.
+    total: AtomicU64,
 }
 
 impl<T: Real> Source<'_, T> {
-    /// Write the records, colours and places of one row of tiles.
-    fn fill_row(&self, row: usize, records: &mut [Local<T>], colors: &mut [T], places: &mut [u32]) {
-        let tiles = row * self.columns..(row + 1) * self.columns;
-        let base = self.offsets[tiles.start];
-        let d = self.channels;
-        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
-        // By index first.
-        let mut keys = vec![0u64; records.len()];
-        let mut by_index = vec![Local::default(); records.len()];
-        for chunk in self.chunks {
-            let mut next = chunk.starts[tiles.clone()].to_vec();
-            let spans =
-                &chunk.by_row[chunk.row_begins[row] as usize..chunk.row_begins[row + 1] as usize];
-            for span in spans.iter().map(|&k| &chunk.spans[k as usize]) {
-                let i = span.gaussian as usize;
-                let splat = &self.projection.splats[i];
-                // Positive floats order like their bits; the low half keeps the order of the indices.
-                let key = u64::from((self.projection.depths[i] as f32).to_bits()) << 32;
-                let begin = usize::from(span.begin);
-                for (x, next) in next[begin..usize::from(span.end)].iter_mut().enumerate() {
-                    let x = begin + x;
-                    let at = *next as usize - base;
-                    *next += 1;
-                    by_index[at] = Local::new(splat, span.gaussian, [middle(x), middle(row)]);
-                    keys[at] = key | (at - (self.offsets[tiles.start + x] - base)) as u64;
-                }
+    /// The spans of the Gaussians `range`, and their pairs; not the pairs if they are too many. The chunk's
+    /// `starts` are counts.
+    #[inline(always)]
+    fn chunk<S: Simd>(&self, _: S, range: Range<usize>) -> (Chunk, Pairs<T>) {
+        let mut spans = Vec::with_capacity(range.len());
+        let mut counts = vec![0u32; self.columns * self.rows];
+        for i in range.clone() {
+            let splat = &self.projection.splats[i];
+            if splat.visible() {
+                tile_spans(splat, |row, x0, x1| {
+                    let span = Span {
+                        gaussian: i as u32,
+                        row: row as u16,
+                        begin: x0 as u16,
+                        end: x1 as u16,
+                    };
+                    for count in &mut counts[span.tiles(self.columns)] {
+                        *count += 1;
+                    }
+                    spans.push(span);
+                });
             }
         }
-        for tile in tiles {
-            let range = self.offsets[tile] - base..self.offsets[tile + 1] - base;
-            let keys = &mut keys[range.clone()];
-            let by_index = &by_index[range.clone()];
-            let places = &mut places[range.clone()];
-            keys.sort_unstable();
-            for (place, key) in places.iter_mut().zip(keys.iter()) {
-                *place = *key as u32;
-            }
-            self.order_ties(keys, by_index, places);
-            let colors = &mut colors[range.start * d..range.end * d];
-            for ((record, color), place) in records[range]
-                .iter_mut()
-                .zip(colors.chunks_exact_mut(d))
-                .zip(places.iter())
-            {
-                *record = by_index[*place as usize];
-                let i = record.gaussian as usize;
-                color.copy_from_slice(&self.colors[i * d..(i + 1) * d]);
-            }
-        }
+        let total: u64 = spans
+            .iter()
+            .map(|span| u64::from(span.end - span.begin))
+            .sum();
+        let chunk = Chunk {
+            begin: range.start,
+            end: range.end,
+            spans,
+            starts: counts,
+        };
+        let before = self.total.fetch_add(total, Ordering::Relaxed);
+        let spans = if before + total <= MAX_PAIRS {
+            &chunk.spans[..]
+        } else {
+            &[]
+        };
+        let pairs = self.pairs(spans, &chunk.starts);
+        (chunk, pairs)
     }
 
-    /// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
-    /// equal ones stay in the order of their indices.
-    fn order_ties(&self, keys: &[u64], records: &[Local<T>], order: &mut [u32]) {
-        let depth = |o: &u32| self.projection.depths[records[*o as usize].gaussian as usize];
-        let mut begin = 0;
-        for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
-            if run.len() > 1 {
-                order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
-            }
-            begin += run.len();
+    #[inline(always)]
+    fn pairs(&self, spans: &[Span], counts: &[u32]) -> Pairs<T> {
+        let d = self.channels;
+        let mut begins = Vec::with_capacity(counts.len() + 1);
+        let mut sum = 0usize;
+        for count in counts {
+            begins.push(sum as u32);
+            sum += *count as usize;
         }
+        begins.push(sum as u32);
+        if spans.is_empty() {
+            sum = 0;
+        }
+        let mut next = begins.clone();
+        let mut depths = vec![0; sum];
+        let mut records = vec![Local::default(); sum];
+        let mut colors = vec![T::ZERO; sum * d];
+        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
+        for span in spans {
+            let i = span.gaussian as usize;
+            let splat = &self.projection.splats[i];
+            let depth = (self.projection.depths[i] as f32).to_bits();
+            let color = &self.colors[i * d..(i + 1) * d];
+            for x in span.begin..span.end {
+                let slot = &mut next[usize::from(span.row) * self.columns + usize::from(x)];
+                let at = *slot as usize;
+                *slot += 1;
+                let center = [middle(usize::from(x)), middle(usize::from(span.row))];
+                depths[at] = depth;
+                records[at] = Local::new(splat, span.gaussian, center);
+                copy_color(&mut colors[at * d..(at + 1) * d], color);
+            }
+        }
+        Pairs {
+            begins,
+            depths,
+            records,
+            colors,
+        }
+    }
+}
+
+/// Three channels are worth their own path: a call to copy a dozen bytes costs more than the copy.
+#[inline(always)]
+fn copy_color<T: Copy>(out: &mut [T], color: &[T]) {
+    match (out, color) {
+        ([r, g, b], &[x, y, z]) => (*r, *g, *b) = (x, y, z),
+        (out, color) => out.copy_from_slice(color),
+    }
+}
+
+/// Buffers of one thread, reused from tile to tile.
+struct Scratch<T> {
+    /// (bits of the depth as f32, place by index).
+    keys: Vec<u64>,
+    /// Records and colours by index.
+    records: Vec<Local<T>>,
+    colors: Vec<T>,
+    shapes: Shapes,
+    reached: [Vec<u32>; TILE_BLOCKS],
+}
+
+impl<T> Default for Scratch<T> {
+    fn default() -> Self {
+        Self {
+            keys: Vec::new(),
+            records: Vec::new(),
+            colors: Vec::new(),
+            shapes: Shapes::default(),
+            reached: Default::default(),
+        }
+    }
+}
+
+/// Collect a tile's pairs and order them.
+#[inline(always)]
+fn list<S: Simd, T: Real>(
+    simd: S,
+    projection: &Projection,
+    chunks: &[Pairs<T>],
+    channels: usize,
+    tile: usize,
+    scratch: &mut Scratch<T>,
+) -> List<T> {
+    let Scratch {
+        keys,
+        records,
+        colors,
+        shapes,
+        reached,
+    } = scratch;
+    keys.clear();
+    records.clear();
+    colors.clear();
+    for pairs in chunks {
+        let range = pairs.tile(tile);
+        for depth in &pairs.depths[range.clone()] {
+            keys.push(u64::from(*depth) << 32 | keys.len() as u64);
+        }
+        colors.extend_from_slice(&pairs.colors[range.start * channels..range.end * channels]);
+        records.extend_from_slice(&pairs.records[range]);
+    }
+    let n = keys.len();
+    let mut list = List {
+        records: Vec::with_capacity(n),
+        colors: vec![T::ZERO; n * channels],
+        places: Vec::with_capacity(n),
+        ..List::default()
+    };
+    if n == 0 {
+        return list;
+    }
+    keys.sort_unstable();
+    for key in keys.iter() {
+        list.places.push(*key as u32);
+    }
+    order_ties(projection, keys, records, &mut list.places);
+    shapes.resize(n);
+    for (k, (place, out)) in list
+        .places
+        .iter()
+        .zip(list.colors.chunks_exact_mut(channels))
+        .enumerate()
+    {
+        let place = *place as usize;
+        copy_color(out, &colors[place * channels..(place + 1) * channels]);
+        shapes.set(k, &records[place]);
+        list.records.push(records[place]);
+    }
+    kernel::reached(simd, shapes, n, &mut list.masks, reached);
+    list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
+    for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
+        list.blocks.extend_from_slice(records);
+        *begin = list.blocks.len() as u32;
+    }
+    list
+}
+
+/// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
+/// equal ones stay in the order of their indices.
+fn order_ties<T>(projection: &Projection, keys: &[u64], records: &[Local<T>], order: &mut [u32]) {
+    let depth = |o: &u32| projection.depths[records[*o as usize].gaussian as usize];
+    let mut begin = 0;
+    for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
+        if run.len() > 1 {
+            order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
+        }
+        begin += run.len();
     }
 }
