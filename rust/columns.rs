@@ -110,7 +110,7 @@ fn transpose<S: Simd, V: SimdBase<S>>(mut m: [V; GROUP]) -> [V; GROUP] {
         m = sixteen!(i => {
             if i >= V::LEN {
                 m[i]
-            } else if i % 2 == 0 {
+            } else if i & 1 == 0 {
                 m[i / 2].zip_low(m[i / 2 + half])
             } else {
                 m[i / 2].zip_high(m[i / 2 + half])
@@ -240,8 +240,8 @@ impl<T: Real> Rows<T> {
             let columns = &columns[block..block + n];
             for at in (0..GROUP).step_by(n) {
                 let m = transpose(sixteen!(i => columns[i % n].get(simd, at)));
-                for i in 0..n {
-                    m[i].store_slice(&mut self.0[at + i][block..block + n]);
+                for (row, m) in self.0[at..at + n].iter_mut().zip(&m[..n]) {
+                    m.store_slice(&mut row[block..block + n]);
                 }
             }
         }

@@ -271,10 +271,12 @@ impl Group {
             self.radii[k].set(simd, at, radii);
             self.mean[k].set(simd, at, mean[k]);
         }
-        keep = keep & largest.simd_gt(splat_lanes(simd, o.radius_clip));
-        for k in 0..3 {
-            self.factors[k].set(simd, at, g.factors[k]);
-            self.conic[k].set(simd, at, conic[k]);
+        keep &= largest.simd_gt(splat_lanes(simd, o.radius_clip));
+        for (column, x) in self.factors.iter_mut().zip(&g.factors) {
+            column.set(simd, at, *x);
+        }
+        for (column, x) in self.conic.iter_mut().zip(&conic) {
+            column.set(simd, at, *x);
         }
         self.opacity.set(simd, at, opacity);
         self.reach.set(simd, at, reach);
