@@ -57,9 +57,10 @@ impl<S: Simd> CameraLanes<S> {
 /// What projection computes; the VJP computes it again instead of storing it.
 pub(crate) struct Geometry<S: Simd> {
     pub mean: V3<Wide<S>>,
-    /// Unit quaternion w, x, y, z.
+    /// w, x, y, z, as given.
     quat: [Wide<S>; 4],
-    quat_norm: Wide<S>,
+    /// One over its squared norm.
+    inverse_norm2: Wide<S>,
     scale: V3<Wide<S>>,
     rotation: M3<Wide<S>>,
     /// Centre in the camera frame.
@@ -78,13 +79,14 @@ pub(crate) struct Geometry<S: Simd> {
     /// Rows of `A = J W R S`.
     rows: [V3<Wide<S>>; 2],
     /// Covariance entry xx, low-pass included.
-    pub a: Wide<S>,
+    a: Wide<S>,
     /// Covariance entry xy.
     b: Wide<S>,
     /// Covariance entry yy, low-pass included.
-    pub c: Wide<S>,
+    c: Wide<S>,
     det_raw: Wide<S>,
-    det: Wide<S>,
+    /// One over the determinant, low-pass included.
+    inverse_det: Wide<S>,
     /// Factors (s, m, t) of the conic.
     pub factors: [Wide<S>; 3],
     /// Inside the depth range, with a rotation, and finite.
@@ -165,26 +167,18 @@ fn bound<S: Simd>(simd: S, w: V3<Wide<S>>, scale: V3<Wide<S>>) -> V3<Wide<S>> {
     )
 }
 
-/// Rotation matrix of a unit quaternion.
+/// Rotation matrix of a quaternion; `k` is 2 over its squared norm.
 #[inline(always)]
-fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4]) -> M3<Wide<S>> {
-    let (one, two) = (splat(simd, 1.0), splat(simd, 2.0));
+fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4], k: Wide<S>) -> M3<Wide<S>> {
+    let one = splat(simd, 1.0);
+    let (kx, ky, kz) = (k * x, k * y, k * z);
+    let (xx, yy, zz) = (kx * x, ky * y, kz * z);
+    let (xy, xz, yz) = (kx * y, kx * z, ky * z);
+    let (wx, wy, wz) = (kx * w, ky * w, kz * w);
     M3([
-        V3::new(
-            one - two * (y * y + z * z),
-            two * (x * y - w * z),
-            two * (x * z + w * y),
-        ),
-        V3::new(
-            two * (x * y + w * z),
-            one - two * (x * x + z * z),
-            two * (y * z - w * x),
-        ),
-        V3::new(
-            two * (x * z - w * y),
-            two * (y * z + w * x),
-            one - two * (x * x + y * y),
-        ),
+        V3::new(one - (yy + zz), xy - wz, xz + wy),
+        V3::new(xy + wz, one - (xx + zz), yz - wx),
+        V3::new(xz - wy, yz + wx, one - (xx + yy)),
     ])
 }
 
@@ -201,15 +195,8 @@ impl<S: Simd> Geometry<S> {
         let infinity = splat(simd, f64::INFINITY);
         let p = camera.rotation.times(mean) + camera.translation;
         let norm2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
-        let quat_norm = norm2.sqrt();
-        let inverse_norm = splat(simd, 1.0) / quat_norm;
-        let quat = [
-            quat[0] * inverse_norm,
-            quat[1] * inverse_norm,
-            quat[2] * inverse_norm,
-            quat[3] * inverse_norm,
-        ];
-        let rotation = rotation_matrix(simd, quat);
+        let inverse_norm2 = splat(simd, 1.0) / norm2;
+        let rotation = rotation_matrix(simd, quat, inverse_norm2 * 2.0);
         let rz = splat(simd, 1.0) / p.z;
         let ratios = [p.x * rz, p.y * rz];
         let ratio = [
@@ -244,11 +231,13 @@ impl<S: Simd> Geometry<S> {
             & det.simd_gt(splat(simd, 0.0))
             & det.simd_lt(infinity)
             & (p.x * p.y * b).abs().simd_lt(infinity);
-        let factors = [(c / det).sqrt(), b / c, splat(simd, 1.0) / c.sqrt()];
+        // Where an inverse overflows, so does a factor, and the Gaussian is culled.
+        let (inverse_det, inverse_c) = (one / det, one / c);
+        let factors = [(c * inverse_det).sqrt(), b * inverse_c, inverse_c.sqrt()];
         Self {
             mean,
             quat,
-            quat_norm,
+            inverse_norm2,
             scale,
             rotation,
             p,
@@ -263,7 +252,7 @@ impl<S: Simd> Geometry<S> {
             b,
             c,
             det_raw,
-            det,
+            inverse_det,
             factors,
             valid,
         }
@@ -281,14 +270,24 @@ impl<S: Simd> Geometry<S> {
     /// Inverse covariance, entries xx, xy, yy.
     #[inline(always)]
     pub fn conic(&self) -> [Wide<S>; 3] {
-        [self.c / self.det, -self.b / self.det, self.a / self.det]
+        [
+            self.c * self.inverse_det,
+            -self.b * self.inverse_det,
+            self.a * self.inverse_det,
+        ]
+    }
+
+    /// Standard deviations along x and y, pixels.
+    #[inline(always)]
+    pub fn sigma(&self) -> [Wide<S>; 2] {
+        [self.a.sqrt(), self.c * self.factors[2]]
     }
 
     /// `sqrt(det(cov2d - eps I) / det(cov2d))`: keeps a Gaussian's total energy under the low-pass
     /// (Mip-Splatting, eq. 9).
     #[inline(always)]
     pub fn compensation(&self) -> Wide<S> {
-        (self.det_raw / self.det).sqrt()
+        (self.det_raw * self.inverse_det).sqrt()
     }
 
     /// Vector-Jacobian product; the camera's part is added to `camera_grad` if there is one.
@@ -424,7 +423,13 @@ impl<S: Simd> Geometry<S> {
         let r0 = v_axes[0].by(j0.x) + v_axes[1].by(j1.x);
         let r1 = v_axes[0].by(j0.y) + v_axes[1].by(j1.y);
         let r2 = v_axes[0].by(j0.z) + v_axes[1].by(j1.z);
-        let [w, x, y, z] = self.quat;
+        let inverse = self.inverse_norm2.sqrt();
+        let [w, x, y, z] = [
+            self.quat[0] * inverse,
+            self.quat[1] * inverse,
+            self.quat[2] * inverse,
+            self.quat[3] * inverse,
+        ];
         let (s01, s02, s12) = (r0.y + r1.x, r0.z + r2.x, r1.z + r2.y);
         let (d21, d02, d10) = (r2.y - r1.z, r0.z - r2.x, r1.x - r0.y);
         let g = [
@@ -434,7 +439,6 @@ impl<S: Simd> Geometry<S> {
             two * (x * s02 + y * s12 + w * d10 - two * z * (r0.x + r1.y)),
         ];
         let along = w * g[0] + x * g[1] + y * g[2] + z * g[3];
-        let inverse = splat(simd, 1.0) / self.quat_norm;
         [
             (g[0] - w * along) * inverse,
             (g[1] - x * along) * inverse,

@@ -7,6 +7,7 @@
 
 pub mod adam;
 pub mod camera;
+mod columns;
 pub mod composite;
 pub mod constants;
 pub mod error;

@@ -2,12 +2,13 @@
 
 use crate::{
     camera::{Camera, CameraGrad},
+    columns::{self, Column, GROUP, MAX_COLUMNS, Rows, get3, wide3},
     constants::{
         ALPHA_MIN, EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE,
     },
-    geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry},
-    lanes::{V3, Wide, lanes, load, load3, splat as splat_lanes, splat3},
-    real::Real,
+    geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry, GeometryGrad},
+    lanes::{V3, Wide, lanes, ln, splat as splat_lanes, splat3},
+    real::{Lanes, Real},
     scene::{Colors, Gaussians, Harmonics},
     sh,
 };
@@ -69,7 +70,7 @@ impl Splat {
 pub struct Projection {
     /// All N Gaussians, culled ones included.
     pub splats: Vec<Splat>,
-    /// View-space depth, [N]; unspecified where culled.
+    /// View-space depth, [N]; 0 where culled.
     pub depths: Vec<f64>,
 }
 
@@ -90,101 +91,220 @@ pub struct ProjectOut<'a, T> {
     pub colors: &'a mut [T],
 }
 
-/// The geometry of Gaussians `first..` of `g`, one per lane.
-#[inline(always)]
-fn geometry<S: Simd, T: Real>(
-    simd: S,
-    g: &Gaussians<T>,
-    first: usize,
-    camera: &CameraLanes<S>,
-) -> Geometry<S> {
-    let quat = [
-        load(simd, g.quats, 4, 0, first),
-        load(simd, g.quats, 4, 1, first),
-        load(simd, g.quats, 4, 2, first),
-        load(simd, g.quats, 4, 3, first),
-    ];
-    Geometry::new(
-        simd,
-        load3(simd, g.means, first),
-        quat,
-        load3(simd, g.scales, first),
-        camera,
-    )
+/// The geometry of a group of Gaussians, one column per number.
+struct Inputs<T> {
+    means: [Column<T>; 3],
+    quats: [Column<T>; 4],
+    scales: [Column<T>; 3],
+    opacities: Column<T>,
 }
 
-#[inline(always)]
-fn columns3<S: Simd, T: Real>(simd: S, data: &[T], first: usize) -> [Wide<S>; 3] {
-    [
-        load(simd, data, 3, 0, first),
-        load(simd, data, 3, 1, first),
-        load(simd, data, 3, 2, first),
-    ]
+impl<T: Real> Inputs<T> {
+    const ZERO: Self = Self {
+        means: [Column::ZERO; 3],
+        quats: [Column::ZERO; 4],
+        scales: [Column::ZERO; 3],
+        opacities: Column::ZERO,
+    };
+
+    #[inline(always)]
+    fn read<S: Simd>(&mut self, simd: S, g: &Gaussians<T>, first: usize) {
+        columns::read(simd, g.means, first, &mut self.means);
+        columns::read(simd, g.quats, first, &mut self.quats);
+        columns::read(simd, g.scales, first, &mut self.scales);
+        self.opacities.load(g.opacities, first);
+    }
+
+    /// The geometry of the Gaussians `at..` of the group.
+    #[inline(always)]
+    fn geometry<S: Simd>(&self, simd: S, at: usize, camera: &CameraLanes<S>) -> Geometry<S> {
+        let quat = [
+            self.quats[0].wide(simd, at),
+            self.quats[1].wide(simd, at),
+            self.quats[2].wide(simd, at),
+            self.quats[3].wide(simd, at),
+        ];
+        Geometry::new(
+            simd,
+            wide3(simd, &self.means, at),
+            quat,
+            wide3(simd, &self.scales, at),
+            camera,
+        )
+    }
 }
 
-/// Unit vectors from the camera centre, and distances. A Gaussian on the centre has no direction: (0, 0, 0).
+/// Unit vectors from the camera centre, and one over the distances. A Gaussian on the centre has no direction:
+/// both are 0.
 #[inline(always)]
 fn direction<S: Simd>(simd: S, mean: V3<Wide<S>>, center: V3<Wide<S>>) -> (V3<Wide<S>>, Wide<S>) {
     let (zero, one) = (splat_lanes(simd, 0.0), splat_lanes(simd, 1.0));
     let d = mean - center;
     let length = d.dot(d).sqrt();
     let inverse = length.simd_gt(zero).select(one / length, zero);
-    (d.by(inverse), length)
+    (d.by(inverse), inverse)
 }
 
-/// Range of tiles whose pixel centres lie within `center +- extent`, clipped to `size` pixels.
-fn tile_range(center: f64, extent: f64, size: usize) -> (u16, u16) {
-    let first = (center - extent - 0.5).ceil().max(0.0);
-    let last = (center + extent - 0.5).floor().min(size as f64 - 1.0);
-    if first <= last {
-        (
-            (first as usize / TILE) as u16,
-            (last as usize / TILE + 1) as u16,
-        )
-    } else {
-        (0, 0)
-    }
+/// Spherical harmonics of a group: 3 k + channel.
+struct Coefficients<T> {
+    columns: [Column<T>; MAX_COLUMNS],
+    rows: Rows<T>,
 }
 
-/// One lane of the geometry, as the culling reads it.
-struct Projected {
-    mean: [f64; 2],
-    /// Standard deviations along x and y, pixels.
-    sigma: [f64; 2],
-    factors: [f64; 3],
-    opacity: f64,
-}
-
-/// Cull and pack one Gaussian; the radii in pixels, rounded up.
-#[inline(always)]
-fn splat(p: &Projected, camera: &Camera, o: &ProjectOptions) -> Option<(Splat, [f64; 2])> {
-    if !(p.opacity >= ALPHA_MIN && p.opacity.is_finite()) {
-        return None;
-    }
-    let radius = (2.0 * (p.opacity / ALPHA_MIN).ln()).sqrt();
-    let radii = p.sigma.map(|s| (radius * s).ceil());
-    let size = [camera.width as f64, camera.height as f64];
-    let inside = (0..2).all(|k| p.mean[k] + radii[k] > 0.0 && p.mean[k] - radii[k] < size[k]);
-    if !(inside && radii[0].max(radii[1]) > o.radius_clip) {
-        return None;
-    }
-    let [s, m, t] = p.factors;
-    let stiffness = s * (1.0 + m.abs()) + t;
-    if !stiffness.is_finite() || stiffness >= FACTOR_MAX {
-        return None;
-    }
-    let reach = radius + SUPPORT_SLACK * (1.0 + stiffness);
-    let (x0, x1) = tile_range(p.mean[0], reach * p.sigma[0], camera.width);
-    let (y0, y1) = tile_range(p.mean[1], reach * p.sigma[1], camera.height);
-    let splat = Splat {
-        mean: p.mean,
-        factors: p.factors,
-        opacity: p.opacity,
-        // f32 rounds to nearest: the slack is far larger than half an ulp of any radius below 10.
-        reach: reach as f32,
-        tiles: [x0, x1, y0, y1],
+impl<T: Real> Coefficients<T> {
+    const ZERO: Self = Self {
+        columns: [Column::ZERO; MAX_COLUMNS],
+        rows: Rows::ZERO,
     };
-    Some((splat, radii))
+
+    /// The coefficients in use of the Gaussians `first..`.
+    #[inline(always)]
+    fn read<S: Simd>(&mut self, simd: S, h: &Harmonics<T>, first: usize) {
+        let used = 3 * sh::count(h.degree);
+        let (row, rest_row) = h.rows();
+        if let Some(rest) = h.rest {
+            let (low, high) = self.columns.split_first_chunk_mut::<3>().expect("3 of 64");
+            columns::read(simd, h.coefficients, first, low);
+            self.rows.read(simd, rest, rest_row, first, used - 3, high);
+        } else {
+            self.rows
+                .read(simd, h.coefficients, row, first, used, &mut self.columns);
+        }
+    }
+}
+
+/// Colours of the Gaussians `at..` of a group, before the clamp at 0.
+#[inline(always)]
+fn evaluate<S: Simd, T: Real>(
+    simd: S,
+    degree: usize,
+    coefficients: &[Column<T>; MAX_COLUMNS],
+    basis: &[Lanes<T, S>; sh::MAX_COUNT],
+    at: usize,
+) -> [Lanes<T, S>; 3] {
+    let mut rgb = [Lanes::<T, S>::splat(simd, T::from_f64(0.5)); 3];
+    for (k, y) in basis.iter().enumerate().take(sh::count(degree)) {
+        rgb[0] = y.mul_add(coefficients[3 * k].get(simd, at), rgb[0]);
+        rgb[1] = y.mul_add(coefficients[3 * k + 1].get(simd, at), rgb[1]);
+        rgb[2] = y.mul_add(coefficients[3 * k + 2].get(simd, at), rgb[2]);
+    }
+    rgb
+}
+
+/// The lanes of a group in a bit set, as 1 or 0.
+#[inline(always)]
+fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> <Wide<S> as SimdBase<S>>::Mask {
+    let mut ones = [0.0; GROUP];
+    for (lane, one) in ones.iter_mut().enumerate() {
+        *one = f64::from(set >> lane & 1);
+    }
+    Wide::<S>::from_slice(simd, &ones[at..at + lanes::<S>()]).simd_gt(splat_lanes(simd, 0.0))
+}
+
+/// Splats of a group, a column per number. The numbers of culled ones are of no meaning.
+struct Group {
+    mean: [Column<f64>; 2],
+    factors: [Column<f64>; 3],
+    opacity: Column<f64>,
+    reach: Column<f64>,
+    /// x begin, x end, y begin, y end.
+    tiles: [Column<f64>; 4],
+    radii: [Column<f64>; 2],
+    depth: Column<f64>,
+    conic: [Column<f64>; 3],
+    direction: [Column<f64>; 3],
+}
+
+impl Group {
+    const ZERO: Self = Self {
+        mean: [Column::ZERO; 2],
+        factors: [Column::ZERO; 3],
+        opacity: Column::ZERO,
+        reach: Column::ZERO,
+        tiles: [Column::ZERO; 4],
+        radii: [Column::ZERO; 2],
+        depth: Column::ZERO,
+        conic: [Column::ZERO; 3],
+        direction: [Column::ZERO; 3],
+    };
+
+    /// Project and pack the Gaussians `at..`; returns which are kept, their colours aside.
+    #[inline(always)]
+    fn fill<S: Simd>(
+        &mut self,
+        simd: S,
+        at: usize,
+        g: &Geometry<S>,
+        opacity: Wide<S>,
+        camera: &Camera,
+        camera_lanes: &CameraLanes<S>,
+        o: &ProjectOptions,
+    ) -> u64 {
+        let (zero, infinity) = (splat_lanes(simd, 0.0), splat_lanes(simd, f64::INFINITY));
+        let mean = g.mean2d(camera_lanes);
+        let sigma = g.sigma();
+        let conic = g.conic();
+        let opaque = opacity.simd_ge(splat_lanes(simd, ALPHA_MIN)) & opacity.simd_lt(infinity);
+        let radius = (ln(simd, opacity * (1.0 / ALPHA_MIN)).max(zero) * 2.0).sqrt();
+        let [s, m, t] = g.factors;
+        let stiffness = s * (m.abs() + 1.0) + t;
+        let reach = radius + (stiffness + 1.0) * SUPPORT_SLACK;
+        let mut keep = g.valid & opaque & stiffness.simd_lt(splat_lanes(simd, FACTOR_MAX));
+        let mut largest = zero;
+        let size = [camera.width as f64, camera.height as f64];
+        for k in 0..2 {
+            let radii = (radius * sigma[k]).ceil();
+            keep = keep
+                & (mean[k] + radii).simd_gt(zero)
+                & (mean[k] - radii).simd_lt(splat_lanes(simd, size[k]));
+            largest = largest.max(radii);
+            // Tiles whose pixel centres lie within `mean +- extent`, clipped to the image.
+            let extent = reach * sigma[k];
+            let first = (mean[k] - extent - 0.5).ceil().max(zero);
+            let last = (mean[k] + extent - 0.5)
+                .floor()
+                .min(splat_lanes(simd, size[k] - 1.0));
+            let some = first.simd_le(last);
+            let tile = 1.0 / TILE as f64;
+            self.tiles[2 * k].set(simd, at, some.select((first * tile).floor(), zero));
+            self.tiles[2 * k + 1].set(simd, at, some.select((last * tile).floor() + 1.0, zero));
+            self.radii[k].set(simd, at, radii);
+            self.mean[k].set(simd, at, mean[k]);
+        }
+        keep &= largest.simd_gt(splat_lanes(simd, o.radius_clip));
+        for (column, x) in self.factors.iter_mut().zip(&g.factors) {
+            column.set(simd, at, *x);
+        }
+        for (column, x) in self.conic.iter_mut().zip(&conic) {
+            column.set(simd, at, *x);
+        }
+        self.opacity.set(simd, at, opacity);
+        self.reach.set(simd, at, reach);
+        self.depth.set(simd, at, g.p.z);
+        keep.to_bitmask()
+    }
+
+    /// One Gaussian as the compositor reads it.
+    #[inline(always)]
+    fn splat(&self, i: usize) -> Splat {
+        Splat {
+            mean: [self.mean[0].0[i], self.mean[1].0[i]],
+            factors: [
+                self.factors[0].0[i],
+                self.factors[1].0[i],
+                self.factors[2].0[i],
+            ],
+            opacity: self.opacity.0[i],
+            // f32 rounds to nearest: the slack is far larger than half an ulp of any radius below 10.
+            reach: self.reach.0[i] as f32,
+            tiles: [
+                self.tiles[0].0[i] as u16,
+                self.tiles[1].0[i] as u16,
+                self.tiles[2].0[i] as u16,
+                self.tiles[3].0[i] as u16,
+            ],
+        }
+    }
 }
 
 /// Project all Gaussians into `camera`.
@@ -200,7 +320,9 @@ pub fn forward<T: Real>(
     out: ProjectOut<T>,
 ) {
     let n = gaussians.len();
-    projection.splats.resize(n, Splat::default());
+    if projection.splats.len() != n {
+        projection.splats = rayon::iter::repeat_n(Splat::default(), n).collect();
+    }
     projection.depths.resize(n, 0.0);
     let color_channels = if matches!(colors, Colors::Harmonics(_)) {
         3
@@ -263,7 +385,7 @@ fn forward_chunk<S: Simd, T: Real>(
     keys: &mut [f64],
     out: &mut ProjectOut<T>,
 ) {
-    let lanes_of = CameraLanes::new(
+    let camera_lanes = CameraLanes::new(
         simd,
         camera,
         options.near_plane,
@@ -271,95 +393,138 @@ fn forward_chunk<S: Simd, T: Real>(
         options.eps2d,
     );
     let center = splat3(simd, camera.center);
-    for first in (0..splats.len()).step_by(lanes::<S>()) {
-        let g = geometry(simd, gaussians, begin + first, &lanes_of);
-        let valid = g.valid.to_bitmask();
-        let mean2d = g.mean2d(&lanes_of);
-        let sigma = [g.a.sqrt(), g.c.sqrt()];
-        let conic = g.conic();
-        let mut opacity = load(simd, gaussians.opacities, 1, 0, begin + first);
-        if options.antialiased {
-            opacity *= g.compensation();
+    let mut inputs = Inputs::ZERO;
+    let mut group = Group::ZERO;
+    let mut harmonics = Coefficients::ZERO;
+    for start in (0..splats.len()).step_by(GROUP) {
+        let rows = GROUP.min(splats.len() - start);
+        let first = begin + start;
+        inputs.read(simd, gaussians, first);
+        let mut keep = 0u16;
+        for at in (0..GROUP).step_by(lanes::<S>()) {
+            let g = inputs.geometry(simd, at, &camera_lanes);
+            let mut opacity = inputs.opacities.wide(simd, at);
+            if options.antialiased {
+                opacity *= g.compensation();
+            }
+            let kept = group.fill(simd, at, &g, opacity, camera, &camera_lanes, options);
+            keep |= (kept as u16) << at;
+            if let Colors::Harmonics(_) = colors {
+                let (d, _) = direction(simd, g.mean, center);
+                group.direction[0].set(simd, at, d.x);
+                group.direction[1].set(simd, at, d.y);
+                group.direction[2].set(simd, at, d.z);
+            }
         }
-        let basis = match colors {
-            Colors::Harmonics(h) => {
-                Some(sh::basis(simd, h.degree, direction(simd, g.mean, center).0))
+        if rows < GROUP {
+            keep &= (1 << rows) - 1;
+        }
+        match colors {
+            Colors::Harmonics(h) if keep != 0 => {
+                harmonics.read(simd, h, first);
+                let d = narrow3::<T>(&group.direction);
+                let mut rgb = [Column::ZERO; 3];
+                for at in (0..GROUP).step_by(Lanes::<T, S>::LEN) {
+                    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+                    let basis = sh::basis::<S, T>(simd, h.degree, get3(simd, &d, at));
+                    let values = evaluate(simd, h.degree, &harmonics.columns, &basis, at);
+                    // A sum of finite numbers that overflowed counts as not finite: it is culled either way.
+                    let finite =
+                        values[0].is_finite() & values[1].is_finite() & values[2].is_finite();
+                    let lanes = ((1u32 << Lanes::<T, S>::LEN) - 1) << at;
+                    keep &= !(lanes as u16) | (finite.to_bitmask() as u16) << at;
+                    for (rgb, value) in rgb.iter_mut().zip(values) {
+                        rgb.set(simd, at, value.simd_gt(zero).select(value, zero));
+                    }
+                }
+                for column in &mut rgb {
+                    for (lane, x) in column.0.iter_mut().enumerate() {
+                        *x = if keep >> lane & 1 == 1 { *x } else { T::ZERO };
+                    }
+                }
+                let [r, g, b] = &rgb;
+                columns::write([&r.0, &g.0, &b.0], rows_of(out.colors, 3, start, rows));
             }
-            Colors::Channels(..) => None,
-        };
-        for lane in 0..lanes::<S>().min(splats.len() - first) {
-            let j = first + lane;
-            let projected = Projected {
-                mean: mean2d.map(|m| m[lane]),
-                sigma: sigma.map(|s| s[lane]),
-                factors: g.factors.map(|f| f[lane]),
-                opacity: opacity[lane],
-            };
-            let mut kept = if valid >> lane & 1 == 1 {
-                splat(&projected, camera, options)
+            Colors::Harmonics(_) => rows_of(out.colors, 3, start, rows).fill(T::ZERO),
+            Colors::Channels(data, channels) => {
+                for lane in 0..rows {
+                    let i = first + lane;
+                    if !finite(&data[i * channels..(i + 1) * channels]) {
+                        keep &= !(1 << lane);
+                    }
+                }
+            }
+        }
+        let splats = &mut splats[start..start + rows];
+        for (lane, splat) in splats.iter_mut().enumerate() {
+            *splat = if keep >> lane & 1 == 1 {
+                group.splat(lane)
             } else {
-                None
+                Splat::default()
             };
-            match (colors, &basis) {
-                (Colors::Harmonics(h), Some(basis)) => {
-                    let mut rgb = evaluate(h, begin + j, |k| T::from_f64(basis[k][lane]));
-                    if kept.is_none() || !finite(&rgb) {
-                        (kept, rgb) = (None, [T::ZERO; 3]);
-                    }
-                    for (o, c) in out.colors[3 * j..3 * j + 3].iter_mut().zip(rgb) {
-                        *o = if c > T::ZERO { c } else { T::ZERO };
-                    }
-                }
-                (Colors::Channels(data, channels), _) => {
-                    if !finite(&data[(begin + j) * channels..(begin + j + 1) * channels]) {
-                        kept = None;
-                    }
-                }
-                _ => unreachable!("the basis belongs to the harmonics"),
-            }
-            let (s, r) = kept.unwrap_or_default();
-            splats[j] = s;
-            let depth = if kept.is_some() { g.p.z[lane] } else { 0.0 };
-            keys[j] = depth;
-            out.depths[j] = T::from_f64(depth);
-            out.opacities[j] = T::from_f64(s.opacity);
-            for (o, m) in out.means2d[2 * j..2 * j + 2].iter_mut().zip(s.mean) {
-                *o = T::from_f64(m);
-            }
-            for (o, r) in out.radii[2 * j..2 * j + 2].iter_mut().zip(r) {
-                *o = r as i32; // saturates
-            }
-            for (o, q) in out.conics[3 * j..3 * j + 3].iter_mut().zip(conic) {
-                *o = if kept.is_some() {
-                    T::from_f64(q[lane])
-                } else {
-                    T::ZERO
-                };
-            }
+        }
+        let depth = kept::<f64>(&group.depth, keep);
+        keys[start..start + rows].copy_from_slice(&depth[..rows]);
+        let depth = kept(&group.depth, keep);
+        columns::write([&depth], rows_of(out.depths, 1, start, rows));
+        let opacity = kept(&group.opacity, keep);
+        columns::write([&opacity], rows_of(out.opacities, 1, start, rows));
+        let (x, y) = (kept(&group.mean[0], keep), kept(&group.mean[1], keep));
+        columns::write([&x, &y], rows_of(out.means2d, 2, start, rows));
+        let (x, y) = (kept(&group.radii[0], keep), kept(&group.radii[1], keep));
+        columns::write(
+            [&integers(&x), &integers(&y)],
+            rows_of(out.radii, 2, start, rows),
+        );
+        let [a, b, c] = &group.conic;
+        let conic = [&kept(a, keep), &kept(b, keep), &kept(c, keep)];
+        columns::write(conic, rows_of(out.conics, 3, start, rows));
+    }
+}
+
+/// The values of the Gaussians in a set, 0 elsewhere.
+#[inline(always)]
+fn kept<T: Real>(column: &Column<f64>, set: u16) -> [T; GROUP] {
+    let mut out = [T::ZERO; GROUP];
+    for (lane, (o, x)) in out.iter_mut().zip(column.0).enumerate() {
+        *o = if set >> lane & 1 == 1 {
+            T::from_f64(x)
+        } else {
+            T::ZERO
+        };
+    }
+    out
+}
+
+#[inline(always)]
+fn integers(values: &[f64; GROUP]) -> [i32; GROUP] {
+    let mut out = [0; GROUP];
+    for (o, x) in out.iter_mut().zip(values) {
+        *o = *x as i32; // saturates
+    }
+    out
+}
+
+/// Three columns in the type of the inputs.
+#[inline(always)]
+fn narrow3<T: Real>(columns: &[Column<f64>; 3]) -> [Column<T>; 3] {
+    let mut out = [Column::ZERO; 3];
+    for (out, column) in out.iter_mut().zip(columns) {
+        for (o, x) in out.0.iter_mut().zip(column.0) {
+            *o = T::from_f64(x);
         }
     }
+    out
+}
+
+/// Rows `start..start + rows` of an array.
+#[inline(always)]
+fn rows_of<T>(data: &mut [T], row: usize, start: usize, rows: usize) -> &mut [T] {
+    &mut data[start * row..(start + rows) * row]
 }
 
 fn finite<T: Real>(values: &[T]) -> bool {
     values.iter().all(|x| x.to_f64().is_finite())
-}
-
-/// Colour of Gaussian `i` before the clamp at 0.
-#[inline(always)]
-fn evaluate<T: Real>(h: &Harmonics<T>, i: usize, basis: impl Fn(usize) -> T) -> [T; 3] {
-    let (first, rest) = h.of(i);
-    let y = basis(0);
-    let mut rgb = [T::ZERO; 3];
-    for (c, x) in rgb.iter_mut().zip(first) {
-        *c = T::from_f64(0.5) + y * *x;
-    }
-    for (k, row) in rest.chunks_exact(3).enumerate() {
-        let y = basis(k + 1);
-        for (c, x) in rgb.iter_mut().zip(row) {
-            *c += y * *x;
-        }
-    }
-    rgb
 }
 
 /// Cotangents of the projection's outputs, all dense over N.
@@ -379,7 +544,8 @@ pub struct ProjectCotangents<'a, T> {
     pub colors: Option<&'a [T]>,
 }
 
-/// Gradients to add to; `None` is not computed.
+/// Gradients to fill; `None` is not computed. They hold zeros before: what belongs to a culled Gaussian, or to
+/// a harmonic above the degree in use, is left as it is.
 #[derive(Debug, Default)]
 pub struct GaussianGrads<'a, T> {
     /// [N, 3]
@@ -405,22 +571,7 @@ fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T
     }
 }
 
-fn add<T: Real>(out: &mut Option<&mut [T]>, j: usize, values: &[f64]) {
-    if let Some(out) = out {
-        for (o, v) in out[j * values.len()..].iter_mut().zip(values) {
-            *o = T::saturating(o.to_f64() + v);
-        }
-    }
-}
-
-#[inline(always)]
-fn add_scaled<T: Real>(out: &mut [T], y: T, v: &[T; 3]) {
-    for (o, v) in out.iter_mut().zip(v) {
-        *o += y * *v;
-    }
-}
-
-/// Vector-Jacobian product of [`forward`]: adds to `grads` and returns the gradient of the camera (of its
+/// Vector-Jacobian product of [`forward`]: fills `grads` and returns the gradient of the camera (of its
 /// centre alone unless `camera_wanted`).
 ///
 /// `projection` must be the one that `forward` filled from the same inputs.
@@ -476,7 +627,7 @@ fn backward_chunk<S: Simd, T: Real>(
     camera_wanted: bool,
 ) -> CameraGrad {
     let zero = splat_lanes(simd, 0.0);
-    let lanes_of = CameraLanes::new(
+    let camera_lanes = CameraLanes::new(
         simd,
         camera,
         options.near_plane,
@@ -485,116 +636,244 @@ fn backward_chunk<S: Simd, T: Real>(
     );
     let center = splat3(simd, camera.center);
     let mut camera_grad = CameraGradLanes::zero(simd);
+    let mut inputs = Inputs::ZERO;
+    let (mut v_means2d, mut v_whitened) = ([Column::ZERO; 2], [Column::ZERO; 3]);
+    let (mut v_opacities, mut v_depths) = (Column::ZERO, Column::ZERO);
+    let (mut v_conics, mut v_rgb) = ([Column::ZERO; 3], [Column::ZERO; 3]);
+    let mut colors = ColorGroup::ZERO;
+    let mut out = GradColumns::<T>::ZERO;
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
-    for first in (begin..end).step_by(lanes::<S>()) {
-        let rows = lanes::<S>().min(end - first);
-        let visible = |lane: usize| lane < rows && projection.splats[first + lane].visible();
-        if !(0..rows).any(visible) {
+    for first in (begin..end).step_by(GROUP) {
+        let rows = GROUP.min(end - first);
+        let start = first - begin;
+        let mut visible = 0u16;
+        for (lane, depth) in projection.depths[first..first + rows].iter().enumerate() {
+            visible |= u16::from(*depth > 0.0) << lane;
+        }
+        if visible == 0 {
             continue;
         }
-        let mut g = geometry(simd, gaussians, first, &lanes_of);
-        // Lanes that were culled for another reason, or lie beyond the end, are not valid here.
-        g.valid = Wide::<S>::from_fn(simd, |lane| f64::from(u8::from(visible(lane)))).simd_gt(zero);
-        let v_opacity = load(simd, v.opacities, 1, 0, first);
-        let mut v_input_opacity = v_opacity;
-        let mut direct = None;
-        if options.antialiased || v.conics.is_some() {
-            let conic = match v.conics {
-                Some(c) => columns3(simd, c, first),
-                None => [zero; 3],
+        inputs.read(simd, gaussians, first);
+        columns::read(simd, v.means2d, first, &mut v_means2d);
+        columns::read(simd, v.whitened, first, &mut v_whitened);
+        v_opacities.load(v.opacities, first);
+        if let Some(d) = v.depths {
+            v_depths.load(d, first);
+        }
+        if let Some(c) = v.conics {
+            columns::read(simd, c, first, &mut v_conics);
+        }
+        let mut v_colors = None;
+        if let (Some(h), Some(v)) = (harmonics, v.colors) {
+            columns::read(simd, v, first, &mut v_rgb);
+            colors.coefficients.read(simd, h, first);
+            let (means, directions) = (&inputs.means, &mut colors.directions);
+            for at in (0..GROUP).step_by(lanes::<S>()) {
+                let (d, inverse) = direction(simd, wide3(simd, means, at), center);
+                let valid = lanes_in(simd, visible, at);
+                let d = d.only(valid, zero);
+                directions[0].set(simd, at, d.x);
+                directions[1].set(simd, at, d.y);
+                directions[2].set(simd, at, d.z);
+                colors.inverses.set(simd, at, valid.select(inverse, zero));
+            }
+            colors.backward(simd, h.degree, &v_rgb, visible);
+            v_colors = Some(h);
+        }
+        for at in (0..GROUP).step_by(lanes::<S>()) {
+            let mut g = inputs.geometry(simd, at, &camera_lanes);
+            // Lanes that were culled for another reason, or lie beyond the end, are not valid here.
+            g.valid = lanes_in(simd, visible, at);
+            let v_opacity = v_opacities.wide(simd, at);
+            let mut v_input_opacity = v_opacity;
+            let mut direct = None;
+            if options.antialiased || v.conics.is_some() {
+                // Without a cotangent these are zeros.
+                let conic = [
+                    v_conics[0].wide(simd, at),
+                    v_conics[1].wide(simd, at),
+                    v_conics[2].wide(simd, at),
+                ];
+                let mut compensation = zero;
+                if options.antialiased {
+                    compensation = v_opacity * inputs.opacities.wide(simd, at);
+                    v_input_opacity = v_opacity * g.compensation();
+                }
+                direct = Some((conic, compensation));
+            }
+            let cotangent = Cotangent {
+                mean2d: [v_means2d[0].wide(simd, at), v_means2d[1].wide(simd, at)],
+                whitened: [
+                    v_whitened[0].wide(simd, at),
+                    v_whitened[1].wide(simd, at),
+                    v_whitened[2].wide(simd, at),
+                ],
+                depth: v_depths.wide(simd, at),
+                direct,
             };
-            let mut compensation = zero;
-            if options.antialiased {
-                compensation = v_opacity * load(simd, gaussians.opacities, 1, 0, first);
-                v_input_opacity = v_opacity * g.compensation();
+            let mut grad = g.vjp(
+                simd,
+                &cotangent,
+                &camera_lanes,
+                camera_wanted.then_some(&mut camera_grad),
+            );
+            if v_colors.is_some() {
+                // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
+                let d = wide3(simd, &colors.directions, at);
+                let v_d = wide3(simd, &colors.v_directions, at).only(g.valid, zero);
+                let v_mean = (v_d - d.by(d.dot(v_d))).by(colors.inverses.wide(simd, at));
+                grad.mean = grad.mean + v_mean;
+                camera_grad.center = camera_grad.center - v_mean;
             }
-            direct = Some((conic, compensation));
+            out.set(simd, at, &grad, v_input_opacity, g.valid, zero);
         }
-        let cotangent = Cotangent {
-            mean2d: [
-                load(simd, v.means2d, 2, 0, first),
-                load(simd, v.means2d, 2, 1, first),
-            ],
-            whitened: columns3(simd, v.whitened, first),
-            depth: match v.depths {
-                Some(d) => load(simd, d, 1, 0, first),
-                None => zero,
-            },
-            direct,
+        let GradColumns {
+            means: [x, y, z],
+            quats: [q0, q1, q2, q3],
+            scales: [s0, s1, s2],
+            opacities,
+        } = &out;
+        if let Some(out) = &mut grads.means {
+            columns::write([&x.0, &y.0, &z.0], rows_of(out, 3, start, rows));
+        }
+        if let Some(out) = &mut grads.quats {
+            columns::write([&q0.0, &q1.0, &q2.0, &q3.0], rows_of(out, 4, start, rows));
+        }
+        if let Some(out) = &mut grads.scales {
+            columns::write([&s0.0, &s1.0, &s2.0], rows_of(out, 3, start, rows));
+        }
+        if let Some(out) = &mut grads.opacities {
+            columns::write([&opacities.0], rows_of(out, 1, start, rows));
+        }
+        let Some(h) = v_colors else {
+            continue;
         };
-        let mut grad = g.vjp(
-            simd,
-            &cotangent,
-            &lanes_of,
-            camera_wanted.then_some(&mut camera_grad),
-        );
-        if let (Some(h), Some(colors)) = (harmonics, v.colors) {
-            let (d, length) = direction(simd, g.mean, center);
-            let basis = sh::basis(simd, h.degree, d);
-            let mut weights = [zero; sh::MAX_COUNT];
-            for lane in (0..rows).filter(|&lane| visible(lane)) {
-                let i = first + lane;
-                let basis = |k: usize| T::from_f64(basis[k][lane]);
-                let rgb = evaluate(h, i, basis);
-                // Zero gradient where the colour is clamped at 0.
-                let v_rgb: [T; 3] = std::array::from_fn(|c| {
-                    if rgb[c] >= T::ZERO {
-                        colors[3 * i + c]
-                    } else {
-                        T::ZERO
-                    }
-                });
-                let (first, rest) = h.of(i);
-                let along = |row: &[T]| v_rgb[0] * row[0] + v_rgb[1] * row[1] + v_rgb[2] * row[2];
-                weights[0][lane] = along(first).to_f64();
-                for (w, row) in weights[1..].iter_mut().zip(rest.chunks_exact(3)) {
-                    w[lane] = along(row).to_f64();
-                }
-                let (row, rest_row) = h.rows();
-                let j = i - begin;
-                let (mut first_grad, mut rest_grad) = (None, None);
-                if let Some(out) = &mut grads.harmonics {
-                    let (first, rest) = out[j * row..(j + 1) * row].split_at_mut(3);
-                    (first_grad, rest_grad) = (Some(first), Some(rest));
-                }
-                if h.rest.is_some() {
-                    let out = grads.harmonics_rest.as_mut();
-                    rest_grad = out.map(|out| &mut out[j * rest_row..(j + 1) * rest_row]);
-                }
-                if let Some(out) = first_grad {
-                    add_scaled(out, basis(0), &v_rgb);
-                }
-                if let Some(out) = rest_grad {
-                    let rows = out.chunks_exact_mut(3).take(sh::count(h.degree) - 1);
-                    for (k, out) in rows.enumerate() {
-                        add_scaled(out, basis(k + 1), &v_rgb);
-                    }
-                }
-            }
-            let v_d = sh::basis_vjp(simd, h.degree, d, &weights);
-            // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
-            let inverse = length
-                .simd_gt(zero)
-                .select(splat_lanes(simd, 1.0) / length, zero);
-            let v_mean = (v_d - d.by(d.dot(v_d))).by(inverse);
-            grad.mean = grad.mean + v_mean;
-            camera_grad.center = camera_grad.center - v_mean.only(g.valid, zero);
+        let (row, rest_row) = h.rows();
+        let used = 3 * sh::count(h.degree);
+        let v_coefficients = &colors.v_coefficients[..used];
+        let (in_first, in_rest) = v_coefficients.split_at(if h.rest.is_some() { 3 } else { used });
+        let buffer = &mut colors.coefficients.rows;
+        if let Some(out) = &mut grads.harmonics {
+            let out = rows_of(out, row, start, rows);
+            buffer.write(simd, in_first, out, row, rows);
         }
-        for lane in (0..rows).filter(|&lane| visible(lane)) {
-            let j = first - begin + lane;
-            add(
-                &mut grads.means,
-                j,
-                &[grad.mean.x[lane], grad.mean.y[lane], grad.mean.z[lane]],
-            );
-            add(&mut grads.quats, j, &grad.quat.map(|q| q[lane]));
-            add(
-                &mut grads.scales,
-                j,
-                &[grad.scale.x[lane], grad.scale.y[lane], grad.scale.z[lane]],
-            );
-            add(&mut grads.opacities, j, &[v_input_opacity[lane]]);
+        if let (Some(out), false) = (&mut grads.harmonics_rest, in_rest.is_empty()) {
+            let out = rows_of(out, rest_row, start, rows);
+            buffer.write(simd, in_rest, out, rest_row, rows);
         }
     }
     camera_grad.sum()
+}
+
+/// Gradients of a group in the type of the inputs.
+struct GradColumns<T> {
+    means: [Column<T>; 3],
+    quats: [Column<T>; 4],
+    scales: [Column<T>; 3],
+    opacities: Column<T>,
+}
+
+impl<T: Real> GradColumns<T> {
+    const ZERO: Self = Self {
+        means: [Column::ZERO; 3],
+        quats: [Column::ZERO; 4],
+        scales: [Column::ZERO; 3],
+        opacities: Column::ZERO,
+    };
+
+    /// Set the Gaussians `at..`; 0 where they are not valid.
+    #[inline(always)]
+    fn set<S: Simd>(
+        &mut self,
+        simd: S,
+        at: usize,
+        grad: &GeometryGrad<S>,
+        opacity: Wide<S>,
+        valid: <Wide<S> as SimdBase<S>>::Mask,
+        zero: Wide<S>,
+    ) {
+        let mean = grad.mean.only(valid, zero);
+        let scale = grad.scale.only(valid, zero);
+        self.means[0].saturate(simd, at, mean.x);
+        self.means[1].saturate(simd, at, mean.y);
+        self.means[2].saturate(simd, at, mean.z);
+        self.scales[0].saturate(simd, at, scale.x);
+        self.scales[1].saturate(simd, at, scale.y);
+        self.scales[2].saturate(simd, at, scale.z);
+        for k in 0..4 {
+            self.quats[k].saturate(simd, at, valid.select(grad.quat[k], zero));
+        }
+        self.opacities
+            .saturate(simd, at, valid.select(opacity, zero));
+    }
+}
+
+/// The colours of a group and their gradients, a column per number.
+struct ColorGroup<T> {
+    coefficients: Coefficients<T>,
+    v_coefficients: [Column<T>; 3 * sh::MAX_COUNT],
+    /// Unit vectors from the camera centre, and one over the distances.
+    directions: [Column<f64>; 3],
+    inverses: Column<f64>,
+    v_directions: [Column<T>; 3],
+}
+
+impl<T: Real> ColorGroup<T> {
+    const ZERO: Self = Self {
+        coefficients: Coefficients::ZERO,
+        v_coefficients: [Column::ZERO; 3 * sh::MAX_COUNT],
+        directions: [Column::ZERO; 3],
+        inverses: Column::ZERO,
+        v_directions: [Column::ZERO; 3],
+    };
+
+    /// Gradients of the coefficients and of the directions, from that of the colours.
+    #[inline(always)]
+    fn backward<S: Simd>(
+        &mut self,
+        simd: S,
+        degree: usize,
+        v_colors: &[Column<T>; 3],
+        visible: u16,
+    ) {
+        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+        let d = narrow3::<T>(&self.directions);
+        let mut v_visible = *v_colors;
+        for column in &mut v_visible {
+            for (lane, x) in column.0.iter_mut().enumerate() {
+                *x = if visible >> lane & 1 == 1 {
+                    *x
+                } else {
+                    T::ZERO
+                };
+            }
+        }
+        for at in (0..GROUP).step_by(Lanes::<T, S>::LEN) {
+            let d = get3(simd, &d, at);
+            let basis = sh::basis::<S, T>(simd, degree, d);
+            let rgb = evaluate(simd, degree, &self.coefficients.columns, &basis, at);
+            // Zero gradient where the colour is clamped at 0.
+            let v = get3(simd, &v_visible, at);
+            let v = [
+                rgb[0].simd_ge(zero).select(v.x, zero),
+                rgb[1].simd_ge(zero).select(v.y, zero),
+                rgb[2].simd_ge(zero).select(v.z, zero),
+            ];
+            let mut weights = [zero; sh::MAX_COUNT];
+            for k in 0..sh::count(degree) {
+                let [r, g, b] = [3 * k, 3 * k + 1, 3 * k + 2];
+                let c = &self.coefficients.columns;
+                let along = v[0] * c[r].get(simd, at);
+                let along = v[1].mul_add(c[g].get(simd, at), along);
+                weights[k] = v[2].mul_add(c[b].get(simd, at), along);
+                self.v_coefficients[r].set(simd, at, basis[k] * v[0]);
+                self.v_coefficients[g].set(simd, at, basis[k] * v[1]);
+                self.v_coefficients[b].set(simd, at, basis[k] * v[2]);
+            }
+            let v_d = sh::basis_vjp::<S, T>(simd, degree, d, &weights);
+            self.v_directions[0].set(simd, at, v_d.x);
+            self.v_directions[1].set(simd, at, v_d.y);
+            self.v_directions[2].set(simd, at, v_d.z);
+        }
+    }
 }

@@ -87,6 +87,13 @@ fn zeros<T: Real>(wanted: bool, n: usize) -> Vec<T> {
     vec![T::ZERO; if wanted { n } else { 0 }]
 }
 
+/// Add the gradient from another camera; it stays finite.
+fn accumulate<T: Real>(sum: &mut [T], part: &[T]) {
+    for (s, p) in sum.iter_mut().zip(part) {
+        *s = T::saturating(s.to_f64() + p.to_f64());
+    }
+}
+
 fn some<T>(wanted: bool, data: &mut [T]) -> Option<&mut [T]> {
     wanted.then_some(data)
 }
@@ -521,12 +528,17 @@ fn project_backward_as<'py, T: Scalar>(
     let (row, rest_row) = harmonics.as_ref().map_or((0, 0), Harmonics::rows);
     let out = py.detach(|| {
         threads::install(|| {
-            let mut means = zeros::<T>(want_means, 3 * n);
-            let mut quats = zeros::<T>(want_quats, 4 * n);
-            let mut scales = zeros::<T>(want_scales, 3 * n);
-            let mut opacities = zeros::<T>(want_opacities, n);
-            let mut sh = zeros::<T>(want_harmonics, row * n);
-            let mut rest = zeros::<T>(want_rest, rest_row * n);
+            let fresh = || {
+                [
+                    zeros::<T>(want_means, 3 * n),
+                    zeros::<T>(want_quats, 4 * n),
+                    zeros::<T>(want_scales, 3 * n),
+                    zeros::<T>(want_opacities, n),
+                    zeros::<T>(want_harmonics, row * n),
+                    zeros::<T>(want_rest, rest_row * n),
+                ]
+            };
+            let mut sums = fresh();
             let mut viewmats = Vec::with_capacity(16 * c);
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let cotangents = ProjectCotangents {
@@ -537,13 +549,19 @@ fn project_backward_as<'py, T: Scalar>(
                     conics: slices.4.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
                     colors: slices.5.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
                 };
+                let mut one = if i == 0 {
+                    std::mem::take(&mut sums)
+                } else {
+                    fresh()
+                };
+                let [means, quats, scales, opacities, sh, rest] = &mut one;
                 let grads = GaussianGrads {
-                    means: some(want_means, &mut means),
-                    quats: some(want_quats, &mut quats),
-                    scales: some(want_scales, &mut scales),
-                    opacities: some(want_opacities, &mut opacities),
-                    harmonics: some(want_harmonics, &mut sh),
-                    harmonics_rest: some(want_rest, &mut rest),
+                    means: some(want_means, means),
+                    quats: some(want_quats, quats),
+                    scales: some(want_scales, scales),
+                    opacities: some(want_opacities, opacities),
+                    harmonics: some(want_harmonics, sh),
+                    harmonics_rest: some(want_rest, rest),
                 };
                 let camera_grad = project::backward(
                     &gaussians,
@@ -556,11 +574,18 @@ fn project_backward_as<'py, T: Scalar>(
                     want_viewmats,
                 );
                 viewmats.extend(camera_grad.viewmat(camera));
+                if i == 0 {
+                    sums = one;
+                } else {
+                    for (sum, part) in sums.iter_mut().zip(&one) {
+                        accumulate(sum, part);
+                    }
+                }
             }
-            (means, quats, scales, opacities, sh, rest, viewmats)
+            (sums, viewmats)
         })
     });
-    let (means, quats, scales, opacities, sh, rest, viewmats) = out;
+    let ([means, quats, scales, opacities, sh, rest], viewmats) = out;
     Ok((
         want_means.then(|| means.into_pyarray(py)),
         want_quats.then(|| quats.into_pyarray(py)),

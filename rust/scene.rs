@@ -55,24 +55,13 @@ pub struct Harmonics<'a, T> {
     pub degree: usize,
 }
 
-impl<'a, T: Real> Harmonics<'a, T> {
+impl<T: Real> Harmonics<'_, T> {
     /// Numbers per Gaussian in `coefficients` and in `rest`.
     pub fn rows(&self) -> (usize, usize) {
         if self.rest.is_some() {
             (3, 3 * (self.stored - 1))
         } else {
             (3 * self.stored, 0)
-        }
-    }
-
-    /// The constant coefficients of Gaussian `i`, and those of higher degrees in use.
-    pub(crate) fn of(&self, i: usize) -> (&'a [T], &'a [T]) {
-        let used = 3 * (sh::count(self.degree) - 1);
-        let (row, rest_row) = self.rows();
-        let first = &self.coefficients[i * row..(i + 1) * row];
-        match self.rest {
-            Some(rest) => (first, &rest[i * rest_row..i * rest_row + used]),
-            None => (&first[..3], &first[3..3 + used]),
         }
     }
 

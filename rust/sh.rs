@@ -1,7 +1,10 @@
 //! Real spherical harmonics of degree 0..3 in the basis order and signs of the original 3DGS, one direction
 //! per SIMD lane.
 
-use crate::lanes::{V3, Wide};
+use crate::{
+    lanes::V3,
+    real::{Lanes, Real},
+};
 use fearless_simd::{Simd, SimdBase};
 
 /// Number of coefficients of all degrees up to `degree`.
@@ -28,72 +31,82 @@ const C3E: f64 = 1.445_305_721_320_277; // sqrt(105 / 16 pi)
 
 /// Basis functions at the unit vector `d`; those above `degree` are 0.
 #[inline(always)]
-pub(crate) fn basis<S: Simd>(simd: S, degree: usize, d: V3<Wide<S>>) -> [Wide<S>; MAX_COUNT] {
+pub(crate) fn basis<S: Simd, T: Real>(
+    simd: S,
+    degree: usize,
+    d: V3<Lanes<T, S>>,
+) -> [Lanes<T, S>; MAX_COUNT] {
+    let real = T::from_f64;
     let V3 { x, y, z } = d;
-    let mut b = [Wide::<S>::splat(simd, 0.0); MAX_COUNT];
-    b[0] = Wide::<S>::splat(simd, C0);
+    let mut b = [Lanes::<T, S>::splat(simd, T::ZERO); MAX_COUNT];
+    b[0] = Lanes::<T, S>::splat(simd, real(C0));
     if degree >= 1 {
-        b[1] = y * -C1;
-        b[2] = z * C1;
-        b[3] = x * -C1;
+        b[1] = y * real(-C1);
+        b[2] = z * real(C1);
+        b[3] = x * real(-C1);
     }
     let (xx, yy, zz) = (x * x, y * y, z * z);
     if degree >= 2 {
-        b[4] = x * y * C2A;
-        b[5] = y * z * -C2A;
-        b[6] = (zz * 2.0 - xx - yy) * C2B;
-        b[7] = x * z * -C2A;
-        b[8] = (xx - yy) * C2C;
+        b[4] = x * y * real(C2A);
+        b[5] = y * z * real(-C2A);
+        b[6] = (zz * real(2.0) - xx - yy) * real(C2B);
+        b[7] = x * z * real(-C2A);
+        b[8] = (xx - yy) * real(C2C);
     }
     if degree >= 3 {
-        b[9] = y * (xx * 3.0 - yy) * -C3A;
-        b[10] = x * y * z * C3B;
-        b[11] = y * (zz * 4.0 - xx - yy) * -C3C;
-        b[12] = z * (zz * 2.0 - (xx + yy) * 3.0) * C3D;
-        b[13] = x * (zz * 4.0 - xx - yy) * -C3C;
-        b[14] = z * (xx - yy) * C3E;
-        b[15] = x * (xx - yy * 3.0) * -C3A;
+        b[9] = y * (xx * real(3.0) - yy) * real(-C3A);
+        b[10] = x * y * z * real(C3B);
+        b[11] = y * (zz * real(4.0) - xx - yy) * real(-C3C);
+        b[12] = z * (zz * real(2.0) - (xx + yy) * real(3.0)) * real(C3D);
+        b[13] = x * (zz * real(4.0) - xx - yy) * real(-C3C);
+        b[14] = z * (xx - yy) * real(C3E);
+        b[15] = x * (xx - yy * real(3.0)) * real(-C3A);
     }
     b
 }
 
 /// Gradient of `sum_k weights[k] basis[k]` with respect to `d`, as three free variables.
 #[inline(always)]
-pub(crate) fn basis_vjp<S: Simd>(
+pub(crate) fn basis_vjp<S: Simd, T: Real>(
     simd: S,
     degree: usize,
-    d: V3<Wide<S>>,
-    w: &[Wide<S>; MAX_COUNT],
-) -> V3<Wide<S>> {
+    d: V3<Lanes<T, S>>,
+    w: &[Lanes<T, S>; MAX_COUNT],
+) -> V3<Lanes<T, S>> {
+    let real = T::from_f64;
     let V3 { x, y, z } = d;
-    let zero = Wide::<S>::splat(simd, 0.0);
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
     let mut g = V3::new(zero, zero, zero);
     if degree >= 1 {
-        g = V3::new(w[3] * -C1, w[1] * -C1, w[2] * C1);
+        g = V3::new(w[3] * real(-C1), w[1] * real(-C1), w[2] * real(C1));
     }
     if degree >= 2 {
-        g.x += (y * w[4] - z * w[7]) * C2A - x * w[6] * (2.0 * C2B) + x * w[8] * (2.0 * C2C);
-        g.y += (x * w[4] - z * w[5]) * C2A - y * w[6] * (2.0 * C2B) - y * w[8] * (2.0 * C2C);
-        g.z += z * w[6] * (4.0 * C2B) - (y * w[5] + x * w[7]) * C2A;
+        g.x += (y * w[4] - z * w[7]) * real(C2A) - x * w[6] * real(2.0 * C2B)
+            + x * w[8] * real(2.0 * C2C);
+        g.y += (x * w[4] - z * w[5]) * real(C2A)
+            - y * w[6] * real(2.0 * C2B)
+            - y * w[8] * real(2.0 * C2C);
+        g.z += z * w[6] * real(4.0 * C2B) - (y * w[5] + x * w[7]) * real(C2A);
     }
     if degree >= 3 {
         let (xx, yy, zz) = (x * x, y * y, z * z);
-        g.x += y * z * w[10] * C3B - x * y * w[9] * (6.0 * C3A) + x * y * w[11] * (2.0 * C3C)
-            - x * z * w[12] * (6.0 * C3D)
-            - (zz * 4.0 - xx * 3.0 - yy) * w[13] * C3C
-            + x * z * w[14] * (2.0 * C3E)
-            - (xx - yy) * w[15] * (3.0 * C3A);
-        g.y += x * z * w[10] * C3B
-            - (xx - yy) * w[9] * (3.0 * C3A)
-            - (zz * 4.0 - xx - yy * 3.0) * w[11] * C3C
-            - y * z * w[12] * (6.0 * C3D)
-            + x * y * w[13] * (2.0 * C3C)
-            - y * z * w[14] * (2.0 * C3E)
-            + x * y * w[15] * (6.0 * C3A);
-        g.z += x * y * w[10] * C3B - y * z * w[11] * (8.0 * C3C)
-            + (zz * 6.0 - (xx + yy) * 3.0) * w[12] * C3D
-            - x * z * w[13] * (8.0 * C3C)
-            + (xx - yy) * w[14] * C3E;
+        g.x += y * z * w[10] * real(C3B) - x * y * w[9] * real(6.0 * C3A)
+            + x * y * w[11] * real(2.0 * C3C)
+            - x * z * w[12] * real(6.0 * C3D)
+            - (zz * real(4.0) - xx * real(3.0) - yy) * w[13] * real(C3C)
+            + x * z * w[14] * real(2.0 * C3E)
+            - (xx - yy) * w[15] * real(3.0 * C3A);
+        g.y += x * z * w[10] * real(C3B)
+            - (xx - yy) * w[9] * real(3.0 * C3A)
+            - (zz * real(4.0) - xx - yy * real(3.0)) * w[11] * real(C3C)
+            - y * z * w[12] * real(6.0 * C3D)
+            + x * y * w[13] * real(2.0 * C3C)
+            - y * z * w[14] * real(2.0 * C3E)
+            + x * y * w[15] * real(6.0 * C3A);
+        g.z += x * y * w[10] * real(C3B) - y * z * w[11] * real(8.0 * C3C)
+            + (zz * real(6.0) - (xx + yy) * real(3.0)) * w[12] * real(C3D)
+            - x * z * w[13] * real(8.0 * C3C)
+            + (xx - yy) * w[14] * real(C3E);
     }
     g
 }
@@ -101,14 +114,14 @@ pub(crate) fn basis_vjp<S: Simd>(
 #[cfg(test)]
 mod tests {
     use super::{basis as lanes_basis, basis_vjp as lanes_vjp, *};
-    use crate::lanes::splat3;
+    use crate::lanes::{Wide, splat3};
     use fearless_simd::{Level, dispatch};
     use glam::DVec3;
 
     fn basis(degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
         #[inline(always)]
         fn run<S: Simd>(simd: S, degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
-            lanes_basis(simd, degree, splat3(simd, DVec3::from(d))).map(|b| b[0])
+            lanes_basis::<S, f64>(simd, degree, splat3(simd, DVec3::from(d))).map(|b| b[0])
         }
         dispatch!(Level::new(), simd => run(simd, degree, d))
     }
@@ -117,7 +130,7 @@ mod tests {
         #[inline(always)]
         fn run<S: Simd>(simd: S, degree: usize, d: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
             let w = w.map(|w| Wide::<S>::splat(simd, w));
-            let g = lanes_vjp(simd, degree, splat3(simd, DVec3::from(d)), &w);
+            let g = lanes_vjp::<S, f64>(simd, degree, splat3(simd, DVec3::from(d)), &w);
             [g.x[0], g.y[0], g.z[0]]
         }
         dispatch!(Level::new(), simd => run(simd, degree, d, w))
