@@ -16,6 +16,8 @@ class Composite:
     """Tile lists and replay state of a composited frame."""
 
     work: tuple[int, int, int]
+    blended: int
+    bin_seconds: float
 
 def project_forward(
     means: Array,

@@ -109,6 +109,7 @@ def scene_fingerprint(scene: Scene) -> dict[str, str]:
         "views": hashlib.sha256(names.encode()).hexdigest()[:16],
         "cameras": digest(array for v in views for array in (v.camera.K, v.camera.viewmat)),
         "photos": digest(v.image for v in views),
+        "low": digest(v.low for v in views if v.low is not None),
         "masks": digest(v.mask for v in views if v.mask is not None),
         "points": digest([scene.points, scene.point_colors]),
     }

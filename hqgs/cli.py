@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import hqgs
+from hqgs.bench.cli import add_parser as add_bench_parser
 from hqgs.camera import Scene
 from hqgs.checkpoint import FolderBusyError
 from hqgs.config import TrainConfig
@@ -22,7 +23,9 @@ from hqgs.degradations import parse_degradation
 from hqgs.degrade import check_new_folder, degrade_scene, write_degraded_scene
 from hqgs.densify import DensifyConfig
 from hqgs.methods import METHODS
+from hqgs.methods.hqgs import AUTO, GUIDANCES, HQGSConfig
 from hqgs.report import RunResult
+from hqgs.restore import restore_scene
 from hqgs.run import CHECKPOINT, open_run, run
 from hqgs.synthetic import embedded_scene
 from hqgs.train import TrainingError
@@ -69,6 +72,14 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--degrade", default="none", metavar="KIND", help=f"what happens to the training photos: {KINDS_HELP}"
     )
+    add("--restore", type=Path, metavar="WEIGHTS", help="send the training photos through this network first")
+    add("--guidance", default=config.hqgs.guidance, choices=GUIDANCES, help="of hqgs (%(default)s)")
+    add(
+        "--formation",
+        default=config.hqgs.formation,
+        metavar="KIND",
+        help=f"what hqgs takes for the photos' degradation; {AUTO}: it looks (%(default)s)",
+    )
     add("--threads", type=int, metavar="T", help="(all cores; the result does not depend on it)")
     add(
         "--max-gaussians",
@@ -84,6 +95,8 @@ def _parser() -> argparse.ArgumentParser:
     degrade.set_defaults(run=_degrade)
     _add_scene(degrade, "folder for the new scene; missing or empty", config.seed)
     degrade.add_argument("--kind", required=True, help=KINDS_HELP)
+
+    add_bench_parser(commands)
     return parser
 
 
@@ -116,6 +129,8 @@ def _train(args: argparse.Namespace) -> int:
             scene = _scene(args, cache=args.out / "scene")
             if degradation.steps:
                 scene = degrade_scene(scene, degradation, config.seed)
+            if args.restore is not None:
+                scene = restore_scene(scene, args.restore)
             trainer = stack.enter_context(open_run(scene, config, args.out, args.resume))
         except BAD_INPUT as error:
             return _fail(2, str(error))
@@ -151,6 +166,7 @@ def _config(args: argparse.Namespace) -> TrainConfig:
         method=args.method,
         seed=args.seed,
         densify=DensifyConfig(max_gaussians=args.max_gaussians),
+        hqgs=HQGSConfig(guidance=args.guidance, formation=args.formation),
     ).scaled()
     return config if args.eval_every is None else replace(config, eval_every=args.eval_every)
 

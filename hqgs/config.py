@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from hqgs.densify import DensifyConfig
 from hqgs.gaussians import MAX_SH_DEGREE
 from hqgs.methods import check_method
+from hqgs.methods.hqgs import HQGSConfig
+from hqgs.methods.srgs import SRGSConfig
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class TrainConfig:
     eval_every: int = 3_000  # iterations between evaluations on the held-out views
     checkpoint_every: int = 1_000  # iterations; does not change the result
     densify: DensifyConfig = field(default_factory=DensifyConfig)
+    srgs: SRGSConfig = field(default_factory=SRGSConfig)  # of the method of that name, as the next
+    hqgs: HQGSConfig = field(default_factory=HQGSConfig)
 
     def __post_init__(self) -> None:
         check_method(self.method)

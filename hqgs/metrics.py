@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import piq
 import torch
 from numpy.typing import NDArray
 
@@ -84,7 +83,9 @@ def haarpsi(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] |
     if torch.equal(x, y):
         return 1.0  # the limit; the formula divides 0 by 0 for two black images
     with one_torch_thread(), torch.no_grad():
-        return float(piq.haarpsi(x, y, data_range=1.0))
+        from piq import haarpsi as measure  # takes seconds and 200 MB to import
+
+        return float(measure(x, y, data_range=1.0))
 
 
 def lpips(

@@ -135,6 +135,8 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
     def leave_out(what: str, why: str) -> None:
         left_out.append({"what": what, "why": why})
 
+    for what, why in trainer.method.left_out():
+        leave_out(what, why)
     rows = write_ply(out / PLY, trainer.method.modulate(trainer.gaussians))
     if rows:
         leave_out(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf")

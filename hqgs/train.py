@@ -49,9 +49,9 @@ class Trainer:
         """ValueError if the scene or the configuration cannot be trained."""
         _check_views(scene)
         self.scene = scene
-        self.config = config
         self.extent = scene.extent
         self.method = make_method(scene, config)
+        self.config = config = self.method.adapt(config)
         self.gaussians = Gaussians.from_points(scene.points, scene.point_colors, config.sh_degree)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(config.densify, self.extent, config.seed, len(self.gaussians))

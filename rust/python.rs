@@ -18,6 +18,7 @@ use numpy::{
     PyUntypedArrayMethods,
 };
 use pyo3::{exceptions::PyValueError, prelude::*};
+use std::time::Instant;
 
 /// The buffers of an iteration are as large as those of the last one: an allocator that keeps them saves the
 /// page faults, which cost more than the arithmetic of the gradients.
@@ -113,6 +114,7 @@ struct Frame {
 struct Composite {
     state: State,
     work: Work,
+    bin_seconds: f64,
 }
 
 #[pymethods]
@@ -147,6 +149,12 @@ impl Composite {
     #[getter]
     fn work(&self) -> (u64, u64, u64) {
         (self.work.pairs, self.work.blocks, self.work.hit_blocks)
+    }
+
+    /// Wall-clock seconds that the tile lists took.
+    #[getter]
+    fn bin_seconds(&self) -> f64 {
+        self.bin_seconds
     }
 
     /// (Gaussian, pixel) pairs that were blended.
@@ -660,16 +668,18 @@ fn composite_as<'py, T: Scalar>(
             let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
             let mut image = zeros::<T>(true, frame.cameras.len() * pixels * channels);
             let mut alphas = zeros::<T>(true, frame.cameras.len() * pixels);
-            let (mut views, mut total) = (Vec::new(), Work::default());
+            let (mut views, mut total, mut bin_seconds) = (Vec::new(), Work::default(), 0.0);
             for (i, (camera, projection)) in
                 frame.cameras.iter().zip(&frame.projections).enumerate()
             {
+                let started = Instant::now();
                 let tiles = tiles::bin(
                     projection,
                     of_camera(colors, i, frame.n * channels),
                     channels,
                     camera,
                 )?;
+                bin_seconds += started.elapsed().as_secs_f64();
                 let input = CompositeInput {
                     projection,
                     tiles: &tiles,
@@ -688,6 +698,7 @@ fn composite_as<'py, T: Scalar>(
                 Composite {
                     state: T::wrap(views),
                     work: total,
+                    bin_seconds,
                 },
                 image,
                 alphas,

@@ -7,12 +7,18 @@ from typing import TYPE_CHECKING
 
 from hqgs.camera import Scene
 from hqgs.methods.base import Method
+from hqgs.methods.hqgs import make_hqgs
+from hqgs.methods.srgs import SRGS
 from hqgs.methods.three_dgs import ThreeDGS
 
 if TYPE_CHECKING:
     from hqgs.config import TrainConfig  # which itself checks its method here
 
-METHODS: dict[str, Callable[[Scene, TrainConfig], Method]] = {"3dgs": lambda scene, config: ThreeDGS()}
+METHODS: dict[str, Callable[[Scene, TrainConfig], Method]] = {
+    "3dgs": lambda scene, config: ThreeDGS(),
+    "srgs": lambda scene, config: SRGS(scene, config.srgs),
+    "hqgs": lambda scene, config: make_hqgs(scene, config.hqgs, config.seed),
+}
 
 
 def check_method(name: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -12,9 +12,20 @@ from torch import Tensor
 from hqgs.camera import View
 from hqgs.gaussians import Gaussians
 
+if TYPE_CHECKING:
+    from hqgs.config import TrainConfig  # which itself imports the methods
+
 
 class Method(Protocol):
     """The replaceable part of a training step."""
+
+    def adapt(self, config: TrainConfig) -> TrainConfig:
+        """The configuration to train with: the given one, with what the method decides for this scene."""
+        ...
+
+    def left_out(self) -> list[tuple[str, str]]:
+        """Parts of the method that this scene does not need: (what, why)."""
+        ...
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         """The Gaussians to rasterize, differentiable in the trained ones and in the method's own tensors.
@@ -38,6 +49,31 @@ class Method(Protocol):
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Take the values of `state_dict` over, into the tensors that `param_groups` gave out."""
         ...
+
+
+class Plain:
+    """The parts of a method that has no tensors of its own and decides nothing about the training."""
+
+    name: str
+
+    def adapt(self, config: TrainConfig) -> TrainConfig:
+        return config
+
+    def left_out(self) -> list[tuple[str, str]]:
+        return []
+
+    def modulate(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        return []
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        if state:
+            raise ValueError(f"{self.name} has no state of its own, the checkpoint has {sorted(state)}")
 
 
 def photo_tensors(view: View) -> tuple[Tensor, Tensor | None]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,12 +12,19 @@ from torch import Tensor
 
 from hqgs.camera import Scene, View
 from hqgs.degradations import Degradation, parse_degradation, shrink
+from hqgs.diagnosis import diagnose_scene
 from hqgs.formation import formation
-from hqgs.gaussians import Gaussians
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
+from hqgs.methods.base import Method, Plain
+from hqgs.methods.paper import PaperConfig, PaperHQGS
 from hqgs.separable import Separable
 
+if TYPE_CHECKING:
+    from hqgs.config import TrainConfig  # which itself imports the methods
+
+AUTO = "auto"
+FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
 
 
@@ -25,13 +32,20 @@ LAMBDA_DSSIM = 0.2
 class HQGSConfig:
     """What HQGS assumes and how it weighs its terms. ValueError for a value out of range."""
 
-    formation: str = "none"  # what happened to the photos, in the grammar of `parse_degradation`
+    guidance: str = FORMATION  # or "paper": `PaperHQGS` instead of everything below
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    formation: str = AUTO  # what happened to the photos, as `parse_degradation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
+    gaussians_per_pixel: float = 1 / 3  # of degraded photos, at their true resolution: the most that may grow
 
     def __post_init__(self) -> None:
-        parse_degradation(self.formation)
-        if not self.jpeg_pixels >= 0:
-            raise ValueError(f"jpeg_pixels is {self.jpeg_pixels}, wanted at least 0")
+        if self.guidance not in GUIDANCES:
+            raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
+        if self.formation != AUTO:
+            parse_degradation(self.formation)
+        for name in ("jpeg_pixels", "gaussians_per_pixel"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
 
 
 @dataclass(frozen=True)
@@ -44,7 +58,7 @@ class Target:
     centres: Coefficients | None  # of the photo's JPEG cells
 
 
-class HQGS:
+class HQGS(Plain):
     """The image formation in the loss.
 
     - Blur and low resolution: the render is blurred and shrunk as the photo was, and compared there.
@@ -52,12 +66,19 @@ class HQGS:
     - Noise or JPEG: no D-SSIM. It is normalised by the local contrast, so that it asks for the noise in flat
       parts; L1 averages the noise over the views.
     - None of them: the loss of 3DGS.
+    - The fewer pixels the photos have, the fewer Gaussians they determine: growth ends at a share of them.
     """
+
+    name = "hqgs"
 
     def __init__(self, scene: Scene, config: HQGSConfig) -> None:
         """ValueError where the photos do not fit the formation."""
         self.config = config
-        self.degradation = parse_degradation(config.formation)
+        self._left_out: list[tuple[str, str]] = []
+        self.degradation = (
+            self._diagnose(scene) if config.formation == AUTO else parse_degradation(config.formation)
+        )
+        self._least = len(scene.points)
         kinds = {step.kind: step.value for step in self.degradation.steps}
         self._lowres = "lowres" in kinds
         self._jpeg = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
@@ -66,8 +87,17 @@ class HQGS:
         self._cells: dict[tuple[int, int], JpegCells] = {}
         self._targets = {view.name: self._target(view) for view in scene.train}
 
-    def modulate(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians
+    def adapt(self, config: TrainConfig) -> TrainConfig:
+        """The formation that was found, and a budget of Gaussians that the photos can determine."""
+        hqgs = replace(config.hqgs, formation=str(self.degradation))
+        budget = config.densify.max_gaussians
+        if self.degradation.steps:
+            pixels = sum(t.photo.shape[0] * t.photo.shape[1] for t in self._targets.values())
+            budget = min(budget, max(int(self.config.gaussians_per_pixel * pixels), self._least))
+        return replace(config, hqgs=hqgs, densify=replace(config.densify, max_gaussians=budget))
+
+    def left_out(self) -> list[tuple[str, str]]:
+        return self._left_out
 
     def loss(self, render: Tensor, view: View) -> Tensor:
         target = self._targets[view.name]
@@ -80,15 +110,12 @@ class HQGS:
         cells = self._cells[target.photo.shape[0], target.photo.shape[1]]
         return cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        return []
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        if state:
-            raise ValueError(f"hqgs has no state of its own, the checkpoint has {sorted(state)}")
+    def _diagnose(self, scene: Scene) -> Degradation:
+        diagnosis = diagnose_scene(scene)
+        self._left_out = [
+            (f"{part} in the loss", why) for part, needed, why in diagnosis.needs() if not needed
+        ]
+        return parse_degradation(diagnosis.formation)
 
     def _target(self, view: View) -> Target:
         size = view.camera.height, view.camera.width
@@ -122,3 +149,10 @@ def _photo(view: View, degradation: Degradation, lowres: bool) -> NDArray[np.flo
         factor = next(int(step.value or 1) for step in degradation.steps if step.kind == "lowres")
         image = shrink(image, factor)
     return np.ascontiguousarray(image)
+
+
+def make_hqgs(scene: Scene, config: HQGSConfig, seed: int) -> Method:
+    """HQGS with the guidance that `config` names."""
+    if config.guidance == PAPER:
+        return PaperHQGS(scene, seed, config.paper)
+    return HQGS(scene, config)

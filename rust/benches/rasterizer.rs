@@ -1,7 +1,9 @@
-//! `cargo bench`: the stages of the rasterizer at three sizes, 504 x 378, degree 3, f32, all threads.
+//! `cargo bench`: the stages of the rasterizer at three sizes, 504 x 378, degree 3, f32, all threads, for a
+//! cloud and for a room as a trained scene looks like; and Adam on as many Gaussians.
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::{
+    adam::{self, AdamArrays, AdamOptions},
     composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, GeometryGrads},
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
     scene::{Colors, Harmonics},
@@ -9,120 +11,173 @@ use hqgs::{
     tiles,
 };
 
-fn stages(c: &mut Criterion) {
-    for n in [10_000, 100_000, 500_000] {
-        let s = Synthetic::<f32>::new(n, 504, 378, 1234).expect("a valid camera");
-        let gaussians = s.gaussians();
-        let harmonics = Harmonics {
-            coefficients: &s.harmonics,
-            rest: None,
-            stored: 16,
-            degree: 3,
-        };
-        let options = ProjectOptions::default();
-        let (mut means2d, mut depths, mut conics) =
-            (vec![0f32; 2 * n], vec![0f32; n], vec![0f32; 3 * n]);
-        let (mut radii, mut opacities, mut colors) =
-            (vec![0; 2 * n], vec![0f32; n], vec![0f32; 3 * n]);
-        let mut projection = Projection::default();
-        let mut group = c.benchmark_group("rasterizer");
+const SIZES: [usize; 3] = [10_000, 100_000, 500_000];
+const WIDTH: usize = 504;
+const HEIGHT: usize = 378;
+
+fn cloud(c: &mut Criterion) {
+    for n in SIZES {
+        let scene = Synthetic::new(n, WIDTH, HEIGHT, 1234).expect("a valid camera");
+        stages(c, "rasterizer", &scene);
+    }
+}
+
+fn room(c: &mut Criterion) {
+    for n in SIZES {
+        let scene = Synthetic::room(n, WIDTH, HEIGHT, 1234).expect("a valid camera");
+        stages(c, "rasterizer, room", &scene);
+    }
+}
+
+fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
+    let n = s.opacities.len();
+    let gaussians = s.gaussians();
+    let harmonics = Harmonics {
+        coefficients: &s.harmonics,
+        rest: None,
+        stored: 16,
+        degree: 3,
+    };
+    let options = ProjectOptions::default();
+    let (mut means2d, mut depths, mut conics) =
+        (vec![0f32; 2 * n], vec![0f32; n], vec![0f32; 3 * n]);
+    let (mut radii, mut opacities, mut colors) = (vec![0; 2 * n], vec![0f32; n], vec![0f32; 3 * n]);
+    let mut projection = Projection::default();
+    let mut group = c.benchmark_group(name);
+    group.sample_size(20);
+    group.bench_function(BenchmarkId::new("project", n), |b| {
+        b.iter(|| {
+            let out = ProjectOut {
+                means2d: &mut means2d,
+                depths: &mut depths,
+                conics: &mut conics,
+                radii: &mut radii,
+                opacities: &mut opacities,
+                colors: &mut colors,
+            };
+            project::forward(
+                &gaussians,
+                Colors::Harmonics(&harmonics),
+                &s.camera,
+                &options,
+                &mut projection,
+                out,
+            );
+        });
+    });
+    group.bench_function(BenchmarkId::new("bin and order", n), |b| {
+        b.iter(|| tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs"));
+    });
+    let tiles = tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs");
+    let input = CompositeInput {
+        projection: &projection,
+        tiles: &tiles,
+        camera: &s.camera,
+        background: None,
+    };
+    let pixels = s.camera.width * s.camera.height;
+    let (mut image, mut alphas) = (vec![0f32; 3 * pixels], vec![0f32; pixels]);
+    group.bench_function(BenchmarkId::new("composite", n), |b| {
+        b.iter(|| composite::forward(&input, &mut image, &mut alphas).expect("right lengths"));
+    });
+    let (composited, work) =
+        composite::forward(&input, &mut image, &mut alphas).expect("right lengths");
+    println!("{name}, {n} Gaussians: {work:?}");
+    let v_image: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
+    let (mut v_means2d, mut v_whitened) = (vec![0f32; 2 * n], vec![0f32; 3 * n]);
+    let (mut v_opacities, mut v_colors) = (vec![0f32; n], vec![0f32; 3 * n]);
+    let v = CompositeCotangents {
+        image: &v_image,
+        alphas: None,
+    };
+    group.bench_function(BenchmarkId::new("composite backward", n), |b| {
+        b.iter(|| {
+            let grads = CompositeGrads {
+                geometry: Some(GeometryGrads {
+                    means2d: &mut v_means2d,
+                    whitened: &mut v_whitened,
+                    opacities: &mut v_opacities,
+                    absolute: None,
+                }),
+                colors: Some(&mut v_colors),
+                background: None,
+            };
+            composite::backward(&input, &composited, &v, grads).expect("right lengths");
+        });
+    });
+    let cotangents = ProjectCotangents {
+        means2d: &v_means2d,
+        whitened: &v_whitened,
+        opacities: &v_opacities,
+        depths: None,
+        conics: None,
+        colors: Some(&v_colors),
+    };
+    let (mut g_means, mut g_quats, mut g_scales) =
+        (vec![0f32; 3 * n], vec![0f32; 4 * n], vec![0f32; 3 * n]);
+    let (mut g_opacities, mut g_harmonics) = (vec![0f32; n], vec![0f32; 48 * n]);
+    group.bench_function(BenchmarkId::new("project backward", n), |b| {
+        b.iter(|| {
+            let grads = GaussianGrads {
+                means: Some(&mut g_means),
+                quats: Some(&mut g_quats),
+                scales: Some(&mut g_scales),
+                opacities: Some(&mut g_opacities),
+                harmonics: Some(&mut g_harmonics),
+                harmonics_rest: None,
+            };
+            project::backward(
+                &gaussians,
+                Some(&harmonics),
+                &s.camera,
+                &options,
+                &projection,
+                &cotangents,
+                grads,
+                false,
+            )
+        });
+    });
+    group.finish();
+}
+
+/// One step on all parameters of N Gaussians, 59 numbers each, in one array; and with a mask in which two of
+/// three are visible, as they come in a scene that is sorted in no way.
+fn optimizer(c: &mut Criterion) {
+    const NUMBERS: usize = 59;
+    let options = AdamOptions {
+        lr: 1e-3,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-15,
+    };
+    for n in SIZES {
+        let wave =
+            |step: f32| -> Vec<f32> { (0..n * NUMBERS).map(|i| (i as f32 * step).sin()).collect() };
+        let (mut param, grad) = (wave(0.37), wave(0.73));
+        let (mut exp_avg, mut exp_avg_sq) = (vec![0f32; n * NUMBERS], vec![0f32; n * NUMBERS]);
+        let hash = |i: usize| (i as u32).wrapping_mul(0x9e37_79b9) >> 16;
+        let visible: Vec<u8> = (0..n).map(|i| u8::from(hash(i) % 3 != 0)).collect();
+        let mut group = c.benchmark_group("adam");
         group.sample_size(20);
-        group.bench_function(BenchmarkId::new("project", n), |b| {
-            b.iter(|| {
-                let out = ProjectOut {
-                    means2d: &mut means2d,
-                    depths: &mut depths,
-                    conics: &mut conics,
-                    radii: &mut radii,
-                    opacities: &mut opacities,
-                    colors: &mut colors,
-                };
-                project::forward(
-                    &gaussians,
-                    Colors::Harmonics(&harmonics),
-                    &s.camera,
-                    &options,
-                    &mut projection,
-                    out,
-                );
+        for (name, visible) in [("all", None), ("visible", Some(&visible[..]))] {
+            let mut step = 0;
+            group.bench_function(BenchmarkId::new(name, n), |b| {
+                b.iter(|| {
+                    step += 1;
+                    let arrays = AdamArrays {
+                        param: &mut param,
+                        grad: &grad,
+                        exp_avg: &mut exp_avg,
+                        exp_avg_sq: &mut exp_avg_sq,
+                    };
+                    adam::step(arrays, step, &options, visible).expect("right lengths");
+                });
             });
-        });
-        group.bench_function(BenchmarkId::new("bin and order", n), |b| {
-            b.iter(|| tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs"));
-        });
-        let tiles = tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs");
-        let input = CompositeInput {
-            projection: &projection,
-            tiles: &tiles,
-            camera: &s.camera,
-            background: None,
-        };
-        let pixels = s.camera.width * s.camera.height;
-        let (mut image, mut alphas) = (vec![0f32; 3 * pixels], vec![0f32; pixels]);
-        group.bench_function(BenchmarkId::new("composite", n), |b| {
-            b.iter(|| composite::forward(&input, &mut image, &mut alphas).expect("right lengths"));
-        });
-        let (composited, work) =
-            composite::forward(&input, &mut image, &mut alphas).expect("right lengths");
-        println!("{n} Gaussians: {work:?}");
-        let v_image: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
-        let (mut v_means2d, mut v_whitened) = (vec![0f32; 2 * n], vec![0f32; 3 * n]);
-        let (mut v_opacities, mut v_colors) = (vec![0f32; n], vec![0f32; 3 * n]);
-        let v = CompositeCotangents {
-            image: &v_image,
-            alphas: None,
-        };
-        group.bench_function(BenchmarkId::new("composite backward", n), |b| {
-            b.iter(|| {
-                let grads = CompositeGrads {
-                    geometry: Some(GeometryGrads {
-                        means2d: &mut v_means2d,
-                        whitened: &mut v_whitened,
-                        opacities: &mut v_opacities,
-                        absolute: None,
-                    }),
-                    colors: Some(&mut v_colors),
-                    background: None,
-                };
-                composite::backward(&input, &composited, &v, grads).expect("right lengths");
-            });
-        });
-        let cotangents = ProjectCotangents {
-            means2d: &v_means2d,
-            whitened: &v_whitened,
-            opacities: &v_opacities,
-            depths: None,
-            conics: None,
-            colors: Some(&v_colors),
-        };
-        let (mut g_means, mut g_quats, mut g_scales) =
-            (vec![0f32; 3 * n], vec![0f32; 4 * n], vec![0f32; 3 * n]);
-        let (mut g_opacities, mut g_harmonics) = (vec![0f32; n], vec![0f32; 48 * n]);
-        group.bench_function(BenchmarkId::new("project backward", n), |b| {
-            b.iter(|| {
-                let grads = GaussianGrads {
-                    means: Some(&mut g_means),
-                    quats: Some(&mut g_quats),
-                    scales: Some(&mut g_scales),
-                    opacities: Some(&mut g_opacities),
-                    harmonics: Some(&mut g_harmonics),
-                    harmonics_rest: None,
-                };
-                project::backward(
-                    &gaussians,
-                    Some(&harmonics),
-                    &s.camera,
-                    &options,
-                    &projection,
-                    &cotangents,
-                    grads,
-                    false,
-                )
-            });
-        });
+        }
         group.finish();
     }
 }
 
-criterion_group!(benches, stages);
+criterion_group!(benches, cloud, room, optimizer);
 criterion_main!(benches);

@@ -1,0 +1,85 @@
+"""What every benchmark gives back, and how it is written and printed."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+import hqgs
+from hqgs.files import atomic_path, write_json
+from hqgs.machine import machine_facts, version_facts
+
+
+@dataclass
+class Report:
+    """The outcome of a benchmark. `settings`, `results` and `left_out` hold plain JSON values."""
+
+    settings: dict[str, Any]
+    results: dict[str, Any] = field(default_factory=dict)
+    tables: list[str] = field(default_factory=list)  # Markdown
+    figures: dict[str, Figure] = field(default_factory=dict)  # by what they show
+    left_out: list[dict[str, str]] = field(default_factory=list)  # {"what", "why"}
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A subcommand of `hqgs bench`."""
+
+    help: str
+    add_options: Callable[[argparse.ArgumentParser], None]  # beyond --out, --threads and --quick
+    run: Callable[[argparse.Namespace], Report]  # raises ValueError or FileNotFoundError for bad options
+
+
+def write_results(out: Path, name: str, command: str, report: Report) -> list[Path]:
+    """Write `NAME.json` and `NAME_FIGURE.png` into `out`; return their paths, JSON first."""
+    versions = version_facts()
+    facts = {
+        "benchmark": name,
+        "command": command,
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "commit": versions["git_commit"],
+        "threads": hqgs.get_num_threads(),
+        "machine": machine_facts(),
+        "versions": versions,
+        "settings": report.settings,
+        "results": report.results,
+        "left_out": report.left_out,
+    }
+    pictures = {out / f"{name}_{what}.png": figure for what, figure in report.figures.items()}
+    for path, figure in pictures.items():
+        with atomic_path(path) as tmp:
+            figure.savefig(tmp)
+    write_json(out / f"{name}.json", facts)
+    return [out / f"{name}.json", *pictures]
+
+
+def command_line(args: argparse.Namespace) -> str:
+    """The command that gives these results again, every option written out, folders by their name alone."""
+    words = ["python", "-m", "hqgs", "bench", args.benchmark]
+    for name, value in sorted(vars(args).items()):
+        if name in ("benchmark", "command", "out") or value is None or value is False or callable(value):
+            continue
+        values = value if isinstance(value, list) else [] if value is True else [value]
+        words += [f"--{name.replace('_', '-')}", *(v.name if isinstance(v, Path) else str(v) for v in values)]
+    return shlex.join(words)
+
+
+def markdown_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table under a bold title; the first column to the left, the others to the right."""
+    widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [
+            c.ljust(w) if k == 0 else c.rjust(w) for k, (c, w) in enumerate(zip(cells, widths, strict=True))
+        ]
+        return f"| {' | '.join(padded)} |"
+
+    rule = [("-" * w) if k == 0 else "-" * (w - 1) + ":" for k, w in enumerate(widths)]
+    return "\n".join([f"**{title}**", "", line(head), line(rule), *map(line, rows)])

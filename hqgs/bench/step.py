@@ -1,0 +1,86 @@
+"""One training iteration with everything in it, and where its time goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+import hqgs.train
+from hqgs.bench.rasterizer import CRATE, STAGES
+from hqgs.bench.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
+from hqgs.train import Trainer
+
+# In the order of a step. Each is without the others that run inside it.
+PARTS = (
+    "activations",  # of the Gaussians, and the checks of hqgs.rasterization
+    "method",  # what it makes of the Gaussians before they are rasterized
+    *list(STAGES.values())[:2],
+    "loss",
+    "autograd",  # the backward pass of the activations, and torch's own work
+    *list(STAGES.values())[2:],
+    "density statistics",
+    "Adam",
+)
+
+
+def places(trainer: Trainer) -> list[tuple[Any, str, str]]:
+    """Where the parts of a step are called."""
+    return [
+        *CRATE,
+        (hqgs.train, "render_view", "activations"),
+        (type(trainer.method), "modulate", "method"),
+        (type(trainer.method), "loss", "loss"),
+        (torch.Tensor, "backward", "autograd"),
+        (type(trainer.densifier), "observe", "density statistics"),
+        (type(trainer.densifier), "update", "density statistics"),
+        (type(trainer.optimizer), "step", "Adam"),
+    ]
+
+
+def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
+    """A step of which only the whole is timed."""
+    clock = StageClock()
+    return lambda: clock.seconds(trainer.step, [])
+
+
+def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
+    """A step with a clock around each part."""
+    clock = StageClock()
+
+    def call() -> Seconds:
+        with clock.watching(places(trainer)):
+            return clock.seconds(trainer.step, PARTS)
+
+    return call
+
+
+def measure_steps(trainers: Sequence[Trainer], repeats: int) -> list[dict[str, Any]]:
+    """Seconds of a step, and the share of each part of it, for each trainer."""
+    cases: dict[str, Callable[[], Seconds]] = {}
+    for trainer in trainers:
+        n = len(trainer.gaussians)
+        cases |= {f"{n}/whole": whole_step(trainer), f"{n}/parts": step_by_parts(trainer)}
+    measured = interleaved(cases, repeats)
+    rows = []
+    for trainer in trainers:
+        n, view = len(trainer.gaussians), trainer.scene.train[0]
+        whole, parts = measured[f"{n}/whole"], measured[f"{n}/parts"]
+        stages = {part: median(parts, part) for part in (*PARTS, "rest")}
+        total = sum(stages.values())
+        rows.append(
+            {
+                "method": trainer.config.method,
+                "gaussians": n,
+                "width": view.camera.width,
+                "height": view.camera.height,
+                "seconds": median(whole),
+                "seconds_quartiles": quartiles(whole),
+                "clocked": median_ratio(parts, whole),  # how much the clocks slow the step down
+                "stages": stages,
+                "percent": {stage: 100 * seconds / total for stage, seconds in stages.items()},
+                "rounds": parts,
+            }
+        )
+    return rows

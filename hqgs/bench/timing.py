@@ -1,0 +1,96 @@
+"""Timing on a machine that does other things too: interleaved rounds, medians, ratios within a round."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+Seconds = dict[str, float]  # by stage; "total" is the whole, and what no stage holds is "rest"
+
+
+def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dict[str, list[Seconds]]:
+    """Call each case once to warm up, then all of them in each of `repeats` rounds.
+
+    What disturbs the machine for a while then disturbs all cases alike. Every other round goes backwards.
+    """
+    measured: dict[str, list[Seconds]] = {name: [] for name in cases}
+    for case in cases.values():
+        case()
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        for k in range(repeats):
+            for name in list(cases)[:: -1 if k % 2 else 1]:
+                measured[name].append(cases[name]())
+    finally:
+        if collecting:
+            gc.enable()
+    return measured
+
+
+def median(rounds: Sequence[Seconds], stage: str = "total") -> float:
+    """Median seconds of a stage."""
+    return float(np.median([r[stage] for r in rounds]))
+
+
+def quartiles(rounds: Sequence[Seconds], stage: str = "total") -> list[float]:
+    """The seconds below which a quarter and three quarters of the rounds lie."""
+    return [float(q) for q in np.quantile([r[stage] for r in rounds], [0.25, 0.75])]
+
+
+def median_ratio(rounds: Sequence[Seconds], others: Sequence[Seconds]) -> float:
+    """Median over the rounds of the ratio of two cases: what slows both down in a round cancels."""
+    return float(np.median([a["total"] / b["total"] for a, b in zip(rounds, others, strict=True)]))
+
+
+def exponent(x: Sequence[float], seconds: Sequence[float]) -> float:
+    """The power of x with which the time grows: slope of the line through (log x, log seconds)."""
+    return float(np.polyfit(np.log(x), np.log(seconds), 1)[0])
+
+
+class StageClock:
+    """Seconds by stage of what runs inside `watching`; a stage does not count the stages within it."""
+
+    def __init__(self) -> None:
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._inner: list[float] = []  # of each open stage, the seconds of the stages within it
+
+    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """`function`, with its time added to `stage`."""
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            self._inner.append(0.0)
+            started = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                spent = time.perf_counter() - started
+                self._seconds[stage] += spent - self._inner.pop()
+                if self._inner:
+                    self._inner[-1] += spent
+
+        return call
+
+    @contextmanager
+    def watching(self, places: Iterable[tuple[Any, str, str]]) -> Iterator[None]:
+        """Time functions in the place where their callers find them: (class or module, name, stage)."""
+        with ExitStack() as stack:
+            for owner, name, stage in places:
+                stack.enter_context(patch.object(owner, name, self.timed(stage, getattr(owner, name))))
+            yield
+
+    def seconds(self, function: Callable[[], Any], stages: Iterable[str]) -> Seconds:
+        """Run `function` and return its total, the stages in it (0 for those not reached) and the rest."""
+        self._seconds.clear()
+        self.timed("rest", function)()
+        return {
+            "total": sum(self._seconds.values()),
+            **{stage: self._seconds[stage] for stage in [*stages, "rest"]},
+        }

@@ -1,0 +1,169 @@
+"""What degraded the photos of a scene, and which parts of the method that calls for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hqgs.camera import Scene
+from hqgs.degradations import NONE, parse_degradation
+from hqgs.diagnosis.coefficients import MAX_BLOCKS, estimate_hidden
+from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, inspect_photo, with_hidden
+
+PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
+LEAST_NOISE = 2.5  # levels; sharp photos of fine texture reach 1.8
+LEAST_BLUR = 0.7  # px of the small photo, a Gaussian's sigma; photos that count as sharp reach 0.4
+VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
+
+
+@dataclass(frozen=True)
+class Part:
+    """One step of how the photos were made, and whether the method must undo it."""
+
+    name: str  # "blur", "lowres", "noise" or "jpeg"
+    needed: bool
+    value: float | None  # median over photos: px, factor, levels or quality; None: not told
+    spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
+    step: str | None  # in the grammar of `parse_degradation`, where needed
+    reason: str  # one sentence
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What degraded a scene's training photos. `asdict` makes it JSON."""
+
+    scene: str
+    formation: str  # the degradation that best explains the photos, as `parse_degradation` reads it
+    parts: tuple[Part, ...]  # in the order of the formation
+    photos: tuple[PhotoDiagnosis, ...]  # those looked at
+
+    def needs(self) -> list[tuple[str, bool, str]]:
+        """Per part: its name, whether the method needs it, and why, in one sentence."""
+        return [(part.name, part.needed, part.reason) for part in self.parts]
+
+
+def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
+    """Diagnose up to `max_photos` training photos, spread over the scene, and sum them up by medians.
+
+    A part that less than half of the photos show, or that lies below its threshold, is left out of the
+    formation: when in doubt, "none". Under JPEG of visible quality noise and blur come from the coefficients
+    of all photos together. ValueError for `max_photos` below 1, or a bad photo, which is named.
+    """
+    if max_photos < 1:
+        raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
+    views = scene.train
+    chosen = [
+        views[k] for k in np.unique(np.linspace(0, len(views) - 1, max_photos).round().astype(np.int64))
+    ]
+    found: list[Inspected] = []
+    for view in chosen:
+        probes = [f.diagnosis for f in found[:PROBES] if f.diagnosis.enlargement.evidence is not None]
+        known = None
+        if len(probes) == PROBES and len({(p.enlargement.factor, p.height, p.width) for p in probes}) == 1:
+            first = probes[0]
+            if view.image.shape[:2] == (first.height, first.width):
+                known = first.enlargement
+        found.append(inspect_photo(view.name, view.image, view.low, enlargement=known))
+    photos = _pool_hidden(found)
+    parts = (_blur(photos), _lowres(photos), _noise(photos), _jpeg(photos))
+    text = "+".join(part.step for part in parts if part.step is not None) or NONE
+    return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+
+
+def _pool_hidden(found: Sequence[Inspected]) -> tuple[PhotoDiagnosis, ...]:
+    """Complete the photos whose JPEG hides noise and blur with one estimate per quantisation table."""
+    photos = [f.diagnosis for f in found]
+    for table in {photo.jpeg.table for photo in photos if photo.hiding}:
+        members = [k for k, photo in enumerate(photos) if photo.hiding and photo.jpeg.table == table]
+        share = -(-MAX_BLOCKS // len(members))
+        steps = [found[k].steps[:share] for k in members]  # they come shuffled
+        hidden = estimate_hidden(np.concatenate(steps), np.array(table))
+        for k in members:
+            photos[k] = with_hidden(photos[k], hidden)
+    return tuple(photos)
+
+
+def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:
+    factors = [photo.enlargement.factor for photo in photos]
+    factor, count = Counter(factors).most_common(1)[0]
+    known = all(photo.enlargement.evidence is None for photo in photos)
+    of = f"{count} of {len(photos)} photos"
+    if factor == 1 or 2 * count <= len(photos):
+        reason = f"{len(photos) - factors.count(1)} of {len(photos)} photos show the grid of an enlargement"
+        return Part("lowres", False, 1.0, _spread_of(factors), None, reason)
+    size = f"{photos[0].enlargement.width} x {photos[0].enlargement.height}"
+    how = (
+        f"the small photos of about {size} px are at hand"
+        if known
+        else f"{of} show the grid of smaller pixels"
+    )
+    return Part(
+        "lowres", True, float(factor), _spread_of(factors), f"lowres:{factor}", f"enlarged by {factor}: {how}"
+    )
+
+
+def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Part:
+    qualities = [photo.jpeg.quality for photo in photos if photo.jpeg.quality is not None]
+    of = f"{len(qualities)} of {len(photos)} photos show quantised coefficients"
+    if 2 * len(qualities) <= len(photos):
+        return Part("jpeg", False, None, None, None, of)
+    quality = float(np.median(qualities))
+    spread = _spread_of(qualities)
+    if quality >= VISIBLE_QUALITY:
+        reason = f"quality {quality:.0f} is too good to matter (needed below {VISIBLE_QUALITY})"
+        return Part("jpeg", False, quality, spread, None, reason)
+    return Part("jpeg", True, quality, spread, f"jpeg:{quality:.0f}", f"{of} of quality {quality:.0f}")
+
+
+def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
+    values = [photo.noise for photo in photos if photo.noise is not None]
+    if not values:
+        return Part("noise", False, None, None, None, "the photos are too small or too clipped to tell")
+    level, limit = float(np.median(values)), float(np.median([photo.noise_limit for photo in photos]))
+    spread = None if _pooled(photos) else _spread_of(values)
+    if level >= LEAST_NOISE:
+        return Part("noise", True, level, spread, f"noise:{level:.0f}", f"white noise of {level:.1f} levels")
+    if limit:
+        reason = f"below {limit:.0f} levels the JPEG hides it, and no more than that is seen"
+    else:
+        reason = f"{level:.1f} levels could be fine texture (needed from {LEAST_NOISE:g})"
+    return Part("noise", False, level, spread, None, reason)
+
+
+def _blur(photos: Sequence[PhotoDiagnosis]) -> Part:
+    blurs = [photo.blur for photo in photos if photo.blur is not None]
+    if not blurs:
+        return Part("blur", False, None, None, None, "the photos are too small to tell")
+    scale = float(np.median([photo.width / photo.enlargement.width for photo in photos]))
+    sigma, least = float(np.median([blur.sigma for blur in blurs])), LEAST_BLUR * scale
+    kind, count = Counter(blur.kind for blur in blurs).most_common(1)[0]
+    kind = kind if 2 * count > len(blurs) else "gaussian"
+    amounts = [b.sigma for b in blurs] if kind == "gaussian" else [b.amount for b in blurs if b.kind == kind]
+    amount = float(np.median(amounts))
+    spread = None if _pooled(photos) else _spread_of(amounts)
+    if sigma < least:
+        blurred = sum(blur.sigma >= least for blur in blurs)
+        reason = f"sigma {sigma:.1f} px is within what sharp photos show (needed from {least:.1f} px)"
+        reason += f"; {blurred} of {len(blurs)} photos are blurred" if blurred else ""
+        return Part("blur", False, sigma, spread, None, reason)
+    name, unit = {
+        "gaussian": ("blur", "sigma"),
+        "defocus": ("defocus", "radius"),
+        "motion": ("motion", "length"),
+    }[kind]
+    step = f"{name}:{round(amount, 1):g}"
+    return Part(
+        "blur", True, amount, spread, step, f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
+    )
+
+
+def _pooled(photos: Sequence[PhotoDiagnosis]) -> bool:
+    return 2 * sum(photo.hiding for photo in photos) > len(photos)
+
+
+def _spread_of(values: Sequence[float]) -> float:
+    """1.4826 times the median distance from the median: a normal distribution's standard deviation."""
+    return float(1.4826 * np.median(np.abs(np.asarray(values) - np.median(values))))

@@ -1,0 +1,150 @@
+"""HQGS as the paper states it: ESFG moves the means, L1 and the SCS loss judge the render."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hqgs.camera import Scene, View
+from hqgs.edges import edge_magnitude
+from hqgs.gaussians import Gaussians
+from hqgs.losses import photometric_loss
+from hqgs.methods.base import photo_tensors
+from hqgs.methods.esfg import ESFG, ESFGConfig, FeatureRows
+from hqgs.methods.three_dgs import ThreeDGS
+from hqgs.scs import ScsWeights, weighted_scs_loss
+from hqgs.torch_threads import one_torch_thread
+
+if TYPE_CHECKING:
+    from hqgs.config import TrainConfig  # which itself imports the methods
+
+SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS
+CACHE_BYTES = 2**30  # of SCS weights (12 bytes a pixel); those of further views are computed at each step
+
+ROWS = ("rows.rows", "rows.place", "rows.look")  # names in the state
+
+Loss = Literal["l1", "l1+dssim", "l1+scs"]
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """The method, or a part of it. `VARIANTS` has those of the paper's ablation.
+
+    The paper gives one row of figures, V1 (3DGS) to V7 (everything), for five parts. Read so that each
+    variant is a method and that V4 may be worse than V3, as it is there:
+
+    | variant | SAF | EAF | concat | CA | loss | F' |
+    |---|---|---|---|---|---|---|
+    | V1 | | | | | L1 + D-SSIM | none: 3DGS |
+    | V2 | x | | | | L1 + D-SSIM | SAF |
+    | V3 | | x | | | L1 + D-SSIM | EAF |
+    | V4 | x | x | | | L1 + D-SSIM | SAF + EAF |
+    | V5 | x | x | x | | L1 + D-SSIM | [SAF; EAF] |
+    | V6 | x | x | x | x | L1 + D-SSIM | [CA; EAF] |
+    | V7 | x | x | x | x | L1 + 5 SCS | [CA; EAF] |
+
+    L1 + D-SSIM is 3DGS's, with the weights 0.8 and 0.2. The ablation of losses is V7 with each `loss`.
+    """
+
+    esfg: ESFGConfig | None = field(default_factory=ESFGConfig)  # None: the means are rasterized as they are
+    loss: Loss = "l1+scs"
+
+    def __post_init__(self) -> None:
+        if self.loss not in get_args(Loss):
+            raise ValueError(f"loss is {self.loss!r}, wanted one of {', '.join(get_args(Loss))}")
+
+
+VARIANTS = {
+    "V1": PaperConfig(None, "l1+dssim"),
+    "V2": PaperConfig(ESFGConfig(eaf=False, concat=False, cross_attention=False), "l1+dssim"),
+    "V3": PaperConfig(ESFGConfig(saf=False, concat=False, cross_attention=False), "l1+dssim"),
+    "V4": PaperConfig(ESFGConfig(concat=False, cross_attention=False), "l1+dssim"),
+    "V5": PaperConfig(ESFGConfig(cross_attention=False), "l1+dssim"),
+    "V6": PaperConfig(ESFGConfig(), "l1+dssim"),
+    "V7": PaperConfig(),
+}
+
+
+class PaperHQGS:
+    """HQGS (ICLR 2025) from its equations; where its released code differs, the paper holds.
+
+    A modulated mean is about 1.5 times as far from the frame's origin as the trained one, so the cloud that
+    COLMAP gives would start too large. The first call of `modulate` therefore moves the first Gaussians, in
+    place, to where modulation takes them back to that cloud. From then on it changes nothing in place.
+    """
+
+    def __init__(self, scene: Scene, seed: int, config: PaperConfig | None = None) -> None:
+        """ValueError for photos that are not finite, or where no pixel counts."""
+        self.config = PaperConfig() if config is None else config
+        esfg = self.config.esfg
+        self.esfg = None if esfg is None else ESFG(scene.train, seed, esfg)
+        self.rows = None if esfg is None else FeatureRows(esfg.feature_size)
+        self._cache: dict[str, tuple[NDArray[Any], ScsWeights]] = {}  # by name, with the photo they are of
+
+    def adapt(self, config: TrainConfig) -> TrainConfig:
+        return config
+
+    def left_out(self) -> list[tuple[str, str]]:
+        return []
+
+    def modulate(self, gaussians: Gaussians) -> Gaussians:
+        if self.esfg is None or self.rows is None:
+            return gaussians
+        if self.rows.rows is None:
+            start = self.esfg.unmodulate(gaussians.means, self.rows.start(gaussians))
+            with torch.no_grad():
+                gaussians.means.copy_(start)
+        means = self.esfg.modulate(gaussians.means, self.rows.of(gaussians))
+        return Gaussians(**(gaussians.named() | {"means": means}))
+
+    def loss(self, render: Tensor, view: View) -> Tensor:
+        image, mask = photo_tensors(view)
+        dssim = ThreeDGS.LAMBDA_DSSIM if self.config.loss == "l1+dssim" else 0.0
+        loss = photometric_loss(render, image, mask=mask, lambda_dssim=dssim)
+        if self.config.loss == "l1+scs":
+            loss = loss + SCS_WEIGHT * weighted_scs_loss(render, image, self._scs_weights_of(view))
+        return loss
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        if self.esfg is None:
+            return []
+        return [{"name": "esfg", "params": list(self.esfg.parameters()), "lr": self.esfg.config.lr}]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        if self.esfg is None or self.rows is None:
+            return {}
+        state = {f"esfg.{name}": tensor for name, tensor in self.esfg.state_dict().items()}
+        return state | {f"rows.{name}": tensor for name, tensor in self.rows.state_dict().items()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """ValueError where the state is that of another variant."""
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {n.removeprefix(prefix): t for n, t in state.items() if n.startswith(prefix)}
+
+        free = ROWS if self.esfg is not None else ()  # there are none before the first step
+        here = {name: t.shape for name, t in self.state_dict().items() if name not in free}
+        there = {name: t.shape for name, t in state.items() if name not in free}
+        if here != there:
+            odd = sorted({name for name, _ in here.items() ^ there.items()})
+            raise ValueError(f"the checkpoint is that of another variant; tensors that differ: {odd}")
+        if self.esfg is not None and self.rows is not None:
+            self.esfg.load_state_dict(part("esfg."))
+            self.rows.load_state_dict(part("rows."))
+
+    def _scs_weights_of(self, view: View) -> ScsWeights:
+        """The weights of a training view, kept while there is room."""
+        image, weights = self._cache.get(view.name, (None, None))
+        if weights is not None and image is view.image:
+            return weights
+        photo, mask = photo_tensors(view)
+        with one_torch_thread():
+            weights = ScsWeights.of(photo, edge_magnitude(photo, mask), mask)
+        used = sum(kept.weights.nbytes for _, kept in self._cache.values())
+        if used + weights.weights.nbytes <= CACHE_BYTES:
+            self._cache[view.name] = (view.image, weights)
+        return weights

@@ -1,0 +1,316 @@
+"""`hqgs bench speed` at tiny sizes: the fields of its JSON, numbers that agree with each other and with those
+of another computation, and what it says when something is missing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import hqgs
+from hqgs import _rust
+from hqgs.bench import cli
+from hqgs.bench.inputs import RasterInputs, load_inputs, make_inputs
+from hqgs.bench.output import command_line, markdown_table
+from hqgs.bench.peers import find_gsplat
+from hqgs.bench.replay import blended_counts, random_pixels
+from hqgs.bench.scene import make_trainer, warm_up
+from hqgs.bench.timing import StageClock, exponent, interleaved, median, median_ratio
+from hqgs.bench.work import count_work
+
+CRATE = ["project", "bin and composite", "composite backward", "project backward"]
+
+
+def call(*arguments: str | Path) -> int:
+    parser = argparse.ArgumentParser()
+    cli.add_parser(parser.add_subparsers(required=True))
+    args = parser.parse_args(["bench", "speed", *map(str, arguments)])
+    return args.run(args)
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    out = tmp_path_factory.mktemp("bench")
+    before = hqgs.get_num_threads()
+    hqgs.set_num_threads(2)
+    try:
+        assert call("--quick", "--out", out, "--seed", "5") == 0
+        assert hqgs.get_num_threads() == 2
+    finally:
+        hqgs.set_num_threads(before)
+    result = json.loads((out / "speed.json").read_text(encoding="utf-8"))
+    assert {p.name for p in out.iterdir()} == {"speed.json", "speed_scaling.png"}
+    with Image.open(out / "speed_scaling.png") as chart:
+        assert chart.size == (1350, 600)
+        assert len(np.unique(np.asarray(chart.convert("RGB")).reshape(-1, 3), axis=0)) > 10
+    return result
+
+
+def test_the_file_says_where_it_comes_from(quick: dict[str, Any]) -> None:
+    assert quick["benchmark"] == "speed"
+    assert quick["command"].startswith("python -m hqgs bench speed --method 3dgs --parts rasterizer step")
+    assert quick["command"].endswith("--quick --seed 5")
+    assert datetime.fromisoformat(quick["date"]).utcoffset() is not None
+    assert quick["commit"] == quick["versions"]["git_commit"]
+    assert quick["machine"]["cores"] >= 1
+    assert quick["threads"] == 2
+    assert quick["settings"]["seed"] == quick["settings"]["memory"]["seed"] == 5
+
+
+def test_stages_make_up_the_whole(quick: dict[str, Any]) -> None:
+    for part, stages in (("rasterizer", CRATE), ("step", [*CRATE, "loss", "Adam", "autograd"])):
+        for row in quick["results"][part]:
+            assert len(row["rounds"]) == quick["settings"]["repeats"]
+            for seconds in row["rounds"]:
+                assert sum(v for k, v in seconds.items() if k != "total") == pytest.approx(seconds["total"])
+                assert min(seconds.values()) >= 0
+            assert min(row["stages"][stage] for stage in stages) > 0
+            low, high = row["seconds_quartiles"]
+            assert 0 < low <= row["seconds"] <= high
+    for row in quick["results"]["step"]:
+        assert sum(row["percent"].values()) == pytest.approx(100)
+
+
+def test_work_and_limit_follow_from_the_counts(quick: dict[str, Any]) -> None:
+    for row in quick["results"]["rasterizer"]:
+        work = row["work"]
+        assert 30 < work["blended_per_pixel"] < 42
+        assert work["blended_pairs"] == pytest.approx(work["blended_per_pixel"] * 96 * 72)
+        assert row["limit_seconds"] == pytest.approx(work["blended_pairs"] * 1.7e-9 / 2)
+        assert row["times_limit"] == pytest.approx(row["seconds"] / row["limit_seconds"])
+        assert 0 < work["changed_blocks"] <= work["blocks"] <= 16 * work["tile_pairs"]
+        assert work["blended_pairs"] <= 16 * work["changed_blocks"]
+        assert work["lane_use"] == pytest.approx(work["blended_pairs"] / (16 * work["blocks"]))
+
+
+def test_speed_up_growth_and_memory(quick: dict[str, Any]) -> None:
+    results = quick["results"]
+    assert [r["threads"] for r in results["threads"]] == [1, 2, 1, 2]
+    assert [r["speedup"] for r in results["threads"] if r["threads"] == 1] == [1, 1]
+    assert all(0 < r["speedup"] < 20 for r in results["threads"])
+    for name in ("gaussians", "pixels"):
+        curve = results["scaling"][name]
+        assert curve["x"] == sorted(curve["x"])
+        assert math.isfinite(curve["exponent"])
+        assert curve["exponent"] <= curve["steepest"] + 1e-9
+    memory = results["memory"]
+    assert 50 < memory["imports_mb"] <= memory["scene_mb"] <= memory["peak_mb"]
+
+
+def test_a_peer_that_is_missing_is_named(quick: dict[str, Any]) -> None:
+    if "gsplat" not in quick["results"]:
+        assert [entry["what"] for entry in quick["left_out"]] == ["gsplat"]
+
+
+def test_parts_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("--quick", "--parts", "rasterizer", "--repeats", "1", "--out", tmp_path) == 0
+    result = json.loads((tmp_path / "speed.json").read_text(encoding="utf-8"))
+    assert list(result["results"]) == ["rasterizer"]
+    assert len(result["results"]["rasterizer"][0]["rounds"]) == 1
+    printed = capsys.readouterr().out
+    assert "| Gaussians | project | bin and composite |" in printed
+    assert printed.splitlines()[-1] == f"written: {tmp_path / 'speed.json'}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--repeats", "0"], "repeats is 0, wanted at least 1"),
+        (["--method", "4dgs"], "unknown method '4dgs'"),
+        (["--inputs", "/no/such/folder"], "there is no /no/such/folder/inputs_500.npz"),
+        (["--threads", "0"], "threads"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert call("--quick", "--out", tmp_path, *arguments) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "speed.json").exists()
+
+
+@pytest.mark.parametrize(("n", "width", "height"), [(300, 80, 60), (2_000, 80, 60), (4_000, 252, 189)])
+def test_blended_gaussians_are_those_with_a_colour_gradient(
+    n: int, width: int, height: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inputs = make_inputs(n, width, height, seed=3)
+    pixels = random_pixels(inputs, 12, seed=1)
+    means, quats, scales, opacities = (
+        torch.from_numpy(getattr(inputs, name)).double() for name in ("means", "quats", "scales", "opacities")
+    )
+    colors = torch.rand(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    colors.requires_grad_()
+    view = torch.from_numpy(inputs.viewmat)[None], torch.from_numpy(inputs.K)[None]
+    states = []
+    composite = _rust.composite_forward
+
+    def keeping_the_state(*args: Any) -> Any:
+        states.append(composite(*args))
+        return states[-1]
+
+    monkeypatch.setattr(_rust, "composite_forward", keeping_the_state)
+    image, _, _ = hqgs.rasterization(means, quats, scales, opacities, colors, *view, width, height)
+    expected = []
+    for column, row in pixels:
+        (grad,) = torch.autograd.grad(image[0, row, column].sum(), colors, retain_graph=True)
+        expected.append(int((grad[:, 0] != 0).sum()))
+    assert blended_counts(inputs, pixels).tolist() == expected
+    everywhere = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    if width * height < 10_000:
+        assert blended_counts(inputs, everywhere).sum() == states[0][0].blended  # the crate's own counter
+
+
+@pytest.mark.parametrize(("n", "width", "height"), [(3_000, 252, 189), (30_000, 252, 189), (3_000, 504, 378)])
+def test_the_overlap_does_not_depend_on_the_sizes(n: int, width: int, height: int) -> None:
+    inputs = make_inputs(n, width, height)
+    assert len(inputs) == n
+    assert (inputs.width, inputs.height) == (width, height)
+    assert 36 < blended_counts(inputs, random_pixels(inputs, 300, seed=0)).mean() < 41
+
+
+def test_inputs_follow_from_the_seed() -> None:
+    first, again, other = make_inputs(50, 80, 60, 1), make_inputs(50, 80, 60, 1), make_inputs(50, 80, 60, 2)
+    for name in vars(first):
+        assert np.array_equal(getattr(first, name), getattr(again, name)), name
+    assert not np.array_equal(first.means, other.means)
+
+
+def test_too_many_gaussians_for_the_image_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"90000 Gaussians are too many for 80 x 60 pixels"):
+        make_inputs(90_000, 80, 60)
+
+
+def _save(folder: Path, inputs: RasterInputs, **changes: Any) -> None:
+    arrays = {"v_output" if k == "v_image" else k: v for k, v in vars(inputs).items()} | changes
+    arrays = {name: array for name, array in arrays.items() if array is not None}
+    np.savez(folder / f"inputs_{len(inputs)}.npz", **arrays, colors=np.zeros((len(inputs), 3)))
+
+
+def test_inputs_of_others_are_read_and_checked(tmp_path: Path) -> None:
+    inputs = make_inputs(20, 30, 20)
+    _save(tmp_path, inputs, viewmat=inputs.viewmat.astype(np.float32))
+    read = load_inputs(tmp_path, 20)
+    for name, value in vars(inputs).items():
+        assert getattr(read, name).dtype == value.dtype
+        assert np.allclose(getattr(read, name), value, atol=1e-6)
+    _save(tmp_path, inputs, sh=None)
+    with pytest.raises(ValueError, match=r"inputs_20\.npz lacks sh"):
+        load_inputs(tmp_path, 20)
+    _save(tmp_path, inputs, scales=inputs.scales[:, :2])
+    with pytest.raises(ValueError, match=r"scales has shape \[20, 2\], wanted \[20, 3\]"):
+        load_inputs(tmp_path, 20)
+
+
+def test_a_stage_does_not_count_the_stages_within_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    owner = SimpleNamespace()
+
+    def passing(seconds: float) -> None:
+        now[0] += seconds
+
+    def outer() -> None:
+        passing(1.0)
+        owner.inner(2.0)
+        passing(4.0)
+        owner.inner(8.0)
+
+    owner.inner, owner.outer = passing, outer
+
+    def work() -> None:
+        owner.outer()
+        passing(16.0)
+
+    clock = StageClock()
+    with clock.watching([(owner, "outer", "a"), (owner, "inner", "b")]):
+        seconds = clock.seconds(work, ["a", "b", "c"])
+    assert seconds == {"total": 31.0, "a": 5.0, "b": 10.0, "c": 0.0, "rest": 16.0}
+    assert (owner.inner, owner.outer) == (passing, outer)
+
+
+def test_cases_take_turns() -> None:
+    calls: list[str] = []
+
+    def case(name: str, factor: float) -> Any:
+        def run() -> dict[str, float]:
+            calls.append(name)
+            return {"total": factor * len(calls)}
+
+        return run
+
+    measured = interleaved({"a": case("a", 1.0), "b": case("b", 10.0)}, 3)
+    assert "".join(calls) == "ab" + "abbaab"
+    assert [r["total"] for r in measured["a"]] == [3, 6, 7]
+    assert median(measured["b"]) == 50
+    assert median_ratio(measured["b"], measured["a"]) == pytest.approx(80 / 7)
+
+
+def test_exponent_of_a_power_law() -> None:
+    assert exponent([1, 10, 100], [2, 2 * 10**1.3, 2 * 100**1.3]) == pytest.approx(1.3)
+
+
+def test_operations_and_limit_of_a_hand_made_case() -> None:
+    # One pixel in two of which 30 and 50 blend: 40 each. 10 pairs with tiles, 8 blocks of 16 lanes.
+    work = count_work(np.array([30, 50]), 2, 10, 8, 6)
+    assert work["blended_pairs"] == 80
+    assert work["blended_standard_error"] == pytest.approx(10 / math.sqrt(2))
+    assert work["lane_use"] == 80 / 128
+    assert work["operations"] == (46 + 75) * 128 + (12 + 239 + 185) * 10
+    assert work["bytes"] == 312 * 10 + 12 * 8
+    assert work["limit_core_seconds"] == pytest.approx(136e-9)
+
+
+def test_the_scene_stays_what_it_is_while_it_is_timed() -> None:
+    trainer = make_trainer(400, 64, 48, 2, "3dgs", seed=1)
+    before = {name: tensor.detach().clone() for name, tensor in trainer.gaussians.named().items()}
+    warm_up(trainer)
+    for _ in range(5):
+        trainer.step()
+    for name, tensor in trainer.gaussians.named().items():
+        assert torch.allclose(tensor, before[name], atol=1e-4), name
+        assert not torch.equal(tensor, before[name]), name  # Adam did update it
+    grad = trainer.gaussians.shN.grad
+    assert grad is not None
+    assert (grad[:, -7:] != 0).any()  # degree 3 is trained
+    assert trainer.densifier.count.max() == 8
+
+
+def test_gsplat_is_left_out_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.util
+    from importlib.machinery import ModuleSpec
+
+    find = importlib.util.find_spec
+    specs: dict[str, ModuleSpec | None] = {"gsplat": None}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: specs[name] if name in specs else find(name, *rest)
+    )
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(RuntimeError, match="gsplat is not installed"):
+        find_gsplat()
+    specs["gsplat"] = ModuleSpec("gsplat", None)
+    with pytest.raises(RuntimeError, match="CUDA"):
+        find_gsplat()
+
+
+def test_command_line_holds_no_paths() -> None:
+    args = argparse.Namespace(
+        benchmark="speed", out=Path("/x"), inputs=Path("/home/me/raster"), quick=True, seed=3, threads=None,
+        parts=["step"], run=print, command="bench",
+    )  # fmt: skip
+    assert command_line(args) == "python -m hqgs bench speed --inputs raster --parts step --quick --seed 3"
+
+
+def test_markdown_table() -> None:
+    assert markdown_table("T", ["a", "bb"], [["x", "1"], ["yyy", "22"]]).splitlines() == [
+        "**T**", "", "| a   | bb |", "| --- | -: |", "| x   |  1 |", "| yyy | 22 |",
+    ]  # fmt: skip

@@ -1,0 +1,533 @@
+"""The paper's method: ESFG by its equations, the rows of the Gaussians, its variants, its runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
+from torch import Tensor
+
+import hqgs
+import hqgs.densify as densify_module
+from hqgs.camera import Camera, Scene, View
+from hqgs.densify import Densifier, DensifyConfig
+from hqgs.edges import edge_aware_map, edge_magnitude
+from hqgs.gaussians import Gaussians
+from hqgs.losses import photometric_loss
+from hqgs.methods import METHODS
+from hqgs.methods.esfg import ESFG, ESFGConfig, FeatureRows
+from hqgs.methods.paper import CACHE_BYTES, VARIANTS, PaperConfig, PaperHQGS
+from hqgs.optim import Adam
+from hqgs.ply import read_ply
+from hqgs.run import PLY, open_run
+from hqgs.run import run as run_in_folder
+from hqgs.scs import scs_loss
+from hqgs.train import Trainer
+
+SMALL = 20  # F: more than once in the 40 points of the tiny scene
+OFF = {"concat": False, "cross_attention": False}
+
+
+@pytest.fixture(autouse=True)
+def methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every variant as a method with a small F, and one whose F' moves fast enough to be seen."""
+    for name, config in VARIANTS.items():
+        monkeypatch.setitem(METHODS, name, maker(small(config)))
+    monkeypatch.setitem(METHODS, "fast", maker(small(VARIANTS["V7"], lr=1e-2)))
+
+
+def small(config: PaperConfig, **changes: Any) -> PaperConfig:
+    esfg = config.esfg
+    return replace(config, esfg=esfg and replace(esfg, feature_size=SMALL, **changes))
+
+
+def maker(config: PaperConfig) -> Any:
+    return lambda scene, train_config: PaperHQGS(scene, train_config.seed, config)
+
+
+def view(image: NDArray[Any], mask: NDArray[np.bool_] | None = None, name: str = "a.png") -> View:
+    height, width = image.shape[:2]
+    return View(name, Camera(width, height, np.diag([9.0, 9.0, 1.0]), np.eye(4)), image, mask)
+
+
+def noisy(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def paper(trainer: Trainer) -> PaperHQGS:
+    assert isinstance(trainer.method, PaperHQGS)
+    return trainer.method
+
+
+def rows_of(trainer: Trainer) -> Tensor:
+    rows = paper(trainer).rows
+    assert rows is not None
+    return rows.of(trainer.gaussians)
+
+
+def bits(trainer: Trainer) -> dict[str, bytes]:
+    tensors = trainer.gaussians.named() | trainer.method.state_dict()
+    return {name: t.detach().numpy().tobytes() for name, t in tensors.items()}
+
+
+def run(method: str = "V7", count: int = 30, scene: Scene | None = None, **changes: Any) -> Trainer:
+    trainer = Trainer(scene or tiny_scene(), tiny_config(method=method, **changes))
+    for _ in range(count):
+        trainer.step()
+    return trainer
+
+
+# --- F' ---
+
+
+@pytest.mark.parametrize("downscale", [1, 2, 4])
+@pytest.mark.parametrize("sizes", [[(1, 1)], [(3, 5), (40, 7)], [(16, 24)] * 3, [(1, 50), (37, 1), (33, 65)]])
+def test_any_views_of_any_size(sizes: list[tuple[int, int]], downscale: int) -> None:
+    views = [view(noisy(h, w, i)) for i, (h, w) in enumerate(sizes)]
+    esfg = ESFG(views, 0, ESFGConfig(feature_size=50, downscale=downscale))
+    feature = esfg()
+    assert feature.shape == (50, 3)
+    assert torch.isfinite(feature).all()
+    # Averages of averages: where the blocks divide the views the mean is that of all pixels.
+    if sizes[0] == (16, 24):
+        mean = np.mean([v.image for v in views], axis=(0, 1, 2)) / 255
+        np.testing.assert_allclose(esfg.photo_tokens.mean(dim=0), mean, rtol=2e-2)
+
+
+def test_tokens_are_runs_of_averaged_pixels() -> None:
+    image = noisy(8, 12)
+    config = ESFGConfig(feature_size=24, downscale=2)
+    esfg = ESFG([view(image)], 0, config)
+    for tokens, photo in (
+        (esfg.photo_tokens, image / 255),
+        (esfg.edge_tokens, edge_aware_map(torch.from_numpy(image)).numpy()),
+    ):
+        blocks = photo.reshape(4, 2, 6, 2, 3).mean(axis=(1, 3))  # 24 pixels for 12 tokens
+        np.testing.assert_allclose(tokens, blocks.reshape(12, 2, 3).mean(axis=1), atol=1e-6)
+
+
+def test_a_photo_of_one_colour_has_no_edge_tokens() -> None:
+    image = np.full((9, 7, 3), [10, 200, 30], dtype=np.uint8)
+    esfg = ESFG([view(image)], 0, ESFGConfig())
+    np.testing.assert_allclose(esfg.photo_tokens, np.broadcast_to(image[0, 0] / 255, (500, 3)), atol=1e-6)
+    assert esfg.edge_tokens.abs().max() == 0
+
+
+def test_masked_pixels_play_no_part() -> None:
+    mask = np.ones((20, 22), dtype=bool)
+    mask[3:12, 5:15] = False
+    image, other = noisy(20, 22), noisy(20, 22)
+    other[~mask] = 0
+    whole, empty = noisy(11, 9, 1), np.zeros((11, 9), dtype=bool)
+    config = ESFGConfig(feature_size=30)
+    one, two = (ESFG([view(i, mask), view(whole)], 0, config) for i in (image, other))
+    assert torch.equal(one.photo_tokens, two.photo_tokens)
+    assert torch.equal(one.edge_tokens, two.edge_tokens)
+    skipped = ESFG([view(image, mask), view(whole), view(whole, empty)], 0, config)
+    assert torch.equal(one(), skipped())
+    with pytest.raises(ValueError, match="the masks of all 1 views are empty"):
+        ESFG([view(whole, empty)], 0, config)
+
+
+def mlp(layers: Any, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    (w0, b0), (w1, b1) = ((layer.weight, layer.bias) for layer in (layers[0], layers[2]))
+    w0, b0, w1, b1 = (t.detach().numpy() for t in (w0, b0, w1, b1))
+    return np.maximum(x @ w0.T + b0, 0) @ w1.T + b1
+
+
+def test_the_feature_of_every_variant() -> None:
+    views = [view(noisy(13, 17, i)) for i in range(3)]
+    made = {}
+    variants = {name: small(config).esfg for name, config in VARIANTS.items() if config.esfg}
+    for name, config in (variants | {"CA alone": ESFGConfig(concat=False, feature_size=SMALL)}).items():
+        assert config is not None
+        esfg = ESFG(views, 3, config).double()
+        photo, edge = esfg.photo_tokens.numpy(), esfg.edge_tokens.numpy()
+        saf = mlp(esfg.saf, photo) if config.saf else np.zeros(0)
+        eaf = mlp(esfg.eaf, edge) if config.eaf else np.zeros(0)
+        if config.cross_attention:
+            wq, wk, wv = (p.weight.detach().numpy() for p in (esfg.query, esfg.key, esfg.value))
+            score = (eaf @ wq.T) @ (saf @ wk.T).T / np.sqrt(3)
+            weight = np.exp(score) / np.exp(score).sum(axis=1, keepdims=True)
+            attended = weight @ (saf @ wv.T)
+        expected = {
+            "V2": lambda s=saf: s,
+            "V3": lambda e=eaf: e,
+            "V4": lambda s=saf, e=eaf: s + e,
+            "V5": lambda s=saf, e=eaf: np.concatenate([s, e]),
+            "CA alone": lambda: attended,  # noqa: B023  (called within the pass)
+        }.get(name, lambda e=eaf: np.concatenate([attended, e]))()  # noqa: B023
+        np.testing.assert_allclose(esfg().detach().numpy(), expected, atol=1e-12)
+        assert expected.shape == (SMALL, 3)
+        made[name] = expected
+        # Every parameter takes part; there is none for a part that is off.
+        esfg().square().sum().backward()
+        assert all(p.grad is not None and p.grad.abs().max() > 0 for p in esfg.parameters())
+    assert VARIANTS["V1"].esfg is None
+    assert np.array_equal(made["V6"], made["V7"])  # they differ in the loss
+    assert VARIANTS["V6"].loss != VARIANTS["V7"].loss
+    del made["V6"]
+    keys = [feature.tobytes() for feature in made.values()]
+    assert len(set(keys)) == len(keys)
+
+
+def test_downscaling_changes_the_feature() -> None:
+    views = [view(noisy(13, 18))]
+    found = [ESFG(views, 0, ESFGConfig(feature_size=20, downscale=d))() for d in (1, 2, 4)]
+    assert not torch.equal(found[0], found[1])
+    assert not torch.equal(found[1], found[2])
+
+
+def test_the_seed_alone_decides() -> None:
+    views = [view(noisy(9, 9))]
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    one, two, other = (ESFG(views, seed, ESFGConfig())() for seed in (5, 5, 6))
+    assert torch.equal(one, two)
+    assert not torch.equal(one, other)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+# --- the modulation ---
+
+
+def test_the_modulation_and_its_gradients() -> None:
+    scene = tiny_scene()
+    esfg = ESFG(scene.train, 0, ESFGConfig(feature_size=8)).double()
+    means = torch.from_numpy(scene.points[:11].astype(np.float64)).requires_grad_()
+    rows = torch.arange(11) * 3 % 8
+    out = esfg.modulate(means, rows)
+    center = np.mean([v.camera.center for v in scene.train], axis=0)
+    s = 1 / (1 + np.exp(-esfg().detach().numpy()[rows]))
+    mu = means.detach().numpy() - center
+    np.testing.assert_allclose(out.detach().numpy() - center, mu + s * mu, atol=1e-6)  # center is float32
+    back = esfg.unmodulate(out.detach(), rows)
+    torch.testing.assert_close(back, means.detach(), rtol=0, atol=1e-12)
+
+    names = [name for name, _ in esfg.named_parameters()]
+
+    def modulated(means: Tensor, *parameters: Tensor) -> Tensor:
+        class Modulate(torch.nn.Module):
+            def __init__(self) -> None:
+                super().__init__()
+                self.esfg = esfg
+
+            def forward(self, means: Tensor) -> Tensor:
+                return self.esfg.modulate(means, rows)
+
+        values = {f"esfg.{name}": p for name, p in zip(names, parameters, strict=True)}
+        return torch.func.functional_call(Modulate(), values, (means,))
+
+    inputs = (means, *(p.detach().clone().requires_grad_() for p in esfg.parameters()))
+    assert torch.autograd.gradcheck(modulated, inputs, eps=1e-6, atol=1e-7, fast_mode=True)
+
+
+@pytest.mark.parametrize("variant", ["V2", "V3", "V4", "V5", "V6", "V7"])
+def test_training_starts_from_the_cloud_that_colmap_gave(variant: str) -> None:
+    scene = tiny_scene()
+    trainer = Trainer(scene, tiny_config(method=variant))
+    first = trainer.method.modulate(trainer.gaussians)
+    np.testing.assert_allclose(first.means.detach().numpy(), scene.points, atol=2e-6)
+    again = trainer.method.modulate(trainer.gaussians)
+    assert torch.equal(first.means, again.means)
+    # About two thirds of the way from the frame's origin.
+    center = np.mean([v.camera.center for v in scene.train], axis=0)
+    ratio = (trainer.gaussians.means.detach().numpy() - center) / (scene.points - center)
+    assert np.all((ratio > 0.5) & (ratio < 0.9))
+    plain = Trainer(scene, tiny_config()).gaussians
+    for name in ("scales", "quats", "opacities", "sh0", "shN"):
+        assert getattr(first, name) is getattr(trainer.gaussians, name)
+        assert torch.equal(getattr(first, name), getattr(plain, name))
+
+
+def moved(scene: Scene, shift: NDArray[np.float64], scale: float) -> Scene:
+    """The same scene where a point X has become scale X + shift."""
+
+    def camera(c: Camera) -> Camera:
+        viewmat = c.viewmat.copy()
+        viewmat[:3, 3] = scale * viewmat[:3, 3] - viewmat[:3, :3] @ shift
+        return replace(c, viewmat=viewmat)
+
+    train, test = (
+        [replace(v, camera=camera(v.camera)) for v in views] for views in (scene.train, scene.test)
+    )
+    points = (scale * scene.points.astype(np.float64) + shift).astype(np.float32)
+    return Scene(scene.name, train, test, points, scene.point_colors, scene.source)
+
+
+@pytest.mark.parametrize(
+    ("shift", "scale"), [([30.0, -7.0, 11.0], 1.0), ([0.0, 0.0, 0.0], 50.0), ([-9.0, 4.0, 2.0], 0.1)]
+)
+def test_the_origin_and_the_unit_of_the_world_change_nothing(shift: list[float], scale: float) -> None:
+    renders = []
+    rng = np.random.default_rng(0)
+    plane = tiny_scene()  # on which rounding decides which point is in front
+    depths = np.linspace(0, 0.5, len(plane.points), dtype=np.float32)
+    solid = replace(plane, points=plane.points + rng.permutation(depths)[:, None] * np.array([0, 0, 1], "f4"))
+    for scene in (solid, moved(solid, np.array(shift, dtype=np.float64), scale)):
+        # Without split or clone: which Gaussian passes a threshold may hang on a rounding.
+        trainer = Trainer(scene, tiny_config(method="fast", densify=DensifyConfig(stop=0)))
+        at_start = trainer.render_test_views()[0].render
+        method = paper(trainer)
+        assert method.esfg is not None
+        before = method.esfg().detach()
+        for _ in range(12):
+            trainer.step()
+        assert (method.esfg() - before).abs().max() > 0.05  # the modulation itself has moved
+        renders.append((at_start, trainer.render_test_views()[0].render))
+    (start, trained), (start_moved, trained_moved) = renders
+    np.testing.assert_allclose(start_moved, start, atol=2e-4)
+    np.testing.assert_allclose(trained_moved, trained, atol=5e-3)
+    assert np.abs(trained - start).max() > 0.1
+
+
+# --- which row a Gaussian reads ---
+
+
+def gaussians(count: int) -> Gaussians:
+    rng = np.random.default_rng(7)
+    points = rng.normal(size=(count, 3)).astype(np.float32)
+    made = Gaussians.from_points(points, np.zeros((count, 3), dtype=np.uint8), 1)
+    made.sh0[:, 0, 0] = torch.arange(count) + 0.5  # tells who stems from whom
+    made.scales += torch.from_numpy(rng.normal(0, 0.7, (count, 3))).float()
+    made.opacities = torch.from_numpy(rng.normal(-3, 2, count)).float()
+    return made
+
+
+def test_f_is_replicated_over_the_first_gaussians() -> None:
+    rows = FeatureRows(7).start(gaussians(18))
+    assert rows.tolist() == [0, 1, 2, 3, 4, 5, 6] * 2 + [0, 1, 2, 3]
+    assert FeatureRows(7).start(gaussians(4)).tolist() == [0, 1, 2, 3]
+
+
+def test_a_gaussian_keeps_its_row_and_its_offspring_inherits_it() -> None:
+    scene = gaussians(200)
+    optimizer = Adam(
+        [{"name": n, "params": [t.requires_grad_()], "lr": 0.1} for n, t in scene.named().items()]
+    )
+    rows = FeatureRows(7)
+    rows.start(scene)
+    config = DensifyConfig(start=0, every=1, percent_dense=0.1, grad_threshold=0.5, prune_opacity=0.02)
+    densifier = Densifier(config, 1.0, 0, len(scene))
+    lost = grown = 0
+    for iteration in range(1, 5):
+        scene.means.grad = torch.ones_like(scene.means)
+        optimizer.step()  # the positions change between two calls
+        densifier.grad_sum = torch.from_numpy(np.random.default_rng(iteration).random(len(scene))).float()
+        densifier.count = torch.ones(len(scene))
+        growth = densifier.update(iteration, scene, optimizer)
+        lost, grown = lost + growth.pruned, grown + min(growth.cloned, growth.split)
+        found = rows.of(scene)
+        expected = scene.sh0.detach()[:, 0, 0].long() % 7
+        assert torch.equal(found, expected)
+        assert rows.of(scene) is found
+    assert lost > 20
+    assert grown > 20
+
+
+def test_rows_follow_gaussians_that_are_reordered_or_merely_copied() -> None:
+    scene = gaussians(50)
+    rows = FeatureRows(7)
+    first = rows.start(scene)
+    order = torch.from_numpy(np.random.default_rng(0).permutation(50)[:30])
+    some = Gaussians(**{n: t[order] for n, t in scene.named().items()})
+    assert torch.equal(rows.of(some), first[order])
+    assert torch.equal(rows.of(some.detached()), first[order])
+
+
+def test_gaussians_from_nowhere_are_refused() -> None:
+    scene = gaussians(50)
+    rows = FeatureRows(7)
+    with pytest.raises(ValueError, match="no rows yet"):
+        rows.of(scene)
+    rows.start(scene)
+    other = Gaussians(**{n: t.clone() for n, t in scene.named().items()})
+    other.means[3] += 1
+    assert torch.equal(rows.of(other), torch.arange(50) % 7)  # as a split child: its looks tell
+    other = Gaussians(**{n: t.clone() for n, t in scene.named().items()})
+    other.means[[3, 8]] += 2
+    other.sh0[[3, 8]] += 1
+    with pytest.raises(ValueError, match=r"2 of 50 Gaussians are no copies of the 50 before them.*row 3"):
+        rows.of(other)
+
+
+@pytest.mark.parametrize("same_colour", [False, True])
+def test_rows_in_a_run_that_grows_and_prunes(monkeypatch: pytest.MonkeyPatch, same_colour: bool) -> None:
+    expected = torch.arange(40) % SMALL
+    split = pruned = 0
+    real = densify_module.select_rows
+
+    def spy(gaussians: Gaussians, optimizer: Any, rows: Tensor, old: int) -> None:
+        nonlocal expected, split, pruned
+        split += len(rows) > old < len(gaussians)
+        pruned += len(rows) < len(gaussians)
+        expected = expected[rows]
+        real(gaussians, optimizer, rows, old)
+
+    monkeypatch.setattr(densify_module, "select_rows", spy)
+    scene = tiny_scene()
+    if same_colour:  # as random points have
+        scene = replace(scene, point_colors=np.full_like(scene.point_colors, 128))
+    config = tiny_config(method="fast")
+    trainer = Trainer(scene, replace(config, densify=replace(config.densify, prune_opacity=0.09)))
+    for _ in range(11):  # a round, and on
+        trainer.step()
+        assert torch.equal(rows_of(trainer), expected)
+    assert split == pruned == 1
+
+
+# --- runs ---
+
+
+@pytest.mark.parametrize("method", ["fast", "V3"])
+@pytest.mark.parametrize("at", [0, 5, 16, 24])
+def test_a_resumed_run_has_the_same_bits(tmp_path: Path, method: str, at: int) -> None:
+    """16 and 24 end with a change of the set of Gaussians, which no call of `modulate` has seen yet."""
+    whole = run(method)
+    path = tmp_path / "checkpoint.safetensors"
+    run(method, at).save(path)
+    trainer = Trainer(tiny_scene(), tiny_config(method=method))
+    trainer.render_test_views()  # starts the rows of a fresh run, which the checkpoint replaces
+    trainer.restore(path)
+    trainer.save(path)  # at once, before any step
+    trainer.restore(path)
+    for _ in range(30 - at):
+        trainer.step()
+    assert bits(trainer) == bits(whole)
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    found = []
+    before = hqgs.get_num_threads(), torch.get_num_threads()
+    try:
+        for rasterizer, torch_threads in ((1, 1), (2, 2), (3, 1)):
+            hqgs.set_num_threads(rasterizer)
+            torch.set_num_threads(torch_threads)
+            found.append(bits(run("fast", 20)))
+    finally:
+        hqgs.set_num_threads(before[0])
+        torch.set_num_threads(before[1])
+    assert found[0] == found[1] == found[2]
+    assert bits(run("fast", 20, seed=1)) != found[0]
+
+
+def test_the_ply_holds_what_is_rasterized(tmp_path: Path) -> None:
+    with open_run(tiny_scene(), tiny_config(6, method="V7"), tmp_path) as trainer:
+        run_in_folder(trainer, tmp_path, progress=False)
+        shown = trainer.method.modulate(trainer.gaussians).means.detach()
+    assert torch.equal(read_ply(tmp_path / PLY).means, shown)
+    assert (shown - trainer.gaussians.means).abs().max() > 0.5
+
+
+def test_v1_is_3dgs() -> None:
+    assert bits(run("V1")) == bits(run("3dgs"))
+
+
+def test_every_part_changes_the_run() -> None:
+    runs = {name: run(name, 6).gaussians.means.detach().numpy().tobytes() for name in VARIANTS}
+    assert len(set(runs.values())) == 7
+
+
+def test_held_out_views_get_better() -> None:
+    trainer = Trainer(tiny_scene(num_points=80), tiny_config(150, method="V7", densify=DensifyConfig(stop=0)))
+    trainer.evaluate()
+    for _ in range(150):
+        trainer.step()
+    trainer.evaluate()
+    first, last = trainer.history
+    assert last["psnr"] > first["psnr"] + 5
+    assert trainer.skipped == 0
+
+
+def test_the_features_are_trained_at_their_own_rate() -> None:
+    trainer = run("V7", 1)
+    group = trainer.optimizer.param_groups[-1]
+    assert (group["name"], group["lr"]) == ("esfg", 1e-6)
+    fresh = ESFG(tiny_scene().train, 0, ESFGConfig(feature_size=SMALL))
+    for (name, new), old in zip(fresh.named_parameters(), group["params"], strict=True):
+        step = (old - new).abs()
+        assert 5e-7 < step.max() < 1.5e-6, name  # Adam's first step is the rate
+
+
+def test_the_losses() -> None:
+    scene = tiny_scene()
+    mask = np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.8
+    photo = scene.train[0]
+    render = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
+    for found in (
+        photo,
+        replace(photo, mask=mask),
+        replace(photo, image=(photo.image / 255).astype(np.float32)),
+    ):
+        image = torch.from_numpy(found.image)
+        counted = None if found.mask is None else torch.from_numpy(found.mask)
+        l1 = photometric_loss(render, image, counted, 0.0).item()
+        scs = scs_loss(render, image, edge_magnitude(image, counted), counted).item()
+        assert scs > 0.01
+        expected = {
+            "l1": l1,
+            "l1+dssim": photometric_loss(render, image, counted, 0.2).item(),
+            "l1+scs": l1 + 5 * scs,
+        }
+        for loss, value in expected.items():
+            method = PaperHQGS(scene, 0, small(PaperConfig(loss=loss)))  # type: ignore[arg-type]
+            for _ in range(2):  # the second time from the cache
+                assert method.loss(render, found).item() == pytest.approx(value, rel=1e-6)
+
+
+def test_views_of_one_name_are_not_confused() -> None:
+    method = PaperHQGS(tiny_scene(), 0, small(PaperConfig()))
+    a, b = view(noisy(9, 8, 0)), view(noisy(9, 8, 1))
+    render = torch.rand(9, 8, 3, generator=torch.Generator().manual_seed(0))
+    for v in (a, b, a, b):
+        alone = PaperHQGS(tiny_scene(), 0, small(PaperConfig()))
+        assert method.loss(render, v).item() == alone.loss(render, v).item()
+
+
+def test_weights_beyond_the_memory_for_them_are_computed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for room in (CACHE_BYTES, 0):
+        monkeypatch.setattr("hqgs.methods.paper.CACHE_BYTES", room)
+        found.append(bits(run("V7", 8)))
+    assert found[0] == found[1]
+
+
+# --- errors ---
+
+
+def test_bad_settings_are_refused_by_name() -> None:
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"saf": False, "eaf": False} | OFF, "saf and eaf are both off"),
+        ({"saf": False, "concat": False}, "cross_attention needs both saf and eaf, got saf=False, eaf=True"),
+        ({"eaf": False, "cross_attention": False}, "concat needs both saf and eaf"),
+        ({"downscale": 3}, "downscale is 3, wanted 1, 2 or 4"),
+        ({"feature_size": 7}, "feature_size is 7, wanted a positive even number"),
+        ({"feature_size": 0, "concat": False}, "feature_size is 0, wanted a positive number"),
+        ({"lr": 0.0}, "lr is 0.0, wanted a positive number"),
+        ({"lr": np.nan}, "lr is nan"),
+    ]
+    for settings, message in cases:
+        with pytest.raises(ValueError, match=message):
+            ESFGConfig(**settings)
+    assert ESFGConfig(feature_size=7, **OFF).feature_size == 7
+    with pytest.raises(ValueError, match="loss is 'l2', wanted one of l1, l1\\+dssim, l1\\+scs"):
+        PaperConfig(loss="l2")  # type: ignore[arg-type]
+
+
+def test_the_state_of_another_variant_is_refused() -> None:
+    scene = tiny_scene()
+    states = {name: run(name, 1).method.state_dict() for name in ("V1", "V3", "V7")}
+    for name in states:
+        method = PaperHQGS(scene, 0, small(VARIANTS[name]))
+        for other, state in states.items():
+            if other == name:
+                method.load_state_dict(state)
+            else:
+                with pytest.raises(ValueError, match="the checkpoint is that of another variant"):
+                    method.load_state_dict(state)

@@ -1,0 +1,100 @@
+"""The operators that degrade a render in the loss, against the degradations of the photos themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from hqgs.degradations import degrade_image, parse_degradation
+from hqgs.formation import formation
+from hqgs.jpeg_cells import JpegCells, tables_of_quality
+from hqgs.separable import Separable
+
+
+def picture(height: int, width: int) -> NDArray[np.float32]:
+    """Waves of several lengths and an edge, float32 [H, W, 3]."""
+    y, x = np.mgrid[:height, :width]
+    waves = [0.5 + 0.2 * np.sin(0.3 * x + k) * np.cos(0.2 * y) + 0.2 * (x + y > 40) for k in range(3)]
+    return np.stack(waves, -1).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["blur:1.7", "blur", "lowres:4", "blur+lowres:2", "blur:2+lowres:3"])
+def test_the_operator_is_the_degradation(kind: str) -> None:
+    image, degradation = picture(61, 90), parse_degradation(kind)
+    degraded = degrade_image(image, degradation, np.random.default_rng(0))
+    expected = degraded.image if degraded.low is None else degraded.low
+    operator = formation(degradation, 61, 90)
+    assert operator is not None
+    np.testing.assert_allclose(operator(torch.from_numpy(image)).numpy(), expected, atol=2e-6)
+
+
+def test_noise_and_jpeg_are_not_linear() -> None:
+    assert formation(parse_degradation("noise:10+jpeg:20"), 40, 50) is None
+
+
+def test_the_gradient_is_the_transposed_operator() -> None:
+    rng = np.random.default_rng(1)
+    operator = Separable.of(rng.random((3, 5)), rng.random((4, 6)))
+    image = torch.rand(5, 6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(operator, (image.requires_grad_(),), atol=1e-5, fast_mode=True)
+
+
+def test_a_masked_pixel_spoils_what_it_reaches() -> None:
+    operator = formation(parse_degradation("lowres:2"), 40, 40)
+    assert operator is not None
+    mask = np.ones((40, 40), bool)
+    mask[20, 10] = False
+    low = operator.mask(mask)
+    image = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0))
+    changed = image.clone()
+    changed[20, 10] += 1
+    moved = (operator(changed) != operator(image)).any(-1).numpy()
+    assert moved.any()
+    assert not (moved & low).any()
+    assert low.sum() > 300
+
+
+@pytest.mark.parametrize("size", [(48, 64), (45, 61)])
+@pytest.mark.parametrize("quality", [5, 10, 20, 50])
+def test_the_clean_picture_lies_in_the_cells_of_its_file(quality: int, size: tuple[int, int]) -> None:
+    image = np.float32(0.2) + np.float32(0.6) * picture(*size)  # nothing is clipped
+    photo = degrade_image(image, parse_degradation(f"jpeg:{quality}"), np.random.default_rng(0)).image
+    cells = JpegCells(tables_of_quality(quality), *size)
+    centres = cells.centres(torch.from_numpy(photo))
+    inside = float(cells.loss(torch.from_numpy(image), centres))
+    assert inside < 0.02 * np.abs(photo - image).mean()  # rounding to 8 bits and libjpeg's integer arithmetic
+    brighter = float(cells.loss(torch.from_numpy(image + 0.1), centres))
+    assert brighter > 3e-3 > 3 * inside
+
+
+def test_cells_at_quality_100_are_the_pixels() -> None:
+    """With steps of 1/255 the distance is that of the coefficients, here of a change in one block's mean."""
+    ones = (1,) * 64
+    cells = JpegCells((ones, ones), 16, 16)
+    photo = torch.full((16, 16, 3), 0.5)
+    centres = cells.centres(photo)
+    image = photo.clone()
+    image[:8, :8] += 0.1  # grey: luma only; the DC coefficient of an 8 x 8 block is 8 times its mean
+    expected = (8 * 0.1 - 0.5 / 255 - (cells.coefficients(photo).luma - centres.luma)[0, 0, 0].abs()).item()
+    assert float(cells.loss(image, centres)) * 3 * 256 == pytest.approx(expected, abs=3e-3)
+
+
+def test_slack_widens_the_cells() -> None:
+    cells = JpegCells(tables_of_quality(20), 16, 16)
+    photo = torch.full((16, 16, 3), 0.5)
+    image, centres = photo + 0.2, cells.centres(photo)
+    wide, narrow = (float(cells.loss(image, centres, slack)) for slack in (0.1, 0.0))
+    assert 0 < wide < narrow
+
+
+def test_the_cells_have_a_gradient() -> None:
+    cells = JpegCells(tables_of_quality(20), 9, 17)
+    photo = torch.rand(9, 17, 3, generator=torch.Generator().manual_seed(0))
+    centres = cells.centres(photo)
+    image = (photo + 0.3).double().requires_grad_()
+    centres = type(centres)(centres.luma.double(), centres.chroma.double())
+    assert torch.autograd.gradcheck(
+        lambda x: cells.loss(x, centres), (image,), atol=1e-6, rtol=1e-3, fast_mode=True
+    )

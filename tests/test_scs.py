@@ -1,0 +1,204 @@
+"""The SCS loss: value, gradient, digits in single precision, and its limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hqgs.edges import edge_magnitude
+from hqgs.scs import DIMMEST, ScsWeights, scs_loss, weighted_scs_loss
+
+
+def images(
+    height: int = 7, width: int = 6, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A render, a target and the target's g."""
+    rng = np.random.default_rng(0)
+    render, target = (torch.from_numpy(rng.uniform(0, 1, (height, width, 3))).to(dtype) for _ in range(2))
+    return render, target, edge_magnitude(target)
+
+
+def reference(render: Tensor, target: Tensor, g: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The equation, by torch's own operations in double precision."""
+    low = 1 - (g[..., None] if g.ndim == 2 else g)
+    low = low if mask is None else low * mask[..., None]
+    a, b = ((low * x).double().flatten() for x in (render, target))
+    return 1 - torch.nn.functional.cosine_similarity(a, b, dim=0)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("gray", [False, True])
+def test_value_and_gradient_follow_the_equation(masked: bool, gray: bool) -> None:
+    render, target, g = images()
+    g = g.mean(dim=2) if gray else g
+    mask = torch.from_numpy(np.random.default_rng(1).random((7, 6)) < 0.7) if masked else None
+    render.requires_grad_()
+    loss, expected = scs_loss(render, target, g, mask), reference(render, target, g, mask)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-12)
+    assert 0.05 < loss.item() < 1
+    (grad,) = torch.autograd.grad(loss, render)
+    (expected_grad,) = torch.autograd.grad(expected, render)
+    torch.testing.assert_close(grad, expected_grad, rtol=1e-10, atol=1e-14)
+    assert torch.autograd.gradcheck(lambda r: scs_loss(r, target, g, mask), (render,), eps=1e-6, atol=1e-9)
+    # No pull on the brightness as a whole.
+    assert abs((grad * render.detach()).sum().item()) < 1e-15
+
+
+def test_the_gradient_below_the_floor() -> None:
+    render, target, g = images()
+    dim = (1e-3 * render).requires_grad_()
+    assert torch.autograd.gradcheck(lambda r: scs_loss(r, target, g), (dim,), eps=1e-6, atol=1e-7)
+    # The floor is entered without a jump.
+    low = 1 - g
+    at_floor = render * (DIMMEST * (low * target).norm() / (low * render).norm())
+    above, below = (scs_loss(at_floor * (1 + s), target, g).item() for s in (1e-9, -1e-9))
+    assert above == pytest.approx(below, abs=1e-8)
+    assert above == pytest.approx(reference(render, target, g).item(), rel=1e-9)
+
+
+def test_bytes_and_floats_agree() -> None:
+    render, _, _ = images(20, 30, torch.float32)
+    target = torch.from_numpy(np.random.default_rng(2).integers(0, 256, (20, 30, 3), dtype=np.uint8))
+    g = edge_magnitude(target)
+    found = []
+    for photo in (target, target / 255.0):
+        for scale in (1.0, 1e-3):  # above and below the floor
+            r = (scale * render).requires_grad_()
+            loss = scs_loss(r, photo, g)
+            (grad,) = torch.autograd.grad(loss, r)
+            found.append((loss.item(), grad))
+    for one, other in ((found[0], found[2]), (found[1], found[3])):
+        assert one[0] == pytest.approx(other[0], rel=1e-5)
+        torch.testing.assert_close(one[1], other[1], rtol=1e-4, atol=1e-5 * one[1].abs().max().item())
+
+
+def test_only_structure_off_the_edges_counts() -> None:
+    render, target, g = images()
+    base = scs_loss(render, target, g).item()
+    assert scs_loss(3.7 * render, target, g).item() == pytest.approx(base, rel=1e-12)
+    assert scs_loss(0.4 * target, target, g).item() < 1e-30
+    on_edge = torch.where(g == 1, 50.0, 0.0)
+    assert on_edge.any()
+    assert scs_loss(render + on_edge, target, g).item() == base
+    assert scs_loss(render, target, torch.zeros_like(g)).item() != pytest.approx(base, rel=1e-3)
+    assert scs_loss(-target, target, g).item() == pytest.approx(2, rel=1e-12)
+
+
+@pytest.mark.parametrize("noise", [1e-2, 1e-3, 1e-4, 1e-5])
+def test_single_precision_keeps_its_digits_where_render_and_photo_agree(noise: float) -> None:
+    rng = np.random.default_rng(3)
+    target = rng.uniform(0.05, 1, (64, 80, 3)).astype(np.float32)
+    render = (target * (1 + noise * rng.standard_normal(target.shape))).astype(np.float32)
+    g = edge_magnitude(torch.from_numpy(target))
+    low = (1 - g).numpy().astype(np.longdouble)
+    a, b = low * render, low * target
+    u, v = a / np.sqrt((a * a).sum()), b / np.sqrt((b * b).sum())
+    expected = 0.5 * ((u - v) ** 2).sum()
+    expected_grad = low * (u - v - expected * u) / np.sqrt((a * a).sum())
+    r = torch.from_numpy(render).requires_grad_()
+    loss = scs_loss(r, torch.from_numpy(target), g)
+    (grad,) = torch.autograd.grad(loss, r)
+    tolerance = max(1e-6, 2e-7 / noise)
+    assert loss.item() == pytest.approx(float(expected), rel=tolerance)
+    error = np.linalg.norm((grad.numpy() - expected_grad).astype(np.float64).ravel())
+    assert error < tolerance * np.linalg.norm(expected_grad.astype(np.float64).ravel())
+
+
+def value_and_gradient(render: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[float, Tensor]:
+    render = render.clone().requires_grad_()
+    loss = scs_loss(render, target, edge_magnitude(target), mask)
+    (grad,) = torch.autograd.grad(loss, render)
+    return loss.item(), grad
+
+
+def test_limits() -> None:
+    render, target, g = images(dtype=torch.float32)
+    black, white = torch.zeros_like(render), torch.ones_like(render)
+    # A black target has no direction, and neither has one that is masked away.
+    for r in (render, black, white):
+        assert value_and_gradient(r, black)[0] == 0
+        assert value_and_gradient(r, black)[1].abs().max() == 0
+    nothing = torch.zeros(7, 6, dtype=torch.bool)
+    loss, grad = value_and_gradient(render, target, nothing)
+    assert loss == 0
+    assert grad.abs().max() == 0
+    # A black render: 1, and a finite pull towards the target.
+    loss, grad = value_and_gradient(black, target)
+    assert loss == 1
+    low = 1 - g
+    expected = -low * (low * target) / (DIMMEST * (low * target).square().sum())
+    torch.testing.assert_close(grad, expected, rtol=1e-5, atol=0)
+    # Constant images point the same way, whatever their brightness.
+    loss, grad = value_and_gradient(0.3 * white, white)
+    assert loss < 1e-12
+    assert grad.abs().max() < 1e-7
+    assert value_and_gradient(white, white)[0] < 1e-14
+
+
+@pytest.mark.parametrize("render", [0.0, 1e-30, 1e-3, 0.5, 1.0, 1e4])
+@pytest.mark.parametrize("target", [0.0, 1e-6, 0.5, 1.0])
+def test_one_pixel(render: float, target: float) -> None:
+    loss, grad = value_and_gradient(torch.full((1, 1, 3), render), torch.full((1, 1, 3), target))
+    assert 0 <= loss <= 1
+    assert torch.isfinite(grad).all()
+    if render >= 0.1 * target > 0:
+        assert loss < 1e-12  # the same hue
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_what_is_not_finite_stays_so(bad: float) -> None:
+    render, target, g = images(dtype=torch.float32)
+    render[2, 3, 1] = bad
+    assert scs_loss(render, target, g).isnan()
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    render, target, g = images(150, 200)
+    before = torch.get_num_threads()
+    found = set()
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            r = render.clone().requires_grad_()
+            loss = scs_loss(r, target, g)
+            loss.backward()
+            assert r.grad is not None
+            found.add((loss.item(), r.grad.numpy().tobytes()))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert len(found) == 1
+
+
+def test_what_was_computed_before_gives_the_same() -> None:
+    render, target, g = images(dtype=torch.float32)
+    mask = torch.from_numpy(np.random.default_rng(1).random((7, 6)) < 0.7)
+    fixed = ScsWeights.of(target, g, mask)
+    assert weighted_scs_loss(render, target, fixed).item() == scs_loss(render, target, g, mask).item()
+    assert fixed.target_norm == pytest.approx(((1 - g) * mask[..., None] * target).norm().item(), rel=1e-6)
+
+
+def test_bad_input_is_named() -> None:
+    render, target, g = images()
+    cases: list[tuple[tuple[Any, ...], str]] = [
+        ((render[:-1], target, g), r"render: must have the shape of the target, \[7, 6, 3\]"),
+        ((render.half(), target, g), "render: must be float32 or float64, got torch.float16"),
+        (
+            (render, target[..., 0], g),
+            r"target: must be \[H, W, C\], uint8 or float, got torch.float64 \[7, 6\]",
+        ),
+        ((render, target, g[:-1]), r"g: must be \[7, 6, 3\] or \[7, 6\] as the target, got \[6, 6, 3\]"),
+        (
+            (render, target, g, torch.ones(7, 6)),
+            r"mask: must be bool \[7, 6\] as the target, got torch.float32 \[7, 6\]",
+        ),
+    ]
+    for arguments, message in cases:
+        with pytest.raises(ValueError, match=message):
+            scs_loss(*arguments)
+    with pytest.raises(ValueError, match=r"weights: must be torch\.float32 as the render"):
+        weighted_scs_loss(render.float(), target, ScsWeights.of(target, g, dtype=torch.float64))
