@@ -29,6 +29,7 @@ EM_STEPS = 12
 LIKELIHOOD_GAIN = 8.0  # nats that noise must bring, or there is none
 SHOWS = 0.3  # times the mean of the three finest steps: the least noise that is told from fine texture
 LEAST = 6.0  # levels; below it fine texture is taken for noise at any table
+LEAST_SIGMA = 0.7  # px; coarse tables (quality 10 and below) make sharp photos look 0.8 px soft
 
 _GRID = (np.arange(-32, 32) + 0.5) * np.pi / 32  # rad/px
 _BASIS = np.cos(np.pi * np.arange(8)[:, None] * (2 * np.arange(8) + 1) / 16)
@@ -55,7 +56,8 @@ class Hidden:
 
     sigma: float  # px: Gaussian blur, with a sharp photo's own softness
     noise: float  # levels: of white noise in each channel; 0 where it cannot be told from none
-    limit: float  # levels: the least noise that would have been told
+    noise_limit: float  # levels: the least noise that would have been told
+    sigma_limit: float  # px: below this it could be JPEG alone
 
 
 def quantised(
@@ -82,10 +84,11 @@ def estimate_hidden(steps: NDArray[np.int64], table: NDArray[np.int64]) -> Hidde
     noisy = model.minimise([*clean[0], 3.8])
     finest = np.sort(table.ravel()[1:])[:3].mean()
     limit = max(LEAST, SHOWS * float(finest))
+    sigma_limit = LEAST_SIGMA + 0.2 * float(np.clip((finest - 30) / 30, 0, 1))
     noise = float(np.exp(noisy[0][2] / 2)) / LUMA_NOISE
     if noise >= limit and clean[1] - noisy[1] >= LIKELIHOOD_GAIN:
-        return Hidden(max(float(noisy[0][1]), 0.0), noise, limit)
-    return Hidden(max(float(clean[0][1]), 0.0), 0.0, limit)
+        return Hidden(max(float(noisy[0][1]), 0.0), noise, limit, sigma_limit)
+    return Hidden(max(float(clean[0][1]), 0.0), 0.0, limit, sigma_limit)
 
 
 class _Model:

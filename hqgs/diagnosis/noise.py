@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hqgs.diagnosis.levels import Floats
@@ -9,12 +11,21 @@ from hqgs.diagnosis.levels import Floats
 LARGE_PATCH, SMALL_PATCH = 5, 3  # px
 FEW_PATCHES = 4_000  # below this the large patch has too many directions for the photo
 MIN_PATCHES = 200  # below this no estimate
+LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise reach 1.9, small ones 3.2
 MAX_PATCHES = 12_000
 HALF_TILE = 24  # px: the photo is cut into a chessboard of tiles of this size
 
 
-def estimate_noise(levels: Floats) -> float | None:
-    """Standard deviation of white noise in a photo [H, W, 3] of levels 0..255; None where it cannot tell.
+@dataclass(frozen=True)
+class Noise:
+    """White noise in a photo."""
+
+    level: float  # levels of 1/255 in each channel: standard deviation
+    limit: float  # levels: below this it could be fine texture
+
+
+def estimate_noise(levels: Floats) -> Noise | None:
+    """White noise in a photo [H, W, 3] of levels 0..255; None where too few pixels tell.
 
     Patches of all three channels span a space in which texture fills few directions and white noise all of
     them, so the smallest eigenvalue of their covariance is the noise variance (Pyatenko 2013, Liu et al.
@@ -41,4 +52,5 @@ def estimate_noise(levels: Floats) -> float | None:
     for here, there in (covariances, covariances[::-1]):
         flattest = np.linalg.eigh(here)[1][:, 0]
         variances.append(flattest @ there @ flattest)
-    return float(np.sqrt(max(np.mean(variances), 0.0)))
+    level = float(np.sqrt(max(np.mean(variances), 0.0)))
+    return Noise(level, LIMIT if size == LARGE_PATCH else SMALL_LIMIT)

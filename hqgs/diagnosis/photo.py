@@ -15,6 +15,7 @@ from hqgs.diagnosis.levels import to_levels
 from hqgs.diagnosis.noise import estimate_noise
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
 
+LEAST_BLUR = 0.7  # px of the small photo, a Gaussian's sigma; photos that count as sharp reach 0.6
 HIDING_QUALITY = 92  # from this quality on, JPEG leaves noise and spectrum as they were
 
 Photo = NDArray[np.uint8] | NDArray[np.float32]
@@ -30,8 +31,9 @@ class PhotoDiagnosis:
     enlargement: Enlargement
     jpeg: Jpeg
     noise: float | None  # levels of 1/255 in each channel; None: not told from this photo
-    noise_limit: float  # levels: weaker noise would not show
+    noise_limit: float  # levels: weaker noise is not told from texture, or hidden by the JPEG
     blur: Blur | None  # beyond a sharp photo's own, px of the full-size photo; None: not told from this photo
+    blur_limit: float  # px of the full-size photo, a Gaussian's sigma: sharp photos can look as soft
 
     @property
     def hiding(self) -> bool:
@@ -84,23 +86,29 @@ def inspect_photo(
         if enlargement.factor > 1:
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     jpeg = find_jpeg(levels, path)
-    found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None)
+    scale = width / levels.shape[1]
+    found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, LEAST_BLUR * scale)
     if found.hiding:
         return Inspected(found, quantised(levels, np.array(jpeg.table), jpeg.phase))
-    noise = estimate_noise(levels)
-    blur = estimate_blur(levels, noise or 0.0)
-    return Inspected(
-        replace(found, noise=noise, blur=blur and _enlarged(blur, width / levels.shape[1])), None
-    )
+    if (noise := estimate_noise(levels)) is not None:
+        found = replace(found, noise=noise.level, noise_limit=noise.limit)
+    if (blur := estimate_blur(levels, found.noise or 0.0)) is not None:
+        found = replace(found, blur=_enlarged(blur, scale))
+    return Inspected(found, None)
 
 
 def with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis:
     """The diagnosis of a photo with a hiding JPEG, completed; under JPEG all blur counts as Gaussian."""
     if hidden is None:
         return photo
-    sigma = extra_sigma(hidden.sigma)
-    blur = _enlarged(Blur("gaussian", sigma, sigma, 0.0), photo.width / photo.enlargement.width)
-    return replace(photo, noise=hidden.noise, noise_limit=hidden.limit, blur=blur)
+    sigma, scale = extra_sigma(hidden.sigma), photo.width / photo.enlargement.width
+    return replace(
+        photo,
+        noise=hidden.noise,
+        noise_limit=hidden.noise_limit,
+        blur=_enlarged(Blur("gaussian", sigma, sigma, 0.0), scale),
+        blur_limit=hidden.sigma_limit * scale,
+    )
 
 
 def _enlarged(blur: Blur, scale: float) -> Blur:

@@ -14,8 +14,6 @@ from hqgs.diagnosis.coefficients import MAX_BLOCKS, estimate_hidden
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, inspect_photo, with_hidden
 
 PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
-LEAST_NOISE = 2.5  # levels; sharp photos of fine texture reach 1.8
-LEAST_BLUR = 0.7  # px of the small photo, a Gaussian's sigma; photos that count as sharp reach 0.4
 VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
 
 
@@ -79,8 +77,9 @@ def _pool_hidden(found: Sequence[Inspected]) -> tuple[PhotoDiagnosis, ...]:
     for table in {photo.jpeg.table for photo in photos if photo.hiding}:
         members = [k for k, photo in enumerate(photos) if photo.hiding and photo.jpeg.table == table]
         share = -(-MAX_BLOCKS // len(members))
-        steps = [found[k].steps[:share] for k in members]  # they come shuffled
-        hidden = estimate_hidden(np.concatenate(steps), np.array(table))
+        steps = [found[k].steps for k in members]
+        pooled = np.concatenate([s[:share] for s in steps if s is not None])  # the blocks come shuffled
+        hidden = estimate_hidden(pooled, np.array(table))
         for k in members:
             photos[k] = with_hidden(photos[k], hidden)
     return tuple(photos)
@@ -124,12 +123,12 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
         return Part("noise", False, None, None, None, "the photos are too small or too clipped to tell")
     level, limit = float(np.median(values)), float(np.median([photo.noise_limit for photo in photos]))
     spread = None if _pooled(photos) else _spread_of(values)
-    if level >= LEAST_NOISE:
+    if level >= limit:
         return Part("noise", True, level, spread, f"noise:{level:.0f}", f"white noise of {level:.1f} levels")
-    if limit:
+    if spread is None:
         reason = f"below {limit:.0f} levels the JPEG hides it, and no more than that is seen"
     else:
-        reason = f"{level:.1f} levels could be fine texture (needed from {LEAST_NOISE:g})"
+        reason = f"{level:.1f} levels could be fine texture (needed from {limit:g})"
     return Part("noise", False, level, spread, None, reason)
 
 
@@ -137,8 +136,8 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Part:
     blurs = [photo.blur for photo in photos if photo.blur is not None]
     if not blurs:
         return Part("blur", False, None, None, None, "the photos are too small to tell")
-    scale = float(np.median([photo.width / photo.enlargement.width for photo in photos]))
-    sigma, least = float(np.median([blur.sigma for blur in blurs])), LEAST_BLUR * scale
+    sigma = float(np.median([blur.sigma for blur in blurs]))
+    least = float(np.median([photo.blur_limit for photo in photos]))
     kind, count = Counter(blur.kind for blur in blurs).most_common(1)[0]
     kind = kind if 2 * count > len(blurs) else "gaussian"
     amounts = [b.sigma for b in blurs] if kind == "gaussian" else [b.amount for b in blurs if b.kind == kind]

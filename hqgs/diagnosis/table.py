@@ -26,7 +26,7 @@ def _row(photo: PhotoDiagnosis) -> tuple[str, ...]:
     enlarged = "no" if small.factor == 1 else f"x{small.factor} from {small.width} x {small.height}"
     if photo.noise is None:
         noise = "?"
-    elif photo.noise == 0 and photo.noise_limit:
+    elif photo.noise == 0:
         noise = f"< {photo.noise_limit:.0f}"
     else:
         noise = f"{photo.noise:.1f}"

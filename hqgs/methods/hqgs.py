@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.camera import Scene, View
-from hqgs.degradations import Degradation, parse_degradation, shrink
+from hqgs.degradations import Degradation, parse_degradation, small_side
 from hqgs.diagnosis import diagnose_scene
+from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.formation import formation
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
@@ -53,7 +54,7 @@ class Target:
     """What a view's renders are compared with."""
 
     operator: Separable | None  # from the render to the photo
-    photo: Tensor  # [h, w, 3] float32
+    photo: Tensor  # [h, w, 3], uint8 where the photo is
     mask: Tensor | None  # [h, w] bool, True where it counts
     centres: Coefficients | None  # of the photo's JPEG cells
 
@@ -80,7 +81,7 @@ class HQGS(Plain):
         )
         self._least = len(scene.points)
         kinds = {step.kind: step.value for step in self.degradation.steps}
-        self._lowres = "lowres" in kinds
+        self._factor = int(kinds.get("lowres") or 1)
         self._jpeg = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
         self._dssim = 0.0 if "noise" in kinds or self._jpeg else LAMBDA_DSSIM
         self._operators: dict[tuple[int, int], Separable | None] = {}
@@ -106,7 +107,8 @@ class HQGS(Plain):
         if target.centres is None:
             return pixels
         if target.mask is not None:
-            image = torch.where(target.mask[..., None], image, target.photo)
+            photo = target.photo if target.photo.is_floating_point() else target.photo / 255
+            image = torch.where(target.mask[..., None], image, photo)
         cells = self._cells[target.photo.shape[0], target.photo.shape[1]]
         return cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
 
@@ -122,7 +124,8 @@ class HQGS(Plain):
         if size not in self._operators:
             self._operators[size] = formation(self.degradation, *size)
         operator = self._operators[size]
-        photo = torch.from_numpy(_photo(view, self.degradation, self._lowres))
+        array = np.require(_photo(view, self._factor), requirements=["C", "W"])
+        photo = torch.from_numpy(array)
         if operator is not None and operator.size != photo.shape[:2]:
             raise ValueError(
                 f"view {view.name!r}: the photo is {list(photo.shape[:2])}, but {self.config.formation} of "
@@ -136,19 +139,22 @@ class HQGS(Plain):
             height, width = photo.shape[:2]
             if (height, width) not in self._cells:
                 self._cells[height, width] = JpegCells(tables_of_quality(self._jpeg), height, width)
-            centres = self._cells[height, width].centres(photo)
+            centres = self._cells[height, width].centres(torch.from_numpy(_floats(array)))
         return Target(operator, photo, None if mask is None else torch.from_numpy(mask), centres)
 
 
-def _photo(view: View, degradation: Degradation, lowres: bool) -> NDArray[np.float32]:
-    """The photo as it was taken: the small one where it was enlarged."""
-    if lowres and view.low is not None:
-        return np.ascontiguousarray(view.low)
-    image = np.divide(view.image, 255 if view.image.dtype == np.uint8 else 1, dtype=np.float32)
-    if lowres:  # enlarged somewhere else: back to the resolution that it really has
-        factor = next(int(step.value or 1) for step in degradation.steps if step.kind == "lowres")
-        image = shrink(image, factor)
-    return np.ascontiguousarray(image)
+def _photo(view: View, factor: int) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """The photo as it was taken: the small one where it was enlarged by `factor`."""
+    if factor == 1:
+        return view.image
+    if view.low is not None:
+        return view.low
+    size = (small_side(side, factor) for side in view.image.shape[:2])
+    return undo_enlargement(_floats(view.image).astype(np.float64), *size).astype(np.float32)
+
+
+def _floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32)
 
 
 def make_hqgs(scene: Scene, config: HQGSConfig, seed: int) -> Method:

@@ -1,0 +1,147 @@
+"""HQGS: what its loss becomes for each kind of photo, its budget, its diagnosis, its gain over 3DGS."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_srgs import fine_scene
+from tiny_scene import tiny_config, tiny_scene
+
+from hqgs.camera import Scene
+from hqgs.degradations import parse_degradation
+from hqgs.degrade import degrade_scene
+from hqgs.densify import DensifyConfig
+from hqgs.losses import photometric_loss
+from hqgs.methods.hqgs import HQGS, HQGSConfig, make_hqgs
+from hqgs.methods.paper import PaperHQGS
+from hqgs.metrics import psnr
+from hqgs.run import train
+from hqgs.train import Trainer
+
+
+def fixed(formation: str, **changes: float) -> HQGSConfig:
+    return HQGSConfig(formation=formation, **changes)  # type: ignore[arg-type]
+
+
+def render_like(image: np.ndarray, seed: int = 0) -> torch.Tensor:
+    return torch.rand(image.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_clean_photos_train_as_3dgs_bit_for_bit() -> None:
+    plain, ours = (Trainer(tiny_scene(), tiny_config(method=m, hqgs=fixed("none"))) for m in ("3dgs", "hqgs"))
+    for _ in range(12):
+        plain.step()
+        ours.step()
+    for name, tensor in plain.gaussians.named().items():
+        assert torch.equal(tensor, ours.gaussians.named()[name]), name
+    assert ours.config.densify == plain.config.densify
+
+
+def test_low_resolution_compares_shrunk_renders() -> None:
+    scene, _ = fine_scene(views=3)
+    method, view = HQGS(scene, fixed("lowres:4")), scene.train[1]
+    assert view.low is not None
+    render = render_like(view.image)
+    small = torch.nn.functional.avg_pool2d(render.permute(2, 0, 1)[None], 4)[0].permute(1, 2, 0)
+    loss = float(method.loss(render, view))
+    near = float(photometric_loss(small.contiguous(), torch.from_numpy(view.low)))
+    assert loss == pytest.approx(near, rel=0.1)  # bicubic is no average of 4 x 4 pixels, but close to it
+    without = replace(scene, train=[replace(v, low=None) for v in scene.train])
+    again = HQGS(without, fixed("lowres:4")).loss(render, without.train[1])
+    assert float(again) == pytest.approx(loss, rel=0.02)  # the enlarged photo still holds the small one
+
+
+def test_noise_leaves_dssim_out() -> None:
+    scene = tiny_scene()
+    view = scene.train[0]
+    render = render_like(view.image)
+    expected = np.abs(render.numpy() - view.image / 255).mean()
+    assert float(HQGS(scene, fixed("noise:25")).loss(render, view)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_jpeg_forgives_what_the_file_leaves_open() -> None:
+    clean = tiny_scene()
+    scene = degrade_scene(clean, parse_degradation("jpeg:10"), 0)
+    method = HQGS(scene, fixed("jpeg:10", jpeg_pixels=0.0))
+    photos = [torch.from_numpy(v.image.astype(np.float32) / 255) for v in clean.train]
+    inside = max(float(method.loss(p, v)) for p, v in zip(photos, scene.train, strict=True))
+    wrong = float(method.loss(1 - photos[0], scene.train[0]))
+    assert inside < 0.03 * wrong  # the codec clips colours and rounds to 8 bits
+
+
+@pytest.mark.parametrize("formation", ["blur:1", "lowres:2", "noise:10", "jpeg:20", "mixed"])
+def test_masked_pixels_have_no_gradient(formation: str) -> None:
+    scene = degrade_scene(tiny_scene(), parse_degradation(formation), 0)
+    mask = np.ones(scene.train[0].image.shape[:2], bool)
+    mask[:, :12] = False
+    scene = replace(scene, train=[replace(v, mask=mask) for v in scene.train])
+    method = HQGS(scene, fixed(formation))
+    render = render_like(scene.train[0].image).requires_grad_()
+    method.loss(render, scene.train[0]).backward()
+    assert render.grad is not None
+    far = 12 if formation in ("noise:10", "jpeg:20") else 4  # px that an operator may carry over the border
+    if (
+        formation != "jpeg:20"
+    ):  # there a block and the chroma carry it, but no further than the mask's filling
+        assert not render.grad[:, :far].any()
+    assert render.grad[:, 16:].any()
+
+
+def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
+    scene = tiny_scene()
+    budget = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed("noise:9", gaussians_per_pixel=0.1)))
+    assert budget.config.densify.max_gaussians == int(0.1 * 5 * 24 * 16)
+    least = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed("lowres:4", gaussians_per_pixel=0.1)))
+    assert least.config.densify.max_gaussians == len(scene.points)
+
+
+def test_it_looks_by_itself_and_says_what_it_leaves_out(tmp_path: Path) -> None:
+    scene = degrade_scene(tiny_scene(), parse_degradation("noise:40"), 0)
+    result = train(scene, tiny_config(method="hqgs"), tmp_path, progress=False)
+    assert result.config["hqgs"]["formation"] != "auto"
+    assert any("in the loss" in entry["what"] for entry in result.left_out)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"guidance": "none"}, {"formation": "jpeg:400"}, {"jpeg_pixels": -1.0}, {"gaussians_per_pixel": np.nan}],
+)
+def test_a_bad_setting_is_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(changes)).removeprefix("formation") or "jpeg"):
+        HQGSConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_a_photo_that_does_not_fit_is_named() -> None:
+    scene, _ = fine_scene(views=2)
+    with pytest.raises(ValueError, match=r"view '0'.*lowres:2"):
+        HQGS(scene, fixed("lowres:2"))
+
+
+def test_the_papers_guidance_is_another_method() -> None:
+    assert isinstance(make_hqgs(tiny_scene(), HQGSConfig(guidance="paper"), 0), PaperHQGS)
+    assert isinstance(make_hqgs(tiny_scene(), fixed("none"), 0), HQGS)
+
+
+def test_blurred_photos_give_a_sharper_scene_than_3dgs() -> None:
+    scene, clean = fine_scene()
+    photos = [replace(v, image=c, low=None) for v, c in zip(scene.train, clean, strict=True)]
+    blurred = degrade_scene(replace(scene, train=photos), parse_degradation("blur:2"), 0)
+    found = {}
+    for method in ("3dgs", "hqgs"):
+        config = tiny_config(250, method=method, hqgs=fixed("blur:2"), densify=DensifyConfig(stop=0))
+        trainer = Trainer(blurred, config)
+        for _ in range(250):
+            trainer.step()
+        found[method] = psnr_of(trainer, photos, scene)
+    assert found["hqgs"] > found["3dgs"] + 1
+
+
+def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
+    """Mean PSNR of renders of the training cameras against the clean photos."""
+    trainer.scene = replace(scene, test=photos)
+    values = [psnr(v.render.clip(0, 1), v.photo) for v in trainer.render_test_views()]
+    return float(np.mean([value for value in values if value is not None]))
