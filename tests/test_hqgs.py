@@ -20,6 +20,7 @@ from hqgs.methods.hqgs import HQGS, HQGSConfig, make_hqgs
 from hqgs.methods.paper import PaperHQGS
 from hqgs.metrics import psnr
 from hqgs.run import train
+from hqgs.smallest import photo_pixels
 from hqgs.train import Trainer
 
 
@@ -145,3 +146,48 @@ def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
     trainer.scene = replace(scene, test=photos)
     values = [psnr(v.render.clip(0, 1), v.photo) for v in trainer.render_test_views()]
     return float(np.mean([value for value in values if value is not None]))
+
+
+def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hqgs.methods.hqgs.REFRESH", 4)  # some of it between the save and the end
+    config = tiny_config(20, method="hqgs", hqgs=fixed("blur:1"))
+    whole, first, second = (Trainer(tiny_scene(), config) for _ in range(3))
+    for _ in range(20):
+        whole.step()
+    for _ in range(11):
+        first.step()
+    first.save(tmp_path / "checkpoint")
+    second.restore(tmp_path / "checkpoint")
+    second.render_test_views()  # looking changes nothing
+    for _ in range(9):
+        second.step()
+    for name, tensor in whole.gaussians.named().items():
+        assert torch.equal(tensor, second.gaussians.named()[name]), name
+
+
+def test_photo_pixels_are_those_of_the_nearest_view_that_sees_the_mean() -> None:
+    view = tiny_scene().train[0]
+    back = view.camera.viewmat.copy()
+    back[2, 3] += 3.0  # the same view from 3 units further away
+    views = [view, replace(view, camera=replace(view.camera, viewmat=back))]
+    center = view.camera.center
+    means = torch.from_numpy(center + np.array([[0, 0, 3], [2.5, 0, 3], [0, 0, -1]])).float()
+    near, far, behind = photo_pixels(means, views).tolist()
+    assert near == pytest.approx(3 / 20)
+    assert far == pytest.approx(6 / 20)  # outside of the near view's picture, inside the other's
+    assert behind == pytest.approx(2 / 20)  # behind the first, 2 units before the second
+    nowhere = photo_pixels(torch.tensor([[1e6, 0.0, 3.0]]), views)
+    assert nowhere.tolist() == [0.0]
+
+
+def test_no_gaussian_is_smaller_than_its_floor() -> None:
+    scene = tiny_scene()
+    method = HQGS(scene, fixed("lowres:2", smallest=0.5))
+    gaussians = Trainer(scene, tiny_config()).gaussians
+    with torch.no_grad():
+        gaussians.scales[0] = -20.0
+        gaussians.scales[1] = 3.0
+    scales = method.modulate(gaussians).activated_scales()
+    floor = 0.5 * 2 * photo_pixels(gaussians.means, scene.train)  # the photo's pixels are twice as large
+    assert torch.allclose(scales[0].double(), floor[0].expand(3), rtol=1e-5)
+    assert torch.allclose(scales[1], torch.exp(torch.tensor(3.0)).expand(3), rtol=1e-4)

@@ -15,11 +15,13 @@ from hqgs.degradations import Degradation, parse_degradation, small_side
 from hqgs.diagnosis import diagnose_scene
 from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.formation import formation
+from hqgs.gaussians import Gaussians
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
 from hqgs.methods.base import Method, Plain
 from hqgs.methods.paper import PaperConfig, PaperHQGS
 from hqgs.separable import Separable
+from hqgs.smallest import enlarge, photo_pixels
 
 if TYPE_CHECKING:
     from hqgs.config import TrainConfig  # which itself imports the methods
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
+REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,7 @@ class HQGSConfig:
     paper: PaperConfig = field(default_factory=PaperConfig)
     formation: str = AUTO  # what happened to the photos, as `parse_degradation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
+    smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
     gaussians_per_pixel: float = 1 / 3  # of degraded photos, at their true resolution: the most that may grow
 
     def __post_init__(self) -> None:
@@ -44,7 +48,7 @@ class HQGSConfig:
             raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
         if self.formation != AUTO:
             parse_degradation(self.formation)
-        for name in ("jpeg_pixels", "gaussians_per_pixel"):
+        for name in ("jpeg_pixels", "smallest", "gaussians_per_pixel"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
 
@@ -67,6 +71,7 @@ class HQGS(Plain):
     - Noise or JPEG: no D-SSIM. It is normalised by the local contrast, so that it asks for the noise in flat
       parts; L1 averages the noise over the views.
     - None of them: the loss of 3DGS.
+    - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - The fewer pixels the photos have, the fewer Gaussians they determine: growth ends at a share of them.
     """
 
@@ -86,6 +91,9 @@ class HQGS(Plain):
         self._dssim = 0.0 if "noise" in kinds or self._jpeg else LAMBDA_DSSIM
         self._operators: dict[tuple[int, int], Separable | None] = {}
         self._cells: dict[tuple[int, int], JpegCells] = {}
+        self._views = scene.train
+        self._smallest: Tensor | None = None  # [N] world units; None: to be computed
+        self._age = 0  # steps since it was
         self._targets = {view.name: self._target(view) for view in scene.train}
 
     def adapt(self, config: TrainConfig) -> TrainConfig:
@@ -100,7 +108,28 @@ class HQGS(Plain):
     def left_out(self) -> list[tuple[str, str]]:
         return self._left_out
 
+    def modulate(self, gaussians: Gaussians) -> Gaussians:
+        if not self.degradation.steps or not self.config.smallest:
+            return gaussians
+        if self._smallest is None or len(self._smallest) != len(gaussians):
+            pixels = photo_pixels(gaussians.means, self._views) * self._factor
+            self._smallest = (self.config.smallest * pixels).float()
+            self._age = 0
+        return enlarge(gaussians, self._smallest)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        if self._smallest is None:
+            return {}
+        return {"smallest": self._smallest, "age": torch.tensor(self._age)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._smallest = state.get("smallest")
+        self._age = int(state.get("age", 0))
+
     def loss(self, render: Tensor, view: View) -> Tensor:
+        self._age += 1
+        if self._age >= REFRESH:
+            self._smallest = None
         target = self._targets[view.name]
         image = render if target.operator is None else target.operator(render)
         pixels = photometric_loss(image, target.photo, target.mask, self._dssim)

@@ -1,0 +1,45 @@
+"""The smallest Gaussian that photos of a given resolution can show, world units."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hqgs.camera import View
+from hqgs.gaussians import Gaussians
+
+MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
+NEAREST = 0.01  # view-space depth, as the rasterizer's near plane
+
+
+def photo_pixels(means: Tensor, views: list[View]) -> Tensor:
+    """The size of a pixel of the training view that sees each mean best, world units, [N].
+
+    depth / focal length, the smallest over the views that have the mean in their picture (Mip-Splatting, Yu
+    et al. 2024, equation 7). A mean that no view sees gets the median of the others; 0 if none sees any.
+    """
+    best = torch.full((len(means),), torch.inf, dtype=torch.float64)
+    means = means.detach().double()
+    for view in views:
+        camera = view.camera
+        viewmat, K = torch.from_numpy(camera.viewmat), camera.K
+        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
+        seen = (
+            (z > NEAREST)
+            & (x.abs() * K[0, 0] < MARGIN * camera.width / 2 * z)
+            & (y.abs() * K[1, 1] < MARGIN * camera.height / 2 * z)
+        )
+        size = z / max(K[0, 0], K[1, 1])
+        best = torch.where(seen & (size < best), size, best)
+    seen = torch.isfinite(best)
+    best[~seen] = best[seen].median() if seen.any() else 0.0
+    return best
+
+
+def enlarge(gaussians: Gaussians, smallest: Tensor) -> Gaussians:
+    """The Gaussians convolved with round ones of standard deviation `smallest` [N], world units.
+
+    Mip-Splatting's 3D smoothing without its change of the opacities: they are trained with it.
+    """
+    variances = torch.exp(2 * gaussians.scales) + smallest.square()[:, None]
+    return Gaussians(**(gaussians.named() | {"scales": 0.5 * torch.log(variances)}))
