@@ -94,8 +94,11 @@ def test_masked_pixels_have_no_gradient(formation: str) -> None:
 
 def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
     scene = tiny_scene()
-    budget = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed("noise:9", gaussians_per_pixel=0.1)))
-    assert budget.config.densify.max_gaussians == int(0.1 * 5 * 24 * 16)
+    pixels = 5 * 24 * 16
+    for formation, share in {"noise:6": 2, "noise:12": 5, "blur:0.5": 1 + np.pi, "jpeg:10": 1}.items():
+        config = tiny_config(method="hqgs", hqgs=fixed(formation, gaussians_per_pixel=0.2))
+        trainer = Trainer(scene, config)
+        assert trainer.config.densify.max_gaussians == int(0.2 * pixels / share), formation
     least = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed("lowres:4", gaussians_per_pixel=0.1)))
     assert least.config.densify.max_gaussians == len(scene.points)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
+HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -41,7 +43,7 @@ class HQGSConfig:
     formation: str = AUTO  # what happened to the photos, as `parse_degradation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
     smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
-    gaussians_per_pixel: float = 1 / 3  # of degraded photos, at their true resolution: the most that may grow
+    gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
 
     def __post_init__(self) -> None:
         if self.guidance not in GUIDANCES:
@@ -72,7 +74,8 @@ class HQGS(Plain):
       parts; L1 averages the noise over the views.
     - None of them: the loss of 3DGS.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
-    - The fewer pixels the photos have, the fewer Gaussians they determine: growth ends at a share of them.
+    - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
+      Blur and noise make a pixel count less. More Gaussians paint the noise and the ringing of deblurring.
     """
 
     name = "hqgs"
@@ -101,7 +104,7 @@ class HQGS(Plain):
         hqgs = replace(config.hqgs, formation=str(self.degradation))
         budget = config.densify.max_gaussians
         if self.degradation.steps:
-            pixels = sum(t.photo.shape[0] * t.photo.shape[1] for t in self._targets.values())
+            pixels = sum(self._sharp_pixels(target) for target in self._targets.values())
             budget = min(budget, max(int(self.config.gaussians_per_pixel * pixels), self._least))
         return replace(config, hqgs=hqgs, densify=replace(config.densify, max_gaussians=budget))
 
@@ -140,6 +143,22 @@ class HQGS(Plain):
             image = torch.where(target.mask[..., None], image, photo)
         cells = self._cells[target.photo.shape[0], target.photo.shape[1]]
         return cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
+
+    def _sharp_pixels(self, target: Target) -> float:
+        """How many sharp pixels without noise would tell as much as this photo does, roughly.
+
+        A blur of sigma px spreads a point over 4 pi sigma^2 pixels. Noise of s levels asks for the mean of
+        (s / HALVING)^2 more pixels until it is below what one pixel may be off.
+        """
+        height, width = target.photo.shape[:2]
+        share = 1.0
+        for step in self.degradation.for_width(width * self._factor).steps:
+            value = step.value or 0.0
+            if step.kind == "blur":
+                share += 4 * math.pi * (value / self._factor) ** 2
+            elif step.kind == "noise":
+                share += (value / HALVING) ** 2
+        return height * width / share
 
     def _diagnose(self, scene: Scene) -> Degradation:
         diagnosis = diagnose_scene(scene)
