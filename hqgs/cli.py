@@ -10,7 +10,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import hqgs
@@ -22,6 +22,8 @@ from hqgs.data import load_scene
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import check_new_folder, degrade_scene, write_degraded_scene
 from hqgs.densify import DensifyConfig
+from hqgs.diagnosis import diagnose_scene, format_diagnosis
+from hqgs.files import write_json
 from hqgs.methods import METHODS
 from hqgs.methods.hqgs import AUTO, GUIDANCES, HQGSConfig
 from hqgs.report import RunResult
@@ -96,16 +98,26 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene(degrade, "folder for the new scene; missing or empty", config.seed)
     degrade.add_argument("--kind", required=True, help=KINDS_HELP)
 
+    diagnose = commands.add_parser("diagnose", help="say what degraded a scene's training photos")
+    diagnose.set_defaults(run=_diagnose)
+    _add_photos(diagnose)
+    diagnose.add_argument("--out", type=Path, metavar="FILE", help="also write the diagnosis as JSON")
+
     add_bench_parser(commands)
     return parser
 
 
 def _add_scene(parser: argparse.ArgumentParser, out: str, seed: int) -> None:
-    """What every command takes."""
+    """What every command takes that writes a folder."""
+    _add_photos(parser)
     add = parser.add_argument
-    add("scene", metavar="SCENE", help=f"scene folder, or {EMBEDDED!r} for the scene that is built in")
     add("--out", type=Path, required=True, metavar="DIR", help=out)
     add("--seed", type=int, default=seed, metavar="S", help="of everything random (%(default)s)")
+
+
+def _add_photos(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help=f"scene folder, or {EMBEDDED!r} for the scene that is built in")
     add(
         "--downscale",
         type=float,
@@ -157,6 +169,19 @@ def _degrade(args: argparse.Namespace) -> int:
     except OSError as error:
         return _fail(1, f"{args.out}: {error}")
     print(f"{args.out}: {len(scene.train)} training photos with {degradation}, {len(scene.test)} held out")
+    return 0
+
+
+def _diagnose(args: argparse.Namespace) -> int:
+    try:
+        diagnosis = diagnose_scene(_scene(args, cache=None))
+        if args.out is not None:
+            write_json(args.out, asdict(diagnosis))
+    except BAD_INPUT as error:
+        return _fail(2, str(error))
+    except OSError as error:
+        return _fail(1, f"{args.out}: {error}")
+    print(format_diagnosis(diagnosis))
     return 0
 
 

@@ -97,6 +97,40 @@ def test_degrade_writes_a_scene_that_trains(
     assert one_line(capsys) == f"hqgs: {bad} exists and is not an empty folder"
 
 
+def test_diagnose_prints_and_writes_what_it_found(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "diagnosis.json"
+    assert call("diagnose", "embedded", "--downscale", "2", "--out", out) == 0
+    assert asked == [{"cache": None, "width": 252, "height": 189}]
+    printed, written = capsys.readouterr().out, json.loads(out.read_text())
+    assert len(written["photos"]) == 5
+    assert [part["name"] for part in written["parts"]] == ["blur", "lowres", "noise", "jpeg"]
+    assert all(view["name"] in printed for view in written["photos"])
+    assert f": {written['formation']}\n" in printed
+    assert call("diagnose", "/no/such/scene") == 2
+    assert one_line(capsys).startswith("hqgs: there is no scene folder")
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--formation", "fog", "hqgs: unknown degradation 'fog'"),
+        ("--restore", "/no/such/weights.pth", "hqgs: "),
+    ],
+)
+def test_bad_settings_of_hqgs_are_exit_code_2(
+    option: str,
+    value: str,
+    message: str,
+    asked: list[dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert call("train", "embedded", "--out", tmp_path / "out", "--method", "hqgs", option, value) == 2
+    assert one_line(capsys).startswith(message)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
