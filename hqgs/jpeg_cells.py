@@ -75,21 +75,20 @@ class JpegCells:
         c = self.coefficients(photo)
         return Coefficients(_nearest(c.luma, self._luma_steps), _nearest(c.chroma, self._chroma_steps))
 
-    def loss(self, image: Tensor, centres: Coefficients, slack: float = 0.0) -> Tensor:
+    def loss(self, image: Tensor, centres: Coefficients) -> Tensor:
         """Mean distance to the cells per colour value, a scalar; 0 where the file could be this picture's.
 
         Args:
             image: [H, W, 3], white at 1.
             centres: of the photo.
-            slack: widens the cells to both sides, for noise that was there before the codec; white is 1.
         """
         c = self.coefficients(image)
-        outside = _outside(c.luma, centres.luma, self._luma_steps, slack)
-        return (outside + _outside(c.chroma, centres.chroma, self._chroma_steps, slack)) / (3 * self._pixels)
+        outside = _outside(c.luma, centres.luma, self._luma_steps)
+        return (outside + _outside(c.chroma, centres.chroma, self._chroma_steps)) / (3 * self._pixels)
 
 
-def _outside(c: Tensor, centre: Tensor, steps: Tensor, slack: float) -> Tensor:
-    return torch.relu((c - centre).abs() - (steps / 2 + slack)).sum()
+def _outside(c: Tensor, centre: Tensor, steps: Tensor) -> Tensor:
+    return torch.relu((c - centre).abs() - steps / 2).sum()
 
 
 def _nearest(c: Tensor, steps: Tensor) -> Tensor:
