@@ -32,6 +32,7 @@ def project_forward(
     height: int,
     options: tuple[float, float, float, float, bool],
     sh_degree: int | None,
+    knobs: tuple[float, float, str, bool, int] | None = None,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
 def project_backward(
     frame: Frame,

@@ -32,6 +32,7 @@ class TrainConfig:
     lr_sh0: float = 2.5e-3
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
     adam_eps: float = 1e-15
+    selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB
     eval_every: int = 3_000  # iterations between evaluations on the held-out views
     checkpoint_every: int = 1_000  # iterations; does not change the result

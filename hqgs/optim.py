@@ -54,7 +54,8 @@ class Adam(torch.optim.Optimizer):
         Args:
             closure: evaluated first, with gradients enabled; its value is returned.
             visible: bool [N] for parameters [N, ...]: rows where it is False are left as they are, moments
-                included (the selective Adam of Taming 3DGS, Mallick et al. 2024). None: all rows.
+                included (the selective Adam of Taming 3DGS, Mallick et al. 2024). None: all rows. Groups with
+                `every_row` take no notice of it.
         """
         loss = None
         if closure is not None:
@@ -66,9 +67,10 @@ class Adam(torch.optim.Optimizer):
         for group in self.param_groups:
             if asked := [name for name in UNSUPPORTED if group.get(name)]:
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
+            chosen = None if group.get("every_row") else rows
             for param in group["params"]:
                 if param.grad is not None:
-                    self._update(param, param.grad, group, rows)
+                    self._update(param, param.grad, group, chosen)
         return loss
 
     def _update(

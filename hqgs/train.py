@@ -80,7 +80,9 @@ class Trainer:
                     self.densifier.observe(
                         means2d.grad[0], meta["radii"][0], view.camera.width, view.camera.height
                     )
-                self.optimizer.step()
+                # Methods' own tensors have no row for each Gaussian: all of them are updated.
+                visible = (meta["radii"][0] > 0).all(dim=1) if config.selective_adam else None
+                self.optimizer.step(visible=visible)
             self.densifier.update(self.iteration, self.gaussians, self.optimizer)
 
         if not len(self.gaussians):
@@ -159,7 +161,8 @@ class Trainer:
             {"name": name, "params": [tensor.requires_grad_()], "lr": getattr(config, f"lr_{name}")}
             for name, tensor in self.gaussians.named().items()
         ]
-        return Adam(groups + self.method.param_groups(), lr=0.0, eps=config.adam_eps)
+        own = [group | {"every_row": True} for group in self.method.param_groups()]
+        return Adam(groups + own, lr=0.0, eps=config.adam_eps)
 
     def _set_learning_rate(self) -> None:
         """Exponential decay of the means' rate over the run; the others are constant."""

@@ -8,6 +8,7 @@ use crate::{
     project::{Projection, Splat},
     real::{Lanes, Real},
     tiles::{Chunk, Tiles},
+    tuning::EXP2_DEGREE,
 };
 use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
@@ -53,6 +54,8 @@ impl<T: Real> CompositeInput<'_, T> {
             colors: &list.colors,
             background: self.background,
             channels: self.channels(),
+            floor: T::from_f64(self.projection.tuning.alpha_min),
+            least: T::from_f64(self.projection.tuning.transmittance_min),
         }
     }
 
@@ -119,14 +122,28 @@ macro_rules! for_channels {
     };
 }
 
+/// The same for a function that evaluates alpha: with three channels in f32 also for the degree of 2^x.
+macro_rules! for_alpha {
+    ($channels:expr, $degree:expr, $function:ident, $simd:expr, $T:ty, ($($argument:expr),*)) => {
+        match ($channels, if <$T>::SINGLE { $degree } else { EXP2_DEGREE }) {
+            (3, 3) => $function::<_, $T, 3, 3>($simd, $($argument),*),
+            (3, 4) => $function::<_, $T, 3, 4>($simd, $($argument),*),
+            (3, 5) => $function::<_, $T, 3, 5>($simd, $($argument),*),
+            (3, _) => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
+            (4, _) => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
+            _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
+        }
+    };
+}
+
 /// Call a kernel for the number of vectors that a block has on this machine.
 macro_rules! for_vectors {
-    ($simd:ident: $S:ty, $T:ty, $D:ident, $function:ident($($argument:expr),*)) => {
+    ($simd:ident: $S:ty, $T:ty, $D:ident, $E:ident, $function:ident($($argument:expr),*)) => {
         match BLOCK_PIXELS / <Lanes<$T, $S> as SimdBase<$S>>::LEN {
-            1 => kernel::$function::<$S, $T, $D, 1>($simd, $($argument),*),
-            2 => kernel::$function::<$S, $T, $D, 2>($simd, $($argument),*),
-            4 => kernel::$function::<$S, $T, $D, 4>($simd, $($argument),*),
-            8 => kernel::$function::<$S, $T, $D, 8>($simd, $($argument),*),
+            1 => kernel::$function::<$S, $T, $D, $E, 1>($simd, $($argument),*),
+            2 => kernel::$function::<$S, $T, $D, $E, 2>($simd, $($argument),*),
+            4 => kernel::$function::<$S, $T, $D, $E, 4>($simd, $($argument),*),
+            8 => kernel::$function::<$S, $T, $D, $E, 8>($simd, $($argument),*),
             _ => unreachable!("vectors have 2 to 16 lanes"),
         }
     };
@@ -151,14 +168,15 @@ pub fn forward<T: Real>(
     let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * channels];
     let grid = Grid::new();
     let level = Level::new();
+    let degree = input.projection.tuning.exp2_degree;
     let work = depths
         .par_iter_mut()
         .zip(transmittance.par_chunks_mut(TILE_PIXELS))
         .zip(colors.par_chunks_mut(channels))
         .enumerate()
         .map(|(tile, ((depths, transmittance), colors))| {
-            dispatch!(level, simd => for_channels!(
-                channels, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
+            dispatch!(level, simd => for_alpha!(
+                channels, degree, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
             ))
         })
         .reduce(Work::default, Work::plus);
@@ -196,7 +214,7 @@ pub fn forward<T: Real>(
 }
 
 #[inline(always)]
-fn forward_tile<S: Simd, T: Real, const D: usize>(
+fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
@@ -217,7 +235,7 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
         let layers = input.layers(tile, block);
-        let blended = for_vectors!(simd: S, T, D, blend(grid, block, layers, pixels, colors));
+        let blended = for_vectors!(simd: S, T, D, E, blend(grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
         work.blocks += blended.layers as u64;
         work.hit_blocks += blended.changed;
@@ -289,6 +307,7 @@ pub fn backward<T: Real>(
     let columns = Columns { absolute, channels };
     let grid = Grid::new();
     let level = Level::new();
+    let degree = input.projection.tuning.exp2_degree;
     let pair_grads: Vec<_> = (0..tiles.lists.len())
         .into_par_iter()
         .map_init(
@@ -297,8 +316,8 @@ pub fn backward<T: Real>(
                 layers: Vec::new(),
             },
             |scratch, tile| {
-                dispatch!(level, simd => for_channels!(
-                    channels, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch)
+                dispatch!(level, simd => for_alpha!(
+                    channels, degree, backward_tile, simd, T, (input, composited, v, &grid, tile, columns, scratch)
                 ))
             },
         )
@@ -329,7 +348,7 @@ struct Scratch<T> {
 
 /// Gradients of a tile's pairs, by index; empty if all are zero.
 #[inline(always)]
-fn backward_tile<S: Simd, T: Real, const D: usize>(
+fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     simd: S,
     input: &CompositeInput<T>,
     composited: &Composited<T>,
@@ -392,7 +411,7 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
             v_colors: &scratch.v_colors,
         };
         let out = &mut scratch.layers[sum * LAYER..(sum + depth) * LAYER];
-        for_vectors!(simd: S, T, D, unblend(grid, block, layers, &adjoint, out));
+        for_vectors!(simd: S, T, D, E, unblend(grid, block, layers, &adjoint, out));
         next[block] = sum;
         sum += depth;
         ends[block] = sum;

@@ -6,10 +6,7 @@
 //! transmittance 0.
 
 use crate::{
-    constants::{
-        ALPHA_MAX, ALPHA_MIN, BLOCK, BLOCK_PIXELS, BLOCKS_PER_SIDE, TILE, TILE_BLOCKS, TILE_PIXELS,
-        TRANSMITTANCE_MIN,
-    },
+    constants::{ALPHA_MAX, BLOCK, BLOCK_PIXELS, BLOCKS_PER_SIDE, TILE, TILE_BLOCKS, TILE_PIXELS},
     project::Splat,
     real::{Lanes, Real},
 };
@@ -189,6 +186,15 @@ pub(crate) fn reached<S: Simd>(
     }
 }
 
+/// The result of `reached` if every Gaussian reached every block.
+pub(crate) fn all_blocks(count: usize, masks: &mut Vec<u16>, lists: &mut [Vec<u32>; TILE_BLOCKS]) {
+    masks.resize(count, u16::MAX);
+    for list in lists.iter_mut() {
+        list.clear();
+        list.extend(0..count as u32);
+    }
+}
+
 /// `Local` in vectors.
 struct Wide<S: Simd, T: Real> {
     u0: Lanes<T, S>,
@@ -222,12 +228,13 @@ impl<S: Simd, T: Real> Wide<S, T> {
         )
     }
 
-    /// alpha at the pixels (x, y): the one function that both passes use.
+    /// alpha at the pixels (x, y): the one function that both passes use. E: degree of the power of 2.
     #[inline(always)]
-    fn alpha(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
+    fn alpha<const E: usize>(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
         let (u, v) = self.position(x, y);
         let power = u.mul_add(u, v * v);
-        let alpha = self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
+        let alpha =
+            self.opacity * T::exp2::<S, E>(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
         alpha.min(Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX)))
     }
 }
@@ -262,6 +269,10 @@ pub(crate) struct Layers<'a, T> {
     /// Colour behind the last layer.
     pub background: Option<&'a [T]>,
     pub channels: usize,
+    /// Smallest alpha that is blended.
+    pub floor: T,
+    /// Transmittance at which a pixel is finished.
+    pub least: T,
 }
 
 /// Counts of one block.
@@ -281,7 +292,7 @@ const STRIDE: usize = 4;
 /// Blend the layers over one block (V vectors). `transmittance` is 1 inside the image and 0 outside before,
 /// and what the last layer leaves after. The colours go to `colors[channel]`, block by block.
 #[inline(always)]
-pub(crate) fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
+pub(crate) fn blend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -296,12 +307,8 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
         load::<S, T, V>(simd, &grid.x[at..]),
         load::<S, T, V>(simd, &grid.y[at..]),
     );
-    let floor = splat(T::from_f64(ALPHA_MIN));
-    let (least, one, zero) = (
-        splat(T::from_f64(TRANSMITTANCE_MIN)),
-        splat(T::ONE),
-        splat(T::ZERO),
-    );
+    let floor = splat(layers.floor);
+    let (least, one, zero) = (splat(layers.least), splat(T::ONE), splat(T::ZERO));
     // What the last layer leaves, and the same with 0 where the pixel is finished.
     let mut after = load::<S, T, V>(simd, transmittance);
     let mut open = after;
@@ -314,7 +321,7 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
             let rgb = &layers.colors[k * channels..(k + 1) * channels];
             let mut changed = 0;
             for j in 0..V {
-                let alpha = wide.alpha(simd, x[j], y[j]);
+                let alpha = wide.alpha::<E>(simd, x[j], y[j]);
                 let opaque = alpha.simd_ge(floor);
                 let next = open[j] * (one - alpha);
                 let blended = opaque & next.simd_gt(least);
@@ -391,7 +398,7 @@ pub(crate) struct Adjoint<'a, T> {
 /// a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however deep
 /// the layer.
 #[inline(always)]
-pub(crate) fn unblend<S: Simd, T: Real, const D: usize, const V: usize>(
+pub(crate) fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -406,18 +413,14 @@ pub(crate) fn unblend<S: Simd, T: Real, const D: usize, const V: usize>(
         load::<S, T, V>(simd, &grid.x[at..]),
         load::<S, T, V>(simd, &grid.y[at..]),
     );
-    let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(T::from_f64(ALPHA_MIN)));
-    let (least, one, zero) = (
-        splat(T::from_f64(TRANSMITTANCE_MIN)),
-        splat(T::ONE),
-        splat(T::ZERO),
-    );
+    let (cap, floor) = (splat(T::from_f64(ALPHA_MAX)), splat(layers.floor));
+    let (least, one, zero) = (splat(layers.least), splat(T::ONE), splat(T::ZERO));
     let mut open = load::<S, T, V>(simd, adjoint.transmittance);
     for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)) {
         let wide = Wide::<S, T>::new(simd, &layers.records[k as usize]);
         let (mut before, mut alphas) = (open, [zero; V]);
         for j in 0..V {
-            let alpha = wide.alpha(simd, x[j], y[j]);
+            let alpha = wide.alpha::<E>(simd, x[j], y[j]);
             let opaque = alpha.simd_ge(floor);
             let next = open[j] * (one - alpha);
             let blended = opaque & next.simd_gt(least);

@@ -27,5 +27,6 @@ pub mod sh;
 pub mod synthetic;
 pub mod threads;
 pub mod tiles;
+pub mod tuning;
 
 pub use error::Error;

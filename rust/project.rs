@@ -3,14 +3,13 @@
 use crate::{
     camera::{Camera, CameraGrad},
     columns::{self, Column, GROUP, MAX_COLUMNS, Rows, get3, wide3},
-    constants::{
-        ALPHA_MIN, EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE,
-    },
+    constants::{EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE},
     geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry, GeometryGrad},
     lanes::{V3, Wide, lanes, ln, splat as splat_lanes, splat3},
     real::{Lanes, Real},
     scene::{Colors, Gaussians, Harmonics},
     sh,
+    tuning::{Spans, Tuning},
 };
 use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdMask, dispatch};
 use rayon::prelude::*;
@@ -28,6 +27,8 @@ pub struct ProjectOptions {
     pub eps2d: f64,
     /// Scale the opacity so that the low-pass does not brighten small Gaussians.
     pub antialiased: bool,
+    /// What trades accuracy for time, in this and the later stages.
+    pub tuning: Tuning,
 }
 
 impl Default for ProjectOptions {
@@ -38,6 +39,7 @@ impl Default for ProjectOptions {
             radius_clip: 0.0,
             eps2d: EPS2D,
             antialiased: false,
+            tuning: Tuning::default(),
         }
     }
 }
@@ -72,6 +74,8 @@ pub struct Projection {
     pub splats: Vec<Splat>,
     /// View-space depth, [N]; 0 where culled.
     pub depths: Vec<f64>,
+    /// That of the options.
+    pub tuning: Tuning,
 }
 
 /// Arrays that the projection fills; zeros where a Gaussian is culled.
@@ -244,8 +248,9 @@ impl Group {
         let mean = g.mean2d(camera_lanes);
         let sigma = g.sigma();
         let conic = g.conic();
-        let opaque = opacity.simd_ge(splat_lanes(simd, ALPHA_MIN)) & opacity.simd_lt(infinity);
-        let radius = (ln(simd, opacity * (1.0 / ALPHA_MIN)).max(zero) * 2.0).sqrt();
+        let floor = o.tuning.alpha_min;
+        let opaque = opacity.simd_ge(splat_lanes(simd, floor)) & opacity.simd_lt(infinity);
+        let radius = (ln(simd, opacity * (1.0 / floor)).max(zero) * 2.0).sqrt();
         let [s, m, t] = g.factors;
         let stiffness = s * (m.abs() + 1.0) + t;
         let reach = radius + (stiffness + 1.0) * SUPPORT_SLACK;
@@ -259,7 +264,10 @@ impl Group {
                 & (mean[k] - radii).simd_lt(splat_lanes(simd, size[k]));
             largest = largest.max(radii);
             // Tiles whose pixel centres lie within `mean +- extent`, clipped to the image.
-            let extent = reach * sigma[k];
+            let extent = match o.tuning.spans {
+                Spans::Square => g.largest_sigma() * 3.0,
+                Spans::Ellipse | Spans::Box => reach * sigma[k],
+            };
             let first = (mean[k] - extent - 0.5).ceil().max(zero);
             let last = (mean[k] + extent - 0.5)
                 .floor()
@@ -324,6 +332,7 @@ pub fn forward<T: Real>(
         projection.splats = rayon::iter::repeat_n(Splat::default(), n).collect();
     }
     projection.depths.resize(n, 0.0);
+    projection.tuning = options.tuning;
     let color_channels = if matches!(colors, Colors::Harmonics(_)) {
         3
     } else {

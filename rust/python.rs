@@ -12,6 +12,7 @@ use crate::{
     scene::{Colors, Gaussians, Harmonics},
     threads,
     tiles::{self, Tiles},
+    tuning::{Spans, Tuning},
 };
 use numpy::{
     Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
@@ -220,9 +221,37 @@ fn cameras(
         .collect()
 }
 
+/// alpha_min, transmittance_min, spans, skip_blocks, exp2_degree
+type Knobs<'a> = (f64, f64, &'a str, bool, usize);
+
+fn tuning(knobs: Option<Knobs>) -> Result<Tuning, Error> {
+    let Some((alpha_min, transmittance_min, spans, skip_blocks, exp2_degree)) = knobs else {
+        return Ok(Tuning::default());
+    };
+    let spans = match spans {
+        "ellipse" => Spans::Ellipse,
+        "box" => Spans::Box,
+        "square" => Spans::Square,
+        _ => {
+            let message = format!("must be ellipse, box or square, got {spans}");
+            return Err(Error::new("spans", message));
+        }
+    };
+    let tuning = Tuning {
+        alpha_min,
+        transmittance_min,
+        spans,
+        skip_blocks,
+        exp2_degree,
+    };
+    tuning.check()?;
+    Ok(tuning)
+}
+
 /// Project Gaussians; see `hqgs/rasterize.py` for the shapes. `colors` are harmonics if there is a degree.
+/// `knobs`, which also hold for the later stages, are for the benchmark of error against run time alone.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree))]
+#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, knobs=None))]
 fn project_forward<'py>(
     means: &Bound<'py, PyAny>,
     quats: &Bound<'py, PyAny>,
@@ -236,7 +265,17 @@ fn project_forward<'py>(
     height: usize,
     options: (f64, f64, f64, f64, bool),
     sh_degree: Option<usize>,
+    knobs: Option<Knobs>,
 ) -> PyResult<Bound<'py, PyAny>> {
+    let (near_plane, far_plane, radius_clip, eps2d, antialiased) = options;
+    let options = ProjectOptions {
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        antialiased,
+        tuning: tuning(knobs)?,
+    };
     by_dtype!(
         means,
         project_as(
@@ -267,7 +306,7 @@ fn project_as<'py, T: Scalar>(
     ks: &Bound<'py, PyAny>,
     width: usize,
     height: usize,
-    options: (f64, f64, f64, f64, bool),
+    options: ProjectOptions,
     sh_degree: Option<usize>,
 ) -> PyResult<Projected<'py, T>> {
     let py = means.py();
@@ -277,14 +316,6 @@ fn project_as<'py, T: Scalar>(
         Array::<f64>::new("Ks", ks)?,
     );
     let cameras = cameras(viewmats.slice()?, ks.slice()?, width, height)?;
-    let (near_plane, far_plane, radius_clip, eps2d, antialiased) = options;
-    let options = ProjectOptions {
-        near_plane,
-        far_plane,
-        radius_clip,
-        eps2d,
-        antialiased,
-    };
     let gaussians = arrays.gaussians()?;
     let harmonics = arrays.harmonics(sh_degree)?;
     let (channel_data, channels) = match harmonics {

@@ -174,7 +174,11 @@ pub fn backward<T: Real>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{constants::ALPHA_MIN, synthetic::Synthetic};
+    use crate::{
+        constants::ALPHA_MIN,
+        synthetic::Synthetic,
+        tuning::{Spans, Tuning},
+    };
     use rayon::ThreadPoolBuilder;
 
     fn harmonics<T: Real>(s: &Synthetic<T>) -> Harmonics<'_, T> {
@@ -292,6 +296,108 @@ mod tests {
                     "seed {seed}, value {i}: {a} instead of {b}"
                 );
             }
+        }
+    }
+
+    fn tuned(s: &Synthetic<f32>, tuning: Tuning) -> (Rendered<f32>, Gradients<f32>) {
+        let options = ProjectOptions {
+            tuning,
+            ..ProjectOptions::default()
+        };
+        let (g, h) = (s.gaussians(), harmonics(s));
+        let r = forward(&g, &h, &s.camera, &options).unwrap();
+        let v = backward(&g, &h, &s.camera, &options, &r, &cotangent(s)).unwrap();
+        (r, v)
+    }
+
+    #[test]
+    fn what_is_skipped_changes_no_bit() {
+        let s = Synthetic::<f32>::new(2000, 150, 97, 5).unwrap();
+        let (r, g) = tuned(&s, Tuning::default());
+        for (spans, skip_blocks) in [
+            (Spans::Ellipse, false),
+            (Spans::Box, true),
+            (Spans::Box, false),
+        ] {
+            let tuning = Tuning {
+                spans,
+                skip_blocks,
+                ..Tuning::default()
+            };
+            let (other, v) = tuned(&s, tuning);
+            assert!(r.image == other.image && g == v, "{tuning:?}");
+            let pairs = other.tiles.pairs();
+            assert_eq!(pairs > r.tiles.pairs(), spans == Spans::Box, "{tuning:?}");
+        }
+    }
+
+    #[test]
+    fn looser_knobs_have_larger_errors() {
+        let s = Synthetic::<f32>::new(2000, 150, 97, 6).unwrap();
+        let exact = Tuning {
+            alpha_min: 1e-9,
+            transmittance_min: 0.0,
+            ..Tuning::default()
+        };
+        let (r, _) = tuned(&s, exact);
+        let error = |tuning| -> f64 {
+            let (other, _) = tuned(&s, tuning);
+            let pairs = r.image.iter().zip(&other.image);
+            pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum()
+        };
+        let floor = |alpha_min| error(Tuning { alpha_min, ..exact });
+        let stop = |transmittance_min| {
+            error(Tuning {
+                transmittance_min,
+                ..exact
+            })
+        };
+        let degree = |exp2_degree| {
+            error(Tuning {
+                exp2_degree,
+                ..exact
+            })
+        };
+        assert!(0.0 < floor(1e-4) && floor(1e-4) < floor(4e-3) && floor(4e-3) < floor(0.03));
+        assert!(0.0 < stop(1e-4) && stop(1e-4) < stop(1e-3) && stop(1e-3) < stop(1e-2));
+        assert!(0.0 < degree(5) && degree(5) < degree(4) && degree(4) < degree(3));
+    }
+
+    #[test]
+    fn knobs_out_of_range_are_named() {
+        let d = Tuning::default();
+        assert!(d.check().is_ok());
+        for (name, tuning) in [
+            (
+                "alpha_min",
+                Tuning {
+                    alpha_min: 0.0,
+                    ..d
+                },
+            ),
+            (
+                "alpha_min",
+                Tuning {
+                    alpha_min: f64::NAN,
+                    ..d
+                },
+            ),
+            (
+                "transmittance_min",
+                Tuning {
+                    transmittance_min: 1.0,
+                    ..d
+                },
+            ),
+            (
+                "exp2_degree",
+                Tuning {
+                    exp2_degree: 7,
+                    ..d
+                },
+            ),
+        ] {
+            assert_eq!(tuning.check().unwrap_err().name, name);
         }
     }
 

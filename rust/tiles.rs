@@ -12,6 +12,7 @@ use crate::{
     kernel::{self, Local, Shapes},
     project::{Projection, Splat},
     real::Real,
+    tuning::Spans,
 };
 use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
@@ -128,13 +129,14 @@ impl<T> Tiles<T> {
 }
 
 /// Call `f(tile row, first tile column, end tile column)` for the tiles that the support reaches: exactly
-/// those rows of tiles whose band of pixel centres meets the ellipse, each with the ellipse's extent in it.
+/// those rows of tiles whose band of pixel centres meets the ellipse, each with the ellipse's extent in it; or
+/// without `exact` for all tiles of the splat's box.
 ///
 /// Counting and filling both go through here, so that they cannot disagree.
 #[inline(always)]
-pub fn tile_spans(splat: &Splat, mut f: impl FnMut(usize, usize, usize)) {
+pub fn tile_spans(splat: &Splat, exact: bool, mut f: impl FnMut(usize, usize, usize)) {
     let [x0, x1, y0, y1] = splat.tiles.map(usize::from);
-    if x1 - x0 <= 1 || y1 - y0 <= 1 {
+    if !exact || x1 - x0 <= 1 || y1 - y0 <= 1 {
         (y0..y1).for_each(|y| f(y, x0, x1));
         return;
     }
@@ -252,10 +254,11 @@ impl<T: Real> Source<'_, T> {
     fn chunk<S: Simd>(&self, _: S, range: Range<usize>) -> (Chunk, Pairs<T>) {
         let mut spans = Vec::with_capacity(range.len());
         let mut counts = vec![0u32; self.columns * self.rows];
+        let exact = self.projection.tuning.spans == Spans::Ellipse;
         for i in range.clone() {
             let splat = &self.projection.splats[i];
             if splat.visible() {
-                tile_spans(splat, |row, x0, x1| {
+                tile_spans(splat, exact, |row, x0, x1| {
                     let span = Span {
                         gaussian: i as u32,
                         row: row as u16,
@@ -418,7 +421,11 @@ fn list<S: Simd, T: Real>(
         shapes.set(k, &records[place]);
         list.records.push(records[place]);
     }
-    kernel::reached(simd, shapes, n, &mut list.masks, reached);
+    if projection.tuning.skip_blocks {
+        kernel::reached(simd, shapes, n, &mut list.masks, reached);
+    } else {
+        kernel::all_blocks(n, &mut list.masks, reached);
+    }
     list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
     for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
         list.blocks.extend_from_slice(records);

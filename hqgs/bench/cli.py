@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import hqgs
-from hqgs.bench import speed
+from hqgs.bench import accuracy, speed, training
 from hqgs.bench.output import Benchmark, command_line, write_results
 
-BENCHMARKS: dict[str, Benchmark] = {"speed": speed.BENCHMARK}
+BENCHMARKS: dict[str, Benchmark] = {
+    "accuracy": accuracy.BENCHMARK,
+    "speed": speed.BENCHMARK,
+    "training": training.BENCHMARK,
+}
 
 
 def add_parser(commands: argparse._SubParsersAction[Any]) -> None:

@@ -30,28 +30,31 @@ CRATE = [(_rust, name, stage) for name, stage in STAGES.items()]
 
 class RasterPass:
     """`hqgs.rasterization` with harmonics of degree 3 and its backward pass, timed; all gradients but the
-    camera's. Works the same way on another `device` with another implementation of the function."""
+    camera's. Works the same way on another `device` with another implementation of the function, and with
+    the same numbers in another `dtype`."""
 
     def __init__(
         self,
         inputs: RasterInputs,
         rasterize: Callable[..., Any] = hqgs.rasterization,
         device: str = "cpu",
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         names = ("means", "quats", "scales", "opacities", "sh")
-        self.leaves = [torch.from_numpy(getattr(inputs, n)).to(device).requires_grad_() for n in names]
+        self.leaves = [torch.from_numpy(getattr(inputs, n)).to(device, dtype).requires_grad_() for n in names]
         viewmat, K = (torch.from_numpy(m[None]).float().to(device) for m in (inputs.viewmat, inputs.K))
         self.view = (viewmat, K, inputs.width, inputs.height)
-        self.background = torch.from_numpy(inputs.background[None]).to(device)
-        self.v_image = torch.from_numpy(inputs.v_image[None]).to(device)
+        self.background = torch.from_numpy(inputs.background[None]).to(device, dtype)
+        self.v_image = torch.from_numpy(inputs.v_image[None]).to(device, dtype)
         self.rasterize = rasterize
         self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change
 
-    def run(self) -> None:
-        """One pass; the gradients are in the leaves."""
+    def run(self) -> torch.Tensor:
+        """One pass; returns the image [1, H, W, 3], the gradients are in the leaves."""
         image, _, meta = self.rasterize(*self.leaves, *self.view, sh_degree=3, backgrounds=self.background)
         image.backward(self.v_image)
         self.work = meta.get("work", self.work)
+        return image.detach()
 
     def __call__(self) -> Seconds:
         clock, bins = StageClock(), list[float]()

@@ -1,0 +1,244 @@
+"""`hqgs bench accuracy` at tiny sizes, and the knobs behind it against the independent float64 renderer."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import reference
+import torch
+from PIL import Image
+from reference import reference_rasterization
+from scenes import random_scene
+
+import hqgs
+from hqgs import _rust
+from hqgs.bench import cli
+from hqgs.bench.accuracy import beats
+from hqgs.bench.errors import errors_against, pareto_front
+from hqgs.bench.inputs import make_inputs
+from hqgs.bench.knobs import CASES, EXACT, Knobs, TunedPass
+from hqgs.bench.rasterizer import RasterPass
+
+DEFAULT = (1 / 255, 0.999e-4, "ellipse", True, 6)
+
+
+def call(*arguments: str | Path) -> int:
+    parser = argparse.ArgumentParser()
+    cli.add_parser(parser.add_subparsers(required=True))
+    args = parser.parse_args(["bench", "accuracy", *map(str, arguments)])
+    return args.run(args)
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    out = tmp_path_factory.mktemp("bench")
+    before = hqgs.get_num_threads()
+    hqgs.set_num_threads(2)
+    try:
+        assert call("--quick", "--out", out, "--seed", "5") == 0
+        assert hqgs.get_num_threads() == 2
+    finally:
+        hqgs.set_num_threads(before)
+    for picture in ("accuracy_cloud_of_500.png", "accuracy_built-in_scene_trained.png"):
+        with Image.open(out / picture) as chart:
+            assert len(np.unique(np.asarray(chart.convert("RGB")).reshape(-1, 3), axis=0)) > 10
+    return json.loads((out / "accuracy.json").read_text(encoding="utf-8"))
+
+
+def rows_of(result: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    return {(row["knob"], row["value"]): row for row in result["rows"]}
+
+
+def rms(row: dict[str, Any], oracle: str) -> float:
+    return row["errors"][oracle]["image"]["rms"]
+
+
+def gradient(row: dict[str, Any], oracle: str, name: str = "all") -> float:
+    return row["errors"][oracle]["gradients"][name]["relative"]
+
+
+def test_the_file_says_where_it_comes_from(quick: dict[str, Any]) -> None:
+    assert quick["benchmark"] == "accuracy"
+    assert quick["command"] == "python -m hqgs bench accuracy --quick --seed 5"
+    assert datetime.fromisoformat(quick["date"]).utcoffset() is not None
+    assert quick["commit"] == quick["versions"]["git_commit"]
+    assert quick["machine"]["cores"] >= 1
+    assert [entry["what"] for entry in quick["left_out"]] == ["tile size"]
+    assert [r["inputs"] for r in quick["results"]["inputs"]] == ["cloud of 500", "built-in scene, trained"]
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_errors_are_ordered_as_their_causes(quick: dict[str, Any], k: int) -> None:
+    result = quick["results"]["inputs"][k]
+    rows = rows_of(result)
+    assert len(rows) == len(result["rows"]) == len(CASES)
+    default = rows["default", ""]
+    for measure in (rms, gradient):
+        # against the definition: float64 is it, float32 rounds
+        assert measure(rows["dtype", "float64"], "defined") == 0 < measure(default, "defined") < 1e-4
+        # against the exact result: the looser, the larger
+        floors = [rows["cutoffs", "none"], *(rows["alpha floor", f"1/{n}"] for n in (1024, 128, 64))]
+        floors.insert(2, default)
+        found = [measure(row, "exact") for row in floors]
+        assert found == sorted(found)
+        assert 0 < found[0] < 0.01 * found[1]
+        assert found[-1] > 2 * found[2]
+        # against the definition: the polynomials
+        degrees = [measure(rows["degree of 2^x", d], "defined") for d in "543"]
+        assert degrees[0] < degrees[2]
+        assert measure(rows["cutoffs", "none, float64"], "exact") == 0
+    stops = [rms(rows["transmittance stop", stop], "exact") for stop in ("1e-5", "1e-3", "1e-2")]
+    assert stops[0] <= rms(default, "exact") * (1 + 1e-4)
+    assert stops[0] < stops[2]
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_what_only_does_more_work_has_the_same_error(quick: dict[str, Any], k: int) -> None:
+    rows = rows_of(quick["results"]["inputs"][k])
+    default, boxes = rows["default", ""], rows["tiles", "bounding box"]
+    unskipped = rows["block skipping", "off"]
+    assert default["errors"] == boxes["errors"] == unskipped["errors"]
+    assert default["tile_pairs"] <= boxes["tile_pairs"]
+    assert default["tile_pairs"] == unskipped["tile_pairs"]
+    assert default["blocks"] < unskipped["blocks"] <= 16 * unskipped["tile_pairs"]
+
+
+def test_every_row_has_a_time_and_finite_errors(quick: dict[str, Any]) -> None:
+    for result in quick["results"]["inputs"]:
+        assert result["rows"][0]["ratio"] == 1
+        for row in result["rows"]:
+            low, high = row["seconds_quartiles"]
+            assert 0 < low <= row["seconds"] <= high
+            assert 0 < row["ratio_quartiles"][0] <= row["ratio"] <= row["ratio_quartiles"][1]
+            for errors in row["errors"].values():
+                image, grads = errors["image"], errors["gradients"]
+                assert list(grads) == ["means", "quats", "scales", "opacities", "sh", "all"]
+                assert 0 <= image["rms"] <= image["max"]
+                assert (image["psnr"] is None) == (image["rms"] == 0)
+                for entry in grads.values():
+                    assert 0 <= entry["relative"] < 10
+                    assert -1 <= entry["cosine"] <= 1
+
+
+def test_threads_change_no_bit(quick: dict[str, Any]) -> None:
+    rows = quick["results"]["threads"]
+    assert [row["threads"] for row in rows] == [1, 2]
+    assert [row["difference"] for row in rows] == [0, 0]
+    assert all(row["same_bits"] for row in rows)
+
+
+@pytest.mark.parametrize(("floor", "stop"), [(1 / 64, 1e-2), (1 / 1024, 1e-5), (1e-12, 0.0)])
+def test_floor_and_stop_follow_the_definition(
+    floor: float, stop: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The crate with other cutoffs against a renderer that shares nothing with it."""
+    scene = random_scene(80, 32, 24, seed=4, sh_degree=1)
+    _, _, meta = reference_rasterization(**scene.arguments())
+    shown = (meta["radii"][0] > 0).all(dim=1)  # the reference culls by the radii of the default floor
+    scene = scene.pick(shown.nonzero()[:, 0]).with_grad("means", "scales", "opacities", "colors")
+    monkeypatch.setattr(reference, "ALPHA_FLOOR", floor)
+    monkeypatch.setattr(reference, "TRANSMITTANCE_STOP", stop)
+    leaves = (scene.means, scene.scales, scene.opacities, scene.colors)
+    expected, _, _ = reference_rasterization(**scene.arguments())
+    weights = torch.rand(expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    wanted = torch.autograd.grad((expected * weights).sum(), leaves)
+    project = _rust.project_forward
+    tuned = (floor, stop, *DEFAULT[2:])
+    monkeypatch.setattr(_rust, "project_forward", lambda *args: project(*args, knobs=tuned))
+    image, _, _ = hqgs.rasterization(**scene.arguments())
+    grads = torch.autograd.grad((image * weights).sum(), leaves)
+    assert (image - expected).abs().max() < 1e-10
+    for found, grad in zip(grads, wanted, strict=True):
+        assert (found - grad).norm() < 1e-8 * grad.norm()
+
+
+def test_the_exact_oracle_has_no_cutoffs_left() -> None:
+    inputs = make_inputs(300, 48, 36, seed=2)
+    exact = TunedPass(inputs, EXACT).outputs()
+    further = Knobs(dtype="float64", alpha_min=1e-15, transmittance_min=0.0)
+    errors = errors_against(TunedPass(inputs, further).outputs(), exact)
+    assert 0 < errors["image"]["max"] < 1e-10
+    assert errors["gradients"]["all"]["relative"] < 1e-9
+
+
+def test_default_knobs_are_the_default() -> None:
+    inputs = make_inputs(300, 48, 36, seed=2)
+    plain, tuned = RasterPass(inputs), TunedPass(inputs, Knobs())
+    assert tuned.knobs == DEFAULT
+    assert torch.equal(plain.run(), tuned.run())
+    for a, b in zip(plain.leaves, tuned.leaves, strict=True):
+        assert a.grad is not None
+        assert b.grad is not None
+        assert torch.equal(a.grad, b.grad)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ((0.0, *DEFAULT[1:]), r"alpha_min: must be in \[1e-15, 1\), got 0"),
+        ((math.nan, *DEFAULT[1:]), "alpha_min"),
+        ((DEFAULT[0], 1.0, *DEFAULT[2:]), r"transmittance_min: must be in \[0, 1\), got 1"),
+        ((*DEFAULT[:2], "disc", True, 6), "spans: must be ellipse, box or square, got disc"),
+        ((*DEFAULT[:4], 2), "exp2_degree: must be 3 to 6, got 2"),
+    ],
+)
+def test_bad_knobs_are_refused_by_name(
+    knobs: tuple[float, float, str, bool, int], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = TunedPass(make_inputs(20, 30, 20), Knobs())
+    case.knobs = knobs
+    with pytest.raises(ValueError, match=message):
+        case.run()
+
+
+def test_the_public_function_has_no_knobs() -> None:
+    scene = random_scene(5, 8, 8)
+    with pytest.raises(TypeError, match="knobs"):
+        hqgs.rasterization(**scene.arguments(), knobs=DEFAULT)
+
+
+def test_errors_of_a_hand_made_case() -> None:
+    exact = {"image": torch.zeros(1, 2, 1, 1), "a": torch.tensor([3.0, 0.0]), "b": torch.tensor([[4.0]])}
+    found = {"image": torch.tensor([0.3, -0.4]).view(1, 2, 1, 1), "a": torch.tensor([0.0, 3.0])}
+    errors = errors_against(found | {"b": torch.tensor([[4.0]])}, exact)
+    assert errors["image"]["max"] == pytest.approx(0.4)
+    assert errors["image"]["rms"] == pytest.approx(math.sqrt(0.125))
+    assert errors["image"]["psnr"] == pytest.approx(10 * math.log10(8))
+    assert errors["gradients"]["a"] == {"relative": pytest.approx(math.sqrt(2)), "cosine": 0}
+    assert errors["gradients"]["b"] == {"relative": 0, "cosine": 1}
+    assert errors["gradients"]["all"]["relative"] == pytest.approx(math.sqrt(18) / 5)
+    assert errors["gradients"]["all"]["cosine"] == pytest.approx(16 / 25)
+
+
+def test_pareto_front_of_a_hand_made_case() -> None:
+    times = [1.0, 2.0, 2.0, 3.0, 4.0, 0.5]
+    errors = [5.0, 3.0, 4.0, 3.0, 1.0, 9.0]
+    assert pareto_front(times, errors) == [5, 0, 1, 4]
+
+
+def test_the_default_is_beaten_only_by_what_is_clearly_faster_and_nowhere_worse() -> None:
+    def row(error: float, slowest: float, defined: float = 1.0) -> dict[str, Any]:
+        def entry(value: float) -> dict[str, Any]:
+            return {"image": {"rms": value}, "gradients": {"all": {"relative": value}}}
+
+        errors = {"exact": entry(error), "defined": entry(defined)}
+        return {"errors": errors, "ratio_quartiles": [0.5, slowest]}
+
+    default = row(1.0, 1.0)
+    assert beats(row(1.0, 0.9), default)
+    assert not beats(row(1.0, 1.1), default)  # within the noise
+    assert not beats(row(1.1, 0.9), default)
+    assert not beats(row(0.9, 0.9, defined=1.1), default)
+
+
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("--quick", "--out", tmp_path, "--repeats", "0") == 2
+    assert "repeats is 0, wanted at least 1" in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "accuracy.json").exists()
