@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import hqgs
-from hqgs.bench import accuracy, speed, training
+from hqgs.bench import accuracy, quality, speed, training
 from hqgs.bench.output import Benchmark, command_line, write_results
 
 BENCHMARKS: dict[str, Benchmark] = {
     "accuracy": accuracy.BENCHMARK,
+    "quality": quality.BENCHMARK,
     "speed": speed.BENCHMARK,
     "training": training.BENCHMARK,
 }

@@ -1,0 +1,438 @@
+"""`hqgs bench quality` on a tiny scene: what is kept, resumed and left out, and that its tables hold the
+numbers that follow from the runs' files."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+import hqgs
+from hqgs import cli
+from hqgs.bench import quality, quality_runs
+from hqgs.bench.output import Report
+from hqgs.bench.quality_estimate import GROWTH, Estimate, duration
+from hqgs.bench.quality_protocols import PROTOCOLS, Cell, cells, narrowed
+from hqgs.bench.quality_regions import count_regions, edge_robustness
+from hqgs.bench.quality_runs import RunStore
+from hqgs.bench.quality_scenes import degraded, degraded_views, load_scenes, validation_split
+from hqgs.bench.quality_summary import Group, Spread, columns, equal_time_gain, mean_of, psnr_at
+from hqgs.bench.quality_tables import one_scene
+from hqgs.camera import Camera, Scene, View
+from hqgs.checkpoint import scene_fingerprint
+from hqgs.degradations import parse_degradation
+from hqgs.methods.srgs import SRGSConfig
+from hqgs.train import TrainingError
+from tests.tiny_scene import tiny_scene
+
+KINDS, ROWS, SEEDS = ("none", "noise:25", "lowres:2"), ("3dgs", "srgs", "hqgs"), (0, 1)
+OPTIONS = ("--degradations", *KINDS, "--seeds", *map(str, SEEDS), "--iterations", "5")
+
+
+def call(out: Path, *options: str) -> int:
+    before = hqgs.get_num_threads()
+    try:
+        return cli.main(["bench", "quality", "--quick", "--threads", "1", "--out", str(out), *options])
+    finally:
+        hqgs.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("quality")
+    assert call(folder, *OPTIONS) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(out: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
+    """The files' contents by degradation, seed and method."""
+    read = [json.loads(path.read_text(encoding="utf-8")) for path in (out / "runs").iterdir()]
+    return {(run["degradation"], run["seed"], run["method"]): run for run in read}
+
+
+def table(text: str, title: str) -> dict[str, dict[str, str]]:
+    """The cells of the Markdown table whose title starts so, by row and column."""
+    lines = text.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith(f"**{title}"))
+    end = next((k for k in range(start + 2, len(lines)) if not lines[k]), len(lines))
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[start + 2 : end]]
+    head, body = rows[0], rows[2:]
+    return {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in body}
+
+
+def stamps(out: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
+
+
+def test_each_cell_is_one_file_with_its_numbers(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
+    assert set(runs) == {(kind, seed, row) for kind in KINDS for seed in SEEDS for row in ROWS}
+    assert len(stamps(out)) == len(runs) == 18
+    for run in runs.values():
+        assert (out / "runs" / f"{run['key']}.json").is_file()
+        assert run["config"]["seed"] == run["seed"]
+        assert [h["iteration"] for h in run["history"]] == [1, 2, 3, 4, 5]
+        assert run["history"][-1]["psnr"] == pytest.approx(run["metrics"]["psnr"])
+        assert run["history"][-1]["seconds"] == run["seconds"] > 0
+        for metric in ("psnr", "ssim", "haarpsi"):
+            assert run["metrics"][metric] == pytest.approx(np.mean([v[metric] for v in run["views"]]))
+        assert {v["name"] for v in run["views"]} == {"view_00.png", "view_08.png"}
+        assert run["metrics"]["lpips"] is None
+        assert "lpips" in run["reasons"]["lpips"] or "63" in run["reasons"]["lpips"]
+        assert run["threads"] == 1
+        assert run["render_ms"] > 0
+        regions = run["regions"]
+        assert regions["edge"]["pixels"] + regions["flat"]["pixels"] == 8 * 48 * 36
+        assert sum(r["gaussians"] for r in regions.values()) <= 8 * run["gaussians"]
+    for kind in KINDS:
+        formation = runs[kind, 0, "hqgs"]["formation"]
+        assert str(parse_degradation(formation)) == runs[kind, 0, "hqgs"]["config"]["hqgs"]["formation"]
+    assert "lowres:2" in runs["lowres:2", 0, "hqgs"]["formation"]  # the small photos are at hand
+    assert runs["noise:25", 0, "3dgs"]["formation"] is None
+
+
+def test_methods_of_a_cell_see_the_same_photos(runs: dict[Any, dict[str, Any]]) -> None:
+    for kind in KINDS:
+        for seed in SEEDS:
+            notes = [runs[kind, seed, row]["notes"] for row in ROWS]
+            assert notes[0] == notes[1] == notes[2]
+            assert kind == "none" or f"degradation {kind}, seed {seed}" in notes[0][-1]
+    scene = tiny_scene()
+    first = degraded(scene, "noise:25", 3)
+    some = degraded_views(scene, scene.train[1:3], "noise:25", 3)
+    for a, b in zip(first.train[1:3], some, strict=True):
+        assert np.array_equal(a.image, b.image)  # of a few photos as of all of them
+    assert not np.array_equal(first.train[0].image, degraded(scene, "noise:25", 4).train[0].image)
+
+
+def test_tables_follow_from_the_files(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
+    text = (out / "quality_smoke.md").read_text(encoding="utf-8")
+    main = table(text, "PSNR/SSIM/HaarPSI, held-out test views of embedded; 5 iterations")
+    gain = table(text, "PSNR gain over 3dgs (dB)")
+    cost = table(text, "Cost")
+    assert list(main) == list(ROWS)
+    assert list(main["3dgs"]) == [*KINDS, "degraded"]
+    assert list(gain) == ["srgs", "hqgs"]
+    for row in ROWS:
+        for column in main[row]:
+            kinds = KINDS[1:] if column == "degraded" else [column]
+            chosen = [(kind, seed) for kind in kinds for seed in SEEDS]
+            means = [
+                np.mean([runs[kind, seed, row]["metrics"][m] for kind, seed in chosen])
+                for m in ("psnr", "ssim", "haarpsi")
+            ]
+            assert main[row][column] == "{:.2f}/{:.3f}/{:.3f}".format(*means)
+            if row != "3dgs":
+                gains = np.array(
+                    [
+                        runs[kind, seed, row]["metrics"]["psnr"] - runs[kind, seed, "3dgs"]["metrics"]["psnr"]
+                        for kind, seed in chosen
+                    ]
+                )
+                std = math.sqrt(((gains - gains.mean()) ** 2).sum() / (len(gains) - 1))
+                assert gain[row][column] == f"{gains.mean():+.2f} ± {std:.2f} ({gains.min():+.2f})"
+        mine = [run for (_, _, method), run in runs.items() if method == row]
+        assert cost[row]["Gaussians"] == f"{np.mean([run['gaussians'] for run in mine]):,.0f}"
+        assert cost[row]["step (ms)"] == f"{np.mean([200 * run['seconds'] for run in mine]):.1f}"
+
+
+def test_one_file_holds_everything(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
+    whole = json.loads((out / "quality.json").read_text(encoding="utf-8"))
+    assert {run["key"]: run for run in whole["results"]["runs"]} == {run["key"]: run for run in runs.values()}
+    assert whole["settings"]["protocol"] == "smoke"
+    assert whole["settings"]["validation"] is False
+    assert {entry["what"] for entry in whole["left_out"]} == {"lpips", "lpips_vgg"}
+    assert set(whole["results"]["summary"]) == set(ROWS)
+    for what in ("gains", "psnr_vs_time", "regions"):
+        with Image.open(out / f"quality_smoke_{what}.png") as chart:
+            assert len(np.unique(np.asarray(chart.convert("RGB")).reshape(-1, 3), axis=0)) > 10
+
+
+def test_sheets_show_the_photo_and_every_render(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
+    sheets = sorted((out / "pictures").iterdir())
+    assert len(sheets) == len(KINDS)  # one for each degradation, of the first seed
+    with Image.open(next(p for p in sheets if "noise_25" in p.name)) as image:
+        sheet = np.asarray(image)
+    line, gap = 17, 6
+    assert sheet.shape == (2 * (36 + line) + gap, 5 * 48 + 4 * gap, 3)
+    with Image.open(out / "scenes" / "embedded_48x36_10" / "view_00.png") as image:
+        photo = np.asarray(image.convert("RGB")).astype(int)
+    assert np.array_equal(sheet[line : line + 36, :48], photo)
+    for k, row in enumerate(ROWS):
+        with Image.open(out / "renders" / runs["noise:25", 0, row]["key"] / "0.png") as image:
+            render = np.asarray(image).astype(int)
+        left = (k + 2) * (48 + gap)
+        assert np.array_equal(sheet[line : line + 36, left : left + 48], render)
+        below = sheet[2 * line + 36 + gap :, left : left + 48]
+        assert np.array_equal(below, np.minimum(4 * np.abs(render - photo), 255))
+        value = -10 * math.log10(np.mean(((render - photo) / 255) ** 2))
+        assert value == pytest.approx(runs["noise:25", 0, row]["views"][0]["psnr"], abs=0.05)
+
+
+def test_finished_cells_are_not_repeated(
+    out: Path, runs: dict[Any, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = stamps(out)
+    trained: list[str] = []
+    real = quality_runs.run_cell
+
+    def counted(cell: Cell, *rest: Any) -> Any:
+        trained.append(str(cell))
+        return real(cell, *rest)
+
+    monkeypatch.setattr(quality, "run_cell", counted)
+    assert call(out, *OPTIONS) == 0
+    assert (trained, stamps(out)) == ([], before)
+
+    gone = runs["lowres:2", 1, "hqgs"]
+    name = f"{gone['key']}.json"
+    (out / "runs" / name).unlink()
+    assert call(out, "--finished", *OPTIONS) == 0
+    assert not (out / "runs" / name).exists()
+    left_out = json.loads((out / "quality.json").read_text(encoding="utf-8"))["left_out"]
+    assert {"what": "run embedded, lowres:2, hqgs, seed 1", "why": "not finished"} in left_out
+
+    assert call(out, *OPTIONS) == 0
+    assert trained == ["embedded, lowres:2, hqgs, seed 1"]
+    after = stamps(out)
+    assert {k: v for k, v in after.items() if k != name} == {k: v for k, v in before.items() if k != name}
+    again = json.loads((out / "runs" / name).read_text(encoding="utf-8"))
+    for field in ("metrics", "gaussians", "regions", "config", "views"):
+        assert again[field] == gone[field]  # the same bits
+
+
+def test_a_run_serves_other_protocols_and_filters(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
+    assert call(out, "--degradations", "noise:25.0", "--methods", "hqgs", "3dgs", "--iterations", "5") == 0
+    whole = json.loads((out / "quality.json").read_text(encoding="utf-8"))
+    assert [run["method"] for run in whole["results"]["runs"]] == ["3dgs", "hqgs"]  # the protocol's order
+
+
+def test_validation_never_sees_a_test_view(out: Path, tmp_path: Path) -> None:
+    scene = replace(tiny_scene(18), test=tiny_scene(18).train[:2], train=tiny_scene(18).train[2:])
+    split = validation_split(scene)
+    assert [v.name for v in split.test] == [v.name for v in scene.train[::7]]
+    names = {v.name for v in split.train} | {v.name for v in split.test}
+    assert names == {v.name for v in scene.train}
+    assert names.isdisjoint(v.name for v in scene.test)
+    assert {v.name for v in split.train}.isdisjoint(v.name for v in split.test)
+    with pytest.raises(ValueError, match="1 training photos"):
+        validation_split(replace(scene, train=scene.train[:1]))
+
+    options = ("--degradations", "noise:25", "--methods", "3dgs", "--iterations", "2", "--validate")
+    assert call(out, *options) == 0
+    whole = json.loads((out / "quality.json").read_text(encoding="utf-8"))
+    assert whole["settings"]["validation"] is True
+    (run,) = whole["results"]["runs"]
+    assert "-validation-" in run["key"]
+    assert [v["name"] for v in run["views"]] == ["view_01.png", "view_09.png"]  # 00 and 08 are test views
+    assert "for tuning" in run["notes"][1]
+    text = (out / "quality_smoke_validation.md").read_text(encoding="utf-8")
+    assert "VALIDATION" in text.splitlines()[0]
+
+
+def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, store = tiny_scene(), RunStore(tmp_path, validate=False)
+    protocol = narrowed(PROTOCOLS["smoke"], ["none", "noise:25"], ["3dgs", "srgs"], iterations=2)
+    real = quality_runs.run_cell
+
+    def make() -> quality.Quality:
+        return quality.Quality(protocol, [scene], store, 0, Report(settings={}))
+
+    def raising(error: BaseException, at: str) -> None:
+        def run(cell: Cell, *rest: Any) -> Any:
+            if str(cell) == at:
+                raise error
+            return real(cell, *rest)
+
+        monkeypatch.setattr(quality, "run_cell", run)
+
+    raising(KeyboardInterrupt(), "tiny, noise:25, 3dgs, seed 0")
+    with pytest.raises(KeyboardInterrupt):
+        make().train()
+    assert len(stamps(tmp_path)) == 2
+
+    raising(TrainingError("it blew up"), "tiny, noise:25, 3dgs, seed 0")
+    bench = make()
+    bench.train()
+    assert len(stamps(tmp_path)) == 3
+    bench.tables("smoke")
+    assert {"what": "run tiny, noise:25, 3dgs, seed 0", "why": "it blew up"} in bench.report.left_out
+    assert [group.degradation for group in bench.groups()] == ["none"]  # srgs alone is not compared
+
+    first = next(iter((tmp_path / "runs").iterdir()))
+    first.write_text("{", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"is damaged.*remove it"):
+        make()
+
+
+def test_the_key_covers_what_a_result_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, scene = RunStore(tmp_path, validate=False), tiny_scene()
+    base = cells(PROTOCOLS["smoke"], ["tiny"])[0]
+    prints = scene_fingerprint(scene)
+    key = store.key(base, prints)
+    assert key.startswith("tiny-x1-none-3dgs-s0-10-")
+    same = replace(base.row, label="other", srgs=SRGSConfig(texture_weight=0.9))
+    assert store.key(replace(base, row=same), prints) == key  # another method's options
+    srgs = replace(same, method="srgs")
+    others = [
+        store.key(replace(base, seed=1), prints),
+        store.key(replace(base, iterations=11), prints),
+        store.key(replace(base, degradation="blur"), prints),
+        store.key(base, scene_fingerprint(replace(scene, points=scene.points + 1))),
+        store.key(base, scene_fingerprint(validation_split(scene))),
+        store.key(replace(base, row=srgs), prints),
+        store.key(replace(base, row=replace(srgs, srgs=SRGSConfig(texture_weight=0.8))), prints),
+    ]
+    monkeypatch.setattr(hqgs, "__version__", "999")
+    others.append(store.key(base, prints))
+    assert len({key, *others}) == 9
+
+
+def test_protocols() -> None:
+    assert {"standard", "full", "long", "ablation", "loss", "downsampling", "grid", "guidance"} < set(
+        PROTOCOLS
+    )
+    for protocol in PROTOCOLS.values():
+        assert protocol.baseline in protocol.labels
+        assert len(set(protocol.labels)) == len(protocol.rows)
+        assert narrowed(protocol, protocol.degradations) == protocol  # spelled as the parser spells them
+    standard = cells(PROTOCOLS["standard"], ["a", "b"])
+    assert len(standard) == 2 * 6 * 2 * 3
+    assert [cell.row.label for cell in standard[:3]] == list(ROWS)
+    assert len({cell.group for cell in standard[:3]}) == 1
+    assert {cell.seed for cell in standard[:36]} == {0}
+    assert PROTOCOLS["ablation"].labels == [f"V{k}" for k in range(1, 8)]
+    assert all(cell.config.hqgs.guidance == "paper" for cell in cells(PROTOCOLS["ablation"], ["a"]))
+    assert cells(PROTOCOLS["long"], ["a"])[0].config.densify.stop == 15_000
+
+
+def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for options, message in (
+        (["--methods", "nerf"], "unknown method 'nerf'; there are here: 3dgs, srgs, hqgs"),
+        (["--degradations", "fog"], "unknown degradation 'fog'"),
+        (["--degradations", "blur", "blur"], "degradations holds blur twice"),
+        (["--seeds", "-1"], "seed is -1"),
+        (["--iterations", "0"], "iterations is 0"),
+        (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
+        (["--pictures", "-1"], "pictures is -1"),
+        (["--scenes", str(tmp_path / "no")], "there is no scene folder"),
+    ):
+        assert call(tmp_path / "out", *options) == 2
+        assert message in capsys.readouterr().err
+    with pytest.raises(ValueError, match="two scenes are called 'fern'"):
+        load_scenes([tmp_path / "a" / "fern", tmp_path / "b" / "fern"], 1.0, (48, 36, 10), tmp_path, False)
+    (tmp_path / "degradation.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ValueError, match="holds degraded photos"):
+        load_scenes([tmp_path], 1.0, (48, 36, 10), tmp_path, False)
+
+
+def test_regions_of_a_hand_made_view() -> None:
+    image = np.zeros((10, 20, 3), np.uint8)
+    image[5, 5] = 255
+    K = np.array([[10.0, 0, 10], [0, 10.0, 5], [0, 0, 1]])
+    view = View("a", Camera(20, 10, K, np.eye(4)), image)
+
+    def at(column: int, row: int, z: float = 2.0) -> list[float]:
+        return [(column + 0.5 - 10) * z / 10, (row + 0.5 - 5) * z / 10, z]
+
+    means = np.array(
+        [at(4, 5), at(6, 6), at(6, 6, 5.0), at(15, 2), at(0, 0), at(19, 9), at(20, 5), at(5, 5, -2.0)],
+        np.float32,
+    )
+    regions = count_regions(means, [view, view])
+    # The Sobel magnitude of a dot is positive in its 8 neighbours and 0 in itself.
+    assert regions["edge"] == {"gaussians": 2 * 3, "pixels": 2 * 8, "density": 375.0}
+    assert regions["flat"] == {"gaussians": 2 * 3, "pixels": 2 * 192, "density": 1000 * 6 / 384}
+    masked = replace(view, mask=np.zeros((10, 20), bool))
+    assert count_regions(means, [masked])["edge"] == {"gaussians": 0, "pixels": 0, "density": None}
+
+
+def test_edge_maps_against_another_sobel() -> None:
+    scene = tiny_scene()
+    kinds = ["noise:25", "jpeg:10", "none"]
+    found = edge_robustness(scene, kinds, seed=2)
+
+    def edges(image: np.ndarray) -> np.ndarray:
+        image = image.astype(np.float64) / (255 if image.dtype == np.uint8 else 1)
+        smooth, slope = np.array([1, 2, 1]), np.array([-1, 0, 1])
+        kernels = (np.outer(smooth, slope), np.outer(slope, smooth))
+        g = np.hypot(*(ndimage.correlate(image, k[..., None], mode="nearest") for k in kernels))
+        return (g - g.min()) / (g.max() - g.min())
+
+    def decibel(a: np.ndarray, b: np.ndarray) -> float:
+        return -10 * math.log10(np.mean((a.clip(0, 1) - b.clip(0, 1)) ** 2))
+
+    expected = []
+    for kind in kinds[:2]:
+        pairs = list(zip(degraded(scene, kind, 2).train, scene.train, strict=True))
+        photo = np.mean([decibel(a.image.astype(np.float64), b.image / 255) for a, b in pairs])
+        edge = np.mean([decibel(edges(a.image), edges(b.image)) for a, b in pairs])
+        assert found["degradations"][kind] == pytest.approx(
+            {"photo_psnr": photo, "edge_psnr": edge}, abs=1e-3
+        )
+        expected.append((photo, edge))
+    assert set(found["degradations"]) == set(kinds[:2])  # clean photos have no finite PSNR
+    (p, e), (q, f) = expected
+    assert found["photo_variance"] == pytest.approx((p - q) ** 2 / 2, rel=1e-3)
+    assert found["edge_variance"] == pytest.approx((e - f) ** 2 / 2, rel=1e-3)
+    assert edge_robustness(scene, kinds[:1], 0)["edge_variance"] is None
+
+
+def fake(*points: tuple[float, float], **fields: Any) -> dict[str, Any]:
+    history = [{"iteration": k, "seconds": t, "psnr": v, "ssim": None} for k, (t, v) in enumerate(points)]
+    return {"history": history, "metrics": {"psnr": points[-1][1]}, **fields}
+
+
+def test_gain_at_equal_time() -> None:
+    slow, fast = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
+    assert psnr_at(slow, 15) == 22
+    assert psnr_at(slow, 9) is None
+    assert psnr_at(slow, 41) is None
+    assert equal_time_gain(fast, slow) == 26 - 22  # at 15 s, where the fast one ends
+    assert equal_time_gain(slow, fast) == 22 - 26
+    assert equal_time_gain(fake((1, 18), (2, 26)), slow) is None  # the slow one was not evaluated by then
+    assert equal_time_gain(fake((5, 18), (15, None)), slow) is None  # type: ignore[arg-type]
+
+
+def test_means_over_groups() -> None:
+    assert Spread.of([1.0, 3.0, 5.0]) == Spread(3.0, 2.0, 1.0, 5.0, 3)
+    assert Spread.of([4.0]).std is None
+    values = {("a", "none"): 1.0, ("a", "blur"): 2.0, ("b", "blur"): 6.0, ("b", "jpeg:5"): 7.0}
+    groups = [Group(scene, kind, 0, {"x": fake((0, v))}) for (scene, kind), v in values.items()]
+    parts = columns(groups)
+    assert list(parts) == ["none", "blur", "jpeg:5", "degraded"]
+    means = {kind: mean_of(part, "x", lambda run: run["metrics"]["psnr"]) for kind, part in parts.items()}
+    assert means == {"none": 1.0, "blur": 4.0, "jpeg:5": 7.0, "degraded": 5.0}
+    assert list(columns(groups[:2])) == ["none", "blur"]
+    groups[1].runs["x"]["metrics"]["psnr"] = None
+    assert mean_of(parts["blur"], "x", lambda run: run["metrics"]["psnr"]) is None  # never over fewer runs
+
+
+def test_each_scene_has_a_table_of_its_own() -> None:
+    groups = [
+        Group("a", "blur", seed, {"x": {"metrics": {"psnr": 20.0 + seed, "ssim": 0.5}}}) for seed in (0, 3)
+    ]
+    assert table(one_scene(groups, ["x"], "a"), "PSNR/SSIM, a") == {"x": {"blur": "21.50/0.500"}}
+
+
+def test_estimates_learn_from_finished_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, third = cells(replace(PROTOCOLS["smoke"], iterations=100), ["a"])[:3]
+    estimate = Estimate()
+    scene: Scene = tiny_scene()
+    estimate.probe(replace(first, iterations=2), scene)
+    assert estimate.knows(first)
+    assert not estimate.knows(second)
+    monkeypatch.setattr(estimate, "_first", {("a", "3dgs"): 0.1, ("a", "srgs"): 0.2})
+    assert estimate.seconds([first, first]) == pytest.approx(2 * 100 * 0.1 * GROWTH)
+    estimate.add(third, {"wall_seconds": 60.0, "iterations": 100, "first_step_seconds": 0.15})  # grew 4 times
+    assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * 4)
+    assert estimate.seconds([third]) == pytest.approx(60)
+    assert [duration(s) for s in (59.6, 125, 11_100)] == ["60 s", "2 min", "3 h 05 min"]
