@@ -218,12 +218,12 @@ def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
         drawstyle="steps-post",
         label="no other one is better in both",
     )
-    for k, knob in enumerate(dict.fromkeys(p[2] for p in points)):
+    for k, knob in enumerate(dict.fromkeys(case[0] for case in CASES)):
         own = [(x, y, value) for x, y, name, value in points if name == knob]
         first = knob == "default"
         axes.plot(
             [p[0] for p in own], [p[1] for p in own], linestyle="", label=knob, color=f"C{k}",
-            marker="*" if first else "o", markersize=13 if first else 5, zorder=2 if first else 3,
+            marker="*" if first else "o", markersize=13 if first else 5, zorder=4 if first else 3,
         )  # fmt: skip
         for x, y, value in own:
             axes.annotate(value, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6, rotation=40)

@@ -15,8 +15,7 @@ from torch.nn.functional import conv2d
 
 import hqgs
 import hqgs.train
-from hqgs import _rust
-from hqgs.bench.knobs import Knobs
+from hqgs.bench.knobs import Knobs, tuned
 from hqgs.camera import Camera
 from hqgs.config import TrainConfig
 from hqgs.gaussians import Gaussians
@@ -34,15 +33,6 @@ class Feature:
     by_default: bool  # whether the product has it on
     switch: Callable[[], Any] = nullcontext  # a context manager: inside it the other choice is in place
     config: Callable[[TrainConfig], TrainConfig] = lambda config: config
-
-
-@contextmanager
-def _tuned(knobs: Knobs) -> Iterator[None]:
-    """The rasterizer with other knobs."""
-    values = (knobs.alpha_min, knobs.transmittance_min, knobs.spans, knobs.skip_blocks, knobs.exp2_degree)
-    tuned = partial(_rust.project_forward, knobs=values)
-    with patch.object(_rust, "project_forward", tuned):
-        yield
 
 
 @contextmanager
@@ -99,7 +89,7 @@ def torch_loss(
     render: Tensor, target: Tensor, mask: Tensor | None = None, lambda_dssim: float = 0.2
 ) -> Tensor:
     """`hqgs.losses.photometric_loss` from torch's operations and autograd, as the field writes it."""
-    photo = target / 255.0 if target.dtype == torch.uint8 else target
+    photo = target.to(render.dtype) / 255 if target.dtype == torch.uint8 else target
     counted = slice(None) if mask is None else mask
     l1 = (render - photo)[counted].abs().mean()
     if mask is not None:
@@ -135,8 +125,8 @@ FEATURES = (
         True,
         partial(patch.object, hqgs.train, "render_view", render_in_float64),
     ),
-    Feature("exact spans of tiles", "bounding boxes", True, partial(_tuned, Knobs(spans="box"))),
-    Feature("skipping of blocks", "every block of a tile", True, partial(_tuned, Knobs(skip_blocks=False))),
+    Feature("exact spans of tiles", "bounding boxes", True, partial(tuned, Knobs(spans="box"))),
+    Feature("skipping of blocks", "every block of a tile", True, partial(tuned, Knobs(skip_blocks=False))),
     Feature("fused loss", "torch", True, partial(_in_torch, three_dgs, "photometric_loss", torch_loss)),
     Feature("fused Adam", "torch", True, partial(_in_torch, hqgs.train, "Adam", TorchAdam)),
     Feature(

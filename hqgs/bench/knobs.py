@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from unittest.mock import patch
@@ -53,18 +55,23 @@ CASES: tuple[tuple[str, str, Knobs], ...] = (
 )
 
 
+@contextmanager
+def tuned(knobs: Knobs) -> Iterator[None]:
+    """Inside it the rasterizer has these knobs, the dtype aside."""
+    values = (knobs.alpha_min, knobs.transmittance_min, knobs.spans, knobs.skip_blocks, knobs.exp2_degree)
+    with patch.object(_rust, "project_forward", partial(_rust.project_forward, knobs=values)):
+        yield
+
+
 class TunedPass(RasterPass):
     """A pass with other settings than the default."""
 
     def __init__(self, inputs: RasterInputs, knobs: Knobs) -> None:
         super().__init__(inputs, dtype=getattr(torch, knobs.dtype))
-        self.knobs = (
-            knobs.alpha_min, knobs.transmittance_min, knobs.spans, knobs.skip_blocks, knobs.exp2_degree,
-        )  # fmt: skip
+        self.knobs = knobs
 
     def run(self) -> torch.Tensor:
-        tuned = partial(_rust.project_forward, knobs=self.knobs)
-        with patch.object(_rust, "project_forward", tuned):
+        with tuned(self.knobs):
             return super().run()
 
     def outputs(self) -> dict[str, torch.Tensor]:
