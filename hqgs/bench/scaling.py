@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hqgs.bench.inputs import fitted, make_inputs
-from hqgs.bench.rasterizer import RasterPass
+from hqgs.bench.rasterizer import RasterPass, warmed
 from hqgs.bench.timing import exponent, interleaved, median, quartiles
 
 TARGET = 1.05  # the largest exponent that is good
@@ -44,7 +44,7 @@ def measure_scaling(
 
 
 def _curve(x: Sequence[int], passes: Sequence[RasterPass], repeats: int) -> dict[str, Any]:
-    measured = interleaved({str(v): p for v, p in zip(x, passes, strict=True)}, repeats)
+    measured = interleaved({str(v): warmed(p) for v, p in zip(x, passes, strict=True)}, repeats)
     seconds = [median(rounds) for rounds in measured.values()]
     slopes = [exponent(*zip(*ends, strict=True)) for ends in pairwise(zip(x, seconds, strict=True))]
     return {
