@@ -35,6 +35,8 @@ ANGLES = np.arange(18) * np.pi / 18
 CLEARLY = 0.7  # a kind other than Gaussian must have less than this share of the Gaussian's misfit
 SHORTEST = 3.0  # px of motion; a shorter one is not told from the scene's own direction
 RING_ERROR, POINT_ERROR = 0.2, 0.3  # of the log power: how far sharp photos are off the power law
+UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)  # levels^2: what JPEG of a quality too good to be found may have added
+MIN_RINGS = 3  # that must rise above the noise
 PLANE_POINTS = 1_000  # frequencies at which motion is looked for
 RING_SAMPLES = 40.0  # a ring with more counts no more: its error is the law's
 NEIGHBOURS = 8.0  # frequencies that err together
@@ -57,20 +59,25 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
 
     The log power of sharp photos falls linearly in log frequency; Gaussian blur adds -(sigma omega)^2, a disc
     its rings of zeros, a straight motion its parallel stripes. Each kind is fitted with the known noise as
-    floor, and only a kind that fits clearly better is preferred to Gaussian. None for a photo below 32 px.
+    floor, and only a kind that fits clearly better is preferred to Gaussian. None for a photo below 32 px or
+    one in which nothing stands out of the noise.
     """
     grey = luma(levels)
     tile = tile_size(grey)
     if tile is None:
         return None
-    floor = (LUMA_NOISE * noise) ** 2 + FLOOR
     spectrum = power_spectrum(grey, tile)
     frequency, log_power, number = rings(spectrum)
+    known = (LUMA_NOISE * noise) ** 2 + FLOOR
+    if (log_power > np.log(known) + 1).sum() < MIN_RINGS:
+        return None
     weights = np.minimum(number / RING_SAMPLES, 1) / (2 * RING_ERROR**2)
-    gaussian, defocus = (
-        fit_blurs(frequency, log_power, weights, _round_blurs(kind, sizes, frequency, spectrum.step), floor)
-        for kind, sizes in ROUND
-    )
+    blurs = [_round_blurs(kind, sizes, frequency, spectrum.step) for kind, sizes in ROUND]
+    fits = [
+        (*(fit_blurs(frequency, log_power, weights, blur, floor) for blur in blurs), floor)
+        for floor in known + np.array(UNKNOWN_FLOORS)
+    ]
+    gaussian, defocus, floor = min(fits, key=lambda fit: min(fit[0].cost, fit[1].cost))
     sigma, radius = float(SIGMAS[gaussian.best]), float(RADII[defocus.best])
     motion = _motion(spectrum, floor, sigma, radius)
     if motion is not None:

@@ -17,17 +17,14 @@ from scipy.special import ndtr
 from hqgs.diagnosis.jpeg import block_coefficients
 from hqgs.diagnosis.levels import LUMA_NOISE, Floats, luma
 
-SLOPE, SLOPE_SPREAD = (
-    2.45,
-    0.12,
-)  # of the power over frequency; tight, as thousands of coefficients outvote it
+SLOPE, SLOPE_SPREAD = 2.55, 2.0  # of the power over frequency; the spread is that of one block
 VARIANCES = 13 * 6.0 ** np.arange(-1, 8)  # levels^2: of the lowest coefficient, one per class of blocks
 MAGNITUDES = np.array([1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56, 80, 112, 160, 226, 320, 452])  # in steps
 MAX_BLOCKS = 4_000
 MIN_BLOCKS = 60
 EM_STEPS = 12
 LIKELIHOOD_GAIN = 8.0  # nats that noise must bring, or there is none
-SHOWS = 0.3  # times the mean of the three finest steps: the least noise that is told from fine texture
+SHOWS = 0.32  # times the mean of the three finest steps: the least noise that is told from fine texture
 LEAST = 6.0  # levels; below it fine texture is taken for noise at any table
 LEAST_SIGMA = 0.7  # px; coarse tables (quality 10 and below) make sharp photos look 0.8 px soft
 
@@ -75,9 +72,9 @@ def estimate_hidden(steps: NDArray[np.int64], table: NDArray[np.int64]) -> Hidde
     is Gaussian, its variance the power law of photos times a Gaussian blur's response, seen through the DCT's
     basis functions (which leak: eight pixels are short), plus the noise. The likelihood is that of the cells
     in which the coefficients lie; EM finds how frequent the classes are. Noise must pay for itself: it is
-    fitted after the best noiseless model. None for fewer than 60 blocks.
+    fitted after the best noiseless model. None for fewer than 60 blocks, or where JPEG left nothing.
     """
-    if len(steps) < MIN_BLOCKS:
+    if len(steps) < MIN_BLOCKS or not steps.any():
         return None
     model = _Model(steps, table)
     clean = min((model.minimise([SLOPE, sigma]) for sigma in (0.5, 2.0)), key=lambda result: result[1])
@@ -136,5 +133,6 @@ class _Model:
             shares = shares * (likelihoods.T @ (self.counts / (likelihoods @ shares))) / self.counts.sum()
         self.shares = shares
         total = ((np.log(likelihoods @ shares) + highest[:, 0]) * self.counts).sum()
-        unusual = 0.5 * ((slope - SLOPE) / SLOPE_SPREAD) ** 2 + 1e3 * min(sigma, 0.0) ** 2
+        # The law errs alike in all blocks, so its prior counts per block: more blocks must not outvote it.
+        unusual = 0.5 * self.counts.sum() * ((slope - SLOPE) / SLOPE_SPREAD) ** 2 + 1e3 * min(sigma, 0.0) ** 2
         return float(unusual - total)

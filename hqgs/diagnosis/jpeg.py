@@ -17,13 +17,16 @@ from hqgs.diagnosis.levels import Floats, luma
 MAX_BLOCKS = 200  # looked at; they are spread over the photo
 ENOUGH_BLOCKS = 40  # without clipped pixels; where there are fewer, all blocks are taken
 MIN_COEFFICIENTS = 40  # fewer that are not zero prove nothing
+MIN_FREQUENCIES = 4  # in which coefficients must show: few repeat in a drawing
 MIN_EVIDENCE = 0.5  # nats per coefficient; photos that were never JPEG have -0.25, quality 90 has 0.8
 SPREAD = 0.4  # levels: standard deviation of a decoded coefficient, as pixels were rounded twice
 OUTLIERS = 0.02  # share of coefficients off the comb, in blocks that were clipped
 BLOCKING_SEEN = 0.15  # above this a grid that does not begin at the corner is looked at too
 SMALLEST = 24  # px a side
 _ROWS, _COLUMNS = np.mgrid[:6, :6]
-LOW = (_ROWS[_ROWS + _COLUMNS < 6], _COLUMNS[_ROWS + _COLUMNS < 6])  # rows and columns of 21 low frequencies
+_WAVES = _ROWS + _COLUMNS
+# Rows and columns of the 20 low frequencies. Not the mean: in a flat photo it is the same in all blocks.
+LOW = (_ROWS[(_WAVES > 0) & (_WAVES < 6)], _COLUMNS[(_WAVES > 0) & (_WAVES < 6)])
 STEPS = 255  # the largest step of an 8-bit JPEG
 
 Index = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -37,7 +40,9 @@ class Jpeg:
     evidence: float  # mean gain in log-likelihood per coefficient that is not zero, nats
     blocking: float  # steps across the borders of 8 x 8 blocks over those inside, minus 1
     phase: tuple[int, int]  # row and column of the first block border, 0..7
-    table: tuple[tuple[int, ...], ...] | None  # [8, 8] of the luma, steps in 1/255
+    # [8, 8] of the luma, steps in 1/255. Of a table that is not libjpeg's only the low frequencies show; the
+    # rest, and the mean's step, are then those of the nearest quality.
+    table: tuple[tuple[int, ...], ...] | None
 
 
 def find_jpeg(levels: Floats, path: Path | None = None) -> Jpeg:
@@ -76,7 +81,7 @@ def measure_blocking(grey: Floats) -> tuple[float, tuple[int, int]]:
         if len(steps) < 16:
             return 0.0, (0, 0)
         means = np.array([steps[k::8].mean() for k in range(8)])
-        strengths.append(float(means.max() / max(np.median(means), 1e-9) - 1))
+        strengths.append(float((means.max() - np.median(means)) / max(np.median(means), 0.1)))
         phases.append((int(means.argmax()) + 1) % 8)
     return min(strengths), (phases[0], phases[1])
 
@@ -144,7 +149,8 @@ def _best_table(
         candidates.insert(0, (nearest_quality(filed[LOW], LOW), filed, _total(scores, filed[None])[0]))
     quality, table, total = max(candidates, key=lambda candidate: candidate[2])  # the first of equals
     evidence = float(total / max(count, 1))
-    proven = count >= MIN_COEFFICIENTS and evidence >= MIN_EVIDENCE
+    many = count >= MIN_COEFFICIENTS and (scores != 0).any(axis=1).sum() >= MIN_FREQUENCIES
+    proven = many and evidence >= MIN_EVIDENCE
     return (quality if proven else None), evidence, table
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,16 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.diagnosis.blur import Blur, estimate_blur, extra_sigma
-from hqgs.diagnosis.coefficients import Hidden, estimate_hidden, quantised
+from hqgs.diagnosis.coefficients import MAX_BLOCKS, Hidden, estimate_hidden, quantised
 from hqgs.diagnosis.jpeg import Jpeg, find_jpeg
-from hqgs.diagnosis.levels import to_levels
+from hqgs.diagnosis.levels import Floats, to_levels
 from hqgs.diagnosis.noise import estimate_noise
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
 
-LEAST_BLUR = 0.7  # px of the small photo, a Gaussian's sigma; photos that count as sharp reach 0.6
-HIDING_QUALITY = 92  # from this quality on, JPEG leaves noise and spectrum as they were
-
+Table = tuple[tuple[int, ...], ...]
 Photo = NDArray[np.uint8] | NDArray[np.float32]
+
+LEAST_BLUR = 0.7  # px of the small photo, a Gaussian's sigma; photos that count as sharp reach 0.6
+HIDING_QUALITY = 92  # from this quality on, JPEG leaves the luma's noise and spectrum as they were
+LARGEST = 1024  # px a side: more of a photo is not looked at, but for its enlargement
+FEW_BLOCKS = 1_000  # of all photos together, to look for noise in the luma alone
+LUMA_TELLS = 100  # px a side; the coefficients of smaller photos have the fine texture of large ones
+ROUNDING_ONLY: Table = ((1,) * 8,) * 8
 
 
 @dataclass(frozen=True)
@@ -43,10 +49,16 @@ class PhotoDiagnosis:
 
 @dataclass(frozen=True)
 class Inspected:
-    """A photo's diagnosis, and the coefficients that a hiding JPEG leaves to judge noise and blur by."""
+    """A photo on the way to its diagnosis: noise under JPEG and blur are not told yet."""
 
     diagnosis: PhotoDiagnosis
-    steps: NDArray[np.int64] | None  # [blocks, 63]; the diagnosis has no noise and blur yet
+    levels: Floats  # [h, w, 3], 0..255: the middle of the photo before it was enlarged
+
+    @property
+    def table(self) -> Table:
+        """The quantisation table that rules the photo's coefficients, [8] rows of 8."""
+        found = self.diagnosis.jpeg.table
+        return found if found is not None and self.diagnosis.hiding else ROUNDING_ONLY
 
 
 def diagnose_photo(image: Photo, low: Photo | None = None, path: Path | None = None) -> PhotoDiagnosis:
@@ -56,11 +68,7 @@ def diagnose_photo(image: Photo, low: Photo | None = None, path: Path | None = N
     is taken if it is a JPEG and the pixels bear it out. ValueError for another shape or type, values that are
     not finite, or a `low` larger than the photo; FileNotFoundError for a missing file.
     """
-    found = inspect_photo("photo", image, low, path)
-    if found.steps is None:
-        return found.diagnosis
-    table = np.array(found.diagnosis.jpeg.table)
-    return with_hidden(found.diagnosis, estimate_hidden(found.steps, table))
+    return conclude([inspect_photo("photo", image, low, path)])[0]
 
 
 def inspect_photo(
@@ -70,7 +78,7 @@ def inspect_photo(
     path: Path | None = None,
     enlargement: Enlargement | None = None,
 ) -> Inspected:
-    """`diagnose_photo` but for what a hiding JPEG leaves, which a scene pools. `enlargement`: where known."""
+    """The first half of `diagnose_photo`, errors included; `enlargement` where it is known."""
     levels = to_levels(image, f"photo {name!r}")
     height, width = levels.shape[:2]
     if low is not None:
@@ -85,20 +93,48 @@ def inspect_photo(
         enlargement = enlargement or find_enlargement(levels)
         if enlargement.factor > 1:
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
+    levels = _middle(levels)
     jpeg = find_jpeg(levels, path)
-    scale = width / levels.shape[1]
-    found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, LEAST_BLUR * scale)
-    if found.hiding:
-        return Inspected(found, quantised(levels, np.array(jpeg.table), jpeg.phase))
-    if (noise := estimate_noise(levels)) is not None:
+    limit = LEAST_BLUR * width / enlargement.width
+    found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
+    if not found.hiding and (noise := estimate_noise(levels)) is not None:
         found = replace(found, noise=noise.level, noise_limit=noise.limit)
-    if (blur := estimate_blur(levels, found.noise or 0.0)) is not None:
-        found = replace(found, blur=_enlarged(blur, scale))
-    return Inspected(found, None)
+    return Inspected(found, levels)
 
 
-def with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis:
-    """The diagnosis of a photo with a hiding JPEG, completed; under JPEG all blur counts as Gaussian."""
+def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
+    """The diagnoses of photos that were made in the same way.
+
+    Where a JPEG hides them, noise and blur come from the coefficients of all photos of one table together.
+    Otherwise the blur is each photo's own. Its noise is too, unless no photo shows any in all its channels:
+    a JPEG of a quality too good to be found, or a camera, may have smoothed the colours, and the luma's
+    coefficients, again of all photos, may still show it.
+    """
+    diagnoses = [photo.diagnosis for photo in photos]
+    for table in dict.fromkeys(photo.table for photo in photos):
+        members = [k for k, photo in enumerate(photos) if photo.table == table]
+        hiding = table is not ROUNDING_ONLY
+        shown = [d.noise - d.noise_limit for k in members if (d := diagnoses[k]).noise is not None]
+        large = min(min(photos[k].levels.shape[:2]) for k in members) >= LUMA_TELLS
+        hidden = None
+        if hiding or (large and shown and np.median(shown) < 0):
+            share = -(-(MAX_BLOCKS if hiding else FEW_BLOCKS) // len(members))
+            steps = np.array(table)
+            corners = [diagnoses[k].jpeg.phase if hiding else (0, 0) for k in members]
+            blocks = [
+                quantised(photos[k].levels, steps, c)[:share] for k, c in zip(members, corners, strict=True)
+            ]
+            hidden = estimate_hidden(np.concatenate(blocks), steps)
+        for k in members:
+            if hiding:
+                diagnoses[k] = _with_hidden(diagnoses[k], hidden)
+            else:
+                diagnoses[k] = _with_blur(diagnoses[k], photos[k].levels, hidden)
+    return diagnoses
+
+
+def _with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis:
+    """Noise and blur of a photo whose JPEG hides them; all blur counts as Gaussian."""
     if hidden is None:
         return photo
     sigma, scale = extra_sigma(hidden.sigma), photo.width / photo.enlargement.width
@@ -111,6 +147,22 @@ def with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis:
     )
 
 
+def _with_blur(photo: PhotoDiagnosis, levels: Floats, hidden: Hidden | None) -> PhotoDiagnosis:
+    """The blur of a photo without a hiding JPEG; and the noise that `hidden` has in the luma alone."""
+    if hidden is not None and hidden.noise > 0:
+        photo = replace(photo, noise=hidden.noise, noise_limit=hidden.noise_limit)
+    blur = estimate_blur(levels, photo.noise or 0.0)
+    return (
+        photo if blur is None else replace(photo, blur=_enlarged(blur, photo.width / photo.enlargement.width))
+    )
+
+
 def _enlarged(blur: Blur, scale: float) -> Blur:
     """The same blur in pixels of the photo after enlargement."""
     return replace(blur, amount=blur.amount * scale, sigma=blur.sigma * scale)
+
+
+def _middle(levels: Floats) -> Floats:
+    """At most `LARGEST` px a side, cut so that blocks of 8 x 8 pixels stay whole."""
+    top, left = (max(0, side - LARGEST) // 16 * 8 for side in levels.shape[:2])
+    return levels[top : top + LARGEST, left : left + LARGEST]

@@ -10,8 +10,7 @@ import numpy as np
 
 from hqgs.camera import Scene
 from hqgs.degradations import NONE, parse_degradation
-from hqgs.diagnosis.coefficients import MAX_BLOCKS, estimate_hidden
-from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, inspect_photo, with_hidden
+from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 
 PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
 VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
@@ -65,24 +64,10 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
             if view.image.shape[:2] == (first.height, first.width):
                 known = first.enlargement
         found.append(inspect_photo(view.name, view.image, view.low, enlargement=known))
-    photos = _pool_hidden(found)
+    photos = tuple(conclude(found))
     parts = (_blur(photos), _lowres(photos), _noise(photos), _jpeg(photos))
     text = "+".join(part.step for part in parts if part.step is not None) or NONE
     return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
-
-
-def _pool_hidden(found: Sequence[Inspected]) -> tuple[PhotoDiagnosis, ...]:
-    """Complete the photos whose JPEG hides noise and blur with one estimate per quantisation table."""
-    photos = [f.diagnosis for f in found]
-    for table in {photo.jpeg.table for photo in photos if photo.hiding}:
-        members = [k for k, photo in enumerate(photos) if photo.hiding and photo.jpeg.table == table]
-        share = -(-MAX_BLOCKS // len(members))
-        steps = [found[k].steps for k in members]
-        pooled = np.concatenate([s[:share] for s in steps if s is not None])  # the blocks come shuffled
-        hidden = estimate_hidden(pooled, np.array(table))
-        for k in members:
-            photos[k] = with_hidden(photos[k], hidden)
-    return tuple(photos)
 
 
 def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:
@@ -114,15 +99,19 @@ def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Part:
     if quality >= VISIBLE_QUALITY:
         reason = f"quality {quality:.0f} is too good to matter (needed below {VISIBLE_QUALITY})"
         return Part("jpeg", False, quality, spread, None, reason)
+    (row, column), _ = Counter(photo.jpeg.phase for photo in photos if photo.jpeg.quality).most_common(1)[0]
+    if (row, column) != (0, 0):
+        reason = f"{of}, but from row {row} and column {column} on: cropped since, which no step can say"
+        return Part("jpeg", False, quality, spread, None, reason)
     return Part("jpeg", True, quality, spread, f"jpeg:{quality:.0f}", f"{of} of quality {quality:.0f}")
 
 
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
-    values = [photo.noise for photo in photos if photo.noise is not None]
-    if not values:
+    told = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
+    if not told:
         return Part("noise", False, None, None, None, "the photos are too small or too clipped to tell")
-    level, limit = float(np.median(values)), float(np.median([photo.noise_limit for photo in photos]))
-    spread = None if _pooled(photos) else _spread_of(values)
+    level, limit = (float(value) for value in np.median(told, axis=0))
+    spread = None if _pooled(photos) else _spread_of([noise for noise, _ in told])
     if level >= limit:
         return Part("noise", True, level, spread, f"noise:{level:.0f}", f"white noise of {level:.1f} levels")
     if spread is None:
