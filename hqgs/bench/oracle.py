@@ -113,7 +113,7 @@ class Oracle:
         return self._blend(layers)
 
     def gradients(self, cotangents: dict[Pixel, Array], ids: list[int]) -> dict[str, list[list[Any]]]:
-        """Gradients of the sum over pixels of `cotangent . (channels, alpha)`, by group, for Gaussians `ids`."""
+        """Gradients, by group, of the sum over pixels of `cotangent . (channels, alpha)` for Gaussians `ids`."""
         plans = [(pixel, v, *self._layers(pixel)) for pixel, v in cotangents.items()]
         found: dict[str, list[list[Any]]] = {name: [] for name in GROUPS}
         for i in ids:
@@ -141,7 +141,9 @@ class Oracle:
             gradient.append((sides[0] - sides[1]) / (2 * h))
         return gradient
 
-    def _moved_loss(self, i: int, splat: Splat, pixel: Pixel, v: Array, layers: list[Any], capped: set[int]) -> Any:
+    def _moved_loss(
+        self, i: int, splat: Splat, pixel: Pixel, v: Array, layers: list[Any], capped: set[int]
+    ) -> Any:
         moved = []
         for j, alpha, color in layers:
             if j == i:
@@ -204,7 +206,8 @@ class Oracle:
 
     def _camera_point(self, mean: list[Any]) -> list[Any]:
         return [
-            sum((a * b for a, b in zip(row, mean, strict=True)), t) for row, t in zip(self.R, self.t, strict=True)
+            sum((a * b for a, b in zip(row, mean, strict=True)), t)
+            for row, t in zip(self.R, self.t, strict=True)
         ]
 
     def _splat(self, i: int) -> Splat | None:
@@ -225,6 +228,8 @@ class Oracle:
         if splat.det <= 0 or splat.opacity < ALPHA_FLOOR:
             return None
         reach = mp.sqrt(2 * max(mp.mpf(0), mp.log(splat.opacity / ALPHA_FLOOR)))
+        if reach == 0:  # both radii are 0, which is at most the default radius_clip
+            return None
         for mean, variance, size in zip(splat.mean, splat.cov[::2], (s.width, s.height), strict=True):
             radius = mp.ceil(reach * mp.sqrt(variance))
             if mean + radius <= 0 or mean - radius >= size:
@@ -234,7 +239,9 @@ class Oracle:
     def _project(self, i: int, changed: dict[str, list[Any]]) -> Splat:
         """Gaussian `i`, with the parameters in `changed` instead of its own."""
         mp, s = self.mp, self.scene
-        mean, quat, scale, (opacity,), color = (changed.get(name) or self._numbers(name, i) for name in GROUPS)
+        mean, quat, scale, (opacity,), color = (
+            changed.get(name) or self._numbers(name, i) for name in GROUPS
+        )
         x, y, z = self._camera_point(mean)
         fx, fy, cx, cy = (mp.mpf(float(s.K[k])) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
         rows = []

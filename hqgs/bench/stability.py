@@ -61,10 +61,8 @@ def render(s: OracleScene, dtype: str, cotangents: dict[tuple[int, int], Array])
         rasterize_mode="antialiased" if s.antialiased else "classic",
     )
     full = torch.cat([image, alphas], dim=-1)[0]
-    loss = full.new_zeros(())
-    for (i, j), v in cotangents.items():
-        loss = loss + (full[i, j] * tensor(v)).sum()
-    loss.backward()
+    i, j = torch.tensor(list(cotangents)).T
+    (full[i, j] * tensor(np.stack(list(cotangents.values())))).sum().backward()
     gradients = {name: _double(leaf.grad) for name, leaf in leaves.items()}
     return _double(full), meta["radii"][0].numpy(), gradients
 
@@ -101,16 +99,24 @@ def evaluate(case: Case, dtype: str) -> Outcome:
     as_expected = as_expected and all(oracle.kept(i) == (i not in culled) for i in checked)
     wanted = [oracle.pixel(pixel) for pixel in case.pixels]
     got = [image[pixel] for pixel in case.pixels]
-    error = max(float(abs(g - w)) for a, b in zip(got, wanted, strict=True) for g, w in zip(a, b, strict=True))
+    error = max(
+        float(abs(g - w)) for a, b in zip(got, wanted, strict=True) for g, w in zip(a, b, strict=True)
+    )
     size = max(float(abs(w)) for row in wanted for w in row)
     ids = list(case.gradients_of) if case.gradients_of is not None else list(range(len(s.means)))
     reference = oracle.gradients(cotangents, ids)
     worst, cosine, group = compare_gradients(s, dtype, gradients, reference, ids)
-    return Outcome(dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group)
+    return Outcome(
+        dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group
+    )
 
 
 def compare_gradients(
-    s: OracleScene, dtype: str, gradients: dict[str, Array], reference: dict[str, list[list[Any]]], ids: list[int]
+    s: OracleScene,
+    dtype: str,
+    gradients: dict[str, Array],
+    reference: dict[str, list[list[Any]]],
+    ids: list[int],
 ) -> tuple[float, float, str]:
     """Largest relative L2 and smallest cosine over Gaussians and groups, and the group of the former.
 
@@ -127,6 +133,8 @@ def compare_gradients(
             parameter = np.linalg.norm(getattr(s, name)[i])
             if name == "means":
                 parameter = np.linalg.norm(s.viewmat[:3, :3] @ s.means[i] + s.viewmat[:3, 3])
+            if not np.isfinite(parameter):  # culled
+                parameter = 0.0
             rows.append((name, truth, found, parameter))
     largest = max(np.linalg.norm(truth) * parameter for _, truth, _, parameter in rows)
     worst, cosine, group = 0.0, 1.0, ""
@@ -193,6 +201,7 @@ def run(args: argparse.Namespace) -> Report:
             {
                 "name": case.name,
                 "reason": case.reason,
+                "limits": dict(case.limits),
                 "culled": {o.dtype: list(case.expected_culled(o.dtype)) for o in outcomes},
                 "outcomes": [{**vars(o), "misses": misses(case, o)} for o in outcomes],
             }
@@ -214,16 +223,29 @@ def measured(rows: Rows) -> Rows:
 
 
 def tables(rows: Rows, rounding: float) -> list[str]:
-    head = ["case", "why", "culled", "f32 max", "f32 rel", "f32 grad", "f32 1-cos", "f64 rel", "f64 grad", "targets"]
+    head = [
+        "case",
+        "why",
+        "culled",
+        "f32 max",
+        "f32 rel",
+        "f32 grad",
+        "f32 1-cos",
+        "f64 rel",
+        "f64 grad",
+        "targets",
+    ]
     lines = []
     for case, (single, double) in measured(rows):
-        culled = f"{len(single_culled)}" if (single_culled := case.expected_culled("f32")) else ""
-        if case.culled != case.expected_culled("f32"):
-            culled += " in f32"
+        in_f32, in_f64 = (len(case.expected_culled(dtype)) for dtype in ("f32", "f64"))
+        culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
         numbers = (single.value_abs, single.value_relative, single.gradient, max(0.0, 1 - single.cosine))
         numbers += (double.value_relative, double.gradient)
         missed = [f"{o.dtype}: {m}" for o in (single, double) for m in misses(case, o)]
-        lines.append([case.name, case.reason, culled, *(f"{v:.1e}" for v in numbers), "; ".join(missed) or "met"])
+        missed += [f"({dtype}) {why}" for dtype, why in case.limits.items()]
+        lines.append(
+            [case.name, case.reason, culled, *(f"{v:.1e}" for v in numbers), "; ".join(missed) or "met"]
+        )
     poison = [(case, outcomes) for case, outcomes in rows if case.poison]
     good = sum(not misses(case, o) for case, outcomes in poison for o in outcomes)
     return [
