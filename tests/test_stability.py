@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def test_oracle_agrees_with_autograd(antialiased: bool, degree: int | None) -> N
     """Two independent derivations: scalars in mpmath with differences, tensors in torch with autograd."""
     s = CASES["turned camera"].scene if degree is None else CASES["SH degree 3"].scene
     s = replace(s, antialiased=antialiased)
-    leaves = {name: torch.tensor(getattr(s, name), requires_grad=True) for name in GROUPS}
+    leaves: dict[str, Any] = {name: torch.tensor(getattr(s, name), requires_grad=True) for name in GROUPS}
     assert s.background is not None
     image, alphas, _ = reference_rasterization(
         **leaves,

@@ -113,7 +113,7 @@ class Oracle:
         return self._blend(layers)
 
     def gradients(self, cotangents: dict[Pixel, Array], ids: list[int]) -> dict[str, list[list[Any]]]:
-        """Gradients, by group, of the sum over pixels of `cotangent . (channels, alpha)` for Gaussians `ids`."""
+        """Gradients by group, for Gaussians `ids`, of the sum over pixels of cotangent . (color, alpha)."""
         plans = [(pixel, v, *self._layers(pixel)) for pixel, v in cotangents.items()]
         found: dict[str, list[list[Any]]] = {name: [] for name in GROUPS}
         for i in ids:
