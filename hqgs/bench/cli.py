@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import hqgs
-from hqgs.bench import accuracy, quality, speed, training
+from hqgs.bench import accuracy, quality, speed, stability, training
 from hqgs.bench.output import Benchmark, command_line, write_results
 
 BENCHMARKS: dict[str, Benchmark] = {
     "accuracy": accuracy.BENCHMARK,
     "quality": quality.BENCHMARK,
     "speed": speed.BENCHMARK,
+    "stability": stability.BENCHMARK,
     "training": training.BENCHMARK,
 }
 

@@ -1,0 +1,162 @@
+"""Stiff and extreme scenes against 100 decimal digits, and that oracle against numbers known otherwise."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from reference import reference_rasterization
+
+from hqgs.bench.cli import add_parser
+from hqgs.bench.oracle import GROUPS, Oracle
+from hqgs.bench.stability import GRADIENT_F64, VALUE_F64, evaluate, input_rounding, misses
+from hqgs.bench.stability_cases import PIXELS, cases, scene
+
+CASES = {case.name: case for case in cases()}
+
+
+def parameters() -> list[object]:
+    """Every case in both dtypes; one that misses a target for a known reason must go on missing it."""
+    found = []
+    for name, case in CASES.items():
+        for dtype in ("f32", "f64"):
+            why = case.limits.get(dtype)
+            marks = [pytest.mark.xfail(strict=True, reason=why, raises=AssertionError)] if why else []
+            found.append(pytest.param(name, dtype, id=f"{name}-{dtype}", marks=marks))
+    return found
+
+
+@pytest.mark.parametrize(("name", "dtype"), parameters())
+def test_targets(name: str, dtype: str) -> None:
+    outcome = evaluate(CASES[name], dtype)
+    assert misses(CASES[name], outcome) == [], outcome
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.limits])
+def test_limited_cases_stay_finite_and_keep_the_direction_of_the_gradient(name: str) -> None:
+    case = CASES[name]
+    for dtype in ("f32", "f64"):
+        outcome = evaluate(case, dtype)
+        assert outcome.finite
+        assert outcome.as_expected
+        assert outcome.others_equal
+        if dtype == "f64":
+            assert outcome.value_relative < 1e-9
+            assert outcome.gradient < 1e-3
+            assert outcome.cosine > 0.99999
+        else:
+            assert outcome.value_abs < 2e-3
+
+
+def test_oracle_on_a_case_done_by_hand() -> None:
+    """A round Gaussian on the axis: cov2d = (f s / z)^2 + 0.3, and alpha is a plain Gaussian of the pixel."""
+    s = scene(
+        means=np.array([[0.0, 0.0, 4.0]]),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        scales=np.full((1, 3), 0.5),
+        opacities=np.array([0.5]),
+        colors=np.array([[0.25]]),
+        background=np.array([1.0]),
+    )
+    alpha = 0.5 * math.exp(-0.5 * (1.5**2 + 1.0**2) / (2.5**2 + 0.3))
+    color, opaque = Oracle(s).pixel((5, 7))  # centre (7.5, 5.5), Gaussian at (6, 4.5)
+    assert float(opaque) == pytest.approx(alpha, rel=1e-15)
+    assert float(color) == pytest.approx(0.25 * alpha + (1 - alpha), rel=1e-15)
+    gradients = Oracle(s).gradients({(5, 7): np.array([1.0, 0.0])}, [0])
+    assert float(gradients["opacities"][0][0]) == pytest.approx((0.25 - 1) * alpha / 0.5, rel=1e-15)
+    assert float(gradients["colors"][0][0]) == pytest.approx(alpha, rel=1e-15)
+    # d alpha / d x through the centre: x moves it by f / z; the covariance changes in second order only
+    slope = alpha * 1.5 / (2.5**2 + 0.3) * 20 / 4
+    assert float(gradients["means"][0][0]) == pytest.approx((0.25 - 1) * slope, rel=1e-14)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [None, 3])
+def test_oracle_agrees_with_autograd(antialiased: bool, degree: int | None) -> None:
+    """Two independent derivations: scalars in mpmath with differences, tensors in torch with autograd."""
+    s = CASES["turned camera"].scene if degree is None else CASES["SH degree 3"].scene
+    s = replace(s, antialiased=antialiased)
+    leaves: dict[str, Any] = {name: torch.tensor(getattr(s, name), requires_grad=True) for name in GROUPS}
+    assert s.background is not None
+    image, alphas, _ = reference_rasterization(
+        **leaves,
+        viewmats=torch.tensor(s.viewmat)[None],
+        Ks=torch.tensor(s.K)[None],
+        width=s.width,
+        height=s.height,
+        sh_degree=degree,
+        backgrounds=torch.tensor(s.background)[None],
+        rasterize_mode="antialiased" if antialiased else "classic",
+    )
+    full = torch.cat([image, alphas], dim=-1)[0]
+    weights = np.random.default_rng(4).standard_normal((len(PIXELS), 4))
+    oracle = Oracle(s)
+    for pixel in PIXELS:
+        wanted = [float(v) for v in oracle.pixel(pixel)]
+        np.testing.assert_allclose(full[pixel].detach().numpy(), wanted, rtol=VALUE_F64)
+    i, j = torch.tensor(PIXELS).T
+    (full[i, j] * torch.tensor(weights)).sum().backward()
+    gradients = oracle.gradients(dict(zip(PIXELS, weights, strict=True)), [0, 1])
+    for name in GROUPS:
+        got = leaves[name].grad
+        assert got is not None
+        wanted = np.array([[float(v) for v in row] for row in gradients[name]])
+        error = np.linalg.norm(got.reshape(2, -1).numpy() - wanted) / np.linalg.norm(wanted)
+        assert error < GRADIENT_F64, name
+
+
+def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The measure itself: a change of 1e-6 in one value, or of 1 % in one gradient, misses the targets."""
+    from hqgs.bench import stability
+
+    right = stability.render
+
+    def wrong_image(*args):
+        image, radii, gradients = right(*args)
+        image[4, 5, 0] += 1e-6
+        return image, radii, gradients
+
+    def wrong_gradient(*args):
+        image, radii, gradients = right(*args)
+        gradients["quats"][1, 2] *= 1.01
+        return image, radii, gradients
+
+    case = CASES["ordinary"]
+    for wrong, word in ((wrong_image, "values"), (wrong_gradient, "gradient of quats")):
+        monkeypatch.setattr(stability, "render", wrong)
+        assert any(word in miss for miss in misses(case, evaluate(case, "f64")))
+
+
+def test_rounding_of_geo_referenced_inputs_is_what_spoils_them() -> None:
+    """float32 holds 2e6 to 0.125 units: the inputs are another scene, which is rendered right."""
+    assert input_rounding(CASES["world offset 1e6"]) > 1e-3
+    assert evaluate(CASES["world offset 1e6"], "f32").value_abs < 1e-5
+
+
+def test_command_writes_tables_and_chart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hqgs.bench import stability
+
+    few = [CASES[name] for name in ("ordinary", "behind the camera", "NaN in means[0]", "world offset 1e6")]
+    monkeypatch.setattr(stability, "cases", lambda long: few)
+    parser = argparse.ArgumentParser()
+    add_parser(parser.add_subparsers())
+    args = parser.parse_args(["bench", "stability", "--quick", "--out", str(tmp_path)])
+    assert args.run(args) == 0
+    printed = capsys.readouterr().out
+    assert "| ordinary" in printed
+    assert "2 of 2 culled" in printed
+    results = json.loads((tmp_path / "stability.json").read_text())["results"]
+    assert [case["name"] for case in results["cases"]] == [case.name for case in few]
+    assert results["cases"][0]["outcomes"][1]["value_relative"] < VALUE_F64
+    assert (tmp_path / "stability_errors.png").stat().st_size > 10_000
+    both = parser.parse_args(["bench", "stability", "--quick", "--long", "--out", str(tmp_path)])
+    assert both.run(both) == 2
