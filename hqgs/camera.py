@@ -38,6 +38,11 @@ class View:
     low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
 
 
+def as_floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy of a photo with white at 1."""
+    return np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32)
+
+
 @dataclass(frozen=True)
 class Scene:
     """Training views, held-out views and the sparse points that initialise the Gaussians."""

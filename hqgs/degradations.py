@@ -9,13 +9,13 @@ import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.signal import fftconvolve
 
+from hqgs.camera import as_floats
 from hqgs.resize import resize
 from hqgs.torch_threads import one_torch_thread
 
@@ -144,7 +144,7 @@ def degrade_image(
         raise ValueError(f"image must be [H, W, 3] uint8 or float32, got {image.shape} {image.dtype}")
     if not np.isfinite(image).all():
         raise ValueError("image holds NaN or Inf")
-    now = _scaled(image) if image.dtype == np.uint8 else image.astype(np.float32)
+    now = as_floats(image)
     small, jpeg = False, None
     for step in degradation.for_width(image.shape[1]).steps:
         amount, jpeg = step.value or 0.0, None
@@ -183,7 +183,7 @@ def to_uint8(image: Float32) -> NDArray[np.uint8]:
 def decode_jpeg(data: bytes) -> Float32:
     """The pixels of a JPEG file, [H, W, 3], multiples of 1/255."""
     with Image.open(io.BytesIO(data)) as photo:
-        return _scaled(np.asarray(photo.convert("RGB")))
+        return as_floats(np.asarray(photo.convert("RGB")))
 
 
 def shrink(image: Float32, factor: int) -> Float32:
@@ -283,10 +283,6 @@ _OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], Float32]] 
 def small_side(side: int, factor: int) -> int:
     """The side of a photo that was shrunk by `factor`, px."""
     return math.ceil(side / factor)
-
-
-def _scaled(photo: NDArray[Any]) -> Float32:
-    return np.divide(photo, 255, dtype=np.float32)
 
 
 def _check_fits(image: Float32, radius: int, what: str) -> None:

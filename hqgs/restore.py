@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 from tqdm import tqdm
 
-from hqgs.camera import Scene, View
+from hqgs.camera import Scene, View, as_floats
 from hqgs.rasterize import get_num_threads
 from hqgs.resize import resize
 from hqgs.torch_threads import one_torch_thread
@@ -176,7 +176,7 @@ def _restored_image(
     network: Network, view: View, config: RestoreConfig
 ) -> NDArray[np.uint8] | NDArray[np.float32]:
     photo = _as_taken(view)
-    values = np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32).clip(0, 1)
+    values = as_floats(photo).clip(0, 1)
     channels = torch.from_numpy(values).permute(2, 0, 1)[:, None]  # [3, 1, h, w]
     images = [channels.transpose(0, 1)] if network.input_channels == 3 else list(channels.split(1))
     out = (

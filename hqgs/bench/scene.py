@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -14,6 +16,25 @@ from hqgs.train import Trainer
 
 TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
 WARM_UP = 3  # steps
+
+
+def still_config(config: TrainConfig, n: int) -> TrainConfig:
+    """Steps that do all the work of a step on `n` Gaussians, the statistics for their number included, but
+    change next to nothing. The SH degree rises by one in each of the first."""
+    iterations = 1_000_000
+    return replace(
+        config,
+        iterations=iterations,
+        sh_interval=1,
+        lr_means=TINY,
+        lr_means_final=TINY,
+        lr_scales=TINY,
+        lr_quats=TINY,
+        lr_opacities=TINY,
+        lr_sh0=TINY,
+        lr_shN=TINY,
+        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
+    )
 
 
 def make_trainer(n: int, width: int, height: int, photos: int, method: str, seed: int) -> Trainer:
@@ -30,21 +51,7 @@ def make_trainer(n: int, width: int, height: int, photos: int, method: str, seed
     ]
     colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
     scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
-    iterations = 1_000_000
-    config = TrainConfig(
-        iterations=iterations,
-        method=method,
-        seed=seed,
-        sh_interval=1,
-        lr_means=TINY,
-        lr_means_final=TINY,
-        lr_scales=TINY,
-        lr_quats=TINY,
-        lr_opacities=TINY,
-        lr_sh0=TINY,
-        lr_shN=TINY,
-        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
-    )
+    config = still_config(TrainConfig(method=method, seed=seed), n)
     trainer = Trainer(scene, config)
     gaussians = trainer.gaussians
     with torch.no_grad():

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from hqgs.bench.features import FEATURES, Feature
 from hqgs.bench.output import Benchmark, Report, markdown_table
-from hqgs.bench.scene import TINY
+from hqgs.bench.scene import still_config
 from hqgs.bench.timing import Seconds, interleaved, median_ratio, quartiles
 from hqgs.camera import Scene
 from hqgs.config import TrainConfig
@@ -134,22 +134,7 @@ def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Tr
 
     The SH degree is what it is at the end of a run, and statistics for the density are gathered.
     """
-    iterations = 1_000_000
-    config = replace(
-        config,
-        iterations=iterations,
-        sh_interval=1,
-        lr_means=TINY,
-        lr_means_final=TINY,
-        lr_scales=TINY,
-        lr_quats=TINY,
-        lr_opacities=TINY,
-        lr_sh0=TINY,
-        lr_shN=TINY,
-        densify=DensifyConfig(
-            start=iterations, stop=iterations, reset_every=iterations, max_gaussians=max(len(gaussians), 1)
-        ),
-    )
+    config = still_config(config, max(len(gaussians), 1))
     points = gaussians.means.numpy()
     trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
     with torch.no_grad():

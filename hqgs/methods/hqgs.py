@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.camera import Scene, View
+from hqgs.camera import Scene, View, as_floats
 from hqgs.degradations import Degradation, parse_degradation, small_side
 from hqgs.diagnosis import diagnose_scene
 from hqgs.diagnosis.resolution import undo_enlargement
@@ -187,7 +187,7 @@ class HQGS(Plain):
             height, width = photo.shape[:2]
             if (height, width) not in self._cells:
                 self._cells[height, width] = JpegCells(tables_of_quality(self._jpeg), height, width)
-            centres = self._cells[height, width].centres(torch.from_numpy(_floats(array)))
+            centres = self._cells[height, width].centres(torch.from_numpy(as_floats(array)))
         return Target(operator, photo, None if mask is None else torch.from_numpy(mask), centres)
 
 
@@ -198,11 +198,7 @@ def _photo(view: View, factor: int) -> NDArray[np.uint8] | NDArray[np.float32]:
     if view.low is not None:
         return view.low
     size = (small_side(side, factor) for side in view.image.shape[:2])
-    return undo_enlargement(_floats(view.image).astype(np.float64), *size).astype(np.float32)
-
-
-def _floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32)
+    return undo_enlargement(as_floats(view.image).astype(np.float64), *size).astype(np.float32)
 
 
 def make_hqgs(scene: Scene, config: HQGSConfig, seed: int) -> Method:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from numpy.typing import NDArray
@@ -13,14 +13,11 @@ from hqgs.camera import Scene, View
 from hqgs.edges import edge_magnitude
 from hqgs.gaussians import Gaussians
 from hqgs.losses import photometric_loss
-from hqgs.methods.base import photo_tensors
+from hqgs.methods.base import Plain, photo_tensors
 from hqgs.methods.esfg import ESFG, ESFGConfig, FeatureRows
 from hqgs.methods.three_dgs import ThreeDGS
 from hqgs.scs import ScsWeights, weighted_scs_loss
 from hqgs.torch_threads import one_torch_thread
-
-if TYPE_CHECKING:
-    from hqgs.config import TrainConfig  # which itself imports the methods
 
 SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS
 CACHE_BYTES = 2**30  # of SCS weights (12 bytes a pixel); those of further views are computed at each step
@@ -69,13 +66,15 @@ VARIANTS = {
 }
 
 
-class PaperHQGS:
+class PaperHQGS(Plain):
     """HQGS (ICLR 2025) from its equations; where its released code differs, the paper holds.
 
     A modulated mean is about 1.5 times as far from the frame's origin as the trained one, so the cloud that
     COLMAP gives would start too large. The first call of `modulate` therefore moves the first Gaussians, in
     place, to where modulation takes them back to that cloud. From then on it changes nothing in place.
     """
+
+    name = "hqgs"
 
     def __init__(self, scene: Scene, seed: int, config: PaperConfig | None = None) -> None:
         """ValueError for photos that are not finite, or where no pixel counts."""
@@ -84,12 +83,6 @@ class PaperHQGS:
         self.esfg = None if esfg is None else ESFG(scene.train, seed, esfg)
         self.rows = None if esfg is None else FeatureRows(esfg.feature_size)
         self._cache: dict[str, tuple[NDArray[Any], ScsWeights]] = {}  # by name, with the photo they are of
-
-    def adapt(self, config: TrainConfig) -> TrainConfig:
-        return config
-
-    def left_out(self) -> list[tuple[str, str]]:
-        return []
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         if self.esfg is None or self.rows is None:

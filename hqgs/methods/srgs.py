@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.camera import Scene, View
+from hqgs.camera import Scene, View, as_floats
 from hqgs.losses import photometric_loss
 from hqgs.methods.base import Plain, photo_tensors
 from hqgs.resize import resize, resize_matrix
@@ -94,7 +94,7 @@ class SRGS(Plain):
             factor = self.config.own_factor
             if factor == 1:
                 return None
-            image = np.divide(view.image, 255 if view.image.dtype == np.uint8 else 1, dtype=np.float32)
+            image = as_floats(view.image)
             photo = resize(image, -(-camera.height // factor), -(-camera.width // factor))
         _check_low(view, photo)
         sizes = camera.height, camera.width, *photo.shape[:2]
