@@ -13,16 +13,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from hqgs.bench.features import FEATURES, Feature
-from hqgs.bench.output import Benchmark, Report, markdown_table
+from hqgs.bench.output import Benchmark, Report
 from hqgs.bench.scene import still_config
-from hqgs.bench.timing import Seconds, interleaved, median_ratio, quartiles
+from hqgs.bench.timing import Seconds, interleaved
+from hqgs.bench.training_report import DEFAULT, chart, compare, scene_table, verdict_table, verdicts
 from hqgs.camera import Scene
 from hqgs.config import TrainConfig
 from hqgs.data import load_scene
 from hqgs.densify import DensifyConfig
+from hqgs.files import write_json
 from hqgs.gaussians import Gaussians
 from hqgs.ply import read_ply
 from hqgs.report import REPORT
@@ -32,9 +33,9 @@ from hqgs.synthetic.scene import HEIGHT, WIDTH
 from hqgs.train import Trainer
 
 EMBEDDED = "embedded"
-DEFAULT = Feature("default", "", True)
-LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
 TRIAL_STEPS = 5  # for the first estimate of the time
+REFINED = "refined.json"
+REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
 GROWTH = (1.0, 4.0)  # by how much a step gets longer in the course of a run, about
 
 
@@ -97,8 +98,25 @@ class Training:
             (folder / CHECKPOINT).unlink()
             report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
         return {name: report[name] for name in ("seed", "seconds", "gaussians", "history")} | {
-            "psnr": report["history"][-1]["psnr"]
+            "psnr": report["history"][-1]["psnr"],
+            "refined_psnr": self.refined(feature, seed),
         }
+
+    def refined(self, feature: Feature, seed: int) -> float:
+        """Held-out PSNR of the default run's final Gaussians when they are trained on, their number fixed."""
+        path = self.folder(feature, seed) / REFINED
+        if not path.is_file():
+            iterations = -(-self.config.iterations // REFINED_SHARE)
+            config = self.train_config(feature, seed)
+            config = replace(config, iterations=iterations, densify=replace(config.densify, stop=0))
+            grown = read_ply(self.folder(DEFAULT, seed) / PLY)
+            with feature.switch():
+                trainer = trainer_from(self.scene, config, grown)
+                for _ in range(iterations):
+                    trainer.step()
+                trainer.evaluate()
+            write_json(path, trainer.history[-1])
+        return json.loads(path.read_text(encoding="utf-8"))["psnr"]
 
     def step_seconds(self) -> float:
         """Seconds of a step at the start of a run."""
@@ -134,134 +152,20 @@ def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Tr
 
     The SH degree is what it is at the end of a run, and statistics for the density are gathered.
     """
-    config = still_config(config, max(len(gaussians), 1))
-    points = gaussians.means.numpy()
-    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
-    with torch.no_grad():
-        for name, tensor in trainer.gaussians.named().items():
-            tensor.copy_(getattr(gaussians, name))
+    trainer = trainer_from(scene, still_config(config, max(len(gaussians), 1)), gaussians)
     for _ in range(config.sh_degree):
         trainer.step()
     return trainer
 
 
-def compare(runs: dict[str, list[dict[str, Any]]], steps: dict[str, list[Seconds]]) -> list[dict[str, Any]]:
-    """One row for each feature. `cost_db`: what the fast choice costs in held-out PSNR, run by run with the
-    same seed; `speedup`: of the fast choice, over the other one."""
-    default = runs[DEFAULT.name]
-    rows = []
-    for feature in FEATURES:
-        other = runs[feature.name]
-        sign = 1 if feature.by_default else -1
-        costs = [sign * (b["psnr"] - a["psnr"]) for a, b in zip(default, other, strict=True)]
-        seconds = [(b["seconds"] / a["seconds"]) ** sign for a, b in zip(default, other, strict=True)]
-        rounds = [
-            {"total": (b["total"] / a["total"]) ** sign}
-            for a, b in zip(steps[DEFAULT.name], steps[feature.name], strict=True)
-        ]
-        rows.append(
-            {
-                "feature": feature.name,
-                "other": feature.other,
-                "by_default": feature.by_default,
-                "psnr": float(np.mean([r["psnr"] for r in other])),
-                "costs_db": costs,
-                "cost_db": float(np.mean(costs)),
-                "speedup_run": float(np.mean(seconds)),
-                "speedup_step": median_ratio(rounds, [{"total": 1.0}] * len(rounds)),
-                "speedup_step_quartiles": quartiles(rounds),
-                "runs": other,
-            }
-        )
-    return rows
-
-
-def verdicts(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean cost over the scenes, and whether the feature may be on."""
-    found = []
-    for k, feature in enumerate(FEATURES):
-        rows = [scene["features"][k] for scene in scenes]
-        costs = [cost for row in rows for cost in row["costs_db"]]
-        cost = float(np.mean([row["cost_db"] for row in rows]))
-        found.append(
-            {
-                "feature": feature.name,
-                "other": feature.other,
-                "by_default": feature.by_default,
-                "cost_db": cost,
-                "standard_error_db": float(np.std(costs, ddof=1) / np.sqrt(len(costs)))
-                if costs[1:]
-                else None,
-                "limit_db": LIMIT_DB,
-                "passed": not feature.by_default or cost <= LIMIT_DB,
-            }
-        )
-    return found
-
-
-def scene_table(scene: dict[str, Any]) -> str:
-    default = scene["default"]
-    psnr, seconds = (float(np.mean([r[name] for r in default])) for name in ("psnr", "seconds"))
-    title = (
-        f"{scene['scene']}, {scene['width']} x {scene['height']}, {scene['iterations']:,} iterations: "
-        f"default {psnr:.2f} dB, {seconds:.0f} s, {default[0]['gaussians']:,} Gaussians"
-    )
-    body = [
-        [
-            row["feature"],
-            "on" if row["by_default"] else "off",
-            row["other"],
-            f"{row['psnr']:.3f}",
-            f"{row['cost_db']:+.3f}",
-            f"{row['speedup_run']:.2f}",
-            f"{row['speedup_step']:.2f}",
-            " to ".join(f"{q:.2f}" for q in row["speedup_step_quartiles"]),
-        ]
-        for row in scene["features"]
-    ]
-    head = [
-        "feature", "default", "instead", "PSNR with it (dB)", "cost (dB)", "speed-up of the run",
-        "of a final step", "quartiles",
-    ]  # fmt: skip
-    return markdown_table(title, head, body)
-
-
-def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
-    body = [
-        [
-            row["feature"],
-            "on" if row["by_default"] else "off",
-            f"{row['cost_db']:+.3f}",
-            "" if row["standard_error_db"] is None else f"{row['standard_error_db']:.3f}",
-            "pass" if row["passed"] else "FAIL",
-        ]
-        for row in rows
-    ]
-    return markdown_table(
-        f"Mean cost; what is on by default may cost {LIMIT_DB} dB",
-        ["feature", "default", "cost (dB)", "standard error", "verdict"],
-        body,
-    )
-
-
-def chart(scene: dict[str, Any]) -> Figure:
-    """Held-out PSNR over training seconds, a curve for each run of the first seed."""
-    figure = Figure(figsize=(8, 5), dpi=150, layout="constrained")
-    axes = figure.subplots()
-    curves = {DEFAULT.name: scene["default"][0]}
-    curves |= {f"{r['feature']}: {r['other']}": r["runs"][0] for r in scene["features"]}
-    for name, run in curves.items():
-        points = [(h["seconds"], h["psnr"]) for h in run["history"] if h["psnr"] is not None]
-        first = name == DEFAULT.name
-        axes.plot(
-            *zip(*points, strict=True), label=name, lw=2.4 if first else 1.1, zorder=3 if first else 2,
-            color="black" if first else None, marker="o", markersize=2.5,
-        )  # fmt: skip
-    axes.set(xlabel="training (s)", ylabel="held-out PSNR (dB)", title=scene["scene"])
-    axes.grid(color="#dddddd", linewidth=0.7)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=7)
-    return figure
+def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
+    """A trainer that starts with these Gaussians in place of the scene's points."""
+    points = gaussians.means.numpy()
+    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
+    with torch.no_grad():
+        for name, tensor in trainer.gaussians.named().items():
+            tensor.copy_(getattr(gaussians, name))
+    return trainer
 
 
 def _label(feature: Feature) -> str:
