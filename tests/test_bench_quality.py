@@ -144,7 +144,7 @@ def test_tables_follow_from_the_files(out: Path, runs: dict[Any, dict[str, Any]]
 
 
 def test_one_file_holds_everything(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
-    whole = json.loads((out / "quality.json").read_text(encoding="utf-8"))
+    whole = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))
     assert {run["key"]: run for run in whole["results"]["runs"]} == {run["key"]: run for run in runs.values()}
     assert whole["settings"]["protocol"] == "smoke"
     assert whole["settings"]["validation"] is False
@@ -196,7 +196,7 @@ def test_finished_cells_are_not_repeated(
     (out / "runs" / name).unlink()
     assert call(out, "--finished", *OPTIONS) == 0
     assert not (out / "runs" / name).exists()
-    left_out = json.loads((out / "quality.json").read_text(encoding="utf-8"))["left_out"]
+    left_out = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))["left_out"]
     assert {"what": "run embedded, lowres:2, hqgs, seed 1", "why": "not finished"} in left_out
 
     assert call(out, *OPTIONS) == 0
@@ -211,8 +211,40 @@ def test_finished_cells_are_not_repeated(
 def test_a_run_serves_other_protocols_and_filters(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
     assert call(out, "--degradations", "noise:25.0", "--methods", "hqgs", "3dgs", "--iterations", "5") == 0
-    whole = json.loads((out / "quality.json").read_text(encoding="utf-8"))
+    whole = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))
     assert [run["method"] for run in whole["results"]["runs"]] == ["3dgs", "hqgs"]  # the protocol's order
+
+
+def test_known_runs_of_another_machine_are_not_repeated(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = quality_runs.run_cell
+    monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
+    known = tmp_path / "known.json"
+    assert call(out, *OPTIONS, "--finished") == 0
+    known.write_bytes((out / "quality_smoke.json").read_bytes())
+    assert call(tmp_path / "elsewhere", *OPTIONS, "--known", str(known)) == 0
+    here, there = (
+        json.loads((folder / "quality_smoke.json").read_text(encoding="utf-8"))["results"]
+        for folder in (out, tmp_path / "elsewhere")
+    )
+    assert here["runs"] == there["runs"]
+    assert "the runs did not keep its renders" in capsys.readouterr().out
+
+    # An own run is worth more than one that is brought.
+    changed = json.loads(known.read_text(encoding="utf-8"))
+    changed["results"]["runs"][0]["metrics"]["psnr"] = 99.0
+    changed["results"]["runs"][1]["key"] = "../outside"
+    known.write_text(json.dumps(changed), encoding="utf-8")
+    monkeypatch.setattr(quality, "run_cell", real)
+    assert call(out, *OPTIONS, "--known", str(known)) == 2
+    assert "'../outside'" in capsys.readouterr().err
+    assert not (tmp_path / "outside.json").exists()
+    kept = json.loads((out / "runs" / f"{here['runs'][0]['key']}.json").read_text(encoding="utf-8"))
+    assert kept == here["runs"][0]
+    known.write_text("[]", encoding="utf-8")
+    assert call(out, *OPTIONS, "--known", str(known)) == 2
+    assert "holds no runs of this benchmark" in capsys.readouterr().err
 
 
 def test_validation_never_sees_a_test_view(out: Path, tmp_path: Path) -> None:
@@ -228,7 +260,7 @@ def test_validation_never_sees_a_test_view(out: Path, tmp_path: Path) -> None:
 
     options = ("--degradations", "noise:25", "--methods", "3dgs", "--iterations", "2", "--validate")
     assert call(out, *options) == 0
-    whole = json.loads((out / "quality.json").read_text(encoding="utf-8"))
+    whole = json.loads((out / "quality_smoke_validation.json").read_text(encoding="utf-8"))
     assert whole["settings"]["validation"] is True
     (run,) = whole["results"]["runs"]
     assert "-validation-" in run["key"]
@@ -263,7 +295,7 @@ def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.
     bench = make()
     bench.train()
     assert len(stamps(tmp_path)) == 3
-    bench.tables("smoke")
+    bench.tables()
     assert {"what": "run tiny, noise:25, 3dgs, seed 0", "why": "it blew up"} in bench.report.left_out
     assert [group.degradation for group in bench.groups()] == ["none"]  # srgs alone is not compared
 

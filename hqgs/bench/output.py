@@ -22,6 +22,7 @@ class Report:
     """The outcome of a benchmark. `settings`, `results` and `left_out` hold plain JSON values."""
 
     settings: dict[str, Any]
+    part: str = ""  # of the benchmark, where it has several: each is written to files of its own
     results: dict[str, Any] = field(default_factory=dict)
     tables: list[str] = field(default_factory=list)  # Markdown
     figures: dict[str, Figure] = field(default_factory=dict)  # by what they show
@@ -38,7 +39,7 @@ class Benchmark:
 
 
 def write_results(out: Path, name: str, command: str, report: Report) -> list[Path]:
-    """Write `NAME.json` and `NAME_FIGURE.png` into `out`; return their paths, JSON first."""
+    """Write `NAME_PART.json` and `NAME_PART_FIGURE.png` into `out`; return their paths, JSON first."""
     versions = version_facts()
     facts = {
         "benchmark": name,
@@ -52,12 +53,13 @@ def write_results(out: Path, name: str, command: str, report: Report) -> list[Pa
         "results": report.results,
         "left_out": report.left_out,
     }
-    pictures = {out / f"{name}_{what}.png": figure for what, figure in report.figures.items()}
+    stem = f"{name}_{report.part}" if report.part else name
+    pictures = {out / f"{stem}_{what}.png": figure for what, figure in report.figures.items()}
     for path, figure in pictures.items():
         with atomic_path(path) as tmp:
             figure.savefig(tmp)
-    write_json(out / f"{name}.json", facts)
-    return [out / f"{name}.json", *pictures]
+    write_json(out / f"{stem}.json", facts)
+    return [out / f"{stem}.json", *pictures]
 
 
 def command_line(args: argparse.Namespace) -> str:

@@ -132,8 +132,8 @@ class Quality:
             if not (path.is_file() or write_sheet(path, self.store, scene, runs, number)):
                 self.leave_out(f"picture {name}", "the runs did not keep its renders")
 
-    def tables(self, name: str) -> None:
-        """Everything that the finished runs tell; figures are named after the protocol."""
+    def tables(self) -> None:
+        """Everything that the finished runs tell."""
         protocol, report = self.protocol, self.report
         for job in self.jobs:
             if job.run is None:
@@ -148,11 +148,11 @@ class Quality:
         report.results |= {"edge_maps": maps, "runs": [job.run for job in self.jobs if job.run is not None]}
         groups, labels = self.groups(), protocol.labels
         if groups:
-            self.compare(name, groups, labels)
+            self.compare(groups, labels)
         if kinds and maps:
             report.tables.append(tables.edge_maps(maps))
 
-    def compare(self, name: str, groups: list[Group], labels: list[str]) -> None:
+    def compare(self, groups: list[Group], labels: list[str]) -> None:
         """Tables and charts of the groups in which every row is finished."""
         protocol, report = self.protocol, self.report
         for group in groups:
@@ -169,7 +169,7 @@ class Quality:
                     numbers, "equal_time_gain", f"PSNR gain over {baseline} when the faster of the two ends"
                 ),
             ]
-            report.figures[f"{name}_gains"] = gain_chart(groups, labels, baseline)
+            report.figures["gains"] = gain_chart(groups, labels, baseline)
         scenes = dict.fromkeys(group.scene for group in groups)
         for scene in scenes if len(scenes) > 1 else ():
             part = [group for group in groups if group.scene == scene]
@@ -180,8 +180,8 @@ class Quality:
         report.tables.append(tables.regions(groups, labels))
         guessing = [row.label for row in protocol.rows if any(g.runs[row.label]["formation"] for g in groups)]
         report.tables += [tables.formations(groups, label) for label in guessing]
-        report.figures[f"{name}_psnr_vs_time"] = time_chart(groups, labels, what)
-        report.figures[f"{name}_regions"] = region_chart(groups, labels)
+        report.figures["psnr_vs_time"] = time_chart(groups, labels, what)
+        report.figures["regions"] = region_chart(groups, labels)
         for metric, why in sorted({item for run in runs for item in run["reasons"].items()}):
             self.leave_out(metric, why)
 
@@ -230,13 +230,16 @@ def run(args: argparse.Namespace) -> Report:
     sources = args.scenes[:1] if protocol.one_scene else args.scenes
     scenes = load_scenes(sources, protocol.downscale, protocol.embedded, args.out / "scenes", args.validate)
     settings = {"protocol": name, **asdict(protocol), "scenes": [s.name for s in scenes]}
-    report = Report(settings=settings | {"validation": args.validate})
-    quality = Quality(protocol, scenes, RunStore(args.out, args.validate), args.pictures, report)
+    part = name + ("_validation" if args.validate else "")
+    report = Report(settings | {"validation": args.validate}, part)
+    store = RunStore(args.out, args.validate)
+    for path in args.known or ():
+        store.take(path)
+    quality = Quality(protocol, scenes, store, args.pictures, report)
     if not args.finished:
         quality.train()
-    name += "_validation" if args.validate else ""
-    quality.tables(name)
-    write_text(args.out / f"quality_{name}.md", "\n\n".join(report.tables) + "\n")
+    quality.tables()
+    write_text(args.out / f"quality_{part}.md", "\n\n".join(report.tables) + "\n")
     return report
 
 
@@ -255,6 +258,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--downscale", type=float, metavar="F", help="instead of the protocol's")
     add("--validate", action="store_true", help="for tuning: judge on training photos, leave test views out")
     add("--pictures", type=int, default=1, metavar="N", help="sheets per scene and degradation (%(default)s)")
+    add(
+        "--known", nargs="+", type=Path, metavar="JSON",
+        help="results of this benchmark from elsewhere: their runs count as finished",
+    )  # fmt: skip
     add("--finished", action="store_true", help="train nothing: tables of the runs that are finished")
 
 

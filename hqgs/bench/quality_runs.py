@@ -32,6 +32,7 @@ from hqgs.torch_threads import one_torch_thread
 from hqgs.train import Trainer
 
 FORMAT = 1  # raised when a run records something else
+KEY = r"[A-Za-z0-9_][A-Za-z0-9._-]*"  # what a run's name looks like: no path
 FIRST_STEPS = slice(3, 13)  # the steps whose median is a first step's time: warm, and before any growth
 RENDERS = 3  # times that each held-out view is rendered
 
@@ -74,6 +75,22 @@ class RunStore:
         if not isinstance(run, dict) or run.get("key") != key:
             raise ValueError(f"{path} is not the run of that name; remove it, and the run is repeated")
         return run
+
+    def take(self, path: Path) -> None:
+        """Keep the runs of a result file of this benchmark that are not there yet, without their renders.
+
+        ValueError where it is no such file.
+        """
+        try:
+            runs = json.loads(path.read_text(encoding="utf-8"))["results"]["runs"]
+            keys = [run["key"] for run in runs]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"known: {path} holds no runs of this benchmark: {error!r}") from error
+        for key, run in zip(keys, runs, strict=True):
+            if not re.fullmatch(KEY, key):
+                raise ValueError(f"known: {path} has a run of the name {key!r}")
+            if not self._path(key).exists():
+                write_json(self._path(key), run)
 
     def write(self, run: dict[str, Any], renders: Sequence[RenderedView]) -> None:
         """Keep a run and some of its renders; the JSON comes last, so that it vouches for them."""
