@@ -42,6 +42,7 @@ class RunStore:
 
     root: Path
     validate: bool
+    sfm: bool = False  # poses and points are those of the degraded photos
 
     def key(self, cell: Cell, fingerprint: dict[str, str]) -> str:
         """Readable, and a digest of all that the result depends on: configuration, photos, version.
@@ -57,9 +58,12 @@ class RunStore:
             "degradation": cell.degradation,
             "scene": fingerprint,
         }
+        if self.sfm:
+            facts["sfm"] = True
         digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
         parts = [cell.scene, f"x{cell.downscale:g}", cell.degradation, cell.row.method, f"s{cell.seed}"]
-        parts += [str(cell.iterations), *(["validation"] if self.validate else []), digest]
+        parts += [str(cell.iterations), *(["validation"] if self.validate else [])]
+        parts += [*(["sfm"] if self.sfm else []), digest]
         return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))
 
     def read(self, key: str) -> dict[str, Any] | None:
@@ -139,6 +143,7 @@ def run_cell(
         "left_out": [{"what": what, "why": why} for what, why in trainer.method.left_out()],
         "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
         "notes": photos.notes,
+        "sfm": None if photos.sfm is None else asdict(photos.sfm),
         "config": asdict(trainer.config),
         "threads": hqgs.get_num_threads(),
         "peak_rss_mb": peak_rss_mb() if resets else None,  # of this run, with what the process holds
