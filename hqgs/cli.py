@@ -25,7 +25,8 @@ from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene, format_diagnosis
 from hqgs.files import write_json
 from hqgs.methods import METHODS
-from hqgs.methods.hqgs import AUTO, GUIDANCES, HQGSConfig
+from hqgs.methods.base import AUTO
+from hqgs.methods.hqgs import GUIDANCES, HQGSConfig
 from hqgs.report import RunResult
 from hqgs.restore import restore_scene
 from hqgs.run import CHECKPOINT, open_run, run
@@ -70,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     train.set_defaults(run=_train)
     _add_scene(train, "folder for the checkpoint and the report", config.seed)
     add = train.add_argument
-    add("--method", default=config.method, help=f"one of: {', '.join(METHODS)} (%(default)s)")
+    add("--method", default=AUTO, help=f"one of: {', '.join(METHODS)} (%(default)s)")
     add("--iterations", type=int, default=config.iterations, metavar="N", help="training steps (%(default)s)")
     add(
         "--degrade", default="none", metavar="KIND", help=f"what happens to the training photos: {KINDS_HELP}"

@@ -64,6 +64,7 @@ def test_train_the_embedded_scene(
 ) -> None:
     out = tmp_path / "deep" / "out"
     options = ["--iterations", "20", "--seed", "3", "--max-gaussians", "55", "--eval-every", "7"]
+    options += ["--method", "3dgs"]
     assert call("train", "embedded", "--out", out, "--downscale", "2", *options) == 0
     assert asked == [{"cache": out / "scene", "width": 252, "height": 189}]
     report = json.loads((out / "report.json").read_text())
@@ -298,7 +299,7 @@ def test_a_run_that_cannot_go_on_is_exit_code_1(
         return render.sum() * float("nan")
 
     monkeypatch.setattr(ThreeDGS, "loss", broken)
-    assert call("train", "embedded", "--out", tmp_path, "--iterations", "300") == 1
+    assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "300") == 1
     assert "was not finite in 20 steps in a row" in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -315,7 +316,7 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
         return real(self, render, view)
 
     monkeypatch.setattr(ThreeDGS, "loss", interrupting)
-    assert call("train", "embedded", "--out", tmp_path, "--iterations", "20") == 130
+    assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "20") == 130
     assert json.loads((tmp_path / "report.json").read_text())["iterations"] == 6
     assert (tmp_path / CHECKPOINT).exists()
 

@@ -24,7 +24,7 @@ from hqgs.degradations import to_uint8
 from hqgs.files import atomic_path, write_json
 from hqgs.machine import peak_rss_mb
 from hqgs.methods import METHODS
-from hqgs.methods.hqgs import AUTO
+from hqgs.methods.base import AUTO
 from hqgs.metrics import METRICS, evaluate_view, mean_metrics
 from hqgs.render import render_view
 from hqgs.report import RenderedView
