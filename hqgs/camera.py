@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from hqgs.sfm import SfmReport  # which itself imports this module
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,14 @@ def as_floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.floa
 
 
 @dataclass(frozen=True)
+class Tracks:
+    """How the photos bear out the points of a COLMAP model."""
+
+    length: float  # photos that see a point, mean
+    error: float  # px, mean distance between a point and where the photos see it
+
+
+@dataclass(frozen=True)
 class Scene:
     """Training views, held-out views and the sparse points that initialise the Gaussians."""
 
@@ -54,6 +66,8 @@ class Scene:
     point_colors: NDArray[np.uint8]  # [P, 3]
     source: str  # the format it was read from: "colmap", "llff", "transforms", "embedded"
     notes: list[str] = field(default_factory=list)  # what a reader of the report should know
+    tracks: Tracks | None = None  # of the points, px of the views; None: its files do not tell
+    sfm: SfmReport | None = None  # how poses and points differ from its files'; None: they are those
 
     @property
     def extent(self) -> float:

@@ -25,10 +25,12 @@ from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene, format_diagnosis
 from hqgs.files import write_json
 from hqgs.methods import METHODS
-from hqgs.methods.hqgs import AUTO, GUIDANCES, HQGSConfig
+from hqgs.methods.base import AUTO
+from hqgs.methods.hqgs import GUIDANCES, HQGSConfig
 from hqgs.report import RunResult
 from hqgs.restore import restore_scene
 from hqgs.run import CHECKPOINT, open_run, run
+from hqgs.sfm import sfm_scene
 from hqgs.synthetic import embedded_scene
 from hqgs.train import TrainingError
 
@@ -69,10 +71,15 @@ def _parser() -> argparse.ArgumentParser:
     train.set_defaults(run=_train)
     _add_scene(train, "folder for the checkpoint and the report", config.seed)
     add = train.add_argument
-    add("--method", default=config.method, help=f"one of: {', '.join(METHODS)} (%(default)s)")
+    add("--method", default=AUTO, help=f"one of: {', '.join(METHODS)} (%(default)s)")
     add("--iterations", type=int, default=config.iterations, metavar="N", help="training steps (%(default)s)")
     add(
         "--degrade", default="none", metavar="KIND", help=f"what happens to the training photos: {KINDS_HELP}"
+    )
+    add(
+        "--sfm",
+        action="store_true",
+        help="poses and points from the training photos, by COLMAP; SCENE may hold photos alone",
     )
     add("--restore", type=Path, metavar="WEIGHTS", help="send the training photos through this network first")
     add("--guidance", default=config.hqgs.guidance, choices=GUIDANCES, help="of hqgs (%(default)s)")
@@ -138,9 +145,12 @@ def _train(args: argparse.Namespace) -> int:
                 )
             if args.threads is not None:
                 hqgs.set_num_threads(args.threads)
-            scene = _scene(args, cache=args.out / "scene")
+            scene = _scene(args, cache=args.out / "scene", sfm=args.sfm)
             if degradation.steps:
                 scene = degrade_scene(scene, degradation, config.seed)
+            if args.sfm and (scene.source != "photos" or degradation.steps):
+                scene = sfm_scene(scene)
+                print(scene.sfm)
             if args.restore is not None:
                 scene = restore_scene(scene, args.restore)
             trainer = stack.enter_context(open_run(scene, config, args.out, args.resume))
@@ -196,9 +206,9 @@ def _config(args: argparse.Namespace) -> TrainConfig:
     return config if args.eval_every is None else replace(config, eval_every=args.eval_every)
 
 
-def _scene(args: argparse.Namespace, cache: Path | None) -> Scene:
+def _scene(args: argparse.Namespace, cache: Path | None, sfm: bool = False) -> Scene:
     if args.scene != EMBEDDED:
-        return load_scene(args.scene, downscale=args.downscale)
+        return load_scene(args.scene, downscale=args.downscale, reconstruct=sfm)
     if not args.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {args.downscale}")
     width, height = (round(size / args.downscale) for size in EMBEDDED_SIZE)

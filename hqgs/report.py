@@ -58,6 +58,7 @@ class RunResult:
     left_out: list[dict[str, str]]  # {"what", "why"}
     config: dict[str, Any]
     views: list[RenderedView] = field(repr=False)
+    sfm: dict[str, Any] | None = None  # `SfmReport`; None: poses and points are the scene's own
 
 
 def write_report(out_dir: str | Path, result: RunResult) -> dict[str, Any]:

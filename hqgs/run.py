@@ -159,6 +159,7 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         history=trainer.history,
         left_out=left_out,
         config=asdict(config),
+        sfm=None if scene.sfm is None else asdict(scene.sfm),
         views=trainer.render_test_views(),
     )
     write_report(out, result)

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 import hqgs
 from hqgs import cli
-from hqgs.bench import quality, quality_runs
+from hqgs.bench import quality, quality_runs, quality_scenes
 from hqgs.bench.output import Report
 from hqgs.bench.quality_estimate import GROWTH, Estimate, duration
 from hqgs.bench.quality_protocols import PROTOCOLS, Cell, cells, narrowed
@@ -29,6 +29,7 @@ from hqgs.camera import Camera, Scene, View
 from hqgs.checkpoint import scene_fingerprint
 from hqgs.degradations import parse_degradation
 from hqgs.methods.srgs import SRGSConfig
+from hqgs.sfm import SfmReport
 from hqgs.train import TrainingError
 from tests.tiny_scene import tiny_scene
 
@@ -270,6 +271,37 @@ def test_validation_never_sees_a_test_view(out: Path, tmp_path: Path) -> None:
     assert "VALIDATION" in text.splitlines()[0]
 
 
+def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = {"median": 0.125, "max": 0.5}
+    seen = []
+
+    def sfm(scene: Scene) -> Scene:
+        seen.append(scene.train[0].image)
+        report = SfmReport(5, ["lost"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, 0.3)
+        return replace(scene, sfm=report, points=scene.points + np.float32(0.01))
+
+    monkeypatch.setattr(quality_scenes, "sfm_scene", sfm)
+    protocol = narrowed(PROTOCOLS["smoke"], ["noise:25"], ["3dgs", "hqgs"], iterations=2)
+    scene, report = tiny_scene(), Report(settings={})
+    bench = quality.Quality(protocol, [scene], RunStore(tmp_path, validate=False, sfm=True), 0, report)
+    bench.train()
+    bench.tables("smoke_sfm")
+    assert len(seen) == 1
+    np.testing.assert_array_equal(seen[0], degraded(scene, "noise:25", 0).train[0].image)
+    runs = report.results["runs"]
+    assert [run["sfm"]["points"] for run in runs] == [40, 40]
+    assert all("-sfm-" in run["key"] for run in runs)
+    assert "poses and points from the degraded photos" in report.tables[0].splitlines()[0]
+    (table,) = (text for text in report.tables if text.startswith("**Poses and points"))
+    cells_of_row = [cell.strip() for cell in table.splitlines()[-1].split("|")[1:-1]]
+    assert cells_of_row == [
+        "tiny, noise:25, seed 0", "4 / 5", "0.125 / 0.500", "12.50% / 50.00%", "0.40", "40 (40)", "10.00%",
+        "3.5 (–)", "0.50 (0.30)",
+    ]  # fmt: skip
+
+
 def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, store = tiny_scene(), RunStore(tmp_path, validate=False)
     protocol = narrowed(PROTOCOLS["smoke"], ["none", "noise:25"], ["3dgs", "srgs"], iterations=2)
@@ -323,9 +355,10 @@ def test_the_key_covers_what_a_result_depends_on(tmp_path: Path, monkeypatch: py
         store.key(replace(base, row=srgs), prints),
         store.key(replace(base, row=replace(srgs, srgs=SRGSConfig(texture_weight=0.8))), prints),
     ]
+    others.append(replace(store, sfm=True).key(base, prints))
     monkeypatch.setattr(hqgs, "__version__", "999")
     others.append(store.key(base, prints))
-    assert len({key, *others}) == 9
+    assert len({key, *others}) == 10
 
 
 def test_protocols() -> None:

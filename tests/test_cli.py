@@ -7,9 +7,11 @@ import resource
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tiny_scene import tiny_scene
 
@@ -19,6 +21,7 @@ from hqgs.camera import Scene
 from hqgs.methods import ThreeDGS
 from hqgs.ply import read_ply
 from hqgs.run import CHECKPOINT
+from hqgs.sfm import SfmReport
 
 
 @pytest.fixture
@@ -61,6 +64,7 @@ def test_train_the_embedded_scene(
 ) -> None:
     out = tmp_path / "deep" / "out"
     options = ["--iterations", "20", "--seed", "3", "--max-gaussians", "55", "--eval-every", "7"]
+    options += ["--method", "3dgs"]
     assert call("train", "embedded", "--out", out, "--downscale", "2", *options) == 0
     assert asked == [{"cache": out / "scene", "width": 252, "height": 189}]
     report = json.loads((out / "report.json").read_text())
@@ -78,6 +82,42 @@ def test_train_on_degraded_photos(asked: list[dict[str, Any]], tmp_path: Path) -
     assert note.startswith("degradation noise:25, seed 3: all training photos (5), ")
     assert call("train", "embedded", "--out", tmp_path, *options, "--resume") == 0
     assert call("train", "embedded", "--out", tmp_path, *options[:-1], "noise:24", "--resume") == 2
+
+
+@pytest.mark.parametrize(("source", "kind"), [("colmap", "none"), ("photos", "none"), ("photos", "noise:9")])
+def test_sfm_replaces_poses_and_points_once(
+    source: str,
+    kind: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A folder of photos alone has its poses from clean photos already; degraded ones give others."""
+    error = {"median": 0.1, "max": 0.2}
+    report = SfmReport(5, ["lost.png"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, None)
+    seen: list[Any] = []
+
+    def load(path: str, downscale: float, reconstruct: bool) -> Scene:
+        seen.append(reconstruct)
+        return replace(tiny_scene(), source=source)
+
+    def sfm(scene: Scene) -> Scene:
+        seen.append(scene.train[0].image.dtype)
+        return replace(scene, sfm=report)
+
+    monkeypatch.setattr(cli, "load_scene", load)
+    monkeypatch.setattr(cli, "sfm_scene", sfm)
+    options = ["--sfm", "--degrade", kind, "--iterations", "2"]
+    assert call("train", "FOLDER", "--out", tmp_path, *options) == 0
+    written, printed = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
+    if (source, kind) == ("photos", "none"):
+        assert seen == [True]
+        assert written["sfm"] is None
+    else:
+        assert seen == [True, np.uint8 if kind == "none" else np.float32]
+        assert written["sfm"] == asdict(report)
+        assert "4 of 5 registered" in printed
+        assert "lost.png" in printed
 
 
 def test_degrade_writes_a_scene_that_trains(
@@ -259,7 +299,7 @@ def test_a_run_that_cannot_go_on_is_exit_code_1(
         return render.sum() * float("nan")
 
     monkeypatch.setattr(ThreeDGS, "loss", broken)
-    assert call("train", "embedded", "--out", tmp_path, "--iterations", "300") == 1
+    assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "300") == 1
     assert "was not finite in 20 steps in a row" in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -276,7 +316,7 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
         return real(self, render, view)
 
     monkeypatch.setattr(ThreeDGS, "loss", interrupting)
-    assert call("train", "embedded", "--out", tmp_path, "--iterations", "20") == 130
+    assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "20") == 130
     assert json.loads((tmp_path / "report.json").read_text())["iterations"] == 6
     assert (tmp_path / CHECKPOINT).exists()
 

@@ -42,6 +42,46 @@ def test_clean_photos_train_as_3dgs_bit_for_bit() -> None:
     assert ours.config.densify == plain.config.densify
 
 
+@pytest.mark.parametrize(("formation", "name"), [("none", "3dgs"), ("noise:9", "hqgs")])
+def test_auto_is_named_after_what_it_comes_to(formation: str, name: str, tmp_path: Path) -> None:
+    """And it is that, bit for bit; a run goes on under the name that it was started with."""
+    auto, same = (tiny_config(6, method=m, hqgs=fixed(formation)) for m in ("auto", name))
+    results = [
+        train(tiny_scene(), config, tmp_path / config.method, progress=False) for config in (auto, same)
+    ]
+    assert [result.method for result in results] == [name, name]
+    first, second = (view.render for result in results for view in result.views)
+    assert np.array_equal(first, second)
+    train(tiny_scene(), auto, tmp_path / "auto", resume=True, progress=False)
+    paper = Trainer(tiny_scene(), tiny_config(method="auto", hqgs=HQGSConfig(guidance="paper")))
+    assert paper.config.method == "hqgs"
+
+
+def test_motion_has_the_direction_of_each_photo() -> None:
+    """With it, the clean picture is what the photo shows; a photo that tells none is named."""
+    rng = np.random.default_rng(0)
+    scene, views = tiny_scene(), []
+    for view in scene.train[:3]:
+        spectrum = np.fft.rfft2(rng.standard_normal((160, 200, 3)), axes=(0, 1))
+        frequency = np.hypot(np.fft.fftfreq(160)[:, None], np.fft.rfftfreq(200))
+        clean = np.fft.irfft2(spectrum / (frequency[..., None] + 5e-3) ** 1.2, s=(160, 200), axes=(0, 1))
+        clean = (0.5 + 0.12 * (clean - clean.mean()) / clean.std()).astype(np.float32)
+        views.append(replace(view, camera=replace(view.camera, width=200, height=160), image=clean))
+    clean_scene = replace(scene, train=views)
+    moved = degrade_scene(clean_scene, parse_degradation("motion:9"), 0)
+    method = HQGS(moved, fixed("motion:9"))
+    assert method.left_out() == []
+    for clean, photo in zip(views, moved.train, strict=True):
+        image = torch.from_numpy(clean.image)
+        plain = float(photometric_loss(image, torch.from_numpy(photo.image)))
+        assert float(method.loss(image, photo)) < 0.15 * plain
+    flat = replace(moved.train[0], image=np.full_like(moved.train[0].image, 0.5))
+    method = HQGS(replace(moved, train=[flat, *moved.train[1:]]), fixed("motion:9"))
+    assert method.left_out() == [
+        ("motion in the loss of 1 of 3 photos", f"no direction is told from {flat.name}")
+    ]
+
+
 def test_low_resolution_compares_shrunk_renders() -> None:
     scene, _ = fine_scene(views=3)
     method, view = HQGS(scene, fixed("lowres:4")), scene.train[1]

@@ -18,7 +18,7 @@ from hqgs.bench.quality_pictures import write_sheet
 from hqgs.bench.quality_protocols import PROTOCOLS, Cell, Protocol, cells, narrowed
 from hqgs.bench.quality_regions import edge_robustness
 from hqgs.bench.quality_runs import RunStore, run_cell
-from hqgs.bench.quality_scenes import EMBEDDED, degraded, load_scenes
+from hqgs.bench.quality_scenes import EMBEDDED, load_scenes, trained
 from hqgs.bench.quality_summary import Group, Run, summary
 from hqgs.camera import Scene
 from hqgs.checkpoint import scene_fingerprint
@@ -97,7 +97,7 @@ class Quality:
     def photos(self, cell: Cell) -> Scene:
         """What a cell trains on; its group, which comes in a row, shares it."""
         if self._photos is None or self._photos[0] != cell.group:
-            scene = degraded(self.scenes[cell.scene], cell.degradation, cell.seed)
+            scene = trained(self.scenes[cell.scene], cell.degradation, cell.seed, self.store.sfm)
             self._photos = (cell.group, scene)
         return self._photos[1]
 
@@ -149,6 +149,8 @@ class Quality:
         groups, labels = self.groups(), protocol.labels
         if groups:
             self.compare(groups, labels)
+        if self.store.sfm and groups:
+            report.tables.append(tables.reconstructions(groups))
         if kinds and maps:
             report.tables.append(tables.edge_maps(maps))
 
@@ -193,7 +195,12 @@ class Quality:
         held = "VALIDATION views (held-out training photos)" if self.store.validate else "held-out test views"
         return (
             f"{held} of {scenes}; {protocol.iterations:,} iterations, photos at 1/{protocol.downscale:g}, "
-            f"seeds {seeds}"
+            f"seeds {seeds}; "
+            + (
+                "poses and points from the degraded photos"
+                if self.store.sfm
+                else "the scenes' own poses and points"
+            )
         )
 
     def circumstances(self, runs: Sequence[Run]) -> str:
@@ -230,9 +237,9 @@ def run(args: argparse.Namespace) -> Report:
     sources = args.scenes[:1] if protocol.one_scene else args.scenes
     scenes = load_scenes(sources, protocol.downscale, protocol.embedded, args.out / "scenes", args.validate)
     settings = {"protocol": name, **asdict(protocol), "scenes": [s.name for s in scenes]}
-    part = name + ("_validation" if args.validate else "")
-    report = Report(settings | {"validation": args.validate}, part)
-    store = RunStore(args.out, args.validate)
+    part = name + ("_sfm" if args.sfm else "") + ("_validation" if args.validate else "")
+    report = Report(settings | {"validation": args.validate, "sfm": args.sfm}, part)
+    store = RunStore(args.out, args.validate, args.sfm)
     for path in args.known or ():
         store.take(path)
     quality = Quality(protocol, scenes, store, args.pictures, report)
@@ -257,6 +264,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--iterations", type=int, metavar="N", help="instead of the protocol's")
     add("--downscale", type=float, metavar="F", help="instead of the protocol's")
     add("--validate", action="store_true", help="for tuning: judge on training photos, leave test views out")
+    add("--sfm", action="store_true", help="poses and points from the degraded photos, the same for all rows")
     add("--pictures", type=int, default=1, metavar="N", help="sheets per scene and degradation (%(default)s)")
     add(
         "--known", nargs="+", type=Path, metavar="JSON",

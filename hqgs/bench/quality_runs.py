@@ -24,7 +24,7 @@ from hqgs.degradations import to_uint8
 from hqgs.files import atomic_path, write_json
 from hqgs.machine import peak_rss_mb
 from hqgs.methods import METHODS
-from hqgs.methods.hqgs import AUTO
+from hqgs.methods.base import AUTO
 from hqgs.metrics import METRICS, evaluate_view, mean_metrics
 from hqgs.render import render_view
 from hqgs.report import RenderedView
@@ -43,6 +43,7 @@ class RunStore:
 
     root: Path
     validate: bool
+    sfm: bool = False  # poses and points are those of the degraded photos
 
     def key(self, cell: Cell, fingerprint: dict[str, str]) -> str:
         """Readable, and a digest of all that the result depends on: configuration, photos, version.
@@ -58,9 +59,12 @@ class RunStore:
             "degradation": cell.degradation,
             "scene": fingerprint,
         }
+        if self.sfm:
+            facts["sfm"] = True
         digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
         parts = [cell.scene, f"x{cell.downscale:g}", cell.degradation, cell.row.method, f"s{cell.seed}"]
-        parts += [str(cell.iterations), *(["validation"] if self.validate else []), digest]
+        parts += [str(cell.iterations), *(["validation"] if self.validate else [])]
+        parts += [*(["sfm"] if self.sfm else []), digest]
         return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))
 
     def read(self, key: str) -> dict[str, Any] | None:
@@ -156,6 +160,7 @@ def run_cell(
         "left_out": [{"what": what, "why": why} for what, why in trainer.method.left_out()],
         "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
         "notes": photos.notes,
+        "sfm": None if photos.sfm is None else asdict(photos.sfm),
         "config": asdict(trainer.config),
         "threads": hqgs.get_num_threads(),
         "peak_rss_mb": peak_rss_mb() if resets else None,  # of this run, with what the process holds

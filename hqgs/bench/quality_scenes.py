@@ -12,6 +12,7 @@ from hqgs.data.degraded import FILE
 from hqgs.data.llff import hold_marker
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import degrade_scene
+from hqgs.sfm import sfm_scene
 from hqgs.synthetic import embedded_scene
 
 EMBEDDED = Path("embedded")  # stands for the built-in scene
@@ -68,8 +69,14 @@ def validation_split(scene: Scene) -> Scene:
     return replace(scene, train=train, test=held, notes=[*scene.notes, note])
 
 
+def trained(scene: Scene, degradation: str, seed: int, sfm: bool) -> Scene:
+    """The scene that a cell trains: `degraded`, with `sfm` with poses and points from its training photos."""
+    scene = degraded(scene, degradation, seed)
+    return sfm_scene(scene) if sfm else scene
+
+
 def degraded(scene: Scene, degradation: str, seed: int) -> Scene:
-    """The scene that is trained: degraded training photos, clean held-out ones."""
+    """Degraded training photos, clean held-out ones."""
     kind = parse_degradation(degradation)
     return degrade_scene(scene, kind, seed) if kind.steps else scene
 

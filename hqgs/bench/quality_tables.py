@@ -154,6 +154,43 @@ def formations(groups: Sequence[Group], label: str) -> str:
     return markdown_table(f"What {label} took for the degradation", ["", *kinds], body)
 
 
+def reconstructions(groups: Sequence[Group]) -> str:
+    """Poses and points from the degraded photos against the scenes' own; all rows of a group share them."""
+    body = []
+    for group in groups:
+        found = next(iter(group.runs.values()))["sfm"]
+        rotation, translation = found["rotation_error_deg"], found["translation_error"]
+        own_error = _number(found["own_reprojection_error_px"], ".2f")
+        body.append(
+            [
+                f"{group.scene}, {group.degradation}, seed {group.seed}",
+                f"{found['photos'] - len(found['not_registered'])} / {found['photos']}",
+                f"{rotation['median']:.3f} / {rotation['max']:.3f}",
+                f"{translation['median']:.2%} / {translation['max']:.2%}",
+                f"{found['own_cameras_px']:.2f}",
+                f"{found['points']:,} ({found['own_points']:,})",
+                f"{found['point_distance']:.2%}",
+                f"{found['track_length']:.1f} ({_number(found['own_track_length'], '.1f')})",
+                f"{found['reprojection_error_px']:.2f} ({own_error})",
+            ]
+        )
+    return markdown_table(
+        "Poses and points from the degraded photos, in brackets the scene's own; distances in scene extents",
+        [
+            "",
+            "registered",
+            "rotation error (deg), median / max",
+            "centre error, median / max",
+            "own cameras off (px)",
+            "points",
+            "to the nearest own point",
+            "photos a point",
+            "reprojection error (px)",
+        ],
+        body,
+    )
+
+
 def _kinds(numbers: Summary) -> list[str]:
     return list(next(iter(numbers.values())))
 

@@ -6,19 +6,24 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from hqgs.camera import Scene
+import numpy as np
+
+from hqgs.camera import Scene, Tracks, View
 from hqgs.data.capture import Capture, list_photos, photo_folder
 from hqgs.data.colmap import find_models, read_colmap
 from hqgs.data.degraded import read_degraded_folder, with_low
 from hqgs.data.images import load_views
 from hqgs.data.llff import POSES, hold_marker, read_llff
+from hqgs.data.photos import bare_photos, read_photos
 from hqgs.data.points import random_points
 from hqgs.data.transforms import SINGLE, TRAIN, read_transforms
 
 __all__ = ["load_scene"]
 
 
-def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) -> Scene:
+def load_scene(
+    path: str | Path, downscale: float = 1.0, test_every: int = 8, reconstruct: bool = False
+) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
     The format is recognised in this order: a COLMAP model with photos (`sparse/0`, `sparse`, or the folder
@@ -33,6 +38,8 @@ def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) ->
     A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
     at downscale 1, the only one at which they stand for `View.image`.
 
+    With `reconstruct` a folder that holds photos alone gets its cameras and points from them (`read_photos`).
+
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
     root = Path(path).resolve()
@@ -44,7 +51,7 @@ def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) ->
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    capture = _read(root, downscale)
+    capture = _read(root, downscale, reconstruct)
     degraded = read_degraded_folder(root)
     if degraded is not None:
         notes = [*degraded.notes, *capture.notes]
@@ -62,10 +69,10 @@ def load_scene(path: str | Path, downscale: float = 1.0, test_every: int = 8) ->
     if len(points) == 0:
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)
-    return Scene(root.name, train, test, points, colors, capture.source, notes)
+    return Scene(root.name, train, test, points, colors, capture.source, notes, _tracks(capture, views))
 
 
-def _read(root: Path, downscale: float) -> Capture:
+def _read(root: Path, downscale: float, reconstruct: bool) -> Capture:
     has_model, has_photos = bool(find_models(root)), photo_folder(root, downscale) is not None
     others = [name for name in (SINGLE, TRAIN, POSES) if (root / name).is_file()]
     if has_model and (has_photos or not others):
@@ -80,12 +87,24 @@ def _read(root: Path, downscale: float) -> Capture:
         return read_transforms(root, downscale)
     if POSES in others:
         return read_llff(root, downscale)
+    bare = bare_photos(root, downscale) is not None
+    if bare and reconstruct:
+        return read_photos(root, downscale)
     entries = sorted(p.name for p in root.iterdir())
     found = ", ".join(entries[:12]) + (" ..." if len(entries) > 12 else "") if entries else "nothing"
     raise ValueError(
         f"{root} is no scene: looked for a COLMAP model (cameras, images and points3D as .bin or .txt in "
         f"sparse/0, sparse or the folder), {SINGLE}, {TRAIN}, {POSES}; found {found}"
+        + ("; --sfm makes a scene of photos alone" if bare else "")
     )
+
+
+def _tracks(capture: Capture, views: list[View]) -> Tracks | None:
+    """Those of the capture, in px of the views."""
+    if capture.tracks is None:
+        return None
+    scales = [v.camera.width / p.camera.width for v, p in zip(views, capture.photos, strict=True)]
+    return replace(capture.tracks, error=capture.tracks.error * float(np.mean(scales)))
 
 
 def _test_names(root: Path, capture: Capture, test_every: int, notes: list[str]) -> frozenset[str]:

@@ -10,6 +10,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.camera import Tracks
+
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
 
@@ -40,6 +42,7 @@ class Capture:
     test_names: frozenset[str] | None = None  # the test views, where the format names them
     near_far: dict[str, tuple[float, float]] = field(default_factory=dict)  # depth range by photo name
     notes: list[str] = field(default_factory=list)
+    tracks: Tracks | None = None  # px of the cameras' own size
 
 
 def no_points() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

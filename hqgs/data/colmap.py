@@ -8,6 +8,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.camera import Tracks
+from hqgs.colmap_run import model_points
 from hqgs.data.capture import (
     Capture,
     Photo,
@@ -74,8 +76,11 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     unused = [n for n in list_photos(folder) if folder / n not in used]
     if unused:
         notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
-    points, colors = keep_finite(*_points(model), notes)
-    return Capture("colmap", photos, left, points, colors, folder=folder, notes=notes)
+    points, colors = keep_finite(*model_points(model), notes)
+    tracks = None
+    if model.compute_num_observations():
+        tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    return Capture("colmap", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks)
 
 
 def _kind(folder: Path) -> str:
@@ -119,13 +124,6 @@ def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
             f"photo {image.name!r}: its quaternion (x, y, z, w) is not of length 1: {quat.tolist()}"
         )
     return viewmat
-
-
-def _points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points by ascending id: COLMAP keeps them in a hash map, whose order means nothing."""
-    points = [point for _, point in sorted(model.points3D.items(), key=lambda item: item[0])]
-    xyz = np.array([p.xyz for p in points], np.float64).reshape(-1, 3)
-    return xyz, np.array([p.color for p in points], np.uint8).reshape(-1, 3)
 
 
 def _match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:

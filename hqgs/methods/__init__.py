@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from hqgs.camera import Scene
-from hqgs.methods.base import Method
+from hqgs.methods.base import AUTO, Method
 from hqgs.methods.hqgs import make_hqgs
 from hqgs.methods.srgs import SRGS
 from hqgs.methods.three_dgs import ThreeDGS
@@ -18,6 +18,7 @@ METHODS: dict[str, Callable[[Scene, TrainConfig], Method]] = {
     "3dgs": lambda scene, config: ThreeDGS(),
     "srgs": lambda scene, config: SRGS(scene, config.srgs),
     "hqgs": lambda scene, config: make_hqgs(scene, config.hqgs, config.seed),
+    AUTO: lambda scene, config: make_hqgs(scene, config.hqgs, config.seed),  # named after what it comes to
 }
 
 

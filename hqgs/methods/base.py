@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -14,6 +15,9 @@ from hqgs.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from hqgs.config import TrainConfig  # which itself imports the methods
+
+
+AUTO = "auto"  # as a method: what the diagnosis asks for, which is 3dgs where it asks for nothing
 
 
 class Method(Protocol):
@@ -57,7 +61,7 @@ class Plain:
     name: str
 
     def adapt(self, config: TrainConfig) -> TrainConfig:
-        return config
+        return replace(config, method=self.name) if config.method == AUTO else config
 
     def left_out(self) -> list[tuple[str, str]]:
         return []

@@ -12,22 +12,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.camera import Scene, View, as_floats
+from hqgs.data.capture import some
 from hqgs.degradations import Degradation, parse_degradation, small_side
 from hqgs.diagnosis import diagnose_scene
 from hqgs.diagnosis.resolution import undo_enlargement
-from hqgs.formation import formation
+from hqgs.formation import Operator, formation
 from hqgs.gaussians import Gaussians
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
-from hqgs.methods.base import Method, Plain
+from hqgs.methods.base import AUTO, Method, Plain
 from hqgs.methods.paper import PaperConfig, PaperHQGS
-from hqgs.separable import Separable
 from hqgs.smallest import enlarge, photo_pixels
 
 if TYPE_CHECKING:
     from hqgs.config import TrainConfig  # which itself imports the methods
 
-AUTO = "auto"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
@@ -59,7 +58,7 @@ class HQGSConfig:
 class Target:
     """What a view's renders are compared with."""
 
-    operator: Separable | None  # from the render to the photo
+    operator: Operator | None  # from the render to the photo
     photo: Tensor  # [h, w, 3], uint8 where the photo is
     mask: Tensor | None  # [h, w] bool, True where it counts
     centres: Coefficients | None  # of the photo's JPEG cells
@@ -68,7 +67,8 @@ class Target:
 class HQGS(Plain):
     """The image formation in the loss.
 
-    - Blur and low resolution: the render is blurred and shrunk as the photo was, and compared there.
+    - Blur of any kind and low resolution: the render is blurred and shrunk as the photo was, and compared
+      there. The direction of a motion is each photo's own, as the diagnosis tells it.
     - JPEG: beside the pixels, the render is compared with the cells that the file leaves open (`JpegCells`).
     - Noise or JPEG: no D-SSIM. It is normalised by the local contrast, so that it asks for the noise in flat
       parts; L1 averages the noise over the views.
@@ -92,7 +92,8 @@ class HQGS(Plain):
         self._factor = int(kinds.get("lowres") or 1)
         self._jpeg = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
         self._dssim = 0.0 if "noise" in kinds or self._jpeg else LAMBDA_DSSIM
-        self._operators: dict[tuple[int, int], Separable | None] = {}
+        self._directions = self._motion_directions(scene) if "motion" in kinds else {}
+        self._operators: dict[tuple[int, int, float | None], Operator | None] = {}
         self._cells: dict[tuple[int, int], JpegCells] = {}
         self._views = scene.train
         self._smallest: Tensor | None = None  # [N] world units; None: to be computed
@@ -106,7 +107,11 @@ class HQGS(Plain):
         if self.degradation.steps:
             pixels = sum(self._sharp_pixels(target) for target in self._targets.values())
             budget = min(budget, max(int(self.config.gaussians_per_pixel * pixels), self._least))
-        return replace(config, hqgs=hqgs, densify=replace(config.densify, max_gaussians=budget))
+        method = config.method
+        if method == AUTO:
+            method = "hqgs" if self.degradation.steps else "3dgs"
+        densify = replace(config.densify, max_gaussians=budget)
+        return replace(config, method=method, hqgs=hqgs, densify=densify)
 
     def left_out(self) -> list[tuple[str, str]]:
         return self._left_out
@@ -147,15 +152,20 @@ class HQGS(Plain):
     def _sharp_pixels(self, target: Target) -> float:
         """How many sharp pixels without noise would tell as much as this photo does, roughly.
 
-        A blur of sigma px spreads a point over 4 pi sigma^2 pixels. Noise of s levels asks for the mean of
-        (s / HALVING)^2 more pixels until it is below what one pixel may be off.
+        A blur of sigma px spreads a point over 4 pi sigma^2 pixels, a disc or a line over its own. Noise of
+        s levels asks for the mean of (s / HALVING)^2 more pixels until it is below what one pixel may be off.
         """
         height, width = target.photo.shape[:2]
         share = 1.0
         for step in self.degradation.for_width(width * self._factor).steps:
             value = step.value or 0.0
+            value_in_photo = value / self._factor
             if step.kind == "blur":
-                share += 4 * math.pi * (value / self._factor) ** 2
+                share += 4 * math.pi * value_in_photo**2
+            elif step.kind == "defocus":
+                share += math.pi * value_in_photo**2
+            elif step.kind == "motion":
+                share += value_in_photo
             elif step.kind == "noise":
                 share += (value / HALVING) ** 2
         return height * width / share
@@ -167,11 +177,24 @@ class HQGS(Plain):
         ]
         return parse_degradation(diagnosis.formation)
 
+    def _motion_directions(self, scene: Scene) -> dict[str, float]:
+        """Radians by photo, for those that tell one; the others are listed as left out."""
+        found = {
+            photo.name: math.radians(photo.blur.direction)
+            for photo in diagnose_scene(scene, max_photos=len(scene.train)).photos
+            if photo.blur is not None and photo.blur.direction is not None
+        }
+        if unknown := [view.name for view in scene.train if view.name not in found]:
+            what = f"motion in the loss of {len(unknown)} of {len(scene.train)} photos"
+            self._left_out.append((what, f"no direction is told from {some(unknown)}"))
+        return found
+
     def _target(self, view: View) -> Target:
-        size = view.camera.height, view.camera.width
-        if size not in self._operators:
-            self._operators[size] = formation(self.degradation, *size)
-        operator = self._operators[size]
+        size, direction = (view.camera.height, view.camera.width), self._directions.get(view.name)
+        key = (*size, direction)
+        if key not in self._operators:
+            self._operators[key] = formation(self.degradation, *size, direction)
+        operator = self._operators[key]
         array = np.require(_photo(view, self._factor), requirements=["C", "W"])
         photo = torch.from_numpy(array)
         if operator is not None and operator.size != photo.shape[:2]:

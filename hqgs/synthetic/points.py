@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.camera import View
+from hqgs.colmap_run import PROGRAM
 from hqgs.synthetic.shading import render_depth
 
 MIN_POINTS = 200  # fewer are no basis for a reconstruction
@@ -35,13 +36,14 @@ def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -
         for view in views:
             Image.fromarray(view.image).save(directory / "photos" / view.name, compress_level=1)
         np.savez(
-            directory / "cameras.npz",
+            directory / "input.npz",
+            photos=str(directory / "photos"),
             names=np.array([v.name for v in views]),
             sizes=np.array([(v.camera.width, v.camera.height) for v in views]),
             Ks=np.stack([v.camera.K for v in views]),
             viewmats=np.stack([v.camera.viewmat for v in views]),
         )
-        program = [sys.executable, str(Path(__file__).with_name("sfm.py")), name]
+        program = [sys.executable, str(PROGRAM), "triangulate", name]
         try:
             done = subprocess.run(
                 program, capture_output=True, stdin=subprocess.DEVNULL, timeout=time_limit, check=False

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.camera import Camera, Scene, View
+from hqgs.colmap_run import PROGRAM
 from hqgs.files import atomic_path, write_json
 from hqgs.synthetic.points import Points, sfm_points
 from hqgs.synthetic.shading import render_view
@@ -105,8 +106,8 @@ def look_at(
 
 
 def _key(cameras: list[Camera], names: list[str]) -> dict[str, Any]:
-    """What the cached files depend on: the cameras' number and size, and the source of this package."""
-    source = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
+    """What the cached files depend on: the cameras' number and size, and the source that makes them."""
+    source = b"".join(path.read_bytes() for path in [*sorted(Path(__file__).parent.glob("*.py")), PROGRAM])
     return {
         "source": hashlib.sha256(source).hexdigest(),
         "width": cameras[0].width,

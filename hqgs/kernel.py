@@ -1,0 +1,91 @@
+"""Convolution of pictures with a small kernel that is no product of two axes: defocus and motion blur."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+Taps = tuple[tuple[int, int, float], ...]
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Convolution with a kernel of odd size, [H, W, C] to [H, W, C].
+
+    The border mirrors the picture without repeating the edge, as the degradations do. A sum of shifted
+    pictures: for 504 x 378 px and the 45 weights of a disc of 3 px it takes half the time of torch's
+    convolution, and a motion's kernel is mostly zeros.
+    """
+
+    size: tuple[int, int]  # height and width of what goes in and comes out
+    reach: tuple[int, int]  # rows and columns to each side
+    taps: Taps  # row and column of the padded picture that a pixel starts from, and the weight
+
+    @classmethod
+    def of(cls, kernel: NDArray[np.float64], height: int, width: int) -> Kernel:
+        """For pictures of this size. ValueError if they are smaller than the kernel's reach allows."""
+        reach = kernel.shape[0] // 2, kernel.shape[1] // 2
+        if reach[0] >= height or reach[1] >= width:
+            raise ValueError(
+                f"a kernel of {kernel.shape[1]} x {kernel.shape[0]} px is too large for a photo of "
+                f"{width} x {height} px"
+            )
+        flipped = kernel[::-1, ::-1]
+        taps = tuple((int(i), int(j), float(flipped[i, j])) for i, j in np.argwhere(flipped))
+        return cls((height, width), reach, taps)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Differentiable once in the image; the sums have one order."""
+        return _Apply.apply(image, self)
+
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """[H, W], True where no pixel that is left out, in `mask` [H, W], has a weight."""
+        rows, columns = self.sources()
+        padded = mask[rows][:, columns]
+        height, width = self.size
+        counts = np.ones(self.size, bool)
+        for i, j, _ in self.taps:
+            counts &= padded[i : i + height, j : j + width]
+        return counts
+
+    def sources(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of the picture that make up the padded one."""
+        rows, columns = (
+            np.pad(np.arange(n), r, mode="reflect") for n, r in zip(self.size, self.reach, strict=True)
+        )
+        return rows, columns
+
+
+class _Apply(torch.autograd.Function):
+    """The operator is linear: its gradient is the transposed operator."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, kernel: Kernel) -> Tensor:
+        ctx.kernel = kernel
+        rows, columns = (torch.from_numpy(source) for source in kernel.sources())
+        padded = image.index_select(0, rows).index_select(1, columns)
+        height, width = kernel.size
+        out = torch.zeros_like(image, memory_format=torch.contiguous_format)
+        for i, j, weight in kernel.taps:
+            out.add_(padded[i : i + height, j : j + width], alpha=weight)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
+        ctx: Any, v_out: Tensor
+    ) -> tuple[Tensor, None]:
+        kernel: Kernel = ctx.kernel
+        rows, columns = (torch.from_numpy(source) for source in kernel.sources())
+        height, width = kernel.size
+        v_padded = v_out.new_zeros(len(rows), len(columns), v_out.shape[2])
+        for i, j, weight in kernel.taps:
+            v_padded[i : i + height, j : j + width].add_(v_out, alpha=weight)
+        v_wide = v_out.new_zeros(height, len(columns), v_out.shape[2]).index_add_(0, rows, v_padded)
+        return v_out.new_zeros(v_out.shape).index_add_(1, columns, v_wide), None

@@ -1,0 +1,150 @@
+"""Poses and points from the photos themselves (`--sfm`), by COLMAP in a process of its own."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial import KDTree
+
+from hqgs.align import Observations, align, camera_centers, refine, rotation_angles
+from hqgs.camera import Scene, Tracks, View, as_floats
+from hqgs.colmap_run import model_points, registered, run_colmap
+from hqgs.degradations import to_uint8
+
+
+@dataclass(frozen=True)
+class SfmReport:
+    """How poses and points from the photos differ from the scene's own. JSON values only.
+
+    Distances are in units of the scene's extent, after the alignment of the two frames.
+    """
+
+    photos: int  # that were given
+    not_registered: list[str]  # those that COLMAP found no place for
+    outliers: list[str]  # those that the alignment of the two frames left out
+    rotation_error_deg: dict[str, float]  # of the cameras: "median", "max"
+    translation_error: dict[str, float]
+    own_cameras_px: (
+        float  # median distance from where the scene's own cameras see the new points to the photos
+    )
+    points: int
+    point_distance: float  # median over the new points to the nearest of the scene's own, which may be random
+    track_length: float  # photos that see a point, mean
+    reprojection_error_px: float  # mean
+    own_points: int  # the scene's, and of them
+    own_track_length: float | None  # None: its files do not tell
+    own_reprojection_error_px: float | None
+
+    def __str__(self) -> str:
+        rotation, translation = self.rotation_error_deg, self.translation_error
+        found = self.photos - len(self.not_registered)
+        text = (
+            f"poses and points by COLMAP from the training photos: {found} of {self.photos} registered; "
+            f"rotations off the scene's own by {rotation['median']:.3f} deg (median) and "
+            f"{rotation['max']:.3f} deg (max), centres by {translation['median']:.2%} and "
+            f"{translation['max']:.2%} of the extent, so that its own cameras see the new points "
+            f"{self.own_cameras_px:.2f} px off the photos (median); {self.points} points, its own "
+            f"{self.own_points}, the nearest {self.point_distance:.2%} of the extent away (median); "
+            f"{self.track_length:.1f} photos a point, {self.reprojection_error_px:.2f} px off (mean)"
+        )
+        if self.own_track_length is not None:
+            text += f", its own {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px"
+        if self.not_registered:
+            text += f"; left out, as COLMAP found no place for them: {', '.join(self.not_registered)}"
+        return text
+
+
+def sfm_scene(scene: Scene) -> Scene:
+    """The scene with poses and points from its training photos as they are, in its own frame.
+
+    COLMAP (SIFT, exhaustive matching, incremental mapping) sees the training photos alone, clipped and
+    rounded to 8 bits, with the scene's intrinsics, which stay as they are: held-out views share them. The
+    reconstruction is moved into the scene's frame by the training cameras (`align`, `refine`), so that the
+    held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.
+    `Scene.sfm` and `Scene.notes` compare the two. The same photos give the same bits, whatever the number of
+    threads.
+
+    ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
+    """
+    views = {f"{k:05d}.png": view for k, view in enumerate(scene.train)}
+    with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
+        directory = Path(name)
+        _write_photos(directory, views)
+        model = run_colmap(directory, directory / "photos", list(views), [v.camera for v in scene.train])
+    poses = registered(model, len(views))
+    kept = [views[file] for file in poses]
+    viewmats, own = np.stack(list(poses.values())), np.stack([view.camera.viewmat for view in kept])
+    points, colors = model_points(model)
+    similarity, inliers = align(viewmats, own)
+    Ks = np.stack([view.camera.K for view in kept])
+    similarity, misses = refine(similarity, points, _observations(model, list(poses)), Ks, own)
+    viewmats, points = similarity.viewmats(viewmats), similarity.points(points)
+
+    train = [
+        replace(view, camera=replace(view.camera, viewmat=viewmat))
+        for view, viewmat in zip(kept, viewmats, strict=True)
+    ]
+    degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", viewmats[:, :3, :3], own[:, :3, :3])))
+    apart = np.linalg.norm(camera_centers(viewmats) - camera_centers(own), axis=1) / scene.extent
+    distances, _ = KDTree(scene.points).query(points)
+    tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    report = SfmReport(
+        photos=len(views),
+        not_registered=[view.name for file, view in views.items() if file not in poses],
+        outliers=[view.name for view, inlier in zip(kept, inliers, strict=True) if not inlier],
+        rotation_error_deg=_median_and_max(degrees),
+        translation_error=_median_and_max(apart),
+        own_cameras_px=float(np.median(misses)),
+        points=len(points),
+        point_distance=float(np.median(distances)) / scene.extent,
+        track_length=tracks.length,
+        reprojection_error_px=tracks.error,
+        own_points=len(scene.points),
+        own_track_length=None if scene.tracks is None else scene.tracks.length,
+        own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
+    )
+    return replace(
+        scene,
+        train=train,
+        points=points.astype(np.float32),
+        point_colors=colors,
+        notes=[*scene.notes, str(report)],
+        tracks=tracks,
+        sfm=report,
+    )
+
+
+def _observations(model: pycolmap.Reconstruction, names: list[str]) -> Observations:
+    """Which of these photos sees which point of `model_points`, and where."""
+    row = {point: k for k, point in enumerate(sorted(model.points3D))}
+    images = {image.name: image for image in model.images.values()}
+    found = [
+        (k, row[seen.point3D_id], *seen.xy)
+        for k, name in enumerate(names)
+        for seen in images[name].points2D
+        if seen.has_point3D()
+    ]
+    table = np.array(found, np.float64).reshape(-1, 4)
+    return Observations(table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), table[:, 2:])
+
+
+def _write_photos(directory: Path, views: dict[str, View]) -> None:
+    """The photos as PNG files in `photos`, and masks in `masks` where a view has one."""
+    masked = any(view.mask is not None for view in views.values())
+    for folder in ("photos", "masks") if masked else ("photos",):
+        (directory / folder).mkdir()
+    for file, view in views.items():
+        Image.fromarray(to_uint8(as_floats(view.image))).save(directory / "photos" / file, compress_level=1)
+        if masked:
+            counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+            Image.fromarray(counts.astype(np.uint8) * 255).save(directory / "masks" / f"{file}.png")
+
+
+def _median_and_max(values: NDArray[np.float64]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "max": float(values.max())}

@@ -1,0 +1,190 @@
+"""Poses and points from photos: textured cards at known places, seen by known cameras."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+import hqgs
+from hqgs import colmap_run
+from hqgs.camera import Camera, Scene, View
+from hqgs.data import load_scene
+from hqgs.degradations import parse_degradation
+from hqgs.degrade import degrade_scene
+from hqgs.sfm import sfm_scene
+
+WIDTH, HEIGHT = 192, 144
+CARDS = [
+    (5.0, -9, 9, -9, 9),
+    (3.6, -1.4, -0.2, -1, 0.3),
+    (3.0, 0.1, 1.2, -0.3, 0.8),
+]  # z, x from, to, y from, to
+
+
+def photo_of(camera: Camera) -> np.ndarray:
+    """The cards [HEIGHT, WIDTH, 3] uint8, nearest in front, each with a fixed blotchy texture."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = np.linalg.solve(camera.K, np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)]))
+    directions = (camera.viewmat[:3, :3].T @ rays).T
+    image = np.zeros((rows.size, 3))
+    for k, (z, left, right, top, bottom) in enumerate(CARDS):
+        hit = camera.center + directions * ((z - camera.center[2]) / directions[:, 2])[:, None]
+        inside = (left < hit[:, 0]) & (hit[:, 0] < right) & (top < hit[:, 1]) & (hit[:, 1] < bottom)
+        rng = np.random.default_rng(k)
+        layers = [ndimage.gaussian_filter(rng.random((420, 420, 3)), (s, s, 0)) for s in (1.8, 4.5)]
+        texture = np.sum([(layer - 0.5) / layer.std() for layer in layers], axis=0) * 0.14 + 0.5
+        at = np.stack([hit[:, 1], hit[:, 0]]) * 60 + 210
+        colors = np.stack(
+            [ndimage.map_coordinates(texture[..., c], at, order=1, mode="wrap") for c in range(3)], -1
+        )
+        image[inside] = colors[inside]
+    return np.rint(image.clip(0, 1) * 255).astype(np.uint8).reshape(HEIGHT, WIDTH, 3)
+
+
+@pytest.fixture(scope="module")
+def cards() -> Scene:
+    """9 photos; the held-out ones are the first and the last."""
+    rng = np.random.default_rng(5)
+    K = np.array([[184.0, 0, WIDTH / 2], [0, 184, HEIGHT / 2], [0, 0, 1]])
+    views = []
+    for k in range(9):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = Rotation.from_rotvec(0.04 * rng.standard_normal(3)).as_matrix()
+        center = np.array([k % 3 - 1, k // 3 - 1, 0]) * [0.5, 0.35, 0] + 0.05 * rng.standard_normal(3)
+        viewmat[:3, 3] = -viewmat[:3, :3] @ center
+        camera = Camera(WIDTH, HEIGHT, K, viewmat)
+        views.append(View(f"photo {k}.jpg", camera, photo_of(camera)))
+    points = rng.uniform([-2, -1.5, 5], [2, 1.5, 5], (500, 3)).astype(np.float32)
+    return Scene("cards", views[1:-1], [views[0], views[-1]], points, np.zeros((500, 3), np.uint8), "test")
+
+
+@pytest.fixture(scope="module")
+def found(cards: Scene) -> Scene:
+    return sfm_scene(cards)
+
+
+def test_poses_and_points_are_those_of_the_scene(cards: Scene, found: Scene) -> None:
+    assert [view.name for view in found.train] == [view.name for view in cards.train]
+    for new, own in zip(found.train, cards.train, strict=True):
+        cosine = (np.trace(new.camera.viewmat[:3, :3] @ own.camera.viewmat[:3, :3].T) - 1) / 2
+        assert np.rad2deg(np.arccos(min(cosine, 1))) < 0.2
+        assert np.linalg.norm(new.camera.center - own.camera.center) < 0.02 * cards.extent
+        assert new.camera.K is own.camera.K
+        assert new.image is own.image
+    assert found.test is cards.test
+    depth = found.points[:, 2, None]
+    away = np.abs(depth - [card[0] for card in CARDS]).min(1)
+    assert len(found.points) > 150
+    assert np.median(away) < 0.03
+    assert found.points.dtype == np.float32
+    assert found.point_colors.shape == found.points.shape
+
+
+def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> None:
+    report = found.sfm
+    assert report is not None
+    errors = [
+        np.linalg.norm(new.camera.center - own.camera.center) / cards.extent
+        for new, own in zip(found.train, cards.train, strict=True)
+    ]
+    assert report.translation_error["median"] == pytest.approx(np.median(errors))
+    assert report.translation_error["max"] == pytest.approx(max(errors))
+    assert 0 < report.rotation_error_deg["median"] <= report.rotation_error_deg["max"] < 0.2
+    assert (report.photos, report.not_registered, report.points) == (7, [], len(found.points))
+    assert report.own_cameras_px < 0.5
+    assert report.track_length >= 2
+    assert 0 < report.reprojection_error_px < 1
+    nearest = [np.linalg.norm(cards.points - point, axis=1).min() for point in found.points]
+    assert report.point_distance == pytest.approx(np.median(nearest) / cards.extent, rel=1e-4)
+    assert (report.own_points, report.own_track_length) == (500, None)
+    json.dumps(asdict(report), allow_nan=False)
+    assert found.notes == [*cards.notes, str(report)]
+    assert "7 of 7 registered" in str(report)
+
+
+def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene) -> None:
+    black = [replace(view, image=np.zeros_like(view.image)) for view in cards.test]
+    threads = hqgs.get_num_threads()
+    try:
+        hqgs.set_num_threads(3 if threads < 3 else 1)
+        again = sfm_scene(replace(cards, test=black))
+    finally:
+        hqgs.set_num_threads(threads)
+    assert again.points.tobytes() == found.points.tobytes()
+    for a, b in zip(again.train, found.train, strict=True):
+        assert a.camera.viewmat.tobytes() == b.camera.viewmat.tobytes()
+
+
+def test_degraded_photos_without_a_place_are_left_out(cards: Scene) -> None:
+    rng = np.random.default_rng(0)
+    foreign = replace(cards.train[2], image=rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8))
+    bad = degrade_scene(
+        replace(cards, train=[*cards.train[:2], foreign, *cards.train[3:]]), parse_degradation("noise:8"), 0
+    )
+    found = sfm_scene(bad)
+    assert [view.name for view in found.train] == [v.name for v in cards.train if v.name != foreign.name]
+    assert found.sfm is not None
+    assert found.sfm.not_registered == [foreign.name]
+    assert foreign.name in found.notes[-1]
+    assert found.train[0].image is bad.train[0].image
+
+
+def test_masked_pixels_give_no_points(cards: Scene) -> None:
+    """With the nearest card's half of each photo masked out, no point lies on it."""
+
+    def masked(view: View) -> View:
+        x, _, z = (np.array([0.1, 0.25, 3.0]) - view.camera.center) @ view.camera.viewmat[:3, :3].T
+        mask = np.ones((HEIGHT, WIDTH), bool)
+        mask[:, int(184 * x / z + WIDTH / 2) - 12 :] = False
+        return replace(view, mask=mask)
+
+    found = sfm_scene(replace(cards, train=[masked(view) for view in cards.train]))
+    assert len(found.points) > 50
+    assert (np.abs(found.points[:, 2] - 3.0) < 0.3).mean() < 0.02
+
+
+def test_photos_that_make_no_scene_are_refused(cards: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="at least 3 photos, got 2"):
+        sfm_scene(replace(cards, train=cards.train[:2]))
+    flat = [replace(view, image=np.full_like(view.image, 90)) for view in cards.train[:4]]
+    with pytest.raises(ValueError, match="could start from no two of the 4 photos"):
+        sfm_scene(replace(cards, train=flat))
+    rng = np.random.default_rng(0)
+    foreign = [
+        replace(view, name=f"foreign {k}", image=rng.integers(0, 256, view.image.shape).astype(np.uint8))
+        for k, view in enumerate(cards.train[:5])
+    ]
+    with pytest.raises(ValueError, match="registered only 4 of 9 photos"):
+        sfm_scene(replace(cards, train=[*cards.train[:4], *foreign]))
+    program = Path(sys.prefix) / "no such program.py"
+    monkeypatch.setattr(colmap_run, "PROGRAM", program)
+    with pytest.raises(ValueError, match=r"COLMAP ended with status 2 .*no such program"):
+        sfm_scene(cards)
+
+
+def test_a_folder_of_photos_alone_becomes_a_scene(cards: Scene, tmp_path: Path) -> None:
+    folder = tmp_path
+    for view in [*cards.train, *cards.test]:
+        Image.fromarray(view.image).save(folder / view.name.replace(".jpg", ".png"))
+    with pytest.raises(ValueError, match="--sfm makes a scene of photos alone"):
+        load_scene(folder)
+    scene = load_scene(folder, reconstruct=True)
+    assert [view.name for view in scene.test] == ["photo 0.png", "photo 8.png"]
+    assert len(scene.train) == 7
+    assert scene.source == "photos"
+    assert "from all photos (9 of 9 registered), the held-out views among them" in scene.notes[0]
+    assert scene.tracks is not None
+    assert scene.tracks.error < 1
+    own = [*cards.test[:1], *cards.train, *cards.test[1:]]
+    new = sorted([*scene.train, *scene.test], key=lambda view: view.name)
+    a, b = (np.array([v.camera.center for v in views]) for views in (own, new))
+    a, b = (np.linalg.norm(c - c[:, None], axis=-1) for c in (a, b))
+    np.testing.assert_allclose(b / b.mean(), a / a.mean(), atol=0.1)  # up to its unit, with found intrinsics
