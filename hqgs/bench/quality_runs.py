@@ -132,7 +132,7 @@ def run_cell(
         "history": trainer.history,
         "initial_points": first_points,
         "gaussians": len(trainer.gaussians),
-        "skipped_steps": trainer.skipped,
+        "skipped_steps": trainer.guard.skipped,
         "render_ms": _render_ms(trainer),
         "regions": count_regions(means, clean.train),
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
