@@ -87,7 +87,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Delete the temporary files that a killed run left beside its checkpoint. Call it under the lock."""
+    """Delete the temporary files that a killed run left beside this one. Call it under the lock."""
     path = Path(path)
     for leftover in path.parent.glob(f".{path.stem}.*{path.suffix}"):
         leftover.unlink()

@@ -51,7 +51,8 @@ def open_run(scene: Scene, config: TrainConfig, out: str | Path, resume: bool = 
     """
     checkpoint = Path(out) / CHECKPOINT
     with lock_folder(out):
-        remove_leftovers(checkpoint)
+        for file in (CHECKPOINT, PLY):
+            remove_leftovers(Path(out) / file)
         trainer = Trainer(scene, config)
         if not resume:
             checkpoint.unlink(missing_ok=True)

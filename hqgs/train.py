@@ -89,8 +89,8 @@ class Trainer:
         if not len(self.gaussians):
             raise TrainingError(
                 f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent, too "
-                f"large (scene extent {self.extent:.3g}) or not finite ({self.guard.culled}); are the cameras "
-                "and points in one frame?"
+                f"large (scene extent {self.extent:.3g}) or not finite ({self.guard.culled}); are the "
+                "cameras and points in one frame?"
             )
         self.seconds += time.perf_counter() - started
         return Step(float(loss.detach()), render.detach(), view)
