@@ -64,7 +64,13 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
         )
     if header.get("crc32") != str(_crc32(header["meta"], tensors)):
         raise ValueError(f"the checkpoint {path} is damaged: its checksum does not match")
-    return tensors, json.loads(header["meta"])
+    try:
+        meta = json.loads(header["meta"])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the checkpoint {path} is damaged: {error}") from error
+    if not isinstance(meta, dict):
+        raise ValueError(f"the checkpoint {path} is damaged: its values are no JSON object")
+    return tensors, meta
 
 
 @contextmanager

@@ -114,7 +114,7 @@ def read_report(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
         raise ValueError(f"{path} is no hqgs report: it has no metrics")

@@ -137,8 +137,17 @@ class Trainer:
         save_checkpoint(path, tensors, meta)
 
     def restore(self, path: str | Path) -> None:
-        """Go on from a checkpoint, bit for bit. ValueError names the field in which the run differs."""
+        """Go on from a checkpoint, bit for bit.
+
+        ValueError for a damaged one, or one of another run; it names the field in which that differs.
+        """
         tensors, meta = load_checkpoint(path)
+        try:
+            self._take_over(path, tensors, meta)
+        except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+            raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error
+
+    def _take_over(self, path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
         here = {**asdict(self.config), "background": list(self.config.background)}
         _check_same(path, "", meta["config"], here)
         _check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
@@ -146,13 +155,28 @@ class Trainer:
         def part(prefix: str) -> dict[str, Tensor]:
             return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
 
+        def check(name: str, tensor: Tensor, like: Tensor) -> None:
+            if tensor.shape != like.shape or tensor.dtype != like.dtype:
+                raise ValueError(
+                    f"{path} is damaged: {name} is {tensor.dtype} {list(tensor.shape)}, "
+                    f"wanted {like.dtype} {list(like.shape)}"
+                )
+
+        n = len(tensors["gaussians.means"])
+        for name, tensor in self.gaussians.named().items():
+            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *tensor.shape[1:])))
         self.gaussians = Gaussians(**part("gaussians."))
         self.method.load_state_dict(part("method."))
         self.optimizer = self._make_optimizer()
         for group in self.optimizer.param_groups:
             for i, param in enumerate(group["params"]):
                 if state := part(f"adam.{group['name']}.{i}."):
+                    for key in ("exp_avg", "exp_avg_sq"):
+                        check(f"{key} of {group['name']}", state[key], param)
+                    check(f"step of {group['name']}", state["step"], torch.tensor(0.0))
                     self.optimizer.state[param] = state
+        for name, tensor in part("densify.").items():
+            check(f"densify.{name}", tensor, torch.empty(n))
         self.densifier.load_state_dict(part("densify."))
         for name in ("iteration", "seconds", "history"):
             setattr(self, name, meta[name])
@@ -270,6 +294,8 @@ def _check_views(scene: Scene) -> None:
 
 def _check_same(path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any]) -> None:
     """ValueError for the first field that differs; nested fields are named with dots."""
+    if not isinstance(saved, dict):
+        raise ValueError(f"{path} is damaged: {prefix or 'config'} is {saved!r:.80}")
     for name in here | saved:
         old, new = saved.get(name), here.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
