@@ -21,7 +21,7 @@ from torch import Tensor
 from hqgs.camera import Scene
 from hqgs.files import atomic_path
 
-FORMAT = 1  # raised when a newer reader could not use an older file
+FORMAT = 2  # raised when a newer reader could not use an older file
 LOCK = ".lock"
 
 
@@ -64,7 +64,13 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
         )
     if header.get("crc32") != str(_crc32(header["meta"], tensors)):
         raise ValueError(f"the checkpoint {path} is damaged: its checksum does not match")
-    return tensors, json.loads(header["meta"])
+    try:
+        meta = json.loads(header["meta"])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the checkpoint {path} is damaged: {error}") from error
+    if not isinstance(meta, dict):
+        raise ValueError(f"the checkpoint {path} is damaged: its values are no JSON object")
+    return tensors, meta
 
 
 @contextmanager
@@ -87,7 +93,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Delete the temporary files that a killed run left beside its checkpoint. Call it under the lock."""
+    """Delete the temporary files that a killed run left beside this one. Call it under the lock."""
     path = Path(path)
     for leftover in path.parent.glob(f".{path.stem}.*{path.suffix}"):
         leftover.unlink()

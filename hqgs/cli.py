@@ -7,7 +7,6 @@ Then a training run has written everything, unless Ctrl-C was pressed twice, and
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -16,13 +15,13 @@ from pathlib import Path
 import hqgs
 from hqgs.bench.cli import add_parser as add_bench_parser
 from hqgs.camera import Scene
-from hqgs.checkpoint import FolderBusyError
 from hqgs.config import TrainConfig
 from hqgs.data import load_scene
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import check_new_folder, degrade_scene, write_degraded_scene
 from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene, format_diagnosis
+from hqgs.exits import BAD_INPUT, fail
 from hqgs.files import write_json
 from hqgs.methods import METHODS
 from hqgs.methods.base import AUTO
@@ -39,15 +38,6 @@ EMBEDDED_SIZE = (504, 378)  # pixels
 KINDS_HELP = (
     "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], "
     "several joined by + in their order, mixed, or none"
-)
-BAD_INPUT = (
-    ValueError,
-    FolderBusyError,
-    FileNotFoundError,
-    FileExistsError,
-    NotADirectoryError,
-    IsADirectoryError,
-    PermissionError,
 )
 
 
@@ -155,15 +145,15 @@ def _train(args: argparse.Namespace) -> int:
                 scene = restore_scene(scene, args.restore)
             trainer = stack.enter_context(open_run(scene, config, args.out, args.resume))
         except BAD_INPUT as error:
-            return _fail(2, str(error))
+            return fail(2, str(error))
         except OSError as error:
-            return _fail(1, f"{args.out}: {error}")
+            return fail(1, f"{args.out}: {error}")
         try:
             result = run(trainer, args.out)
         except TrainingError as error:
-            return _fail(1, str(error))
+            return fail(1, str(error))
         except OSError as error:
-            return _fail(1, f"{args.out}: {error}")
+            return fail(1, f"{args.out}: {error}")
     _print_summary(args.out, result)
     return 0 if result.iterations == config.iterations else 130
 
@@ -175,9 +165,9 @@ def _degrade(args: argparse.Namespace) -> int:
         scene = _scene(args, cache=None)
         write_degraded_scene(scene, args.out, degradation, args.seed)
     except BAD_INPUT as error:
-        return _fail(2, str(error))
+        return fail(2, str(error))
     except OSError as error:
-        return _fail(1, f"{args.out}: {error}")
+        return fail(1, f"{args.out}: {error}")
     print(f"{args.out}: {len(scene.train)} training photos with {degradation}, {len(scene.test)} held out")
     return 0
 
@@ -188,9 +178,9 @@ def _diagnose(args: argparse.Namespace) -> int:
         if args.out is not None:
             write_json(args.out, asdict(diagnosis))
     except BAD_INPUT as error:
-        return _fail(2, str(error))
+        return fail(2, str(error))
     except OSError as error:
-        return _fail(1, f"{args.out}: {error}")
+        return fail(1, f"{args.out}: {error}")
     print(format_diagnosis(diagnosis))
     return 0
 
@@ -221,8 +211,3 @@ def _print_summary(out: Path, result: RunResult) -> None:
     numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
     numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
     print(f"{out}: {', '.join(numbers)}")
-
-
-def _fail(code: int, message: str) -> int:
-    print(f"hqgs: {' '.join(message.split())}", file=sys.stderr)
-    return code

@@ -121,6 +121,12 @@ class Densifier:
             reset_opacities(gaussians, optimizer, c.reset_opacity)
         return Growth(cloned, split, pruned, reset)
 
+    def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> None:
+        """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay."""
+        kept = torch.nonzero(~bad)[:, 0]
+        select_rows(gaussians, optimizer, kept, old=len(kept))
+        self.grad_sum, self.count = self.grad_sum[kept], self.count[kept]
+
     def state_dict(self) -> dict[str, Tensor]:
         return {"grad_sum": self.grad_sum, "count": self.count}
 

@@ -39,6 +39,7 @@ class RenderedView:
     photo: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3]
     render: NDArray[np.float32]  # [H, W, 3], clamped to [0, 1] by the report, never rounded for the metrics
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts
+    culled: int | None = None  # Gaussians that this view does not show
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ class RunResult:
     history: list[dict[str, Any]]  # {"iteration", "seconds", "psnr", "ssim"}: held-out means while training
     left_out: list[dict[str, str]]  # {"what", "why"}
     config: dict[str, Any]
+    guard: dict[str, Any]  # what was not finite: `Guard.summary`
+    culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
     views: list[RenderedView] = field(repr=False)
     sfm: dict[str, Any] | None = None  # `SfmReport`; None: poses and points are the scene's own
 
@@ -112,7 +115,7 @@ def read_report(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
     if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
         raise ValueError(f"{path} is no hqgs report: it has no metrics")

@@ -51,7 +51,8 @@ def open_run(scene: Scene, config: TrainConfig, out: str | Path, resume: bool = 
     """
     checkpoint = Path(out) / CHECKPOINT
     with lock_folder(out):
-        remove_leftovers(checkpoint)
+        for file in (CHECKPOINT, PLY):
+            remove_leftovers(Path(out) / file)
         trainer = Trainer(scene, config)
         if not resume:
             checkpoint.unlink(missing_ok=True)
@@ -140,12 +141,17 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
     rows = write_ply(out / PLY, trainer.method.modulate(trainer.gaussians))
     if rows:
         leave_out(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf")
-    if trainer.skipped:
-        leave_out(f"{trainer.skipped} training steps", "the loss or a gradient was not finite")
+    guard = trainer.guard
+    if guard.skipped:
+        leave_out(f"{guard.skipped} training steps", "the loss or a gradient was not finite")
+    if guard.culled:
+        leave_out(f"{guard.culled} Gaussians", "a value or a gradient of theirs was not finite")
     if trainer.iteration < config.iterations:
         leave_out(f"iterations {trainer.iteration + 1} to {config.iterations}", "the run was stopped")
     if not scene.test:
         leave_out("held-out metrics", "the scene has no held-out view")
+    views = trainer.render_test_views()
+    culled = [view.culled for view in views if view.culled is not None]
     result = RunResult(
         scene=scene.name,
         source=scene.source,
@@ -160,7 +166,9 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         left_out=left_out,
         config=asdict(config),
         sfm=None if scene.sfm is None else asdict(scene.sfm),
-        views=trainer.render_test_views(),
+        guard=guard.summary(),
+        culled_in_a_view=sum(culled) / len(culled) if culled else None,
+        views=views,
     )
     write_report(out, result)
     return result

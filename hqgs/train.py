@@ -15,8 +15,9 @@ from torch import Tensor
 from hqgs.camera import Camera, Scene, View
 from hqgs.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
 from hqgs.config import TrainConfig
-from hqgs.densify import Densifier
+from hqgs.densify import Densifier, Growth
 from hqgs.gaussians import Gaussians
+from hqgs.guard import LISTED, Event, Guard, bad_rows, bad_values, is_sound
 from hqgs.methods import make_method
 from hqgs.metrics import psnr, ssim
 from hqgs.optim import Adam
@@ -57,8 +58,7 @@ class Trainer:
         self.densifier = Densifier(config.densify, self.extent, config.seed, len(self.gaussians))
         self.iteration = 0  # steps done
         self.seconds = 0.0  # spent in steps
-        self.skipped = 0  # steps without an update because something was not finite
-        self.skipped_in_a_row = 0
+        self.guard = Guard()
         self.history: list[dict[str, Any]] = []
 
     def step(self) -> Step:
@@ -75,7 +75,7 @@ class Trainer:
             means2d.retain_grad()
             loss = self.method.loss(render, view)
             self.optimizer.zero_grad()
-            if self._backward(loss):
+            if self._backward(loss, render, view):
                 if self.iteration < config.densify.stop:
                     self.densifier.observe(
                         means2d.grad[0], meta["radii"][0], view.camera.width, view.camera.height
@@ -83,12 +83,14 @@ class Trainer:
                 # Methods' own tensors have no row for each Gaussian: all of them are updated.
                 visible = (meta["radii"][0] > 0).all(dim=1) if config.selective_adam else None
                 self.optimizer.step(visible=visible)
-            self.densifier.update(self.iteration, self.gaussians, self.optimizer)
+            growth = self.densifier.update(self.iteration, self.gaussians, self.optimizer)
+            self._check_parameters(view, growth)
 
         if not len(self.gaussians):
             raise TrainingError(
-                f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent or too "
-                f"large (scene extent {self.extent:.3g}); are the cameras and points in one frame?"
+                f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent, too "
+                f"large (scene extent {self.extent:.3g}) or not finite ({self.guard.culled}); are the "
+                "cameras and points in one frame?"
             )
         self.seconds += time.perf_counter() - started
         return Step(float(loss.detach()), render.detach(), view)
@@ -98,8 +100,9 @@ class Trainer:
         views = []
         with one_torch_thread(), torch.no_grad():
             for view in self.scene.test:
-                render, _ = self._render(view.camera)
-                views.append(RenderedView(view.name, view.image, render.numpy(), view.mask))
+                render, meta = self._render(view.camera)
+                culled = int((meta["radii"][0] == 0).any(dim=1).sum())
+                views.append(RenderedView(view.name, view.image, render.numpy(), view.mask, culled))
         return views
 
     def evaluate(self) -> None:
@@ -126,17 +129,25 @@ class Trainer:
         meta = {
             "iteration": self.iteration,
             "seconds": self.seconds,
-            "skipped": self.skipped,
-            "skipped_in_a_row": self.skipped_in_a_row,
             "history": self.history,
+            "guard": asdict(self.guard),
             "config": asdict(self.config),
             "scene": scene_fingerprint(self.scene),
         }
         save_checkpoint(path, tensors, meta)
 
     def restore(self, path: str | Path) -> None:
-        """Go on from a checkpoint, bit for bit. ValueError names the field in which the run differs."""
+        """Go on from a checkpoint, bit for bit.
+
+        ValueError for a damaged one, or one of another run; it names the field in which that differs.
+        """
         tensors, meta = load_checkpoint(path)
+        try:
+            self._take_over(path, tensors, meta)
+        except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+            raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error
+
+    def _take_over(self, path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
         here = {**asdict(self.config), "background": list(self.config.background)}
         _check_same(path, "", meta["config"], here)
         _check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
@@ -144,16 +155,32 @@ class Trainer:
         def part(prefix: str) -> dict[str, Tensor]:
             return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
 
+        def check(name: str, tensor: Tensor, like: Tensor) -> None:
+            if tensor.shape != like.shape or tensor.dtype != like.dtype:
+                raise ValueError(
+                    f"{path} is damaged: {name} is {tensor.dtype} {list(tensor.shape)}, "
+                    f"wanted {like.dtype} {list(like.shape)}"
+                )
+
+        n = len(tensors["gaussians.means"])
+        for name, tensor in self.gaussians.named().items():
+            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *tensor.shape[1:])))
         self.gaussians = Gaussians(**part("gaussians."))
         self.method.load_state_dict(part("method."))
         self.optimizer = self._make_optimizer()
         for group in self.optimizer.param_groups:
             for i, param in enumerate(group["params"]):
                 if state := part(f"adam.{group['name']}.{i}."):
+                    for key in ("exp_avg", "exp_avg_sq"):
+                        check(f"{key} of {group['name']}", state[key], param)
+                    check(f"step of {group['name']}", state["step"], torch.tensor(0.0))
                     self.optimizer.state[param] = state
+        for name, tensor in part("densify.").items():
+            check(f"densify.{name}", tensor, torch.empty(n))
         self.densifier.load_state_dict(part("densify."))
-        for name in ("iteration", "seconds", "skipped", "skipped_in_a_row", "history"):
+        for name in ("iteration", "seconds", "history"):
             setattr(self, name, meta[name])
+        self.guard = Guard(**meta["guard"])
 
     def _make_optimizer(self) -> Adam:
         config = self.config
@@ -181,22 +208,76 @@ class Trainer:
         degree = min(self.config.sh_degree, self.iteration // self.config.sh_interval)
         return render_view(self.method.modulate(self.gaussians), camera, degree, self.config.background)
 
-    def _backward(self, loss: Tensor) -> bool:
-        """Compute the gradients; False, counted, where the loss or a gradient is not finite."""
+    def _backward(self, loss: Tensor, render: Tensor, view: View) -> bool:
+        """Compute the gradients. Where the loss or a gradient is not finite: False, and the guard knows.
+
+        Gaussians whose gradient is not finite are removed. They are not at fault where the gradient of the
+        loss with respect to the render is not finite already: that comes from the view.
+        """
+        guard = self.guard
         finite = math.isfinite(loss.detach())
         if finite:
+            render.retain_grad()
             loss.backward()
-            # shN, three quarters of the numbers, is left out: its gradient is sh0's times a bounded basis.
-            grads = [t.grad for name, t in self.gaussians.named().items() if name != "shN"]
-            finite = all(g is None or math.isfinite(g.sum()) for g in grads)
-        self.skipped += not finite
-        self.skipped_in_a_row = 0 if finite else self.skipped_in_a_row + 1
-        if self.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
+            finite = self._check_gradients(render, view)
+        elif count := bad_values(view):
+            guard.add(Event(self.iteration, view.name, "photo", [], count, []))
+        else:
+            guard.add(Event(self.iteration, view.name, "loss", [], 0, []))
+        guard.skipped += not finite
+        guard.skipped_in_a_row = 0 if finite else guard.skipped_in_a_row + 1
+        if guard.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
-                f"the loss or a gradient was not finite in {self.skipped_in_a_row} steps in a row, up to "
-                f"iteration {self.iteration}; the last loss is {float(loss.detach())}"
+                f"the loss or a gradient was not finite in {guard.skipped_in_a_row} steps in a row, up to "
+                f"iteration {self.iteration}; the last loss is {float(loss.detach())}, of view {view.name!r}"
             )
         return finite
+
+    def _check_gradients(self, render: Tensor, view: View) -> bool:
+        """Whether all gradients are finite. If not, the Gaussians at fault are removed."""
+        # shN, three quarters of the numbers, is left out: its gradient is sh0's times a bounded basis.
+        # A method may leave a tensor without a gradient.
+        named = {n: t.grad for n, t in self.gaussians.named().items() if n != "shN" and t.grad is not None}
+        others = [
+            (group["name"], param.grad)
+            for group in self.optimizer.param_groups
+            if group.get("every_row")
+            for param in group["params"]
+            if param.grad is not None
+        ]
+        if all(map(is_sound, (*named.values(), *(grad for _, grad in others)))):
+            return True
+        if render.grad is not None and not torch.isfinite(render.grad).all():
+            self.guard.add(Event(self.iteration, view.name, "gradient", ["render"], 0, []))
+            return False
+        names, rows = bad_rows(self.gaussians.named())
+        if names:  # which is why: the activations pass NaN on
+            self._cull(view, "parameter", names, rows)
+            return False
+        names, rows = bad_rows(named)
+        names += [name for name, grad in others if not torch.isfinite(grad).all()]
+        if names:
+            self._cull(view, "gradient", names, rows)
+        return not names
+
+    def _check_parameters(self, view: View, growth: Growth) -> None:
+        """Remove the Gaussians with a value that is not finite. shN is looked at after a change of rows: its
+        gradients are finite, so nothing else can spoil it."""
+        changed = growth.cloned or growth.split or growth.pruned
+        named = {n: t for n, t in self.gaussians.named().items() if n != "shN" or changed}
+        if not all(map(is_sound, named.values())):
+            names, rows = bad_rows(self.gaussians.named())
+            if names:
+                self._cull(view, "parameter", names, rows)
+
+    def _cull(self, view: View, what: str, names: list[str], rows: Tensor) -> None:
+        """Remove the Gaussians of these rows, bool [N], and note where they were not finite."""
+        indices = torch.nonzero(rows)[:, 0]
+        listed = indices[:LISTED].tolist()
+        self.guard.add(Event(self.iteration, view.name, what, names, len(indices), listed))
+        if len(indices):
+            self.densifier.remove(rows, self.gaussians, self.optimizer)
+            self.guard.culled += len(indices)
 
 
 def _check_views(scene: Scene) -> None:
@@ -213,6 +294,8 @@ def _check_views(scene: Scene) -> None:
 
 def _check_same(path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any]) -> None:
     """ValueError for the first field that differs; nested fields are named with dots."""
+    if not isinstance(saved, dict):
+        raise ValueError(f"{path} is damaged: {prefix or 'config'} is {saved!r:.80}")
     for name in here | saved:
         old, new = saved.get(name), here.get(name)
         if isinstance(old, dict) and isinstance(new, dict):

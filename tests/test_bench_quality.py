@@ -287,7 +287,7 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
     scene, report = tiny_scene(), Report(settings={})
     bench = quality.Quality(protocol, [scene], RunStore(tmp_path, validate=False, sfm=True), 0, report)
     bench.train()
-    bench.tables("smoke_sfm")
+    bench.tables()
     assert len(seen) == 1
     np.testing.assert_array_equal(seen[0], degraded(scene, "noise:25", 0).train[0].image)
     runs = report.results["runs"]

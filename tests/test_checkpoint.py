@@ -1,50 +1,25 @@
-"""Checkpoints: resumed runs equal uninterrupted ones bit for bit, also after kill -9; damage is noticed."""
+"""Checkpoints: resumed runs equal uninterrupted ones bit for bit; another run and damage are noticed."""
 
 from __future__ import annotations
 
-import json
-import multiprocessing
-import os
-import resource
-import signal
-import time
 from dataclasses import replace
-from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from run_state import State, assert_same, whole_state
 from tiny_scene import tiny_config, tiny_scene
-from torch import Tensor
 
 from hqgs.camera import Scene, View
-from hqgs.checkpoint import FolderBusyError, load_checkpoint, save_checkpoint
-from hqgs.config import TrainConfig
+from hqgs.checkpoint import load_checkpoint, save_checkpoint
 from hqgs.densify import DensifyConfig
 from hqgs.run import CHECKPOINT, open_run, train
 from hqgs.train import Trainer
 
 
-def whole_state(trainer: Trainer, path: Path) -> tuple[dict[str, Tensor], dict[str, object]]:
-    """All tensors and values of a trainer but those that measure time."""
-    trainer.save(path)
-    tensors, meta = load_checkpoint(path)
-    for name in ("seconds", "history"):
-        del meta[name]
-    return tensors, meta
-
-
-def assert_same(a: tuple[dict[str, Tensor], object], b: tuple[dict[str, Tensor], object]) -> None:
-    assert a[1] == b[1]
-    assert a[0].keys() == b[0].keys()
-    for name, tensor in a[0].items():
-        assert tensor.dtype == b[0][name].dtype, name
-        assert tensor.numpy().tobytes() == b[0][name].numpy().tobytes(), name
-
-
 @pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Tensor], dict[str, object]]:
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> State:
     """The state after 30 iterations: growth at 8, 16 and 24, resets at 12 and 24."""
     trainer = Trainer(tiny_scene(), tiny_config())
     sizes = []
@@ -56,9 +31,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, T
 
 
 @pytest.mark.parametrize("stop", [0, 1, 8, 11, 12, 16, 23, 29])
-def test_a_resumed_run_is_the_same_run(
-    uninterrupted: tuple[dict[str, Tensor], dict[str, object]], tmp_path: Path, stop: int
-) -> None:
+def test_a_resumed_run_is_the_same_run(uninterrupted: State, tmp_path: Path, stop: int) -> None:
     first = Trainer(tiny_scene(), tiny_config())
     for _ in range(stop):
         first.step()
@@ -70,82 +43,6 @@ def test_a_resumed_run_is_the_same_run(
     while second.iteration < 30:
         second.step()
     assert_same(whole_state(second, tmp_path / "b.safetensors"), uninterrupted)
-
-
-def _run_in_child(out: Path, config: TrainConfig) -> None:
-    train(tiny_scene(), config, out, resume=True, progress=False)
-
-
-@pytest.fixture(scope="module")
-def processes() -> ForkServerContext:
-    """Children that start from a process in which everything is imported already."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hqgs.run", "tiny_scene"])
-    return context
-
-
-def start(processes: ForkServerContext, out: Path, config: TrainConfig) -> ForkServerProcess:
-    child = processes.Process(target=_run_in_child, args=(out, config))
-    child.start()
-    return child
-
-
-def wait_for(path: Path, child: ForkServerProcess) -> None:
-    end = time.monotonic() + 60
-    while not path.exists():
-        assert child.is_alive() or path.exists(), f"the child ended with {child.exitcode}"
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
-def test_runs_killed_at_random_moments_can_be_resumed(
-    uninterrupted: tuple[dict[str, Tensor], dict[str, object]],
-    processes: ForkServerContext,
-    tmp_path: Path,
-) -> None:
-    rng = np.random.default_rng(11)
-    config = replace(tiny_config(), checkpoint_every=1)  # as many chances as there can be to hit a write
-    kills = 0
-    for _ in range(6):
-        child = start(processes, tmp_path, config)
-        wait_for(tmp_path / CHECKPOINT, child)
-        time.sleep(rng.uniform(0.0, 0.3))
-        assert child.pid is not None
-        os.kill(child.pid, signal.SIGKILL)
-        child.join()
-        kills += child.exitcode == -signal.SIGKILL
-        load_checkpoint(tmp_path / CHECKPOINT)  # whole, whenever it was
-    assert kills >= 1
-    with open_run(tiny_scene(), tiny_config(), tmp_path, resume=True) as trainer:
-        assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".checkpoint")] == []
-        while trainer.iteration < 30:
-            trainer.step()
-        tensors, meta = whole_state(trainer, tmp_path / "b.safetensors")
-    assert_same((tensors, meta), uninterrupted)
-
-
-def test_a_real_ctrl_c_leaves_a_report(processes: ForkServerContext, tmp_path: Path) -> None:
-    child = start(processes, tmp_path, tiny_config(100_000, densify=DensifyConfig(stop=0)))
-    wait_for(tmp_path / CHECKPOINT, child)
-    assert child.pid is not None
-    os.kill(child.pid, signal.SIGINT)
-    child.join(60)
-    assert child.exitcode == 0
-    done = json.loads((tmp_path / "report.json").read_text())["iterations"]
-    assert 5 <= done < 100_000
-    assert load_checkpoint(tmp_path / CHECKPOINT)[1]["iteration"] == done
-
-
-def test_a_second_run_in_the_folder_is_refused_until_the_first_ends(
-    processes: ForkServerContext, tmp_path: Path
-) -> None:
-    child = start(processes, tmp_path, tiny_config(100_000, densify=DensifyConfig(stop=0)))
-    wait_for(tmp_path / CHECKPOINT, child)
-    with pytest.raises(FolderBusyError, match=f"another run is writing into {tmp_path}"):
-        train(tiny_scene(), tiny_config(), tmp_path)
-    child.kill()
-    child.join()
-    assert train(tiny_scene(), tiny_config(), tmp_path, progress=False).iterations == 30
 
 
 def test_a_fresh_run_does_not_take_up_an_older_one(tmp_path: Path) -> None:
@@ -253,17 +150,3 @@ def test_any_changed_byte_and_any_cut_is_noticed(tmp_path: Path) -> None:
 def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*a\.safetensors"):
         load_checkpoint(tmp_path / "a.safetensors")
-
-
-def test_a_full_disk_leaves_the_older_checkpoint(tmp_path: Path) -> None:
-    path = tmp_path / "a.safetensors"
-    save_checkpoint(path, {"a": torch.zeros(4)}, {"iteration": 1})
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))  # a larger file fails like a full disk
-    try:
-        with pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors: "):
-            save_checkpoint(path, {"a": torch.zeros(40_000)}, {"iteration": 2})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert load_checkpoint(path)[1] == {"iteration": 1}
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]

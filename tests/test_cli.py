@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import resource
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -46,17 +43,6 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     return lines[0]
-
-
-@contextmanager
-def small_disk(limit: int) -> Iterator[None]:
-    """Writing beyond `limit` bytes of a file fails as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_train_the_embedded_scene(
@@ -192,15 +178,6 @@ def test_bad_input_of_degrade_is_exit_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_degrade_on_a_full_disk_leaves_nothing(
-    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with small_disk(300):
-        assert call("degrade", "embedded", "--kind", "noise:9", "--out", tmp_path / "out") == 1
-    assert one_line(capsys).startswith(f"hqgs: {tmp_path / 'out'}: ")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_threads_are_set(asked: list[dict[str, Any]], tmp_path: Path) -> None:
     before = hqgs.get_num_threads()
     try:
@@ -273,20 +250,6 @@ def test_unknown_options_are_argparse_errors(tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as exit_info:
         call("train", "embedded", "--out", tmp_path, "--method")
     assert exit_info.value.code == 2
-
-
-@pytest.mark.parametrize("limit", [2_000, 40_000])  # too small for the checkpoint; for the report's chart
-def test_a_full_disk_is_exit_code_1_and_names_the_folder(
-    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str], limit: int
-) -> None:
-    with small_disk(limit):
-        code = call("train", "embedded", "--out", tmp_path, "--iterations", "20", "--max-gaussians", "40")
-    assert code == 1
-    assert (tmp_path / CHECKPOINT).exists() == (limit > 30_000)
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith(f"hqgs: {tmp_path}: ")
-    assert "File too large" in last
-    assert [p.name for p in tmp_path.rglob(".*") if p.name != ".lock"] == []  # no temporary file is left
 
 
 def test_a_run_that_cannot_go_on_is_exit_code_1(

@@ -45,6 +45,8 @@ def result_of(*views: RenderedView, **changes: Any) -> RunResult:
         ],
         left_out=[{"what": "pose refinement", "why": "off by default"}],
         config={"iterations": 300, "lr": 1e-3},
+        guard={"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []},
+        culled_in_a_view=12.5,
         views=list(views),
     )
     return dataclasses.replace(result, **changes)

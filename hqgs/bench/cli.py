@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 import hqgs
-from hqgs.bench import accuracy, quality, speed, stability, training
+from hqgs.bench import accuracy, endurance, quality, speed, stability, training
 from hqgs.bench.output import Benchmark, command_line, write_results
+from hqgs.exits import BAD_INPUT, fail
+from hqgs.train import TrainingError
 
 BENCHMARKS: dict[str, Benchmark] = {
     "accuracy": accuracy.BENCHMARK,
+    "endurance": endurance.BENCHMARK,
     "quality": quality.BENCHMARK,
     "speed": speed.BENCHMARK,
     "stability": stability.BENCHMARK,
@@ -44,14 +46,13 @@ def main(args: argparse.Namespace) -> int:
         if args.threads is not None:
             hqgs.set_num_threads(args.threads)
         report = BENCHMARKS[name].run(args)
-    except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError, PermissionError) as error:
-        print(f"hqgs: {error}", file=sys.stderr)
-        return 2
-    try:
         files = write_results(args.out, name, command_line(args), report)
+    except BAD_INPUT as error:
+        return fail(2, str(error))
+    except TrainingError as error:
+        return fail(1, str(error))
     except OSError as error:
-        print(f"hqgs: {args.out}: {error}", file=sys.stderr)
-        return 1
+        return fail(1, f"{args.out}: {error}")
     for table in report.tables:
         print(table, end="\n\n")
     for entry in report.left_out:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -22,7 +21,7 @@ from hqgs.bench.quality_regions import count_regions
 from hqgs.camera import Scene
 from hqgs.degradations import to_uint8
 from hqgs.files import atomic_path, write_json
-from hqgs.machine import peak_rss_mb
+from hqgs.machine import peak_rss_mb, reset_peak_rss
 from hqgs.methods import METHODS
 from hqgs.methods.base import AUTO
 from hqgs.metrics import METRICS, evaluate_view, mean_metrics
@@ -119,7 +118,7 @@ def run_cell(
     `clean` is the scene before the degradation, `photos` what is trained; `facts` are added as they are.
     Raises ValueError as `Trainer` does, and TrainingError.
     """
-    resets = _reset_peak()
+    resets = reset_peak_rss()
     started = time.perf_counter()
     trainer = Trainer(photos, cell.config)
     setup = time.perf_counter() - started
@@ -153,7 +152,7 @@ def run_cell(
         "history": trainer.history,
         "initial_points": first_points,
         "gaussians": len(trainer.gaussians),
-        "skipped_steps": trainer.skipped,
+        "skipped_steps": trainer.guard.skipped,
         "render_ms": _render_ms(trainer),
         "regions": count_regions(means, clean.train),
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
@@ -200,14 +199,3 @@ def _render_ms(trainer: Trainer) -> float:
                 render_view(gaussians, view.camera, config.sh_degree, config.background)
                 milliseconds.append(1_000 * (time.perf_counter() - started))
     return float(np.median(milliseconds))
-
-
-def _reset_peak() -> bool:
-    """Make this process's peak memory start anew; False where the system cannot."""
-    if sys.platform != "linux":
-        return False
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return False
-    return True

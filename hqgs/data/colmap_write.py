@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.camera import Camera
+from hqgs.data.colmap_files import cameras_file_size, check_binary_model
 
 
 def write_colmap(
@@ -17,7 +18,7 @@ def write_colmap(
     """Write a binary model into `folder`: the camera of each photo name, points [P, 3] and colours [P, 3].
 
     Photos with equal intrinsics share a PINHOLE camera. The points have no tracks: a `Scene` holds none.
-    The names are COLMAP's, relative to the folder of photos.
+    The names are COLMAP's, relative to the folder of photos. Raises OSError if the files are not whole.
     """
     model = pycolmap.Reconstruction()
     ids: dict[tuple[float, ...], int] = {}
@@ -37,3 +38,11 @@ def write_colmap(
         model.add_point3D(point.astype(np.float64), pycolmap.Track(), color)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
+    # COLMAP takes no notice of a full disk.
+    cameras_file = folder / "cameras.bin"
+    try:
+        check_binary_model(folder)
+        if cameras_file.stat().st_size != cameras_file_size([4] * len(ids)):
+            raise ValueError(f"{cameras_file} is damaged")
+    except ValueError as error:
+        raise OSError(f"cannot write the COLMAP model (is the disk full?): {error}") from error

@@ -10,7 +10,7 @@ import numpy as np
 
 from hqgs.camera import View
 from hqgs.data.capture import inside
-from hqgs.data.images import decode
+from hqgs.data.images import decode, stored_size
 from hqgs.files import write_json
 
 FILE = "degradation.json"
@@ -62,10 +62,11 @@ def with_low(view: View, folder: DegradedFolder, root: Path) -> View:
     path = inside(root, file, f"{FILE}: the small photo")
     if not path.is_file():
         raise FileNotFoundError(f"photo {view.name!r} has no small photo {path}")
-    low = np.divide(decode(path)[0], 255, dtype=np.float32)
-    if low.shape[0] > view.camera.height or low.shape[1] > view.camera.width:
+    width, height = stored_size(path)
+    if width > view.camera.width or height > view.camera.height:
         raise ValueError(
-            f"the small photo {path} is {low.shape[1]} x {low.shape[0]}, its photo "
+            f"the small photo {path} is {width} x {height}, its photo "
             f"{view.camera.width} x {view.camera.height}"
         )
+    low = np.divide(decode(path)[0], 255, dtype=np.float32)
     return replace(view, low=low)

@@ -56,9 +56,9 @@ def load_views(photos: list[Photo], downscale: float) -> list[View]:
 
 
 def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], Pinhole]) -> View:
+    check_size(photo.camera, *stored_size(photo.path), photo.name)
     image, mask = decode(photo.path)
     height, width = image.shape[:2]
-    check_size(photo.camera, width, height, photo.name)
     if photo.mask_path is not None:
         counts = decode_mask(photo.mask_path, width, height)
         mask = counts if mask is None else mask & counts
@@ -82,6 +82,18 @@ def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], P
     if mask is not None and mask.all():
         mask = None
     return View(photo.name, Camera(width, height, K, photo.viewmat), image, mask)
+
+
+def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
+    """Width and height that the photo's header promises, for a look before memory is taken for the pixels.
+
+    Pillow refuses more than 179 million of them. Raises ValueError that names the file.
+    """
+    try:
+        with Image.open(path) as photo:
+            return photo.size
+    except _DECODE_ERRORS as e:
+        raise ValueError(f"cannot read the {what} {path}: {e}") from e
 
 
 def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
@@ -111,6 +123,9 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
 
 def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     """The mask file as [height, width], True where it is not zero; the nearest pixel at another size."""
+    w, h = stored_size(path, "mask")
+    if abs(w * height - h * width) > width + height:
+        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
     try:
         with Image.open(path) as file:
             pixels = np.asarray(file.convert("RGB") if file.mode == "P" else file)
@@ -118,9 +133,6 @@ def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
         raise ValueError(f"cannot read the mask {path}: {e}") from e
     if pixels.ndim == 3:
         pixels = pixels[..., :3].max(-1)  # without alpha, which says nothing here
-    h, w = pixels.shape
-    if abs(w * height - h * width) > width + height:
-        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
     rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)
     columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64)
     return pixels[rows][:, columns] != 0

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from PIL import Image
 
 from hqgs.data.capture import (
     PHOTO_SUFFIXES,
@@ -22,6 +21,7 @@ from hqgs.data.capture import (
     no_points,
     viewmat_from_pose,
 )
+from hqgs.data.images import stored_size
 from hqgs.data.points import read_ply
 from hqgs.data.undistort import MAX_SIDE
 
@@ -126,7 +126,7 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
         raise ValueError(f"{where}: camera_model {model!r:.80} is none of {sorted(_PERSPECTIVE | _FISHEYE)}")
     width, height = number("w"), number("h")
     if width is None or height is None:
-        width, height = _stored_size(path)
+        width, height = stored_size(path)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"{where}: w, h = {width}, {height} is no photo size")
     fx = _focal(number("fl_x"), number("camera_angle_x"), width, where)
@@ -161,14 +161,6 @@ def _focal(focal: float | None, angle: float | None, size: float, where: str) ->
     if not 0 < angle < math.pi:
         raise ValueError(f"{where}: the angle of view {angle} is not between 0 and pi")
     return 0.5 * size / math.tan(0.5 * angle)
-
-
-def _stored_size(path: Path) -> tuple[int, int]:
-    try:
-        with Image.open(path) as photo:
-            return photo.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as e:
-        raise ValueError(f"cannot read the photo {path}: {e}") from e
 
 
 def _matrix(value: object, where: str) -> NDArray[np.float64]:
