@@ -4,12 +4,16 @@
 //! The covariance is kept in factors, so that nothing cancels for needles and discs (the naive
 //! determinant `ac - b^2` in f32 is wrong by a factor of 7 for 10,000 : 1):
 //!
-//! - `cov2d = A A^T + eps I` with `A = J W R S` (2 x 3), so
+//! - `cov2d = A A^T + eps I` with `A = J W R S` (2 x 3) of rows `a1`, `a2`, so
 //!   `det = |a1 x a2|^2 + eps (|a1|^2 + |a2|^2) + eps^2`, a sum of positive terms;
+//! - the 2 x 2 minors of `J W R` are `n = R^T cof(W) (J1 x J2)` with `J1 x J2 = f1 f2 (x/z, y/z, 1)`: no
+//!   difference of products, whose digits are lost when the rows of `A` are nearly parallel;
 //! - `conic = L L^T`, so `sigma = (u^2 + v^2) / 2` with `u = s (dx - m dy)`, `v = t dy`,
 //!   `s = sqrt(c / det)`, `m = b / c`, `t = 1 / sqrt(c)`: never negative;
 //! - the gradient of the covariance arrives as its whitened form `E` (`d cov2d = L E L^T`), whose entries
-//!   are of order 1 for any anisotropy.
+//!   are of order 1 for any anisotropy. It meets the whitened rows `B = L^T A`. The first is
+//!   `s (a1 - m a2)`, where a long needle leaves only one part in (length / width)^2 of `a1`; with the minors,
+//!   `c (j1 - m j2) = eps j1 + (S^2 j2) x n` for the rows `j1`, `j2` of `J W R`.
 //!
 //! Lanes that turn out invalid are computed to the end and ignored.
 
@@ -17,6 +21,7 @@ use crate::{
     camera::{Camera, CameraGrad},
     constants::QUAT_NORM2_MIN,
     lanes::{M3, V3, Wide, splat, splat3},
+    real::Real,
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 use glam::{DMat3, DVec2, DVec3};
@@ -26,6 +31,8 @@ type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
 /// A camera, the same in each lane.
 pub(crate) struct CameraLanes<S: Simd> {
     rotation: M3<Wide<S>>,
+    /// Its cofactors: `w_y x w_z`, `w_z x w_x`, `w_x x w_y` of its rows.
+    cofactors: M3<Wide<S>>,
     translation: V3<Wide<S>>,
     focal: [Wide<S>; 2],
     principal: [Wide<S>; 2],
@@ -42,6 +49,11 @@ impl<S: Simd> CameraLanes<S> {
         let [r0, r1, r2] = [0, 1, 2].map(|i| camera.rotation.row(i));
         Self {
             rotation: M3([splat3(simd, r0), splat3(simd, r1), splat3(simd, r2)]),
+            cofactors: M3([
+                splat3(simd, r1.cross(r2)),
+                splat3(simd, r2.cross(r0)),
+                splat3(simd, r0.cross(r1)),
+            ]),
             translation: splat3(simd, camera.translation),
             focal: pair(simd, camera.focal),
             principal: pair(simd, camera.principal),
@@ -52,6 +64,38 @@ impl<S: Simd> CameraLanes<S> {
             eps2d: splat(simd, eps2d),
         }
     }
+
+    /// A point of the world in the camera frame. In f64 the far-off origin of a geo-referenced scene takes the
+    /// digits away, so that the roundings are added back; inputs in f32 have none to lose.
+    #[inline(always)]
+    fn point<T: Real>(&self, p: V3<Wide<S>>) -> V3<Wide<S>> {
+        if T::SINGLE {
+            return self.rotation.times(p) + self.translation;
+        }
+        let [r0, r1, r2] = self.rotation.0;
+        V3::new(
+            dot_plus(r0, p, self.translation.x),
+            dot_plus(r1, p, self.translation.y),
+            dot_plus(r2, p, self.translation.z),
+        )
+    }
+}
+
+/// `a . b + c` as if computed with twice the digits (Ogita, Rump, Oishi 2005, Dot2).
+#[inline(always)]
+fn dot_plus<S: Simd, V: SimdFloat<S>>(a: V3<V>, b: V3<V>, c: V) -> V {
+    let products = [a.x * b.x, a.y * b.y, a.z * b.z];
+    let mut lost = a.x.mul_sub_precise(b.x, products[0])
+        + a.y.mul_sub_precise(b.y, products[1])
+        + a.z.mul_sub_precise(b.z, products[2]);
+    let mut sum = c;
+    for product in products {
+        let next = sum + product;
+        let added = next - sum;
+        lost += (sum - (next - added)) + (product - added);
+        sum = next;
+    }
+    sum + lost
 }
 
 /// What projection computes; the VJP computes it again instead of storing it.
@@ -78,6 +122,8 @@ pub(crate) struct Geometry<S: Simd> {
     axes: [V3<Wide<S>>; 2],
     /// Rows of `A = J W R S`.
     rows: [V3<Wide<S>>; 2],
+    /// Minors of `J W R` over the focal lengths over depth.
+    minors: V3<Wide<S>>,
     /// Covariance entry xx, low-pass included.
     a: Wide<S>,
     /// Covariance entry xy.
@@ -97,10 +143,8 @@ pub(crate) struct Geometry<S: Simd> {
 pub(crate) struct Cotangent<S: Simd> {
     pub mean2d: [Wide<S>; 2],
     /// Whitened gradient of the covariance: E_uu, E_uv, E_vv.
-    pub whitened: [Wide<S>; 3],
+    pub whitened: V3<Wide<S>>,
     pub depth: Wide<S>,
-    /// With respect to the conic and to the compensation of the opacity, if either is wanted.
-    pub direct: Option<([Wide<S>; 3], Wide<S>)>,
 }
 
 /// Gradient of the geometry.
@@ -151,22 +195,6 @@ fn pair<S: Simd>(simd: S, v: DVec2) -> [Wide<S>; 2] {
     [splat(simd, v.x), splat(simd, v.y)]
 }
 
-/// Each element of `w` at most 1 / |scale|.
-#[inline(always)]
-fn bound<S: Simd>(simd: S, w: V3<Wide<S>>, scale: V3<Wide<S>>) -> V3<Wide<S>> {
-    let (one, zero) = (splat(simd, 1.0), splat(simd, 0.0));
-    let (x, y, z) = (
-        one / scale.x.abs(),
-        one / scale.y.abs(),
-        one / scale.z.abs(),
-    );
-    V3::new(
-        w.x.min(x).max(zero - x),
-        w.y.min(y).max(zero - y),
-        w.z.min(z).max(zero - z),
-    )
-}
-
 /// Rotation matrix of a quaternion; `k` is 2 over its squared norm.
 #[inline(always)]
 fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4], k: Wide<S>) -> M3<Wide<S>> {
@@ -183,9 +211,9 @@ fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4], k: Wide<S>) -> 
 }
 
 impl<S: Simd> Geometry<S> {
-    /// Project. Each test of `valid` is written so that NaN fails it.
+    /// Project Gaussians of type T. Each test of `valid` is written so that NaN fails it.
     #[inline(always)]
-    pub fn new(
+    pub fn new<T: Real>(
         simd: S,
         mean: V3<Wide<S>>,
         quat: [Wide<S>; 4],
@@ -193,7 +221,7 @@ impl<S: Simd> Geometry<S> {
         camera: &CameraLanes<S>,
     ) -> Self {
         let infinity = splat(simd, f64::INFINITY);
-        let p = camera.rotation.times(mean) + camera.translation;
+        let p = camera.point::<T>(mean);
         let norm2 = quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3];
         let inverse_norm2 = splat(simd, 1.0) / norm2;
         let rotation = rotation_matrix(simd, quat, inverse_norm2 * 2.0);
@@ -218,7 +246,13 @@ impl<S: Simd> Geometry<S> {
         let rows = [axes[0].times(scale), axes[1].times(scale)];
         let (aa, cc) = (rows[0].dot(rows[0]), rows[1].dot(rows[1]));
         let b = rows[0].dot(rows[1]);
-        let cross = rows[0].cross(rows[1]);
+        let minors = rotation.back(camera.cofactors.back(V3::new(ratio[0], ratio[1], one)));
+        let (across, down) = (scale.by(f[0]), scale.by(f[1]));
+        let cross = V3::new(
+            across.y * down.z * minors.x,
+            across.z * down.x * minors.y,
+            across.x * down.y * minors.z,
+        );
         let det_raw = cross.dot(cross);
         let eps = camera.eps2d;
         let det = det_raw + eps * (aa + cc) + eps * eps;
@@ -248,6 +282,7 @@ impl<S: Simd> Geometry<S> {
             jw,
             axes,
             rows,
+            minors,
             a,
             b,
             c,
@@ -308,35 +343,32 @@ impl<S: Simd> Geometry<S> {
     ) -> GeometryGrad<S> {
         let (zero, two) = (splat(simd, 0.0), splat(simd, 2.0));
         let [s, m, t] = self.factors;
-        let [euu, euv, evv] = v.whitened;
-        // Whitened rows: B = L^T A, on the unscaled axes. B B^T = I - eps L^T L, so that no entry of B exceeds
-        // 1: the bound takes away what rounding leaves of a cancellation beyond 1 : 1e16.
+        let (euu, euv, evv) = (v.whitened.x, v.whitened.y, v.whitened.z);
+        // Whitened rows: B = L^T A, on the unscaled axes. B B^T = I - eps L^T L, and no term of an entry of B
+        // exceeds 1.
+        let area = self.rows[1]
+            .by(t)
+            .times(self.scale)
+            .cross(self.minors)
+            .by(t * self.f[0])
+            .by(self.f[1]);
         let white = [
-            bound(simd, (self.axes[0] - self.axes[1].by(m)).by(s), self.scale),
-            bound(simd, self.axes[1].by(t), self.scale),
+            (area + self.axes[0].by(camera.eps2d * t * t)).by(s),
+            self.axes[1].by(t),
         ];
         let half = [
             white[0].by(euu) + white[1].by(euv),
             white[0].by(euv) + white[1].by(evv),
         ];
-        // d cov = L E L^T gives dA = 2 L E B and, along each scale, 2 s_k B_k^T E B_k without cancellation.
-        let inner = white[0].times(half[0]) + white[1].times(half[1]);
-        let mut scale = self.scale.times(inner).by(two);
-        let scale2 = self.scale.times(self.scale).by(two);
-        let mut v_axes = [
-            scale2.times(half[0]).by(s),
-            scale2.times(half[1].by(t) - half[0].by(s * m)),
+        // d cov = L E L^T gives dA = 2 L E B and, along each scale, 2 s_k B_k^T E B_k without cancellation. The
+        // scales come one at a time: the square of one may overflow.
+        let half = [half[0].times(self.scale), half[1].times(self.scale)];
+        let scale = (white[0].times(half[0]) + white[1].times(half[1])).by(two);
+        let twice = self.scale.by(two);
+        let v_axes = [
+            twice.times(half[0]).by(s),
+            twice.times(half[1].by(t) - half[0].by(s * m)),
         ];
-        if let Some((conic, compensation)) = &v.direct {
-            let direct = self.covariance_cotangent(simd, conic, *compensation);
-            let v_rows = [
-                (self.rows[0].by(direct[0]) + self.rows[1].by(direct[1])).by(two),
-                (self.rows[0].by(direct[1]) + self.rows[1].by(direct[2])).by(two),
-            ];
-            scale = scale + v_rows[0].times(self.axes[0]) + v_rows[1].times(self.axes[1]);
-            v_axes[0] = v_axes[0] + v_rows[0].times(self.scale);
-            v_axes[1] = v_axes[1] + v_rows[1].times(self.scale);
-        }
         // axes_i = R^T jw_i
         let v_jw = [
             self.rotation.times(v_axes[0]),
@@ -344,6 +376,7 @@ impl<S: Simd> Geometry<S> {
         ];
 
         let [w0, w1, w2] = camera.rotation.0;
+        // J and the scales stretch A alike: sum_i v_jw_i . jw_i = sum_k v_scale_k scale_k.
         let mut v_p = V3::new(
             self.f[0] * v.mean2d[0],
             self.f[1] * v.mean2d[1],
@@ -351,8 +384,7 @@ impl<S: Simd> Geometry<S> {
                 - self.rz
                     * (self.f[0] * self.p.x * v.mean2d[0]
                         + self.f[1] * self.p.y * v.mean2d[1]
-                        + v_jw[0].dot(self.jw[0])
-                        + v_jw[1].dot(self.jw[1])),
+                        + scale.dot(self.scale)),
         );
         let v_ratio = [
             self.free[0] * self.f[0] * v_jw[0].dot(w2) * self.rz,
@@ -383,42 +415,39 @@ impl<S: Simd> Geometry<S> {
         }
     }
 
-    /// Gradient of the covariance (xx, xy, yy; symmetric) from the conic and the compensation.
+    /// The whitened gradient of the covariance that stands for a gradient of the conic: `-L^T V L`.
     #[inline(always)]
-    fn covariance_cotangent(
-        &self,
-        simd: S,
-        conic: &[Wide<S>; 3],
-        compensation: Wide<S>,
-    ) -> [Wide<S>; 3] {
-        let half = splat(simd, 0.5);
-        let zero = splat(simd, 0.0);
-        let [qa, qb, qc] = self.conic();
+    pub fn whiten_conic(&self, simd: S, v: V3<Wide<S>>) -> V3<Wide<S>> {
+        let [s, m, t] = self.factors;
         // The conic's off-diagonal entry stands for two.
-        let (va, vb, vc) = (conic[0], half * conic[1], conic[2]);
-        let left = [
-            qa * va + qb * vb,
-            qa * vb + qb * vc,
-            qb * va + qc * vb,
-            qb * vb + qc * vc,
-        ];
-        // d comp = comp/2 (d ln det_raw - d ln det). A compensation near 0 is culled with its opacity, so
-        // that det_raw is not 0 in a valid lane with a cotangent.
-        let used = compensation.simd_eq(zero);
-        let k = used.select(
-            zero,
-            half * self.compensation() * compensation / self.det_raw,
-        );
-        let l = half * self.compensation() * compensation;
-        let (a0, c0) = (
-            self.rows[0].dot(self.rows[0]),
-            self.rows[1].dot(self.rows[1]),
-        );
-        [
-            k * c0 - l * qa - (left[0] * qa + left[1] * qb),
-            zero - k * self.b - l * qb - (left[0] * qb + left[1] * qc),
-            k * a0 - l * qc - (left[2] * qb + left[3] * qc),
-        ]
+        let (va, vb, vc) = (v.x, v.y * 0.5, v.z);
+        let zero = splat(simd, 0.0);
+        V3::new(
+            zero - s * s * (va - m * (vb + vb - m * vc)),
+            zero - s * t * (vb - m * vc),
+            zero - t * t * vc,
+        )
+    }
+
+    /// The same for a gradient `v` of the compensation.
+    ///
+    /// `d comp = comp / 2 (d ln det_raw - d ln det)` gives `E = v comp / 2 ((B B^T)^-1 - I)`. With
+    /// `B B^T = I - P`, `P = eps L^T L`, that is `v / (2 comp) (P - det(P) I)`, here without differences.
+    #[inline(always)]
+    pub fn whiten_compensation(&self, simd: S, camera: &CameraLanes<S>, v: Wide<S>) -> V3<Wide<S>> {
+        let [s, m, t] = self.factors;
+        let zero = splat(simd, 0.0);
+        // A compensation near 0 is culled with its opacity, so that it is not 0 in a valid lane with a cotangent.
+        let eps = camera.eps2d;
+        let k = v
+            .simd_eq(zero)
+            .select(zero, v * eps / (self.compensation() * 2.0));
+        let [aa, cc] = [0, 1].map(|i| self.rows[i].dot(self.rows[i]));
+        V3::new(
+            k * self.inverse_det * (cc + self.b * m),
+            zero - k * s * m * t,
+            k * self.inverse_det * t * t * (self.det_raw + eps * aa),
+        )
     }
 
     /// Gradient of the quaternion, its normalisation included; `v_axes` is that of the rows of `J W R`.

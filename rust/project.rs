@@ -128,7 +128,7 @@ impl<T: Real> Inputs<T> {
             self.quats[2].wide(simd, at),
             self.quats[3].wide(simd, at),
         ];
-        Geometry::new(
+        Geometry::new::<T>(
             simd,
             wide3(simd, &self.means, at),
             quat,
@@ -695,30 +695,19 @@ fn backward_chunk<S: Simd, T: Real>(
             g.valid = lanes_in(simd, visible, at);
             let v_opacity = v_opacities.wide(simd, at);
             let mut v_input_opacity = v_opacity;
-            let mut direct = None;
-            if options.antialiased || v.conics.is_some() {
-                // Without a cotangent these are zeros.
-                let conic = [
-                    v_conics[0].wide(simd, at),
-                    v_conics[1].wide(simd, at),
-                    v_conics[2].wide(simd, at),
-                ];
-                let mut compensation = zero;
-                if options.antialiased {
-                    compensation = v_opacity * inputs.opacities.wide(simd, at);
-                    v_input_opacity = v_opacity * g.compensation();
-                }
-                direct = Some((conic, compensation));
+            let mut whitened = wide3(simd, &v_whitened, at);
+            if v.conics.is_some() {
+                whitened = whitened + g.whiten_conic(simd, wide3(simd, &v_conics, at));
+            }
+            if options.antialiased {
+                let v_compensation = v_opacity * inputs.opacities.wide(simd, at);
+                whitened = whitened + g.whiten_compensation(simd, &camera_lanes, v_compensation);
+                v_input_opacity = v_opacity * g.compensation();
             }
             let cotangent = Cotangent {
                 mean2d: [v_means2d[0].wide(simd, at), v_means2d[1].wide(simd, at)],
-                whitened: [
-                    v_whitened[0].wide(simd, at),
-                    v_whitened[1].wide(simd, at),
-                    v_whitened[2].wide(simd, at),
-                ],
+                whitened,
                 depth: v_depths.wide(simd, at),
-                direct,
             };
             let mut grad = g.vjp(
                 simd,

@@ -59,6 +59,18 @@ class OracleScene:
             arrays = {name: getattr(self, name).astype(kind).astype(np.float64) for name in names}
         return replace(self, **arrays)
 
+    def nudged(self, dtype: str, rng: np.random.Generator) -> OracleScene:
+        """Each number that is not 0 moved one ulp of "f32" or "f64" up or down, at random."""
+        kind = {"f32": np.float32, "f64": np.float64}[dtype]
+        arrays = {}
+        for name in (*GROUPS, "viewmat", "K"):
+            values = getattr(self, name).astype(kind)
+            to = np.where(rng.random(values.shape) < 0.5, -np.inf, np.inf).astype(kind)
+            arrays[name] = np.where(values == 0, values, np.nextafter(values, to)).astype(np.float64)
+        arrays["viewmat"][3] = self.viewmat[3]
+        arrays["K"][2] = self.K[2]
+        return replace(self, **arrays)
+
     def without(self, i: int) -> OracleScene:
         """The scene without Gaussian `i`."""
         return replace(self, **{name: np.delete(getattr(self, name), i, axis=0) for name in GROUPS})

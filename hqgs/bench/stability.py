@@ -13,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 
 import hqgs
-from hqgs.bench.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, load_mpmath
+from hqgs.bench.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, Pixel, load_mpmath
 from hqgs.bench.output import Benchmark, Report, markdown_table
 from hqgs.bench.stability_cases import Case, cases
 
@@ -22,6 +22,7 @@ VALUE_F64, GRADIENT_F64 = 1e-12, 1e-9  # relative
 VALUE_F32, COSINE = 1e-5, 0.99999  # absolute, for ordinary cases; of each group of gradients
 # A group of gradients below this share of the largest, each times the size of its parameter, is rounding.
 NEGLIGIBLE = {"f32": 1e-4, "f64": 1e-6}
+NUDGES = 4  # scenes with inputs one ulp off, whose largest change is the condition
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,20 @@ class Outcome:
     worst_group: str = ""
 
 
-def render(s: OracleScene, dtype: str, cotangents: dict[tuple[int, int], Array]) -> Any:
+@dataclass(frozen=True)
+class Condition:
+    """The largest changes of the oracle's own results by one ulp of the inputs; as in `Outcome`."""
+
+    value_relative: float
+    gradient: float
+    cosine: float
+
+    def words(self) -> list[str]:
+        """For a table."""
+        return [f"{self.value_relative:.1e}", f"{self.gradient:.1e}", f"{self.cosine:.6f}"]
+
+
+def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
     """Image with alpha [H, W, D + 1], radii [N, 2] and gradients by group, as float64 arrays."""
     kind = DTYPES[dtype]
 
@@ -72,12 +86,17 @@ def _double(values: torch.Tensor | None) -> Array:
     return values.detach().numpy().astype(np.float64)
 
 
+def weights(case: Case) -> dict[Pixel, Array]:
+    """The cotangents of the compared pixels, exact in float32."""
+    channels = (3 if case.scene.sh_degree is not None else case.scene.colors.shape[1]) + 1
+    values = np.cos(1.0 + np.arange(len(case.pixels) * channels)).astype(np.float32).astype(np.float64)
+    return dict(zip(case.pixels, values.reshape(-1, channels), strict=True))
+
+
 def evaluate(case: Case, dtype: str) -> Outcome:
     """Measure one case."""
     s = case.scene.rounded(dtype)
-    channels = (3 if s.sh_degree is not None else s.colors.shape[1]) + 1
-    weights = np.cos(1.0 + np.arange(len(case.pixels) * channels)).astype(np.float32).astype(np.float64)
-    cotangents = dict(zip(case.pixels, weights.reshape(-1, channels), strict=True))
+    cotangents = weights(case)
     image, radii, gradients = render(s, dtype, cotangents)
     culled = case.expected_culled(dtype)
     seen = (radii > 0).all(axis=1)
@@ -98,17 +117,38 @@ def evaluate(case: Case, dtype: str) -> Outcome:
     checked = range(len(s.means)) if len(s.means) <= 10 else case.gradients_of or ()
     as_expected = as_expected and all(oracle.kept(i) == (i not in culled) for i in checked)
     wanted = [oracle.pixel(pixel) for pixel in case.pixels]
-    got = [image[pixel] for pixel in case.pixels]
-    error = max(
-        float(abs(g - w)) for a, b in zip(got, wanted, strict=True) for g, w in zip(a, b, strict=True)
-    )
+    error = largest_difference([image[pixel] for pixel in case.pixels], wanted)
     size = max(float(abs(w)) for row in wanted for w in row)
-    ids = list(case.gradients_of) if case.gradients_of is not None else list(range(len(s.means)))
-    reference = oracle.gradients(cotangents, ids)
-    worst, cosine, group = compare_gradients(s, dtype, gradients, reference, ids)
+    ids = case.compared
+    worst, cosine, group = compare_gradients(
+        s, dtype, {name: gradients[name][ids] for name in GROUPS}, oracle.gradients(cotangents, ids), ids
+    )
     return Outcome(
         dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group
     )
+
+
+def largest_difference(got: Sequence[Any], wanted: Sequence[Any]) -> float:
+    """Largest absolute difference of two lists of pixels."""
+    pairs = [pair for a, b in zip(got, wanted, strict=True) for pair in zip(a, b, strict=True)]
+    return max(float(abs(g - w)) for g, w in pairs)
+
+
+def condition(case: Case, dtype: str) -> Condition:
+    """What one ulp of the inputs changes: no algorithm can be expected to err by less."""
+    s = case.scene.rounded(dtype)
+    cotangents, ids, rng = weights(case), case.compared, np.random.default_rng(0)
+    oracle = Oracle(s)
+    values, gradients = [oracle.pixel(p) for p in case.pixels], oracle.gradients(cotangents, ids)
+    size = max(float(abs(v)) for row in values for v in row)
+    found = []
+    for _ in range(NUDGES):
+        nudged = Oracle(s.nudged(dtype, rng))
+        change = largest_difference([nudged.pixel(p) for p in case.pixels], values) / size
+        other = {name: np.array(rows, float) for name, rows in nudged.gradients(cotangents, ids).items()}
+        found.append((change, *compare_gradients(s, dtype, other, gradients, ids)[:2]))
+    changes, worst, cosines = zip(*found, strict=True)
+    return Condition(max(changes), max(worst), min(cosines))
 
 
 def compare_gradients(
@@ -118,7 +158,7 @@ def compare_gradients(
     reference: dict[str, list[list[Any]]],
     ids: list[int],
 ) -> tuple[float, float, str]:
-    """Largest relative L2 and smallest cosine over Gaussians and groups, and the group of the former.
+    """Largest relative L2 and smallest cosine over Gaussians `ids` and groups, and the group of the former.
 
     Each Gaussian and group is compared by itself, so that a large one hides no small one. A gradient whose
     product with its parameter is below NEGLIGIBLE of the largest such product is held against that share.
@@ -129,7 +169,7 @@ def compare_gradients(
     for k, i in enumerate(ids):
         for name in GROUPS:
             truth = np.array([float(v) for v in reference[name][k]])
-            found = gradients[name][i].ravel()[: len(truth)]
+            found = gradients[name][k].ravel()[: len(truth)]
             parameter = np.linalg.norm(getattr(s, name)[i])
             if name == "means":
                 parameter = np.linalg.norm(s.viewmat[:3, :3] @ s.means[i] + s.viewmat[:3, 3])
@@ -178,8 +218,7 @@ def misses(case: Case, outcome: Outcome) -> list[str]:
 def input_rounding(case: Case) -> float:
     """Largest change of any compared value that rounding the inputs to float32 alone causes."""
     exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
-    pairs = [(a, b) for p in case.pixels for a, b in zip(exact.pixel(p), rounded.pixel(p), strict=True)]
-    return max(float(abs(a - b)) for a, b in pairs)
+    return largest_difference([exact.pixel(p) for p in case.pixels], [rounded.pixel(p) for p in case.pixels])
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -194,6 +233,12 @@ def run(args: argparse.Namespace) -> Report:
     for case in cases(args.long):
         print(f"bench stability: {case.name}", file=sys.stderr)
         rows.append((case, [evaluate(case, dtype) for dtype in ("f32", "f64")]))
+    conditions = {
+        (case.name, o.dtype): condition(case, o.dtype)
+        for case, outcomes in rows
+        for o in outcomes
+        if misses(case, o)
+    }
     offset = next(case for case, _ in rows if case.name == "world offset 1e6")
     rounding = input_rounding(offset)
     report.results = {
@@ -201,15 +246,17 @@ def run(args: argparse.Namespace) -> Report:
             {
                 "name": case.name,
                 "reason": case.reason,
-                "limits": dict(case.limits),
                 "culled": {o.dtype: list(case.expected_culled(o.dtype)) for o in outcomes},
                 "outcomes": [{**vars(o), "misses": misses(case, o)} for o in outcomes],
             }
             for case, outcomes in rows
         ],
+        "conditions": [
+            {"name": name, "dtype": dtype, **vars(found)} for (name, dtype), found in conditions.items()
+        ],
         "world_offset_f32_input_rounding": rounding,
     }
-    report.tables = tables(rows, rounding)
+    report.tables = tables(rows, conditions, rounding)
     report.figures["errors"] = chart(rows)
     return report
 
@@ -222,7 +269,7 @@ def measured(rows: Rows) -> Rows:
     return [row for row in rows if not row[0].poison]
 
 
-def tables(rows: Rows, rounding: float) -> list[str]:
+def tables(rows: Rows, conditions: dict[tuple[str, str], Condition], rounding: float) -> list[str]:
     head = [
         "case",
         "why",
@@ -246,16 +293,20 @@ def tables(rows: Rows, rounding: float) -> list[str]:
             [case.name, case.reason, culled, *(f"{v:.1e}" for v in numbers), "met" if good else "missed"]
         )
     missed = [
-        [case.name, o.dtype, "; ".join(misses(case, o)), case.limits.get(o.dtype, "not known")]
+        [case.name, o.dtype, "; ".join(misses(case, o)), *c.words()]
         for case, outcomes in rows
         for o in outcomes
-        if misses(case, o)
+        if (c := conditions.get((case.name, o.dtype))) is not None
     ]
     poison = [(case, outcomes) for case, outcomes in rows if case.poison]
     good = sum(not misses(case, o) for case, outcomes in poison for o in outcomes)
     return [
         markdown_table("Error against the oracle, on the same rounded inputs", head, lines),
-        markdown_table("Targets that are missed", ["case", "dtype", "by", "reason"], missed),
+        markdown_table(
+            "Targets that are missed, and what one ulp of the inputs changes",
+            ["case", "dtype", "by", "1 ulp: values", "1 ulp: gradient", "1 ulp: cosine"],
+            missed,
+        ),
         f"Inputs that are not finite: {good} of {2 * len(poison)} culled, with every other bit unchanged.",
         f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
     ]
