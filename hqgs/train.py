@@ -15,7 +15,7 @@ from torch import Tensor
 from hqgs.camera import Camera, Scene, View
 from hqgs.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
 from hqgs.config import TrainConfig
-from hqgs.densify import Densifier, Growth
+from hqgs.densify import Densifier
 from hqgs.gaussians import Gaussians
 from hqgs.guard import LISTED, Event, Guard, bad_rows, bad_values, is_sound
 from hqgs.methods import make_method
@@ -84,7 +84,10 @@ class Trainer:
                 visible = (meta["radii"][0] > 0).all(dim=1) if config.selective_adam else None
                 self.optimizer.step(visible=visible)
             growth = self.densifier.update(self.iteration, self.gaussians, self.optimizer)
-            self._check_parameters(view, growth)
+            changed = bool(growth.cloned or growth.split or growth.pruned)
+            if changed:
+                self.method.rows_changed()
+            self._check_parameters(view, changed)
 
         if not len(self.gaussians):
             raise TrainingError(
@@ -260,10 +263,9 @@ class Trainer:
             self._cull(view, "gradient", names, rows)
         return not names
 
-    def _check_parameters(self, view: View, growth: Growth) -> None:
+    def _check_parameters(self, view: View, changed: bool) -> None:
         """Remove the Gaussians with a value that is not finite. shN is looked at after a change of rows: its
         gradients are finite, so nothing else can spoil it."""
-        changed = growth.cloned or growth.split or growth.pruned
         named = {n: t for n, t in self.gaussians.named().items() if n != "shN" or changed}
         if not all(map(is_sound, named.values())):
             names, rows = bad_rows(self.gaussians.named())
@@ -277,6 +279,7 @@ class Trainer:
         self.guard.add(Event(self.iteration, view.name, what, names, len(indices), listed))
         if len(indices):
             self.densifier.remove(rows, self.gaussians, self.optimizer)
+            self.method.rows_changed()
             self.guard.culled += len(indices)
 
 

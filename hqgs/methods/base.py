@@ -38,6 +38,10 @@ class Method(Protocol):
         """
         ...
 
+    def rows_changed(self) -> None:
+        """Gaussians were added or removed: what was known of each of them is of no use any more."""
+        ...
+
     def loss(self, render: Tensor, view: View) -> Tensor:
         """Scalar loss of a render [H, W, 3] (float, not clamped) against a training view."""
         ...
@@ -68,6 +72,9 @@ class Plain:
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         return gaussians
+
+    def rows_changed(self) -> None:
+        pass
 
     def param_groups(self) -> list[dict[str, Any]]:
         return []

@@ -119,11 +119,14 @@ class HQGS(Plain):
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         if not self.degradation.steps or not self.config.smallest:
             return gaussians
-        if self._smallest is None or len(self._smallest) != len(gaussians):
+        if self._smallest is None:
             pixels = photo_pixels(gaussians.means, self._views) * self._factor
             self._smallest = (self.config.smallest * pixels).float()
             self._age = 0
         return enlarge(gaussians, self._smallest)
+
+    def rows_changed(self) -> None:
+        self._smallest = None
 
     def state_dict(self) -> dict[str, Tensor]:
         if self._smallest is None:
