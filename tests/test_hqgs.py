@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.camera import Scene
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import degrade_scene
-from hqgs.densify import DensifyConfig
+from hqgs.densify import DensifyConfig, select_rows
 from hqgs.losses import photometric_loss
 from hqgs.methods.hqgs import HQGS, HQGSConfig, make_hqgs
 from hqgs.methods.paper import PaperHQGS
@@ -234,3 +235,40 @@ def test_no_gaussian_is_smaller_than_its_floor() -> None:
     floor = 0.5 * 2 * photo_pixels(gaussians.means, scene.train)  # the photo's pixels are twice as large
     assert torch.allclose(scales[0].double(), floor[0].expand(3), rtol=1e-5)
     assert torch.allclose(scales[1], torch.exp(torch.tensor(3.0)).expand(3), rtol=1e-4)
+
+
+def test_sizes_follow_a_change_of_rows_that_keeps_their_number() -> None:
+    trainer = Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:9")))
+    trainer.step()
+    method = trainer.method
+    assert isinstance(method, HQGS)
+    before = method.state_dict()["smallest"]
+    n = len(trainer.gaussians)
+    turned = torch.arange(n - 1, -1, -1)
+    select_rows(trainer.gaussians, trainer.optimizer, turned, old=n)
+    method.rows_changed()
+    assert method.state_dict() == {}
+    method.modulate(trainer.gaussians)
+    expected = method.config.smallest * photo_pixels(trainer.gaussians.means, trainer.scene.train)
+    assert torch.equal(method.state_dict()["smallest"], expected.float())
+    assert not torch.equal(method.state_dict()["smallest"], before)
+
+
+def test_the_trainer_tells_the_method_of_growth_and_culling() -> None:
+    trainer = Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:9")))
+    told: list[int] = []
+    real = trainer.method.rows_changed
+
+    def rows_changed() -> None:
+        told.append(len(trainer.gaussians))
+        real()
+
+    with patch.object(trainer.method, "rows_changed", rows_changed):
+        before = len(trainer.gaussians)
+        while len(trainer.gaussians) == before:
+            trainer.step()
+        assert told == [len(trainer.gaussians)]
+        with torch.no_grad():
+            trainer.gaussians.means[3] = torch.nan
+        trainer.step()
+        assert told[1:] == [len(trainer.gaussians)]
