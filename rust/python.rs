@@ -921,5 +921,6 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
-    crate::python_loss::register(m)
+    crate::python_loss::register(m)?;
+    crate::python_pictures::register(m)
 }
