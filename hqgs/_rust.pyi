@@ -1,4 +1,4 @@
-"""The extension module; rust/python.rs and rust/python_loss.rs are its source."""
+"""The extension module; rust/python.rs, python_loss.rs and python_pictures.rs are its source."""
 
 from typing import Any
 
@@ -18,6 +18,15 @@ class Composite:
     work: tuple[int, int, int]
     blended: int
     bin_seconds: float
+
+class Separable:
+    """A linear operator on pictures and its transpose."""
+
+    size: tuple[int, int]
+
+    def __init__(self, rows: Array, columns: Array, channels: Array | None) -> None: ...
+    def apply(self, image: Array, transposed: bool) -> Array: ...
+    def apply_absolute(self, image: Array) -> Array: ...
 
 def project_forward(
     means: Array,
@@ -57,6 +66,9 @@ def photometric(
     render: Array, target: Array, mask: Array | None, lambda_dssim: float, want_grad: bool
 ) -> tuple[float, float, float | None, Array | None]: ...
 def ssim(a: Array, b: Array, mask: Array | None = None) -> float: ...
+def cell_distance(
+    x: Array, centres: Array, widths: Array, scale: float, want_grad: bool
+) -> tuple[float, Array | None]: ...
 def adam_step(
     param: Array,
     grad: Array,

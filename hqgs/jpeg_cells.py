@@ -10,13 +10,16 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from hqgs import _rust
 from hqgs.separable import Separable
 
 BLOCK = 8
@@ -53,18 +56,19 @@ class JpegCells:
 
     def __init__(self, tables: Tables, height: int, width: int) -> None:
         """`height`, `width`: of the photo, px."""
-        self._luma = Separable.of(*(_analysis(side, halve=False) for side in (height, width)))
-        self._chroma = Separable.of(*(_analysis(side, halve=True) for side in (height, width)))
+        to_ycbcr = np.array(TO_YCBCR)
+        rows, columns = (_analysis(side, halve=False) for side in (height, width))
+        self._luma = Separable.of(rows, columns, to_ycbcr[:1])
+        rows, columns = (_analysis(side, halve=True) for side in (height, width))
+        self._chroma = Separable.of(rows, columns, to_ycbcr[1:])
         luma, chroma = (torch.tensor(table).reshape(BLOCK, BLOCK) / 255 for table in tables)
-        self._luma_steps = _tile(luma, self._luma)
-        self._chroma_steps = _tile(chroma, self._chroma)
+        self._luma_steps = _tile(luma, self._luma, 1)
+        self._chroma_steps = _tile(chroma, self._chroma, 2)
         self._pixels = height * width
-        self._to_ycbcr = torch.tensor(TO_YCBCR).T
 
     def coefficients(self, image: Tensor) -> Coefficients:
         """Of a picture [H, W, 3], white at 1; differentiable."""
-        channels = image @ self._to_ycbcr.to(image)
-        return Coefficients(self._luma(channels[..., :1]), self._chroma(channels[..., 1:]))
+        return Coefficients(self._luma(image), self._chroma(image))
 
     def centres(self, photo: Tensor) -> Coefficients:
         """The centres of the cells of a decoded photo [H, W, 3]: the nearest multiples of the steps.
@@ -80,24 +84,40 @@ class JpegCells:
 
         Args:
             image: [H, W, 3], white at 1.
-            centres: of the photo.
+            centres: of the photo, of the image's dtype.
         """
-        c = self.coefficients(image)
-        outside = _outside(c.luma, centres.luma, self._luma_steps)
-        return (outside + _outside(c.chroma, centres.chroma, self._chroma_steps)) / (3 * self._pixels)
+        c, scale = self.coefficients(image), 1 / (3 * self._pixels)
+        luma = _Distance.apply(c.luma, centres.luma, self._luma_steps, scale)
+        return luma + _Distance.apply(c.chroma, centres.chroma, self._chroma_steps, scale)
 
 
-def _outside(c: Tensor, centre: Tensor, steps: Tensor) -> Tensor:
-    return torch.relu((c - centre).abs() - steps / 2).sum()
+class _Distance(torch.autograd.Function):
+    """`scale` times the sum of relu(|c - centre| - steps / 2). The gradient comes with the value."""
+
+    @staticmethod
+    def forward(ctx: Any, c: Tensor, centres: Tensor, steps: Tensor, scale: float) -> Tensor:
+        x, y, widths = (t.detach().contiguous().numpy() for t in (c, centres, steps.to(c)))
+        value, grad = _rust.cell_distance(x, y, widths, scale, ctx.needs_input_grad[0])
+        if grad is not None:
+            ctx.save_for_backward(torch.from_numpy(grad).view(c.shape))
+        return c.new_tensor(value)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
+        ctx: Any, v_distance: Tensor
+    ) -> tuple[Tensor, None, None, None]:
+        (grad,) = ctx.saved_tensors
+        return v_distance * grad, None, None, None
 
 
 def _nearest(c: Tensor, steps: Tensor) -> Tensor:
     return torch.round(c / steps) * steps
 
 
-def _tile(steps: Tensor, operator: Separable) -> Tensor:
+def _tile(steps: Tensor, operator: Separable, channels: int) -> Tensor:
     rows, columns = (side // BLOCK for side in operator.size)
-    return steps.repeat(rows, columns)[..., None]
+    return steps.repeat(rows, columns)[..., None].repeat(1, 1, channels)
 
 
 def _analysis(side: int, halve: bool) -> NDArray[np.float64]:

@@ -1,70 +1,77 @@
-"""Linear operators on pictures that are a sparse matrix per axis: resizing, blur, block transforms."""
+"""Linear operators on pictures that are a banded matrix per axis: resizing, blur, block transforms."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from hqgs import _rust
 
-@dataclass(frozen=True)
+
 class Separable:
     """rows @ channel @ columns^T for each channel of a picture: [H, W, C] to [h, w, C].
 
-    Sparse, because the dense product for a photo of 1920 x 1080 px takes seconds.
+    Only the band of each row, from its first weight to its last, is multiplied: the dense product for a
+    photo of 1920 x 1080 px takes seconds.
     """
 
-    rows: csr_array  # [h, H]
-    columns: csr_array  # [w, W]
+    def __init__(self, operator: _rust.Separable) -> None:
+        self._operator = operator
 
     @classmethod
-    def of(cls, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Separable:
-        """From dense matrices."""
-        return cls(csr_array(rows.astype(np.float32)), csr_array(columns.astype(np.float32)))
+    def of(
+        cls,
+        rows: NDArray[np.float64],
+        columns: NDArray[np.float64],
+        channels: NDArray[np.float64] | None = None,
+    ) -> Separable:
+        """From dense matrices [h, H], [w, W] and, where it also mixes the channels, [D, C].
+
+        ValueError names a matrix that is none.
+        """
+        dense = np.ascontiguousarray
+        mixing = None if channels is None else dense(channels, np.float64)
+        return cls(_rust.Separable(dense(rows, np.float64), dense(columns, np.float64), mixing))
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width of what comes out."""
-        return len(self.rows.indptr) - 1, len(self.columns.indptr) - 1
+        return self._operator.size
 
     def __call__(self, image: Tensor) -> Tensor:
-        """Differentiable once in the image; the sums have one order."""
-        return _Apply.apply(image, self.rows, self.columns)
+        """Of a picture [H, W, C], float32 or float64; differentiable once in it.
+
+        The sums have one order, in the picture's dtype. What is not finite spoils the pixels that it reaches.
+        ValueError for another shape or dtype.
+        """
+        if image.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"image: must be float32 or float64, got {image.dtype}")
+        return _Apply.apply(image, self._operator)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """[h, w], True where no pixel that is left out, in `mask` [H, W], has a weight."""
-        left_out = abs(self.rows) @ (~mask).astype(np.float32)
-        return (abs(self.columns) @ left_out.T).T == 0
+        left_out = (~mask).astype(np.float32)[..., None]
+        return self._operator.apply_absolute(left_out).reshape(self.size) == 0
 
 
 class _Apply(torch.autograd.Function):
     """The operator is linear: its gradient is the transposed operator."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, rows: csr_array, columns: csr_array) -> Tensor:
-        ctx.matrices = rows, columns
-        return _both_axes(image, rows, columns)
+    def forward(ctx: Any, image: Tensor, operator: _rust.Separable) -> Tensor:
+        ctx.operator, ctx.shape = operator, image.shape
+        out = operator.apply(image.detach().contiguous().numpy(), False)
+        return torch.from_numpy(out).view(*operator.size, -1)
 
     @staticmethod
     @once_differentiable
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
         ctx: Any, v_out: Tensor
-    ) -> tuple[Tensor, None, None]:
-        rows, columns = ctx.matrices
-        return _both_axes(v_out, rows.T, columns.T), None, None
-
-
-def _both_axes(image: Tensor, rows: Any, columns: Any) -> Tensor:
-    """[H, W, C] to [h, w, C] by sparse matrices [h, H] and [w, W]."""
-    array = image.detach().contiguous().numpy()
-    height, width, channels = array.shape
-    tall = rows @ array.reshape(height, width * channels)
-    turned = tall.reshape(-1, width, channels).swapaxes(0, 1).reshape(width, -1)
-    out = (columns @ turned).reshape(columns.shape[0], rows.shape[0], channels).swapaxes(0, 1)
-    return torch.from_numpy(np.ascontiguousarray(out))
+    ) -> tuple[Tensor, None]:
+        v_image = ctx.operator.apply(v_out.contiguous().numpy(), True)
+        return torch.from_numpy(v_image).view(ctx.shape), None

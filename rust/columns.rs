@@ -100,10 +100,11 @@ macro_rules! sixteen {
         }),*]
     };
 }
+pub(crate) use sixteen;
 
 /// Transpose the first `LEN` rows of a matrix: each stage is a perfect shuffle of all its elements.
 #[inline(always)]
-fn transpose<S: Simd, V: SimdBase<S>>(mut m: [V; GROUP]) -> [V; GROUP] {
+pub(crate) fn transpose<S: Simd, V: SimdBase<S>>(mut m: [V; GROUP]) -> [V; GROUP] {
     let half = V::LEN / 2;
     let mut side = 1;
     while side < V::LEN {

@@ -7,6 +7,7 @@
 
 pub mod adam;
 pub mod camera;
+pub mod cells;
 mod columns;
 pub mod composite;
 pub mod constants;
@@ -20,9 +21,12 @@ pub mod project;
 mod python;
 #[cfg(feature = "python")]
 mod python_loss;
+#[cfg(feature = "python")]
+mod python_pictures;
 pub mod real;
 pub mod render;
 pub mod scene;
+pub mod separable;
 pub mod sh;
 pub mod synthetic;
 pub mod threads;

@@ -19,12 +19,31 @@ use numpy::{
     PyUntypedArrayMethods,
 };
 use pyo3::{exceptions::PyValueError, prelude::*};
-use std::time::Instant;
+use rayon::prelude::*;
+use std::{
+    ffi::{c_int, c_long},
+    time::Instant,
+};
 
 /// The buffers of an iteration are as large as those of the last one: an allocator that keeps them saves the
 /// page faults, which cost more than the arithmetic of the gradients.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// Let the allocator keep freed memory for this long: it would give it back after a second, in each second of
+/// the training again.
+const KEEP_FREED_MS: c_long = 10_000;
+
+#[allow(unsafe_code)]
+fn keep_freed_memory() {
+    /// `mi_option_purge_delay` of mimalloc.h.
+    const PURGE_DELAY: c_int = 15;
+    unsafe extern "C" {
+        // SAFETY: any thread may call it with any option, and the crate is linked with mimalloc.
+        safe fn mi_option_set_default(option: c_int, value: c_long);
+    }
+    mi_option_set_default(PURGE_DELAY, KEEP_FREED_MS);
+}
 
 impl From<Error> for PyErr {
     fn from(error: Error) -> Self {
@@ -84,9 +103,26 @@ pub(crate) fn is_f32(value: &Bound<'_, PyAny>) -> bool {
     value.cast::<PyArrayDyn<f32>>().is_ok()
 }
 
-/// Zeros if wanted, else an empty vector.
+/// Numbers of a vector that are set to zero by one thread.
+const ZEROS: usize = 1 << 15;
+
+/// Zeros if wanted, else an empty vector. A large one is made by all threads: for each Gaussian there are more
+/// of them than any stage has of other numbers to write.
 fn zeros<T: Real>(wanted: bool, n: usize) -> Vec<T> {
-    vec![T::ZERO; if wanted { n } else { 0 }]
+    const BLOCK: usize = 64;
+    let n = if wanted { n } else { 0 };
+    if n < 2 * ZEROS {
+        return vec![T::ZERO; n];
+    }
+    let mut blocks = Vec::new();
+    (0..n.div_ceil(BLOCK))
+        .into_par_iter()
+        .with_min_len(ZEROS / BLOCK)
+        .map(|_| [T::ZERO; BLOCK])
+        .collect_into_vec(&mut blocks);
+    let mut zeros = blocks.into_flattened();
+    zeros.truncate(n);
+    zeros
 }
 
 /// Add the gradient from another camera; it stays finite.
@@ -912,6 +948,7 @@ fn data_pointer(array: &Bound<'_, PyAny>) -> PyResult<usize> {
 /// The extension module `hqgs._rust`.
 #[pymodule]
 fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    keep_freed_memory();
     m.add_class::<Frame>()?;
     m.add_class::<Composite>()?;
     m.add_function(wrap_pyfunction!(project_forward, m)?)?;
@@ -921,5 +958,6 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
-    crate::python_loss::register(m)
+    crate::python_loss::register(m)?;
+    crate::python_pictures::register(m)
 }

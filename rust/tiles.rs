@@ -386,6 +386,13 @@ fn list<S: Simd, T: Real>(
     keys.clear();
     records.clear();
     colors.clear();
+    // The pieces are short, and the first line of each is a miss.
+    for pairs in chunks {
+        let range = pairs.tile(tile);
+        fetch(&pairs.depths[range.clone()]);
+        fetch(&pairs.records[range.clone()]);
+        fetch(&pairs.colors[range.start * channels..range.end * channels]);
+    }
     for pairs in chunks {
         let range = pairs.tile(tile);
         for depth in &pairs.depths[range.clone()] {

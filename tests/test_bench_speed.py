@@ -68,7 +68,8 @@ def test_the_file_says_where_it_comes_from(quick: dict[str, Any]) -> None:
 
 
 def test_stages_make_up_the_whole(quick: dict[str, Any]) -> None:
-    for part, stages in (("rasterizer", CRATE), ("step", [*CRATE, "loss", "Adam", "autograd"])):
+    step = [*CRATE, "loss", "Adam", "autograd"]
+    for part, stages in (("rasterizer", CRATE), ("step", step), ("formations", step)):
         for row in quick["results"][part]:
             assert len(row["rounds"]) == quick["settings"]["repeats"]
             for seconds in row["rounds"]:
@@ -81,6 +82,17 @@ def test_stages_make_up_the_whole(quick: dict[str, Any]) -> None:
             assert 0 < low <= row["seconds"] <= high
     for row in quick["results"]["step"]:
         assert sum(row["percent"].values()) == pytest.approx(100)
+
+
+def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: dict[str, Any]) -> None:
+    rows = quick["results"]["formations"]
+    assert [r["case"] for r in rows] == [
+        "3dgs, 500", "hqgs, blur", "hqgs, lowres:2", "hqgs, jpeg:10", "hqgs, blur+lowres:2+jpeg:10",
+    ]  # fmt: skip
+    assert [r["method"] for r in rows] == ["3dgs"] + 4 * ["hqgs"]
+    assert {r["gaussians"] for r in rows} == {500}
+    assert {r["target_ms"] for r in rows} == {None}  # they hold at another size
+    assert rows[0]["stages"]["method"] < rows[1]["stages"]["method"]  # no Gaussian is too small
 
 
 def test_work_and_limit_follow_from_the_counts(quick: dict[str, Any]) -> None:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hqgs.degradations import degrade_image, parse_degradation
-from hqgs.formation import formation
+from hqgs.formation import blur_matrix, formation
 from hqgs.jpeg_cells import JpegCells, tables_of_quality
 from hqgs.kernel import Kernel
+from hqgs.resize import resize_matrix
 from hqgs.separable import Separable
 
 
@@ -75,6 +76,40 @@ def test_a_kernel_is_a_convolution() -> None:
     expected = ndimage.convolve(image[..., 0], kernel, mode="mirror")
     found = Kernel.of(kernel, 8, 9)(torch.from_numpy(image)).numpy()
     np.testing.assert_allclose(found[..., 0], expected, rtol=1e-12)
+
+
+def test_against_dense_matrices_in_float64() -> None:
+    operator = formation(parse_degradation("blur:2+lowres:3"), 120, 90)
+    rows, columns = (resize_matrix(side, side // 3) @ blur_matrix(side, 2.0) for side in (120, 90))
+    assert operator is not None
+    image = picture(120, 90)
+    expected = np.einsum("hH,HWc,wW->hwc", rows, image.astype(np.float64), columns)
+    out = operator(torch.from_numpy(image)).numpy()
+    assert out.dtype == np.float32
+    np.testing.assert_allclose(out, expected, atol=5e-7)
+    double = operator(torch.from_numpy(image).double()).numpy()
+    np.testing.assert_allclose(double, expected, atol=1e-14)
+
+
+def test_channels_are_mixed_between_the_axes() -> None:
+    rng = np.random.default_rng(2)
+    rows, columns, channels = rng.normal(size=(7, 5)), rng.normal(size=(3, 20)), rng.normal(size=(2, 3))
+    operator = Separable.of(rows, columns, channels)
+    image = torch.from_numpy(rng.normal(size=(5, 20, 3))).requires_grad_()
+    expected = np.einsum("hH,HWc,wW,dc->hwd", rows, image.detach().numpy(), columns, channels)
+    np.testing.assert_allclose(operator(image).detach().numpy(), expected, atol=1e-12)
+    assert torch.autograd.gradcheck(operator, (image,), fast_mode=True)
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    operator = Separable.of(np.ones((2, 3)), np.ones((4, 5)))
+    assert operator.size == (2, 4)
+    with pytest.raises(ValueError, match=r"image: expected shape \[3, 5, C\], got \[5, 3, 1\]"):
+        operator(torch.zeros(5, 3, 1))
+    with pytest.raises(ValueError, match=r"image: must be float32 or float64, got torch\.uint8"):
+        operator(torch.zeros(3, 5, 1, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"columns: expected shape \[height, width\], got \[5\]"):
+        Separable.of(np.ones((2, 3)), np.ones(5))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
-from scipy.sparse import csr_array
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.camera import Camera, Scene, View
@@ -79,7 +78,7 @@ def test_downsample_is_resize_and_its_gradient_the_adjoint(
 ) -> None:
     generator = torch.Generator().manual_seed(0)
     dense = [torch.from_numpy(resize_matrix(size[i], to[i])) for i in (0, 1)]
-    down = Separable(csr_array(dense[0].numpy()), csr_array(dense[1].numpy()))
+    down = Separable.of(dense[0].numpy(), dense[1].numpy())
     image = torch.rand(*size, 3, generator=generator, dtype=torch.float64, requires_grad=True)
     out = down(image)
     expected = torch.einsum("hH,HWc,wW->hwc", dense[0], image, dense[1])

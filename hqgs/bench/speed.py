@@ -21,6 +21,7 @@ from hqgs.bench.scaling import measure_scaling, scaling_chart
 from hqgs.bench.scene import make_trainer, warm_up
 from hqgs.bench.step import measure_steps, whole_step
 from hqgs.methods import METHODS, check_method
+from hqgs.methods.hqgs import AUTO
 from hqgs.train import Trainer
 
 
@@ -36,6 +37,7 @@ class SpeedConfig:
     samples: int = 400  # pixels in which the blended Gaussians are counted
     step_gaussians: tuple[int, ...] = (100_000, 200_000)
     step_photos: int = 8
+    formations: tuple[str, ...] = ("blur", "lowres:2", "jpeg:10", "blur+lowres:2+jpeg:10")
     scaling_gaussians: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000)
     scaling_size: tuple[int, int] = (1008, 756)  # in a smaller image 2 million points overlap by themselves
     scaling_sizes: tuple[tuple[int, int], ...] = (
@@ -74,12 +76,17 @@ class Speed:
         return [make_inputs(n, *c.size, c.seed) for n in c.gaussians]
 
     @cached_property
-    def trainers(self) -> list[Trainer]:
-        c = self.config
-        made = [make_trainer(n, *c.size, c.step_photos, c.method, c.seed) for n in c.step_gaussians]
-        for trainer in made:
-            warm_up(trainer)
+    def trainers(self) -> dict[str, Trainer]:
+        made = {}
+        for n in self.config.step_gaussians:
+            made[f"{self.config.method}, {n:,}"] = self._trainer(n, self.config.method, AUTO)
         return made
+
+    def _trainer(self, n: int, method: str, formation: str) -> Trainer:
+        c = self.config
+        trainer = make_trainer(n, *c.size, c.step_photos, method, c.seed, formation)
+        warm_up(trainer)
+        return trainer
 
     def rasterizer(self) -> None:
         rows = measure(self.inputs, self.config.repeats, self.config.samples)
@@ -91,10 +98,19 @@ class Speed:
         self.report.results["step"] = rows
         self.report.tables.append(tables.steps(rows))
 
+    def formations(self) -> None:
+        n = self.config.step_gaussians[0]
+        trainers = {f"3dgs, {n:,}": self._trainer(n, "3dgs", AUTO)}
+        for formation in self.config.formations:
+            trainers[f"hqgs, {formation}"] = self._trainer(n, "hqgs", formation)
+        rows = measure_steps(trainers, self.config.repeats)
+        self.report.results["formations"] = rows
+        self.report.tables.append(tables.steps(rows))
+
     def threads(self) -> None:
         if hqgs.get_num_threads() == 1:
             return self.leave_out("speed-up by threads", "there is one thread")
-        middle, trainer = self.inputs[len(self.inputs) // 2], self.trainers[0]
+        middle, trainer = self.inputs[len(self.inputs) // 2], next(iter(self.trainers.values()))
         cases: dict[str, Callable[[], dict[str, float]]] = {
             f"rasterizer, {len(middle):,} Gaussians": RasterPass(middle),
             f"training step, {len(trainer.gaussians):,} Gaussians": whole_step(trainer),
@@ -133,7 +149,7 @@ class Speed:
         self.report.left_out.append({"what": what, "why": why})
 
 
-PARTS = ("rasterizer", "step", "threads", "scaling", "memory", "peers")
+PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory", "peers")
 
 
 def run(args: argparse.Namespace) -> Report:

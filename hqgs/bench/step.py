@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -23,6 +23,10 @@ PARTS = (
     "density statistics",
     "Adam",
 )
+
+# Milliseconds of a step at 504 x 378, by method and number of Gaussians.
+TARGETS = {("3dgs", 100_000): 80, ("3dgs", 200_000): 140, ("hqgs", 100_000): 90}
+TARGET_SIZE = (504, 378)
 
 
 def places(trainer: Trainer) -> list[tuple[Any, str, str]]:
@@ -56,27 +60,29 @@ def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
     return call
 
 
-def measure_steps(trainers: Sequence[Trainer], repeats: int) -> list[dict[str, Any]]:
-    """Seconds of a step, and the share of each part of it, for each trainer."""
+def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[str, Any]]:
+    """Seconds of a step, and the share of each part of it, for each trainer; `case` is its key."""
     cases: dict[str, Callable[[], Seconds]] = {}
-    for trainer in trainers:
-        n = len(trainer.gaussians)
-        cases |= {f"{n}/whole": whole_step(trainer), f"{n}/parts": step_by_parts(trainer)}
+    for name, trainer in trainers.items():
+        cases |= {f"{name}/whole": whole_step(trainer), f"{name}/parts": step_by_parts(trainer)}
     measured = interleaved(cases, repeats)
     rows = []
-    for trainer in trainers:
-        n, view = len(trainer.gaussians), trainer.scene.train[0]
-        whole, parts = measured[f"{n}/whole"], measured[f"{n}/parts"]
+    for name, trainer in trainers.items():
+        camera = trainer.scene.train[0].camera
+        method, n, size = trainer.config.method, len(trainer.gaussians), (camera.width, camera.height)
+        whole, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
         stages = {part: median(parts, part) for part in (*PARTS, "rest")}
         total = sum(stages.values())
         rows.append(
             {
-                "method": trainer.config.method,
+                "case": name,
+                "method": method,
                 "gaussians": n,
-                "width": view.camera.width,
-                "height": view.camera.height,
+                "width": camera.width,
+                "height": camera.height,
                 "seconds": median(whole),
                 "seconds_quartiles": quartiles(whole),
+                "target_ms": TARGETS.get((method, n)) if size == TARGET_SIZE else None,
                 "clocked": median_ratio(parts, whole),  # how much the clocks slow the step down
                 "stages": stages,
                 "percent": {stage: 100 * seconds / total for stage, seconds in stages.items()},

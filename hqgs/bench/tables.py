@@ -62,16 +62,17 @@ def rasterizer(rows: Rows) -> list[str]:
 
 
 def steps(rows: Rows) -> str:
-    """One column for each number of Gaussians."""
+    """One column for each case."""
     first = rows[0]
     body = [
         ["whole step (ms)", *(_ms(r["seconds"]) for r in rows)],
         ["quartiles (ms)", *(" to ".join(map(_ms, r["seconds_quartiles"])) for r in rows)],
+        ["target (ms)", *(str(r["target_ms"] or "") for r in rows)],
         *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
         ["with clocks / without", *(f"{r['clocked']:.2f}" for r in rows)],
     ]
-    title = f"One training step, {first['method']}, {first['width']} x {first['height']}"
-    return markdown_table(title, ["", *(f"{r['gaussians']:,} Gaussians" for r in rows)], body)
+    title = f"One training step, {first['width']} x {first['height']}"
+    return markdown_table(title, ["", *(r["case"] for r in rows)], body)
 
 
 def threads(rows: Rows) -> str:

@@ -1,0 +1,168 @@
+//! The Python binding of the operators on pictures.
+
+use crate::{
+    cells,
+    error::Error,
+    python::{Array, is_f32},
+    real::Real,
+    separable::{self, Dense},
+    threads,
+};
+use numpy::{Element, IntoPyArray};
+use pyo3::prelude::*;
+
+/// Add the functions and classes of this file to the module.
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<Separable>()?;
+    m.add_function(wrap_pyfunction!(cell_distance, m)?)
+}
+
+/// The operator and its transpose, for either dtype.
+#[pyclass(frozen, module = "hqgs._rust")]
+struct Separable {
+    single: (separable::Separable<f32>, separable::Separable<f32>),
+    double: (separable::Separable<f64>, separable::Separable<f64>),
+}
+
+/// The operators of a dtype.
+trait Typed: Real + Element {
+    fn of(operator: &Separable) -> &(separable::Separable<Self>, separable::Separable<Self>);
+}
+
+impl Typed for f32 {
+    fn of(operator: &Separable) -> &(separable::Separable<Self>, separable::Separable<Self>) {
+        &operator.single
+    }
+}
+
+impl Typed for f64 {
+    fn of(operator: &Separable) -> &(separable::Separable<Self>, separable::Separable<Self>) {
+        &operator.double
+    }
+}
+
+/// A borrowed matrix.
+fn dense<'a>(name: &str, matrix: &'a Array<f64>) -> PyResult<Dense<'a>> {
+    let &[height, width] = matrix.shape() else {
+        let got = format!("{:?}", matrix.shape());
+        return Err(Error::shape(name, "[height, width]", got).into());
+    };
+    Ok(Dense {
+        weights: matrix.slice()?,
+        height,
+        width,
+    })
+}
+
+#[pymethods]
+impl Separable {
+    /// From dense matrices of float64: `rows` [h, H], `columns` [w, W], `channels` [D, C] or None.
+    #[new]
+    fn new(
+        rows: &Bound<'_, PyAny>,
+        columns: &Bound<'_, PyAny>,
+        channels: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<Self> {
+        let (rows, columns) = (Array::new("rows", rows)?, Array::new("columns", columns)?);
+        let channels = channels.map(|m| Array::new("channels", m)).transpose()?;
+        let (rows, columns) = (dense("rows", &rows)?, dense("columns", &columns)?);
+        let channels = channels
+            .as_ref()
+            .map(|m| dense("channels", m))
+            .transpose()?;
+        Ok(Self {
+            single: separable::Separable::pair(rows, columns, channels)?,
+            double: separable::Separable::pair(rows, columns, channels)?,
+        })
+    }
+
+    /// Height and width of what comes out.
+    #[getter]
+    fn size(&self) -> (usize, usize) {
+        let [height, width] = self.single.0.size();
+        (height, width)
+    }
+
+    /// The picture, flat, from `image` [H, W, C]; with `transposed` the other way round.
+    fn apply<'py>(
+        &self,
+        image: &Bound<'py, PyAny>,
+        transposed: bool,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        if is_f32(image) {
+            self.apply_as::<f32>(image, transposed)
+        } else {
+            self.apply_as::<f64>(image, transposed)
+        }
+    }
+
+    /// `apply` of the operator whose weights are the absolute values, on float32.
+    fn apply_absolute<'py>(&self, image: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+        apply(&self.single.0.absolute(), image)
+    }
+}
+
+impl Separable {
+    fn apply_as<'py, T: Typed>(
+        &self,
+        image: &Bound<'py, PyAny>,
+        transposed: bool,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let (straight, turned) = T::of(self);
+        apply(if transposed { turned } else { straight }, image)
+    }
+}
+
+fn apply<'py, T: Real + Element>(
+    operator: &separable::Separable<T>,
+    image: &Bound<'py, PyAny>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let py = image.py();
+    let image = Array::<T>::new("image", image)?;
+    let (data, shape) = (image.slice()?, image.shape());
+    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))?;
+    Ok(out.into_pyarray(py).into_any())
+}
+
+type Distance<'py> = (f64, Option<Bound<'py, PyAny>>);
+
+/// `cells::distance`: the value and, if wanted, the flat gradient.
+#[pyfunction]
+fn cell_distance<'py>(
+    x: &Bound<'py, PyAny>,
+    centres: &Bound<'py, PyAny>,
+    widths: &Bound<'py, PyAny>,
+    scale: f64,
+    want_grad: bool,
+) -> PyResult<Distance<'py>> {
+    if is_f32(x) {
+        cell_distance_as::<f32>(x, centres, widths, scale, want_grad)
+    } else {
+        cell_distance_as::<f64>(x, centres, widths, scale, want_grad)
+    }
+}
+
+fn cell_distance_as<'py, T: Real + Element>(
+    x: &Bound<'py, PyAny>,
+    centres: &Bound<'py, PyAny>,
+    widths: &Bound<'py, PyAny>,
+    scale: f64,
+    want_grad: bool,
+) -> PyResult<Distance<'py>> {
+    let py = x.py();
+    let x = Array::<T>::new("x", x)?;
+    let centres = Array::<T>::new("centres", centres)?;
+    let widths = Array::<T>::new("widths", widths)?;
+    for (name, array) in [("centres", &centres), ("widths", &widths)] {
+        if array.shape() != x.shape() {
+            let (expected, got) = (format!("{:?}", x.shape()), format!("{:?}", array.shape()));
+            return Err(Error::shape(name, expected, got).into());
+        }
+    }
+    let (x, centres, widths) = (x.slice()?, centres.slice()?, widths.slice()?);
+    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let out = want_grad.then_some(&mut grad[..]);
+    let value =
+        py.detach(|| threads::install(|| cells::distance(x, centres, widths, scale, out)))?;
+    Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
+}
