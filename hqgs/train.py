@@ -152,8 +152,9 @@ class Trainer:
 
     def _take_over(self, path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
         here = {**asdict(self.config), "background": list(self.config.background)}
-        _check_same(path, "", meta["config"], here)
+        # The scene first: methods fit the configuration to it.
         _check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
+        _check_same(path, "", meta["config"], here)
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}

@@ -77,10 +77,18 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     if unused:
         notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
     points, colors = keep_finite(*model_points(model), notes)
-    tracks = None
-    if model.compute_num_observations():
-        tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    tracks = _tracks(model, path)
     return Capture("colmap", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks)
+
+
+def _tracks(model: pycolmap.Reconstruction, path: Path) -> Tracks | None:
+    """How the photos saw the points; None where the model does not tell."""
+    try:
+        if not model.compute_num_observations():
+            return None
+        return Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    except ValueError as e:
+        raise ValueError(f"{path}: a point was seen by a photo that the model lacks: {e}") from e
 
 
 def _kind(folder: Path) -> str:
