@@ -144,6 +144,25 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
     assert least.config.densify.max_gaussians == len(scene.points)
 
 
+@pytest.mark.parametrize(
+    ("formation", "given", "threshold"),
+    [
+        ("jpeg:10", 2e-4, 1e-4),
+        ("jpeg:10", 5e-5, 5e-5),
+        ("noise:6+jpeg:10", 2e-4, 2e-4),
+        ("blur:1", 2e-4, 2e-4),
+    ],
+)  # fmt: skip
+def test_growth_asks_for_less_where_only_the_codec_spoils(
+    formation: str, given: float, threshold: float
+) -> None:
+    config = tiny_config(method="hqgs", hqgs=fixed(formation))
+    config = replace(config, densify=replace(config.densify, grad_threshold=given))
+    trainer = Trainer(tiny_scene(), config)
+    assert trainer.config.densify.grad_threshold == threshold
+    assert Trainer(tiny_scene(), trainer.config).config == trainer.config  # fitted once is fitted
+
+
 def test_it_looks_by_itself_and_says_what_it_leaves_out(tmp_path: Path) -> None:
     scene = degrade_scene(tiny_scene(), parse_degradation("noise:40"), 0)
     result = train(scene, tiny_config(method="hqgs"), tmp_path, progress=False)

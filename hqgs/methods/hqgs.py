@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
+JPEG_THRESHOLD = 1e-4  # at most, of growth: `DensifyConfig.grad_threshold`
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -76,6 +77,7 @@ class HQGS(Plain):
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
       Blur and noise make a pixel count less. More Gaussians paint the noise and the ringing of deblurring.
+    - JPEG without noise: growth asks for half the gradient, since within the cells there is none.
     """
 
     name = "hqgs"
@@ -103,6 +105,7 @@ class HQGS(Plain):
     def adapt(self, config: TrainConfig) -> TrainConfig:
         """The formation that was found, and a budget of Gaussians that the photos can determine."""
         hqgs = replace(config.hqgs, formation=str(self.degradation))
+        kinds = {step.kind for step in self.degradation.steps}
         budget = config.densify.max_gaussians
         if self.degradation.steps:
             pixels = sum(self._sharp_pixels(target) for target in self._targets.values())
@@ -110,7 +113,10 @@ class HQGS(Plain):
         method = config.method
         if method == AUTO:
             method = "hqgs" if self.degradation.steps else "3dgs"
-        densify = replace(config.densify, max_gaussians=budget)
+        threshold = config.densify.grad_threshold
+        if "jpeg" in kinds and "noise" not in kinds:
+            threshold = min(threshold, JPEG_THRESHOLD)
+        densify = replace(config.densify, max_gaussians=budget, grad_threshold=threshold)
         return replace(config, method=method, hqgs=hqgs, densify=densify)
 
     def left_out(self) -> list[tuple[str, str]]:
