@@ -23,6 +23,7 @@ from hqgs.files import atomic_path
 
 FORMAT = 2  # raised when a newer reader could not use an older file
 LOCK = ".lock"
+SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 
 
 class FolderBusyError(RuntimeError):
@@ -95,8 +96,9 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
 def remove_leftovers(path: str | Path) -> None:
     """Delete the temporary files that a killed run left beside this one. Call it under the lock."""
     path = Path(path)
-    for leftover in path.parent.glob(f".{path.stem}.*{path.suffix}"):
-        leftover.unlink()
+    for pattern in (f".{path.stem}.*{path.suffix}", SAFETENSORS_TMP):
+        for leftover in path.parent.glob(pattern):
+            leftover.unlink()
 
 
 def scene_fingerprint(scene: Scene) -> dict[str, str]:

@@ -165,6 +165,17 @@ def test_runs_killed_at_random_moments_can_be_resumed(
     assert resumed >= KILLS // 3
 
 
+def test_what_a_killed_writer_leaves_is_removed(tmp_path: Path) -> None:
+    """Also the file that safetensors itself makes: a kill at that moment is too rare to wait for."""
+    train(tiny_scene(), tiny_config(3), tmp_path, progress=False)
+    names = [".tmpAb3dE9", f".{Path(PLY).stem}.x{Path(PLY).suffix}"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"half")
+    assert set(hidden(tmp_path)) >= set(names)
+    train(tiny_scene(), tiny_config(3), tmp_path, resume=True, progress=False)
+    assert hidden(tmp_path) == []
+
+
 def test_a_real_ctrl_c_is_exit_code_130_with_checkpoint_and_report(
     processes: ForkServerContext, folder: Path, tmp_path: Path
 ) -> None:
