@@ -6,9 +6,7 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from hqgs.camera import View
+from hqgs.camera import View, as_floats
 from hqgs.data.capture import inside
 from hqgs.data.images import decode, stored_size
 from hqgs.files import write_json
@@ -68,5 +66,5 @@ def with_low(view: View, folder: DegradedFolder, root: Path) -> View:
             f"the small photo {path} is {width} x {height}, its photo "
             f"{view.camera.width} x {view.camera.height}"
         )
-    low = np.divide(decode(path)[0], 255, dtype=np.float32)
+    low = as_floats(decode(path)[0])
     return replace(view, low=low)
