@@ -75,3 +75,16 @@ class Scene:
         centers = np.stack([v.camera.center for v in self.train])
         radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
         return 1.1 * radius if radius > 0 else 1.0
+
+    @property
+    def reach(self) -> float:
+        """The extent, or the median depth of the points before the training views where that is larger.
+
+        Photos taken side by side may show things that are many times farther away than the cameras are apart.
+        """
+        points, depths = self.points.astype(np.float64), []
+        for view in self.train:
+            depth = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
+            depths.append(depth[depth > 0])
+        seen = np.concatenate(depths)
+        return max(self.extent, float(np.median(seen))) if seen.size else self.extent

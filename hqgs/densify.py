@@ -26,7 +26,9 @@ class DensifyConfig:
     """When and how densely Gaussians are added and removed. The defaults are those of 3DGS at 30,000.
 
     Pruning by size on the screen (20 px in the paper's code) is left out: there it tests radii that were
-    just set to zero, so that no published figure contains it.
+    just set to zero, so that no published figure contains it. Pruning by size in the world goes by the
+    scene's reach, not its extent: photos taken side by side have a small extent, so that it would remove all
+    that is far away, in each round (docs/robustness.md has what that does).
     """
 
     start: int = 500  # iterations before the first round
@@ -35,7 +37,7 @@ class DensifyConfig:
     grad_threshold: float = 2e-4  # mean gradient norm of the 2D mean, in half images, that calls for growth
     percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
     prune_opacity: float = 0.005  # more transparent Gaussians are removed
-    prune_scale: float = 0.1  # of the scene extent: larger Gaussians are removed, after the first reset
+    prune_scale: float = 0.1  # of the scene's reach: larger Gaussians are removed, after the first reset
     reset_every: int = 3_000  # iterations between opacity resets
     reset_opacity: float = 0.01  # opacities are cut to this
     max_gaussians: int = 1_000_000  # growth stops here, the highest gradients go first; bounds the memory
@@ -82,14 +84,17 @@ class Densifier:
     The random numbers of a round follow from (seed, iteration) alone, so there is no generator to save.
     """
 
-    def __init__(self, config: DensifyConfig, extent: float, seed: int, num_gaussians: int) -> None:
-        """`extent`: the scene's, world units. `num_gaussians`: N at the start."""
+    def __init__(
+        self, config: DensifyConfig, extent: float, reach: float, seed: int, num_gaussians: int
+    ) -> None:
+        """`extent`, `reach`: the scene's, world units. `num_gaussians`: N at the start."""
         if num_gaussians > config.max_gaussians:
             raise ValueError(
                 f"max_gaussians is {config.max_gaussians}, but the scene starts with {num_gaussians} points"
             )
         self.config = config
         self.extent = extent
+        self.reach = reach
         self.seed = seed
         self.grad_sum = torch.zeros(num_gaussians)  # of gradient norms, half images
         self.count = torch.zeros(num_gaussians)  # views in which the Gaussian was visible
@@ -161,7 +166,7 @@ class Densifier:
         with torch.no_grad():
             bad = gaussians.activated_opacities() < self.config.prune_opacity
             if iteration > self.config.reset_every:
-                bad |= _largest_scale(gaussians) > self.config.prune_scale * self.extent
+                bad |= _largest_scale(gaussians) > self.config.prune_scale * self.reach
         pruned = int(bad.sum())
         if pruned:
             kept = torch.nonzero(~bad)[:, 0]

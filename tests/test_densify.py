@@ -46,7 +46,7 @@ def make(scales: list[float], opacity: float = 0.5) -> tuple[Gaussians, Adam]:
 
 
 def densifier(gaussians: Gaussians, config: DensifyConfig = CONFIG, seed: int = 0) -> Densifier:
-    return Densifier(config, extent=1.0, seed=seed, num_gaussians=len(gaussians))
+    return Densifier(config, extent=1.0, reach=1.0, seed=seed, num_gaussians=len(gaussians))
 
 
 def see(d: Densifier, gradients: list[float]) -> None:
@@ -196,6 +196,15 @@ def test_large_gaussians_are_pruned_after_the_first_reset_only() -> None:
     assert d.update(30, g, optimizer).pruned == 0
     assert d.update(40, g, optimizer).pruned == 1
     assert identity(g) == [0, 2]
+
+
+def test_the_reach_says_what_is_too_large_and_the_extent_what_is_split() -> None:
+    g, optimizer = make([0.101, 0.301])
+    d = Densifier(CONFIG, extent=100.0, reach=3.0, seed=0, num_gaussians=len(g))
+    see(d, [1.0, 1.0])
+    growth = d.update(40, g, optimizer)  # 0.01 of the extent: both are cloned, not split
+    assert (growth.cloned, growth.split, growth.pruned) == (2, 0, 2)
+    assert identity(g) == [0, 0]
 
 
 def test_children_are_judged_by_their_own_size() -> None:

@@ -314,7 +314,7 @@ def test_a_gaussian_keeps_its_row_and_its_offspring_inherits_it() -> None:
     rows = FeatureRows(7)
     rows.start(scene)
     config = DensifyConfig(start=0, every=1, percent_dense=0.1, grad_threshold=0.5, prune_opacity=0.02)
-    densifier = Densifier(config, 1.0, 0, len(scene))
+    densifier = Densifier(config, 1.0, 1.0, 0, len(scene))
     lost = grown = 0
     for iteration in range(1, 5):
         scene.means.grad = torch.ones_like(scene.means)

@@ -23,6 +23,7 @@ from hqgs.gaussians import Gaussians
 from hqgs.methods import METHODS, ThreeDGS, check_method
 from hqgs.ply import read_ply
 from hqgs.run import CHECKPOINT, PLY, open_run, run, train
+from hqgs.synthetic import embedded_scene
 from hqgs.train import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
 
 ONLY_TRAIN = DensifyConfig(stop=0)
@@ -231,6 +232,21 @@ def test_no_gaussian_left_ends_with_the_reason() -> None:
     trainer = Trainer(tiny_scene(), tiny_config(densify=densify))
     with pytest.raises(TrainingError, match="no Gaussians are left at iteration 5"):
         steps(trainer, 10)
+
+
+def test_what_is_far_away_survives_the_opacity_resets(tmp_path: Path) -> None:
+    # Photos of a room, taken 0.9 apart and 5 away from what they show: pruning by size that goes by the
+    # cameras' extent takes 20 dB here, and takes them again in each round.
+    scene = embedded_scene(tmp_path, 48, 36)
+    assert scene.reach > 5 * scene.extent
+    densify = DensifyConfig(start=50, stop=400, every=50, reset_every=200, max_gaussians=5_000)
+    trainer = Trainer(scene, TrainConfig(iterations=400, sh_degree=0, densify=densify))
+    while trainer.iteration < 400:
+        if trainer.step() and trainer.iteration in (199, 400):
+            trainer.evaluate()
+    before, after = (entry["psnr"] for entry in trainer.history)
+    assert before > 20
+    assert after > before - 1.0
 
 
 def test_a_view_that_sees_nothing_is_no_error() -> None:
