@@ -55,9 +55,7 @@ class Trainer:
         self.config = config = self.method.adapt(config)
         self.gaussians = Gaussians.from_points(scene.points, scene.point_colors, config.sh_degree)
         self.optimizer = self._make_optimizer()
-        self.densifier = Densifier(
-            config.densify, self.extent, scene.reach, config.seed, len(self.gaussians)
-        )
+        self.densifier = Densifier(config.densify, self.extent, scene.reach, config.seed, len(self.gaussians))
         self.iteration = 0  # steps done
         self.seconds = 0.0  # spent in steps
         self.guard = Guard()
@@ -94,8 +92,8 @@ class Trainer:
         if not len(self.gaussians):
             raise TrainingError(
                 f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent, too "
-                f"large (scene's reach {self.densifier.reach:.3g}) or not finite ({self.guard.culled}); are the "
-                "cameras and points in one frame?"
+                f"large (scene's reach {self.densifier.reach:.3g}) or not finite ({self.guard.culled}); are "
+                "the cameras and points in one frame?"
             )
         self.seconds += time.perf_counter() - started
         return Step(float(loss.detach()), render.detach(), view)
