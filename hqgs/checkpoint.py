@@ -21,7 +21,7 @@ from torch import Tensor
 from hqgs.camera import Scene
 from hqgs.files import atomic_path
 
-FORMAT = 2  # raised when a newer reader could not use an older file
+FORMAT = 3  # raised when a newer reader could not use an older file
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 

@@ -23,6 +23,8 @@ from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene, format_diagnosis
 from hqgs.exits import BAD_INPUT, fail
 from hqgs.files import write_json
+from hqgs.left_out import AUTO as LEAVE_OUT
+from hqgs.left_out import ITEMS, NONE, LeftOut, format_left_out, parse_leave_out
 from hqgs.methods import METHODS
 from hqgs.methods.base import AUTO
 from hqgs.methods.hqgs import GUIDANCES, HQGSConfig
@@ -62,7 +64,19 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene(train, "folder for the checkpoint and the report", config.seed)
     add = train.add_argument
     add("--method", default=AUTO, help=f"one of: {', '.join(METHODS)} (%(default)s)")
-    add("--iterations", type=int, default=config.iterations, metavar="N", help="training steps (%(default)s)")
+    add(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help=f"training steps (at most {config.iterations}, fewer where the scene has stopped improving)",
+    )
+    add(
+        "--leave-out",
+        default=LEAVE_OUT,
+        metavar="LIST",
+        help=f"what the run may do without where the scene does not need it: {LEAVE_OUT}, {NONE}, or some of "
+        f"{','.join(ITEMS)} (%(default)s)",
+    )
     add(
         "--degrade", default="none", metavar="KIND", help=f"what happens to the training photos: {KINDS_HELP}"
     )
@@ -155,7 +169,7 @@ def _train(args: argparse.Namespace) -> int:
         except OSError as error:
             return fail(1, f"{args.out}: {error}")
     _print_summary(args.out, result)
-    return 0 if result.iterations == config.iterations else 130
+    return 0 if result.iterations == result.length else 130
 
 
 def _degrade(args: argparse.Namespace) -> int:
@@ -186,8 +200,12 @@ def _diagnose(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> TrainConfig:
+    leave_out = parse_leave_out(args.leave_out)
+    if args.iterations is not None and args.leave_out == LEAVE_OUT:
+        leave_out = tuple(item for item in leave_out if item != "iterations")  # a number means that number
     config = TrainConfig(
-        iterations=args.iterations,
+        iterations=TrainConfig.iterations if args.iterations is None else args.iterations,
+        leave_out=leave_out,
         method=args.method,
         seed=args.seed,
         densify=DensifyConfig(max_gaussians=args.max_gaussians),
@@ -211,3 +229,5 @@ def _print_summary(out: Path, result: RunResult) -> None:
     numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
     numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
     print(f"{out}: {', '.join(numbers)}")
+    if table := format_left_out([LeftOut(**item) for item in result.left_out]):
+        print(table)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from hqgs.densify import DensifyConfig
 from hqgs.gaussians import MAX_SH_DEGREE
+from hqgs.left_out import check_items
 from hqgs.methods import check_method
 from hqgs.methods.hqgs import HQGSConfig
 from hqgs.methods.srgs import SRGSConfig
@@ -33,6 +34,7 @@ class TrainConfig:
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
     adam_eps: float = 1e-15
     selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
+    leave_out: tuple[str, ...] = ()  # of `hqgs.left_out.ITEMS`: what the run may do without, where it pays
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB
     eval_every: int = 3_000  # iterations between evaluations on the held-out views
     checkpoint_every: int = 1_000  # iterations; does not change the result
@@ -42,6 +44,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         check_method(self.method)
+        check_items(set(self.leave_out))
         for name in ("iterations", "sh_interval", "eval_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")

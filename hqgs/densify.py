@@ -7,6 +7,7 @@ Kerbl et al. 2023, section 5.2. Every change of the number of Gaussians is a sel
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -76,6 +77,7 @@ class Growth:
     split: int = 0
     pruned: int = 0
     reset: bool = False
+    refused: int = 0  # Gaussians that would have grown but are too fine
 
 
 class Densifier:
@@ -107,24 +109,31 @@ class Densifier:
         self.grad_sum += torch.where(visible, norm, 0.0)
         self.count += visible
 
-    def update(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> Growth:
+    def update(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer,
+        finest: Callable[[Tensor], Tensor] | None = None,
+    ) -> Growth:
         """Grow, prune and reset, as far as the schedule asks for it after this iteration (1, 2, ...).
 
-        `gaussians` and `optimizer` get new tensors in place of the old ones.
+        `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` gives for means [N, 3]
+        the largest scales [N], world units, of Gaussians that are too fine to be cloned or split.
         """
         c = self.config
         if iteration >= c.stop:
             return Growth()
-        cloned = split = pruned = 0
+        cloned = split = pruned = refused = 0
         if iteration > c.start and iteration % c.every == 0:
-            cloned, split = self._grow(iteration, gaussians, optimizer)
+            cloned, split, refused = self._grow(iteration, gaussians, optimizer, finest)
             pruned = self._prune(iteration, gaussians, optimizer)
             self.grad_sum = torch.zeros(len(gaussians))
             self.count = torch.zeros(len(gaussians))
         reset = iteration % c.reset_every == 0
         if reset:
             reset_opacities(gaussians, optimizer, c.reset_opacity)
-        return Growth(cloned, split, pruned, reset)
+        return Growth(cloned, split, pruned, reset, refused)
 
     def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> None:
         """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay."""
@@ -138,10 +147,22 @@ class Densifier:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.grad_sum, self.count = state["grad_sum"], state["count"]
 
-    def _grow(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> tuple[int, int]:
-        """Clone the small and split the large among those with a high mean gradient."""
+    def _grow(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer,
+        finest: Callable[[Tensor], Tensor] | None,
+    ) -> tuple[int, int, int]:
+        """Clone the small and split the large among those with a high mean gradient; how many each, and how
+        many were too fine for it."""
         n = len(gaussians)
         grad = self.grad_sum / self.count.clamp(min=1)
+        refused = 0
+        if finest is not None:
+            fine = _largest_scale(gaussians) <= finest(gaussians.means.detach())
+            refused = int((fine & (grad >= self.config.grad_threshold)).sum())
+            grad = torch.where(fine, -1.0, grad)
         # Either way a candidate adds one Gaussian to the total.
         order = torch.argsort(grad, descending=True, stable=True)[: self.config.max_gaussians - n]
         grow = torch.zeros(n, dtype=torch.bool)
@@ -160,7 +181,7 @@ class Densifier:
             rotation = quats_to_matrices(gaussians.quats[children])
             gaussians.means[children] += (rotation @ (scales * normal)[:, :, None])[:, :, 0]
             gaussians.scales[children] -= math.log(SPLIT_SHRINK)
-        return len(cloned), len(split)
+        return len(cloned), len(split), refused
 
     def _prune(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> int:
         with torch.no_grad():
@@ -188,6 +209,16 @@ def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: i
                 value[old:] = 0
             state[key] = value
         _replace(gaussians, optimizer, name, chosen, state)
+
+
+def cut_harmonics(gaussians: Gaussians, optimizer: Optimizer, degree: int) -> None:
+    """Drop the coefficients above this degree, and their moments."""
+    old, kept = gaussians.shN, (degree + 1) ** 2 - 1
+    state = {
+        key: value[:, :kept].clone() if isinstance(value, Tensor) and value.shape == old.shape else value
+        for key, value in optimizer.state.pop(old, {}).items()
+    }
+    _replace(gaussians, optimizer, "shN", old.detach()[:, :kept].clone().requires_grad_(), state)
 
 
 def reset_opacities(gaussians: Gaussians, optimizer: Optimizer, highest: float) -> None:

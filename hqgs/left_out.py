@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 AUTO, NONE = "auto", "none"
@@ -26,6 +27,21 @@ class LeftOut:
     memory_mb: float | None = None  # saved
     bytes: int | None = None  # of the scene file saved
     cost_db: float | None = None  # lost in PSNR on training photos that were held back; below 0: gained
+
+
+def format_left_out(items: Sequence[LeftOut]) -> str:
+    """A short table of what was left out and what that saved; empty if nothing was."""
+    rows = []
+    for item in items:
+        saved = [] if item.seconds is None else [f"{item.seconds:.0f} s"]
+        saved += [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
+        saved += [] if item.cost_db is None else [f"{-item.cost_db:+.2f} dB"]
+        rows.append((item.what, ", ".join(saved), item.why))
+    if not rows:
+        return ""
+    widths = [max(len(row[k]) for row in rows) for k in range(2)]
+    lines = [f"  {what:{widths[0]}}  {saved:{widths[1]}}  {why}" for what, saved, why in rows]
+    return "\n".join(["left out:", *lines])
 
 
 def parse_leave_out(text: str) -> tuple[str, ...]:

@@ -56,7 +56,10 @@ class RunResult:
     gaussians: int
     peak_rss_mb: float | None
     history: list[dict[str, Any]]  # {"iteration", "seconds", "psnr", "ssim"}: held-out means while training
-    left_out: list[dict[str, str]]  # {"what", "why"}
+    length: int  # iterations of the whole run; fewer were done where it was stopped
+    left_out: list[dict[str, Any]]  # `LeftOut`
+    decision_seconds: float  # of `seconds`: to find out what may be left out
+    scene_bytes: int  # of scene.ply
     config: dict[str, Any]
     guard: dict[str, Any]  # what was not finite: `Guard.summary`
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from hqgs.camera import Scene
 from hqgs.checkpoint import lock_folder, remove_leftovers
 from hqgs.config import TrainConfig
+from hqgs.left_out import LeftOut
 from hqgs.machine import peak_rss_mb
 from hqgs.metrics import psnr
 from hqgs.ply import write_ply
@@ -68,13 +69,14 @@ def run(trainer: Trainer, out: str | Path, progress: bool = True) -> RunResult:
     """
     out = Path(out)
     config = trainer.config
-    bar = tqdm(total=config.iterations, initial=trainer.iteration, disable=None if progress else True)
+    bar = tqdm(total=trainer.length, initial=trainer.iteration, disable=None if progress else True)
     numbers = _BarNumbers()
     with deferred_interrupt() as interrupted, bar:
-        while trainer.iteration < config.iterations and not interrupted.is_set():
+        while trainer.iteration < trainer.length and not interrupted.is_set():
             step = trainer.step()
             if not bar.disable and trainer.iteration % BAR_EVERY == 0:
                 bar.set_postfix_str(numbers.text(step, len(trainer.gaussians)), refresh=False)
+            bar.total = trainer.length  # which may have become less
             bar.update()
             if trainer.iteration % config.eval_every == 0:
                 trainer.evaluate()
@@ -131,10 +133,10 @@ def _progress_line(trainer: Trainer) -> str:
 
 def _write_results(trainer: Trainer, out: Path) -> RunResult:
     scene, config = trainer.scene, trainer.config
-    left_out: list[dict[str, str]] = []
+    left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
 
     def leave_out(what: str, why: str) -> None:
-        left_out.append({"what": what, "why": why})
+        left_out.append(LeftOut(what, why))
 
     for what, why in trainer.method.left_out():
         leave_out(what, why)
@@ -146,8 +148,8 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         leave_out(f"{guard.skipped} training steps", "the loss or a gradient was not finite")
     if guard.culled:
         leave_out(f"{guard.culled} Gaussians", "a value or a gradient of theirs was not finite")
-    if trainer.iteration < config.iterations:
-        leave_out(f"iterations {trainer.iteration + 1} to {config.iterations}", "the run was stopped")
+    if trainer.iteration < trainer.length:
+        leave_out(f"iterations {trainer.iteration + 1} to {trainer.length}", "the run was stopped")
     if not scene.test:
         leave_out("held-out metrics", "the scene has no held-out view")
     views = trainer.render_test_views()
@@ -163,7 +165,10 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         gaussians=len(trainer.gaussians),
         peak_rss_mb=peak_rss_mb(),
         history=trainer.history,
-        left_out=left_out,
+        length=trainer.length,
+        left_out=[asdict(item) for item in left_out],
+        decision_seconds=trainer.frugality.state.decisions,
+        scene_bytes=(out / PLY).stat().st_size,
         config=asdict(config),
         sfm=None if scene.sfm is None else asdict(scene.sfm),
         guard=guard.summary(),

@@ -16,11 +16,14 @@ from hqgs.camera import Camera, Scene, View
 from hqgs.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
 from hqgs.config import TrainConfig
 from hqgs.densify import Densifier
+from hqgs.frugality import Frugality
 from hqgs.gaussians import Gaussians
 from hqgs.guard import LISTED, Event, Guard, bad_rows, bad_values, is_sound
+from hqgs.left_out import LeftOut
 from hqgs.methods import make_method
 from hqgs.metrics import psnr, ssim
 from hqgs.optim import Adam
+from hqgs.photo_choice import choose_photos
 from hqgs.render import render_view
 from hqgs.report import RenderedView
 from hqgs.torch_threads import one_torch_thread
@@ -49,10 +52,14 @@ class Trainer:
     def __init__(self, scene: Scene, config: TrainConfig) -> None:
         """ValueError if the scene or the configuration cannot be trained."""
         _check_views(scene)
+        self.photos_left_out: list[LeftOut] = []
+        if "photos" in config.leave_out:
+            scene, self.photos_left_out = choose_photos(scene)
         self.scene = scene
         self.extent = scene.extent
         self.method = make_method(scene, config)
         self.config = config = self.method.adapt(config)
+        self.frugality = Frugality(config, scene.train, self.method)
         self.gaussians = Gaussians.from_points(scene.points, scene.point_colors, config.sh_degree)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(config.densify, self.extent, scene.reach, config.seed, len(self.gaussians))
@@ -61,12 +68,17 @@ class Trainer:
         self.guard = Guard()
         self.history: list[dict[str, Any]] = []
 
+    @property
+    def length(self) -> int:
+        """Iterations of the run, as far as it is known: those of the configuration, or fewer."""
+        return self.frugality.length
+
     def step(self) -> Step:
         """Train on one view."""
         started = time.perf_counter()
         config = self.config
         self.iteration += 1
-        view = self._view_of(self.iteration)
+        view = self.frugality.view(self.iteration)
         self._set_learning_rate()
 
         with one_torch_thread():
@@ -76,18 +88,20 @@ class Trainer:
             loss = self.method.loss(render, view)
             self.optimizer.zero_grad()
             if self._backward(loss, render, view):
-                if self.iteration < config.densify.stop:
+                if self.iteration < self.densifier.config.stop:
                     self.densifier.observe(
                         means2d.grad[0], meta["radii"][0], view.camera.width, view.camera.height
                     )
                 # Methods' own tensors have no row for each Gaussian: all of them are updated.
                 visible = (meta["radii"][0] > 0).all(dim=1) if config.selective_adam else None
                 self.optimizer.step(visible=visible)
-            growth = self.densifier.update(self.iteration, self.gaussians, self.optimizer)
+            finest = self.frugality.finest(self.iteration)
+            growth = self.densifier.update(self.iteration, self.gaussians, self.optimizer, finest)
             changed = bool(growth.cloned or growth.split or growth.pruned)
             if changed:
                 self.method.rows_changed()
             self._check_parameters(view, changed)
+            self.frugality.after_step(self, growth, time.perf_counter() - started)
 
         if not len(self.gaussians):
             raise TrainingError(
@@ -97,6 +111,11 @@ class Trainer:
             )
         self.seconds += time.perf_counter() - started
         return Step(float(loss.detach()), render.detach(), view)
+
+    def remove(self, rows: Tensor) -> None:
+        """Remove the Gaussians of these rows, bool [N]."""
+        self.densifier.remove(rows, self.gaussians, self.optimizer)
+        self.method.rows_changed()
 
     def render_test_views(self) -> list[RenderedView]:
         """All held-out views with their renders [H, W, 3]."""
@@ -134,6 +153,7 @@ class Trainer:
             "seconds": self.seconds,
             "history": self.history,
             "guard": asdict(self.guard),
+            "frugality": self.frugality.state_dict(),
             "config": asdict(self.config),
             "scene": scene_fingerprint(self.scene),
         }
@@ -151,7 +171,8 @@ class Trainer:
             raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error
 
     def _take_over(self, path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
-        here = {**asdict(self.config), "background": list(self.config.background)}
+        lists = {name: list(getattr(self.config, name)) for name in ("background", "leave_out")}
+        here = asdict(self.config) | lists
         # The scene first: methods fit the configuration to it.
         _check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
         _check_same(path, "", meta["config"], here)
@@ -166,9 +187,11 @@ class Trainer:
                     f"wanted {like.dtype} {list(like.shape)}"
                 )
 
+        self.frugality.load_state_dict(meta["frugality"])
         n = len(tensors["gaussians.means"])
         for name, tensor in self.gaussians.named().items():
-            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *tensor.shape[1:])))
+            row = tensor.shape[1:] if name != "shN" else (self.frugality.num_higher, 3)
+            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *row)))
         self.gaussians = Gaussians(**part("gaussians."))
         self.method.load_state_dict(part("method."))
         self.optimizer = self._make_optimizer()
@@ -182,6 +205,7 @@ class Trainer:
         for name, tensor in part("densify.").items():
             check(f"densify.{name}", tensor, torch.empty(n))
         self.densifier.load_state_dict(part("densify."))
+        self.densifier.config = self.frugality.densify_config
         for name in ("iteration", "seconds", "history"):
             setattr(self, name, meta[name])
         self.guard = Guard(**meta["guard"])
@@ -198,18 +222,12 @@ class Trainer:
     def _set_learning_rate(self) -> None:
         """Exponential decay of the means' rate over the run; the others are constant."""
         config = self.config
-        part = self.iteration / config.iterations
+        part = self.frugality.part(self.iteration)
         rate = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
         next(g for g in self.optimizer.param_groups if g["name"] == "means")["lr"] = rate
 
-    def _view_of(self, iteration: int) -> View:
-        """Each epoch visits all training views once, in an order of its own."""
-        epoch, index = divmod(iteration - 1, len(self.scene.train))
-        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(self.scene.train))
-        return self.scene.train[order[index]]
-
     def _render(self, camera: Camera) -> tuple[Tensor, dict[str, Any]]:
-        degree = min(self.config.sh_degree, self.iteration // self.config.sh_interval)
+        degree = min(self.gaussians.sh_degree, self.iteration // self.config.sh_interval)
         return render_view(self.method.modulate(self.gaussians), camera, degree, self.config.background)
 
     def _backward(self, loss: Tensor, render: Tensor, view: View) -> bool:
@@ -279,8 +297,7 @@ class Trainer:
         listed = indices[:LISTED].tolist()
         self.guard.add(Event(self.iteration, view.name, what, names, len(indices), listed))
         if len(indices):
-            self.densifier.remove(rows, self.gaussians, self.optimizer)
-            self.method.rows_changed()
+            self.remove(rows)
             self.guard.culled += len(indices)
 
 

@@ -51,6 +51,8 @@ class RunStore:
         Options of other methods do not count, nor does the name of the row: a run serves all protocols.
         """
         config = {k: v for k, v in asdict(cell.config).items() if k not in METHODS or k == cell.row.method}
+        if not config["leave_out"]:
+            del config["leave_out"]  # runs from before there was such a choice are the same
         facts = {
             "format": FORMAT,
             "version": hqgs.__version__,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pycolmap
@@ -23,6 +24,7 @@ MAX_WORKERS = 4  # each holds a few photos at their stored size
 
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
 _DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
+Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
 
 
@@ -139,8 +141,8 @@ def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
 
 
 def area_downscale(
-    image: NDArray[np.uint8], mask: NDArray[np.bool_] | None, width: int, height: int
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    image: Pixels, mask: NDArray[np.bool_] | None, width: int, height: int
+) -> tuple[Pixels, NDArray[np.bool_] | None]:
     """Mean over each new pixel's area in the old photo; parts of old pixels count by their share.
 
     With a mask, only what counts enters the mean (hidden colours must not bleed over the edge), and the new
@@ -151,25 +153,28 @@ def area_downscale(
         return image, mask
     area = image.shape[0] * image.shape[1] / (height * width)
     if mask is None:
-        return _to_uint8(_area_sum(image, height, width) / area), None
+        return _as(image, _area_sum(image, height, width) / area), None
     share = _area_sum(mask.astype(np.uint8), height, width)
     visible = _area_sum(np.where(mask[..., None], image, 0), height, width)
     hidden = _area_sum(np.where(mask[..., None], 0, image), height, width)
     seen = share > 1e-6 * area
     mean = np.where(seen[..., None], visible / np.where(seen, share, 1.0)[..., None], hidden / area)
-    return _to_uint8(mean), share >= 0.5 * area
+    return _as(image, mean), share >= 0.5 * area
 
 
-def _to_uint8(values: NDArray[np.float64]) -> NDArray[np.uint8]:
-    return np.rint(values).clip(0, 255).astype(np.uint8)
+def _as(image: Pixels, values: NDArray[np.float64]) -> Pixels:
+    """The values as the image's type; whole numbers are rounded."""
+    return (np.rint(values).clip(0, 255) if image.dtype == np.uint8 else values).astype(image.dtype)
 
 
-def _area_sum(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.float64]:
+def _area_sum(image: Pixels | NDArray[np.uint8], height: int, width: int) -> NDArray[np.float64]:
     """Sums over the new pixels' areas, [height, width, ...]. Whole numbers stay exact at whole factors."""
     return _sum_rows(_sum_rows(image, height).swapaxes(0, 1), width).swapaxes(0, 1)
 
 
-def _sum_rows(a: NDArray[np.uint8] | NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _sum_rows(
+    a: NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
     """Merge the rows of `a` into `count` equal stretches by differences of the running sum."""
     total = np.uint32 if a.dtype == np.uint8 else np.float64  # 255 * MAX_SIDE fits into 32 bits
     running = np.zeros((len(a) + 1, *a.shape[1:]), total)

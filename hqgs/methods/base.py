@@ -23,6 +23,20 @@ AUTO = "auto"  # as a method: what the diagnosis asks for, which is 3dgs where i
 class Method(Protocol):
     """The replaceable part of a training step."""
 
+    @property
+    def as_photographed(self) -> bool:
+        """Whether a render is compared with the photo as it is, of any size: nothing has degraded it."""
+        ...
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the photos' noise as far as it is known, where 1 is white."""
+        ...
+
+    def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
+        """What of a render [H, W, 3] is compared with what of the photo (float), and the mask of the two."""
+        ...
+
     def adapt(self, config: TrainConfig) -> TrainConfig:
         """The configuration to train with: the given one, with what the method decides for this scene."""
         ...
@@ -63,6 +77,12 @@ class Plain:
     """The parts of a method that has no tensors of its own and decides nothing about the training."""
 
     name: str
+    as_photographed = False
+    noise = 0.0
+
+    def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
+        photo, mask = photo_tensors(view)
+        return render, floats(photo), mask
 
     def adapt(self, config: TrainConfig) -> TrainConfig:
         return replace(config, method=self.name) if config.method == AUTO else config
@@ -85,6 +105,11 @@ class Plain:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         if state:
             raise ValueError(f"{self.name} has no state of its own, the checkpoint has {sorted(state)}")
+
+
+def floats(photo: Tensor) -> Tensor:
+    """A photo with white at 1."""
+    return photo if photo.is_floating_point() else photo / 255
 
 
 def photo_tensors(view: View) -> tuple[Tensor, Tensor | None]:

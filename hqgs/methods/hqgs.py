@@ -20,7 +20,7 @@ from hqgs.formation import Operator, formation
 from hqgs.gaussians import Gaussians
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
-from hqgs.methods.base import AUTO, Method, Plain
+from hqgs.methods.base import AUTO, Method, Plain, floats, photo_tensors
 from hqgs.methods.paper import PaperConfig, PaperHQGS
 from hqgs.smallest import enlarge, photo_pixels
 
@@ -91,6 +91,7 @@ class HQGS(Plain):
         )
         self._least = len(scene.points)
         kinds = {step.kind: step.value for step in self.degradation.steps}
+        self.noise = float(kinds.get("noise") or 0.0) / 255
         self._factor = int(kinds.get("lowres") or 1)
         self._jpeg = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
         self._dssim = 0.0 if "noise" in kinds or self._jpeg else LAMBDA_DSSIM
@@ -101,6 +102,17 @@ class HQGS(Plain):
         self._smallest: Tensor | None = None  # [N] world units; None: to be computed
         self._age = 0  # steps since it was
         self._targets = {view.name: self._target(view) for view in scene.train}
+
+    @property
+    def as_photographed(self) -> bool:
+        return not self.degradation.steps
+
+    def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
+        if self.as_photographed:
+            return super().compared(render, view)
+        target = self._targets[view.name]
+        image = render if target.operator is None else target.operator(render)
+        return image, floats(target.photo), target.mask
 
     def adapt(self, config: TrainConfig) -> TrainConfig:
         """The formation that was found, and a budget of Gaussians that the photos can determine."""
@@ -144,6 +156,9 @@ class HQGS(Plain):
         self._age = int(state.get("age", 0))
 
     def loss(self, render: Tensor, view: View) -> Tensor:
+        if self.as_photographed:
+            photo, mask = photo_tensors(view)
+            return photometric_loss(render, photo, mask, self._dssim)
         self._age += 1
         if self._age >= REFRESH:
             self._smallest = None
@@ -153,8 +168,7 @@ class HQGS(Plain):
         if target.centres is None:
             return pixels
         if target.mask is not None:
-            photo = target.photo if target.photo.is_floating_point() else target.photo / 255
-            image = torch.where(target.mask[..., None], image, photo)
+            image = torch.where(target.mask[..., None], image, floats(target.photo))
         cells = self._cells[target.photo.shape[0], target.photo.shape[1]]
         return cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
 

@@ -13,6 +13,7 @@ class ThreeDGS(Plain):
     """3D Gaussian Splatting (Kerbl et al. 2023, equation 7): 0.8 L1 + 0.2 D-SSIM on the Gaussians as is."""
 
     name = "3dgs"
+    as_photographed = True
     LAMBDA_DSSIM = 0.2
 
     def loss(self, render: Tensor, view: View) -> Tensor:
