@@ -198,7 +198,7 @@ def test_distorted_cameras(
 
     seen = []
     real = data.load_views
-    monkeypatch.setattr(data, "load_views", lambda p, d: seen.extend(p) or real(p, d))
+    monkeypatch.setattr(data, "load_views", lambda p, *rest: seen.extend(p) or real(p, *rest))
     scene = load_scene(write_transforms(make_truth(2), tmp_path, **values), test_every=0)
     assert [p.camera.model.name for p in seen] == [model] * 2
     np.testing.assert_allclose(seen[0].camera.params[4:], params)

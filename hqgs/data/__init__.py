@@ -11,8 +11,8 @@ import numpy as np
 from hqgs.camera import Scene, Tracks, View
 from hqgs.data.capture import Capture, list_photos, photo_folder
 from hqgs.data.colmap import find_models, read_colmap
-from hqgs.data.degraded import read_degraded_folder, with_low
-from hqgs.data.images import load_views
+from hqgs.data.degraded import DegradedFolder, read_degraded_folder, with_low
+from hqgs.data.images import UnreadableError, load_views
 from hqgs.data.llff import POSES, hold_marker, read_llff
 from hqgs.data.photos import bare_photos, read_photos
 from hqgs.data.points import random_points
@@ -22,7 +22,11 @@ __all__ = ["load_scene"]
 
 
 def load_scene(
-    path: str | Path, downscale: float = 1.0, test_every: int = 8, reconstruct: bool = False
+    path: str | Path,
+    downscale: float = 1.0,
+    test_every: int = 8,
+    reconstruct: bool = False,
+    skip_unreadable: bool = False,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
@@ -40,6 +44,11 @@ def load_scene(
 
     With `reconstruct` a folder that holds photos alone gets its cameras and points from them (`read_photos`).
 
+    With `skip_unreadable` training photos that cannot be decoded (or whose mask or small photo cannot) are
+    left out, as long as at least half of the training photos remain; `Scene.notes` names them. The other
+    photos are training or test views as if all could be read. A test photo must be readable, or the numbers
+    of two copies of a scene could not be compared.
+
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
     root = Path(path).resolve()
@@ -56,15 +65,23 @@ def load_scene(
     if degraded is not None:
         notes = [*degraded.notes, *capture.notes]
         capture = replace(capture, test_names=frozenset(degraded.held_out), notes=notes)
-    views = load_views(capture.photos, capture.downscale)
-    if degraded is not None and downscale == 1:
-        views = [with_low(view, degraded, root) for view in views]
     notes = list(capture.notes)
     test_names = _test_names(root, capture, test_every, notes)
+    train_names = frozenset(photo.name for photo in capture.photos) - test_names
+    optional = train_names if skip_unreadable else frozenset[str]()
+    views, unreadable = load_views(capture.photos, capture.downscale, optional)
+    if degraded is not None and downscale == 1:
+        views = _with_lows(views, degraded, root, optional, unreadable)
     train = [v for v in views if v.name not in test_names]
     test = [v for v in views if v.name in test_names]
-    if not train:
+    if not train_names:
         raise ValueError(f"{root}: all {len(views)} views are test views, none is left to train on")
+    if unreadable:
+        _check_half(train, unreadable)
+        notes.append(
+            f"{len(unreadable)} of {len(train_names)} training photos cannot be read and were left out: "
+            + ", ".join(sorted(unreadable))
+        )
     points, colors = capture.points, capture.point_colors
     if len(points) == 0:
         points, colors, note = random_points(train, capture.near_far)
@@ -99,11 +116,37 @@ def _read(root: Path, downscale: float, reconstruct: bool) -> Capture:
     )
 
 
+def _with_lows(
+    views: list[View],
+    folder: DegradedFolder,
+    root: Path,
+    optional: frozenset[str],
+    unreadable: dict[str, UnreadableError],
+) -> list[View]:
+    """The views with their small photos, without those of `optional` whose small photo cannot be read."""
+    found = []
+    for view in views:
+        try:
+            found.append(with_low(view, folder, root))
+        except UnreadableError as error:
+            if view.name not in optional:
+                raise
+            unreadable[view.name] = error
+    return found
+
+
+def _check_half(train: list[View], unreadable: dict[str, UnreadableError]) -> None:
+    """Raise the first error unless at least half of the training photos can be read."""
+    if len(train) < len(unreadable):
+        raise unreadable[min(unreadable)]
+
+
 def _tracks(capture: Capture, views: list[View]) -> Tracks | None:
     """Those of the capture, in px of the views."""
     if capture.tracks is None:
         return None
-    scales = [v.camera.width / p.camera.width for v, p in zip(views, capture.photos, strict=True)]
+    widths = {photo.name: photo.camera.width for photo in capture.photos}
+    scales = [view.camera.width / widths[view.name] for view in views]
     return replace(capture.tracks, error=capture.tracks.error * float(np.mean(scales)))
 
 

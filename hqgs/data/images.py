@@ -28,12 +28,20 @@ Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
 
 
-def load_views(photos: list[Photo], downscale: float) -> list[View]:
+class UnreadableError(ValueError):
+    """A photo or mask that cannot be decoded; the message names the file."""
+
+
+def load_views(
+    photos: list[Photo], downscale: float, optional: frozenset[str] = frozenset()
+) -> tuple[list[View], dict[str, UnreadableError]]:
     """Decode `photos`, in their order, as pinhole views scaled down by `downscale` (at least 1).
 
-    Intrinsics scale with the true ratio of sizes, per axis. Raises FileNotFoundError for a camera without
-    photo, ValueError for a photo that cannot be decoded, does not fit its camera or gets smaller than 8 px;
-    each names the photo.
+    Intrinsics scale with the true ratio of sizes, per axis. The second result tells, by name, why photos of
+    the names in `optional` have no view: they, or their masks, cannot be decoded.
+
+    Raises FileNotFoundError for a camera without photo, ValueError for a photo that does not fit its camera
+    or gets smaller than 8 px, UnreadableError for another that cannot be decoded; each names the photo.
     """
     for photo in photos:
         if not photo.path.is_file():
@@ -46,15 +54,24 @@ def load_views(photos: list[Photo], downscale: float) -> list[View]:
         camera = pycolmap.Camera(model=model, params=params, width=camera_width, height=camera_height)
         return to_pinhole(camera, width, height)
 
-    def load(photo: Photo) -> View:
-        return _load_view(photo, downscale, pinhole)
+    unreadable: dict[str, UnreadableError] = {}
+
+    def load(photo: Photo) -> View | None:
+        try:
+            return _load_view(photo, downscale, pinhole)
+        except UnreadableError as error:
+            if photo.name not in optional:
+                raise
+            unreadable[photo.name] = error
+            return None
 
     with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
         jobs = [pool.submit(load, photo) for photo in photos]
         try:
-            return [job.result() for job in jobs]
+            views = [view for job in jobs if (view := job.result()) is not None]
         finally:
             pool.shutdown(cancel_futures=True)  # after an error the photos still waiting are not wanted
+    return views, {photo.name: unreadable[photo.name] for photo in photos if photo.name in unreadable}
 
 
 def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], Pinhole]) -> View:
@@ -89,13 +106,13 @@ def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], P
 def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
     """Width and height that the photo's header promises, for a look before memory is taken for the pixels.
 
-    Pillow refuses more than 179 million of them. Raises ValueError that names the file.
+    Pillow refuses more than 179 million of them. Raises UnreadableError.
     """
     try:
         with Image.open(path) as photo:
             return photo.size
     except _DECODE_ERRORS as e:
-        raise ValueError(f"cannot read the {what} {path}: {e}") from e
+        raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
 
 
 def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
@@ -103,7 +120,7 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
 
     Greyscale becomes three equal channels, 16 bits become 8. Colours are as stored: nothing is composited,
     no colour profile is applied. EXIF orientation is not applied either: the cameras were computed for the
-    pixels as stored, and a turned photo would no longer fit them. Raises ValueError that names the file.
+    pixels as stored, and a turned photo would no longer fit them. Raises UnreadableError.
     """
     try:
         with Image.open(path) as photo:
@@ -120,7 +137,7 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
                 return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
             return np.array(photo.convert("RGB")), None
     except _DECODE_ERRORS as e:
-        raise ValueError(f"cannot read the photo {path}: {e}") from e
+        raise UnreadableError(f"cannot read the photo {path}: {e}") from e
 
 
 def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
@@ -132,7 +149,7 @@ def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
         with Image.open(path) as file:
             pixels = np.asarray(file.convert("RGB") if file.mode == "P" else file)
     except _DECODE_ERRORS as e:
-        raise ValueError(f"cannot read the mask {path}: {e}") from e
+        raise UnreadableError(f"cannot read the mask {path}: {e}") from e
     if pixels.ndim == 3:
         pixels = pixels[..., :3].max(-1)  # without alpha, which says nothing here
     rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)

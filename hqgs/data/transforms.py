@@ -21,11 +21,14 @@ from hqgs.data.capture import (
     no_points,
     viewmat_from_pose,
 )
-from hqgs.data.images import stored_size
+from hqgs.data.images import UnreadableError, stored_size
 from hqgs.data.points import read_ply
 from hqgs.data.undistort import MAX_SIDE
 
 SINGLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
+
+# Where only the photo tells the size and cannot be read: `load_views` meets the same error, and names it.
+UNKNOWN_CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0.5, 0.5])
 
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
@@ -93,7 +96,10 @@ def _read_frames(root: Path, file: str, meta: dict[str, Any]) -> list[Photo]:
             mask_path = inside(root, _text(mask, "mask_path", where), "mask_path")
             if not mask_path.is_file():
                 raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
-        camera = _camera({**meta, **frame}, path, where)
+        try:
+            camera = _camera({**meta, **frame}, path, where)
+        except UnreadableError:
+            camera = UNKNOWN_CAMERA
         photos.append(Photo(name, path, camera, viewmat, mask_path))
     return photos
 
