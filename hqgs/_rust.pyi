@@ -1,4 +1,4 @@
-"""The extension module; rust/python.rs, python_loss.rs and python_pictures.rs are its source."""
+"""The extension module; rust/python.rs and its neighbours python_*.rs are its source."""
 
 from typing import Any
 
@@ -11,6 +11,7 @@ class Frame:
 
     width: int
     height: int
+    counts: dict[str, int]
 
 class Composite:
     """Tile lists and replay state of a composited frame."""
@@ -18,6 +19,7 @@ class Composite:
     work: tuple[int, int, int]
     blended: int
     bin_seconds: float
+    counts: dict[str, int]
 
 class Separable:
     """A linear operator on pictures and its transpose."""
@@ -46,9 +48,18 @@ def project_forward(
 def project_backward(
     frame: Frame,
     inputs: tuple[Array, Array, Array, Array, Array | None, Array | None],
-    cotangents: tuple[Array, Array, Array, Array | None, Array | None, Array | None],
+    cotangents: tuple[Array | None, Array | None, Array | None, Array | None, Array | None, Array | None],
     wanted: list[bool],
-) -> tuple[Array | None, ...]: ...
+) -> tuple[
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    dict[str, int],
+]: ...
 def composite_forward(
     frame: Frame, colors: Array, backgrounds: Array | None, channels: int
 ) -> tuple[Composite, Array, Array]: ...
@@ -61,7 +72,16 @@ def composite_backward(
     v_alphas: Array | None,
     channels: int,
     wanted: list[bool],
-) -> tuple[Array | None, ...]: ...
+) -> tuple[
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    Array | None,
+    dict[str, int],
+]: ...
+def blending_weights(frame: Frame, mask: Array | None, double: bool) -> Array: ...
 def photometric(
     render: Array, target: Array, mask: Array | None, lambda_dssim: float, want_grad: bool
 ) -> tuple[float, float, float | None, Array | None]: ...
@@ -77,6 +97,7 @@ def adam_step(
     step: int,
     options: tuple[float, float, float, float],
     visible: Array | None,
+    used: int | None,
 ) -> None: ...
 def set_num_threads(threads: int) -> None: ...
 def get_num_threads() -> int: ...

@@ -37,3 +37,266 @@ TOLERANCE = 0.02  # dB on the held-back photos that leaving one thing out may co
 FINEST = 1.5  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
+BAND_CHECK = 0.3  # of the run, at the earliest: when the harmonics are tried
+BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
+REST = 0.5  # of what came before it: the part of a shortened run without growth
+WINDOW = 50  # steps before and after a decision that tell what it saves
+
+
+@dataclass
+class State:
+    """What a checkpoint must hold. `length`: iterations of the run as far as it is known."""
+
+    length: int
+    held: bool  # the photos are held back still
+    degree: int  # of the harmonics, at most
+    released: int = 0  # the iteration that ended growth
+    refused: int = 0  # growth of Gaussians that are too fine
+    best: float = -math.inf  # PSNR on the held-back photos
+    best_at: int = 0
+    decisions: float = 0.0  # seconds that the trials took
+    records: list[dict[str, Any]] = field(default_factory=list)  # of `LeftOut`
+
+
+class Frugality:
+    """The decisions of one run. With nothing to leave out it changes no bit of the training."""
+
+    def __init__(self, config: TrainConfig, views: list[View], method: Method) -> None:
+        self.config, self.method, self.views = config, method, views
+        self.items = set(config.leave_out)
+        if not method.as_photographed:
+            self.items -= {"growth", "resolution"}
+        ask = self.items & {"weight", "harmonics", "iterations"}
+        count = min(MOST_HELD, round(HELD_SHARE * len(views))) if len(views) >= FEWEST_VIEWS and ask else 0
+        places = np.linspace(0, len(views), 2 * count + 1)[1::2].astype(int).tolist()
+        self.held = [views[k] for k in places]
+        self.trained = [view for k, view in enumerate(views) if k not in places]
+        self.state = State(config.iterations, bool(count), config.sh_degree)
+        self._small: dict[str, View] = {}
+        self._seconds: deque[float] = deque(maxlen=WINDOW)  # of the last steps
+        self._open: list[tuple[int, int, float]] = []  # records that wait for what they saved
+
+    @property
+    def length(self) -> int:
+        """Iterations of the run, as far as it is known."""
+        return self.state.length
+
+    def view(self, iteration: int) -> View:
+        """The view of a step. Each epoch visits all views once, in an order of its own."""
+        views = self.trained if self.state.held else self.views
+        epoch, index = divmod(iteration - 1, len(views))
+        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(views))
+        return self._sized(views[order[index]], iteration)
+
+    def part(self, iteration: int) -> float:
+        """How much of the run is done, 0..1: what the learning rate follows."""
+        total, state = self.config.iterations, self.state
+        if state.length == total:
+            return iteration / total
+        start = state.released / total  # what follows is squeezed into the shortened rest
+        return start + (1 - start) * (iteration - state.released) / (state.length - state.released)
+
+    def finest(self, iteration: int) -> Callable[[Tensor], Tensor] | None:
+        """Sizes [N], world units, of Gaussians at means [N, 3] that are fine enough; None: no limit."""
+        if "growth" not in self.items:
+            return None
+        pixels = FINEST * (COARSE_FACTOR if self._is_coarse(iteration) else 1)
+        return lambda means: (pixels * photo_pixels(means, self.views)).float()
+
+    def after_step(self, trainer: Trainer, growth: Growth, seconds: float) -> None:
+        """Note what the step did, and decide what is due at this iteration."""
+        state, iteration = self.state, trainer.iteration
+        self._seconds.append(seconds)
+        self._close(iteration)
+        state.refused += growth.refused
+        if not self.items:
+            return
+        started = time.perf_counter()
+        if state.held:
+            self._decide(trainer, iteration)
+        state.decisions += time.perf_counter() - started
+
+    def left_out(self) -> list[LeftOut]:
+        """What was left out, in the order of the decisions."""
+        found = [LeftOut(**record) for record in self.state.records]
+        if self._coarse_end:
+            size = f"1/{COARSE_FACTOR} of the sides"
+            found.insert(
+                0,
+                LeftOut(
+                    f"full resolution in the first {self._coarse_end} iterations",
+                    f"a scene takes shape at {size}",
+                    None,
+                ),
+            )
+        if self.state.refused:
+            found.insert(
+                0,
+                LeftOut(
+                    f"finer Gaussians, {self.state.refused} times",
+                    f"they had at most {FINEST} px of the photo that sees them best (1 standard deviation)",
+                ),
+            )
+        return found
+
+    @property
+    def num_higher(self) -> int:
+        """Coefficients above degree 0 of each Gaussian."""
+        return (self.state.degree + 1) ** 2 - 1
+
+    @property
+    def densify_config(self) -> DensifyConfig:
+        """The configuration of growth, which a shortened run ends sooner."""
+        config = self.config.densify
+        return replace(config, stop=min(config.stop, self.state.released)) if self.state.released else config
+
+    def state_dict(self) -> dict[str, Any]:
+        return asdict(self.state)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.state = State(**state)
+        self._open = []
+
+    @property
+    def _coarse_end(self) -> int:
+        return round(COARSE_PART * self.config.iterations) if "resolution" in self.items else 0
+
+    def _is_coarse(self, iteration: int) -> bool:
+        return iteration <= self._coarse_end
+
+    def _sized(self, view: View, iteration: int) -> View:
+        camera = view.camera
+        if not self._is_coarse(iteration) or min(camera.width, camera.height) < COARSE_FACTOR * SMALLEST_SIDE:
+            return view
+        if view.name not in self._small:
+            self._small[view.name] = smaller(view)
+        return self._small[view.name]
+
+    def _decide(self, trainer: Trainer, iteration: int) -> None:
+        config, state = self.config, self.state
+        if "iterations" in self.items and iteration % CHECKS == 0 and not self._is_coarse(iteration):
+            now = self._psnr(trainer, self._shown(trainer.gaussians))
+            if now > state.best + BETTER:
+                state.best, state.best_at = now, iteration
+            if iteration - state.best_at >= PATIENCE:
+                state.length = min(config.iterations, math.ceil((1 + REST) * iteration))
+                self._note(
+                    trainer,
+                    LeftOut(
+                        f"iterations {state.length + 1} to {config.iterations}",
+                        "the held-back photos stopped improving",
+                        f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}",
+                    ),
+                )
+                self._release(trainer, iteration)
+                return
+        check = max((config.sh_degree + 1) * config.sh_interval, round(BAND_CHECK * config.iterations))
+        if "harmonics" in self.items and iteration == min(check, config.densify.stop - 1):
+            self._decide_harmonics(trainer)
+        if iteration == config.densify.stop:
+            self._release(trainer, iteration)
+
+    def _release(self, trainer: Trainer, iteration: int) -> None:
+        """Growth is over: what carries no picture goes, and the held-back photos come back."""
+        if "weight" in self.items:
+            self._decide_weight(trainer)
+        self.state.held = False
+        self.state.released = iteration
+        trainer.densifier.config = self.densify_config
+
+    def _decide_harmonics(self, trainer: Trainer) -> None:
+        """The fewest bands that lose no more than TOLERANCE against all of them."""
+        gaussians = trainer.gaussians
+        shown = self._shown(gaussians)
+        whole = self._psnr(trainer, shown)
+        for degree in range(gaussians.sh_degree):
+            cost = whole - self._psnr(trainer, shown, degree)
+            if cost <= TOLERANCE:
+                numbers = gaussians.shN.shape[1] - ((degree + 1) ** 2 - 1)
+                self.state.degree = degree
+                cut_harmonics(gaussians, trainer.optimizer, degree)
+                self._note(
+                    trainer,
+                    LeftOut(
+                        f"harmonics above degree {degree}",
+                        f"the {len(self.held)} held-back photos do not ask for them",
+                        f"{whole:.2f} dB with them, {whole - cost:.2f} dB without",
+                        memory_mb=4 * 12e-6 * numbers * len(gaussians),
+                        bytes=12 * numbers * len(gaussians),
+                        cost_db=cost,
+                    ),
+                )
+                return
+
+    def _decide_weight(self, trainer: Trainer) -> None:
+        """The highest limit of the blending weight that loses no more than TOLERANCE."""
+        gaussians = trainer.gaussians
+        shown = self._shown(gaussians)
+        weights = largest_weights(shown, self.views)
+        whole = self._psnr(trainer, shown)
+        for limit in WEIGHTS:
+            faint = weights < limit
+            count = int(faint.sum())
+            if not 0 < count < len(gaussians):
+                continue
+            rest = Gaussians(**{name: tensor[~faint] for name, tensor in shown.named().items()})
+            cost = whole - self._psnr(trainer, rest)
+            if cost <= TOLERANCE:
+                row = sum(tensor[:1].numel() for tensor in gaussians.named().values())
+                trainer.remove(faint)
+                self._note(
+                    trainer,
+                    LeftOut(
+                        f"{count} of {count + len(trainer.gaussians)} Gaussians",
+                        f"no photo shows them with a blending weight of {limit:g}",
+                        f"{whole:.2f} dB on the held-back photos with them, {whole - cost:.2f} dB without",
+                        memory_mb=4 * 4e-6 * row * count,
+                        bytes=4 * row * count,
+                        cost_db=cost,
+                    ),
+                )
+                return
+
+    def _shown(self, gaussians: Gaussians) -> Gaussians:
+        """As they are rasterized, without a gradient history."""
+        with torch.no_grad():
+            return self.method.modulate(gaussians).detached()
+
+    def _psnr(self, trainer: Trainer, gaussians: Gaussians, degree: int | None = None) -> float:
+        """Of the held-back photos as the method compares them; known noise does not count.
+
+        `gaussians` are those to rasterize.
+        """
+        config, iteration = self.config, trainer.iteration
+        active = min(gaussians.sh_degree, iteration // config.sh_interval)
+        degree = active if degree is None else min(active, degree)
+        errors = []
+        with torch.no_grad():
+            for view in self.held:
+                view = self._sized(view, iteration)
+                render, _ = render_view(gaussians, view.camera, degree, config.background)
+                image, photo, mask = self.method.compared(render, view)
+                difference = (image - photo).square()
+                errors.append(float((difference if mask is None else difference[mask]).double().mean()))
+        return -10 * math.log10(max(float(np.mean(errors)) - self.method.noise**2, 1e-10))
+
+    def _note(self, trainer: Trainer, item: LeftOut) -> None:
+        self.state.records.append(asdict(item))
+        if len(self._seconds) == WINDOW and item.seconds is None:
+            self._open.append((len(self.state.records) - 1, trainer.iteration, float(np.mean(self._seconds))))
+
+    def _close(self, iteration: int) -> None:
+        """Fill in what the decisions WINDOW steps ago saved, if things stay as they are."""
+        while self._open and iteration >= self._open[0][1] + WINDOW:
+            index, start, before = self._open.pop(0)
+            saved = before - float(np.mean(self._seconds))
+            self.state.records[index]["seconds"] = saved * (self.state.length - start)
+
+
+def smaller(view: View) -> View:
+    """The view with photo and camera at 1 / COARSE_FACTOR of the size."""
+    camera = view.camera
+    width, height = round(camera.width / COARSE_FACTOR), round(camera.height / COARSE_FACTOR)
+    image, mask = area_downscale(view.image, view.mask, width, height)
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    return View(view.name, Camera(width, height, K, camera.viewmat), image, mask)

@@ -12,6 +12,7 @@ from torch.autograd.graph import increment_version
 from torch.optim.optimizer import ParamsT
 
 from hqgs import _rust
+from hqgs.work import add_counts, is_counting
 
 UNSUPPORTED = (
     "weight_decay",
@@ -27,8 +28,10 @@ class Adam(torch.optim.Optimizer):
     Parameters are contiguous CPU tensors, float32 or float64. Same bits for any number of threads.
 
     Args:
-        params: tensors, or groups of them, each with its own `lr`, `betas` or `eps`.
-        lr: learning rate; may be changed in `param_groups` between steps.
+        params: tensors, or groups of them, each with its own `lr`, `betas` or `eps`. A group of tensors
+            [N, K, ...] may have `used`: only the first so many of the K are updated. For those that never had
+            a gradient that is the same, bit for bit; the step still counts.
+        lr: learning rate; may be changed in `param_groups` between steps, and so may `used`.
         betas: decay of the two moments, in [0, 1).
         eps: added to the square root of the second moment.
 
@@ -69,29 +72,40 @@ class Adam(torch.optim.Optimizer):
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
             chosen = None if group.get("every_row") else rows
             for param in group["params"]:
-                if param.grad is not None:
-                    self._update(param, param.grad, group, chosen)
+                if param.grad is not None or group.get("used") == 0:
+                    self._update(param, group, chosen)
         return loss
 
-    def _update(
-        self, param: Tensor, grad: Tensor, group: dict[str, Any], rows: np.ndarray[Any, Any] | None
-    ) -> None:
-        if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
-            raise ValueError(
-                "param: must be a contiguous CPU tensor with a dense gradient, got shape "
-                f"{list(param.shape)}, strides {param.stride()}, {param.device}, gradient {grad.layout}"
-            )
+    def _update(self, param: Tensor, group: dict[str, Any], rows: np.ndarray[Any, Any] | None) -> None:
         state = self.state[param]
         if not state:
             state["step"] = torch.tensor(0.0)
             state["exp_avg"] = torch.zeros_like(param)
             state["exp_avg_sq"] = torch.zeros_like(param)
-        moments = state["exp_avg"], state["exp_avg_sq"]
+        step = state["step"] + 1
+        if group.get("used") != 0:
+            self._write(param, int(step), group, rows)
+        state["step"] = step  # a new tensor: a loaded state dict may share the old one
+
+    def _write(
+        self, param: Tensor, step: int, group: dict[str, Any], rows: np.ndarray[Any, Any] | None
+    ) -> None:
+        grad = param.grad
+        assert grad is not None
+        if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
+            raise ValueError(
+                "param: must be a contiguous CPU tensor with a dense gradient, got shape "
+                f"{list(param.shape)}, strides {param.stride()}, {param.device}, gradient {grad.layout}"
+            )
+        moments = self.state[param]["exp_avg"], self.state[param]["exp_avg_sq"]
         values, first, second = (t.detach().numpy() for t in (param, *moments))
         beta1, beta2 = group["betas"]
         options = (float(group["lr"]), beta1, beta2, group["eps"])
-        step = state["step"] + 1
-        _rust.adam_step(values, grad.contiguous().numpy(), first, second, int(step), options, rows)
-        state["step"] = step  # a new tensor: a loaded state dict may share the old one
+        used = group.get("used")
+        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, rows, used)
         for tensor in (param, *moments):
             increment_version(tensor)  # written behind torch's back
+        if is_counting():
+            share = 1.0 if rows is None or not rows.size else float(rows.mean())
+            share *= 1.0 if used is None else used / param.shape[1]
+            add_counts({"adam_numbers": round(param.numel() * share)})

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hqgs import _rust
 from hqgs._rust import get_num_threads, set_num_threads
+from hqgs.work import add_counts, add_gradients, is_counting
 
 __all__ = ["get_num_threads", "rasterization", "set_num_threads"]
 
@@ -75,7 +76,7 @@ def rasterization(
         render_colors [C, height, width, X], render_alphas [C, height, width, 1], and a dict with means2d
         [C, N, 2] (call `.retain_grad()` on it to get its gradient), radii [C, N, 2] int32 (0 where
         culled), depths [C, N], conics [C, N, 3], opacities [C, N], width, height, n_cameras, tile_size
-        and work (pairs, blocks evaluated, blocks with a change).
+        and work (pairs, blocks evaluated, blocks with a change; `hqgs.work.work_counts` counts more).
 
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
@@ -248,17 +249,24 @@ class _Project(torch.autograd.Function):
         )
         n, c = means.shape[0], viewmats.shape[0]
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
+        if is_counting():
+            add_counts(frame.counts)
         ctx.frame, ctx.shapes = frame, (n, c)
         ctx.save_for_backward(means, quats, scales, opacities, harmonics, rest)
         ctx.set_materialize_grads(False)
-        radii = radii.view(c, n, 2)
-        ctx.mark_non_differentiable(radii)
         link = means2d.new_zeros(()).expand(c, n, 3)
+        means2d, depths, conics = means2d.view(c, n, 2), depths.view(c, n), conics.view(c, n, 3)
+        radii, alphas = radii.view(c, n, 2), alphas.view(c, n)
         sh_colors = sh_colors.view(c, n, 3) if harmonics is not None else sh_colors
-        return (
-            frame, means2d.view(c, n, 2), link, depths.view(c, n), conics.view(c, n, 3), radii,
-            alphas.view(c, n), sh_colors,
-        )  # fmt: skip
+        # What depends on no tensor that requires a gradient gets no cotangent, so that none is computed.
+        needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:7]
+        constant = [radii]
+        if not (needs_means or needs_viewmats or any(geometry)):
+            constant += [means2d, link, depths, conics, alphas]
+        if not (needs_means or needs_viewmats or needs_harmonics or needs_rest):
+            constant.append(sh_colors)
+        ctx.mark_non_differentiable(*constant)
+        return frame, means2d, link, depths, conics, radii, alphas, sh_colors
 
     @staticmethod
     def backward(ctx: Any, *grads):
@@ -269,10 +277,7 @@ class _Project(torch.autograd.Function):
         if harmonics is None:
             v_colors = None
 
-        def dense(v: Tensor | None, row: int) -> np.ndarray[Any, Any]:
-            return _numpy(v) if v is not None else np.zeros(c * n * row, dtype=_numpy(means).dtype)
-
-        v_inputs = _rust.project_backward(
+        *v_inputs, counts = _rust.project_backward(
             ctx.frame,
             (
                 _numpy(means),
@@ -283,15 +288,17 @@ class _Project(torch.autograd.Function):
                 _optional(rest),
             ),
             (
-                dense(v_means2d, 2),
-                dense(v_link, 3),
-                dense(v_alphas, 1),
+                _optional(v_means2d),
+                _optional(v_link),
+                _optional(v_alphas),
                 _optional(v_depths),
                 _optional(v_conics),
                 _optional(v_colors),
             ),
             needs,
         )
+        if is_counting():
+            add_gradients(v_inputs, counts)
         if v_inputs[6] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[6].clip(-limit, limit, out=v_inputs[6])
@@ -309,6 +316,8 @@ class _Composite(torch.autograd.Function):
         state, image, alphas = _rust.composite_forward(
             frame, _numpy(colors), _optional(backgrounds), channels
         )
+        if is_counting():
+            add_counts(state.counts)
         c = means2d.shape[0]
         width, height = frame.width, frame.height
         image = torch.from_numpy(image).view(c, height, width, channels)
@@ -329,10 +338,13 @@ class _Composite(torch.autograd.Function):
             return (None,) * 7
         c, n, channels = means2d.shape[0], means2d.shape[1], colors.shape[-1]
         v_image = means2d.new_zeros(ctx.image_shape) if v_image is None else v_image
-        v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = _rust.composite_backward(
+        *v_inputs, counts = _rust.composite_backward(
             ctx.frame, ctx.state, _numpy(colors), _optional(backgrounds), _numpy(v_image),
             _optional(v_alphas), channels, [geometry, ctx.absgrad, need_colors, need_backgrounds],
         )  # fmt: skip
+        if is_counting():
+            add_gradients(v_inputs, counts)
+        v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
         if v_abs is not None:
             means2d.absgrad = _tensor(v_abs, c, n, 2)
         v_color = _tensor(v_colors, c, n, channels)

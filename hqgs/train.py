@@ -79,7 +79,7 @@ class Trainer:
         config = self.config
         self.iteration += 1
         view = self.frugality.view(self.iteration)
-        self._set_learning_rate()
+        self._set_rates()
 
         with one_torch_thread():
             render, meta = self._render(view.camera)
@@ -219,16 +219,23 @@ class Trainer:
         own = [group | {"every_row": True} for group in self.method.param_groups()]
         return Adam(groups + own, lr=0.0, eps=config.adam_eps)
 
-    def _set_learning_rate(self) -> None:
-        """Exponential decay of the means' rate over the run; the others are constant."""
+    def _active_degree(self) -> int:
+        """Of the harmonics: it rises with the iterations."""
+        return min(self.gaussians.sh_degree, self.iteration // self.config.sh_interval)
+
+    def _set_rates(self) -> None:
+        """Exponential decay of the means' rate over the run; the others are constant. Harmonics above the
+        degree in use, which never had a gradient, are left out of Adam."""
         config = self.config
         part = self.frugality.part(self.iteration)
         rate = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
-        next(g for g in self.optimizer.param_groups if g["name"] == "means")["lr"] = rate
+        groups = {group["name"]: group for group in self.optimizer.param_groups}
+        groups["means"]["lr"] = rate
+        groups["shN"]["used"] = (self._active_degree() + 1) ** 2 - 1
 
     def _render(self, camera: Camera) -> tuple[Tensor, dict[str, Any]]:
-        degree = min(self.gaussians.sh_degree, self.iteration // self.config.sh_interval)
-        return render_view(self.method.modulate(self.gaussians), camera, degree, self.config.background)
+        gaussians = self.method.modulate(self.gaussians)
+        return render_view(gaussians, camera, self._active_degree(), self.config.background)
 
     def _backward(self, loss: Tensor, render: Tensor, view: View) -> bool:
         """Compute the gradients. Where the loss or a gradient is not finite: False, and the guard knows.

@@ -41,6 +41,50 @@ pub struct AdamArrays<'a, T> {
     pub exp_avg_sq: &'a mut [T],
 }
 
+/// What a step updates; everything else is left as it is, moments included.
+#[derive(Debug, Clone, Copy)]
+pub struct Selection<'a> {
+    /// Rows whose number here is 0 are left out, [N] for arrays of N rows (the selective Adam of Taming 3DGS,
+    /// Mallick et al. 2024). None: none.
+    pub visible: Option<&'a [u8]>,
+    /// Numbers of a row.
+    pub width: usize,
+    /// How many of them are updated, the first ones.
+    pub used: usize,
+}
+
+impl Selection<'_> {
+    /// Everything.
+    pub const ALL: Self = Self {
+        visible: None,
+        width: 1,
+        used: 1,
+    };
+
+    /// Check it against arrays of `n` numbers.
+    fn check(&self, n: usize) -> Result<(), Error> {
+        let Self {
+            visible,
+            width,
+            used,
+        } = *self;
+        if width == 0 || used > width || !n.is_multiple_of(width) {
+            return Err(Error::new(
+                "used",
+                format!("cannot update {used} of {width} numbers a row of {n} elements"),
+            ));
+        }
+        if let Some(got) = visible.map(<[u8]>::len).filter(|got| got * width != n) {
+            return Err(Error::shape(
+                "visible",
+                "[N] for arrays of N rows",
+                format!("{got} for {n} elements in rows of {width}"),
+            ));
+        }
+        Ok(())
+    }
+}
+
 /// The factors of a step, in the type of the parameters.
 #[derive(Clone, Copy)]
 struct Factors<T> {
@@ -52,10 +96,7 @@ struct Factors<T> {
     eps: T,
 }
 
-/// Make step number `step` (from 1).
-///
-/// With `visible` [N] the arrays are [N, ...], and the rows where it is 0 are left as they are, moments included
-/// (the selective Adam of Taming 3DGS, Mallick et al. 2024).
+/// Make step number `step` (from 1) of what is selected.
 ///
 /// # Errors
 /// Names the array whose length does not match, or the setting out of its range.
@@ -63,7 +104,7 @@ pub fn step<T: Real>(
     arrays: AdamArrays<'_, T>,
     step: u64,
     options: &AdamOptions,
-    visible: Option<&[u8]>,
+    selection: &Selection,
 ) -> Result<(), Error> {
     let AdamArrays {
         param,
@@ -79,15 +120,12 @@ pub fn step<T: Real>(
     if n == 0 {
         return Ok(());
     }
-    let rows = visible.map_or(n, <[u8]>::len);
-    if rows == 0 || n % rows != 0 {
-        return Err(Error::shape(
-            "visible",
-            "[N] for arrays of N rows",
-            format!("{rows} for {n} elements"),
-        ));
-    }
-    let width = n / rows;
+    selection.check(n)?;
+    let Selection {
+        visible,
+        width,
+        used,
+    } = *selection;
     let chunk = (CHUNK / width).max(1) * width;
     let level = Level::new();
     param
@@ -98,7 +136,7 @@ pub fn step<T: Real>(
         .enumerate()
         .for_each(|(i, (((param, m), v), grad))| {
             let Some(visible) = visible else {
-                return dispatch!(level, simd => update(simd, &factors, param, m, v, grad));
+                return dispatch!(level, simd => update_rows(simd, &factors, param, m, v, grad, width, used));
             };
             let first = i * chunk / width;
             let mut at = 0;
@@ -113,7 +151,8 @@ pub fn step<T: Real>(
                         &mut m[part.clone()],
                         &mut v[part.clone()],
                     );
-                    dispatch!(level, simd => update(simd, &factors, param, m, v, &grad[part]));
+                    let grad = &grad[part];
+                    dispatch!(level, simd => update_rows(simd, &factors, param, m, v, grad, width, used));
                 }
             }
         });
@@ -157,6 +196,34 @@ impl AdamOptions {
             bias2_sqrt: T::from_f64(bias(beta2).sqrt()),
             eps: T::from_f64(eps),
         })
+    }
+}
+
+/// The first `used` numbers of each row.
+#[inline(always)]
+fn update_rows<T: Real, S: Simd>(
+    simd: S,
+    factors: &Factors<T>,
+    param: &mut [T],
+    exp_avg: &mut [T],
+    exp_avg_sq: &mut [T],
+    grad: &[T],
+    width: usize,
+    used: usize,
+) {
+    if used == width {
+        return update(simd, factors, param, exp_avg, exp_avg_sq, grad);
+    }
+    for row in (0..param.len()).step_by(width) {
+        let row = row..row + used;
+        update(
+            simd,
+            factors,
+            &mut param[row.clone()],
+            &mut exp_avg[row.clone()],
+            &mut exp_avg_sq[row.clone()],
+            &grad[row],
+        );
     }
 }
 
@@ -260,7 +327,7 @@ mod tests {
     }
 
     /// param, exp_avg, exp_avg_sq after `steps` steps.
-    fn run<T: Real>(n: usize, steps: u64, visible: Option<&[u8]>) -> [Vec<T>; 3] {
+    fn run<T: Real>(n: usize, steps: u64, selection: &Selection) -> [Vec<T>; 3] {
         let param = noise(1, n).into_iter().map(T::from_f64).collect();
         let mut arrays = [param, vec![T::ZERO; n], vec![T::ZERO; n]];
         for at in 1..=steps {
@@ -271,7 +338,7 @@ mod tests {
                 exp_avg,
                 exp_avg_sq,
             };
-            step(arrays, at, &OPTIONS, visible).unwrap();
+            step(arrays, at, &OPTIONS, selection).unwrap();
         }
         arrays
     }
@@ -286,7 +353,7 @@ mod tests {
 
     macro_rules! check {
         ($type:ty, $reference:ident, $n:expr) => {
-            let got = run::<$type>($n, 20, None);
+            let got = run::<$type>($n, 20, &Selection::ALL);
             let mut state: Vec<_> = noise(1, $n)
                 .into_iter()
                 .map(|p| [p as $type, 0.0, 0.0])
@@ -318,8 +385,16 @@ mod tests {
         for width in [1, 3, 45] {
             let rows = 1000;
             let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
-            let [all, some, none] = [None, Some(&visible[..]), Some(&vec![0; rows][..])]
-                .map(|visible| run::<f32>(rows * width, 3, visible));
+            let [all, some, none] =
+                [None, Some(&visible[..]), Some(&vec![0; rows][..])].map(|visible| {
+                    let used = width;
+                    let selection = Selection {
+                        visible,
+                        width,
+                        used,
+                    };
+                    run::<f32>(rows * width, 3, &selection)
+                });
             for k in 0..3 {
                 for i in 0..rows * width {
                     let expected = if visible[i / width] != 0 { &all } else { &none };
@@ -338,13 +413,43 @@ mod tests {
     }
 
     #[test]
+    fn numbers_of_a_row_that_are_not_used_are_left_alone() {
+        let (rows, width) = (1000, 45);
+        let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
+        let all = run::<f32>(rows * width, 3, &Selection::ALL);
+        for used in [0, 9, 24, 45] {
+            for visible in [None, Some(&visible[..])] {
+                let selection = Selection {
+                    visible,
+                    width,
+                    used,
+                };
+                let some = run::<f32>(rows * width, 3, &selection);
+                for (i, start) in noise(1, rows * width).into_iter().enumerate() {
+                    let updated = i % width < used && visible.is_none_or(|v| v[i / width] != 0);
+                    let expected = if updated {
+                        all.each_ref().map(|a| a[i])
+                    } else {
+                        [start as f32, 0.0, 0.0]
+                    };
+                    assert_eq!(
+                        some.each_ref().map(|a| a[i]),
+                        expected,
+                        "{used}, element {i}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
     fn same_bits_for_any_number_of_threads() {
         let at = |threads| {
             let pool = rayon::ThreadPoolBuilder::new()
                 .num_threads(threads)
                 .build()
                 .unwrap();
-            pool.install(|| run::<f32>(70_001, 3, None))
+            pool.install(|| run::<f32>(70_001, 3, &Selection::ALL))
                 .map(|a| a.into_iter().map(f32::to_bits).collect::<Vec<_>>())
         };
         let one = at(1);
@@ -361,7 +466,11 @@ mod tests {
                 exp_avg: &mut exp_avg,
                 exp_avg_sq: &mut exp_avg_sq,
             };
-            step(arrays, at, &options, visible).map_err(|e| e.name)
+            let selection = Selection {
+                visible,
+                ..Selection::ALL
+            };
+            step(arrays, at, &options, &selection).map_err(|e| e.name)
         };
         let named = |name: &str| Err(name.to_owned());
         assert_eq!(call([6, 5, 6, 6], 1, OPTIONS, None), named("grad"));

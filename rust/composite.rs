@@ -9,6 +9,7 @@ use crate::{
     real::{Lanes, Real},
     tiles::{Chunk, Tiles},
     tuning::EXP2_DEGREE,
+    work::Work,
 };
 use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
@@ -41,12 +42,12 @@ impl<T: Real> CompositeInput<'_, T> {
         self.tiles.channels
     }
 
-    fn pixels(&self) -> usize {
+    pub(crate) fn pixels(&self) -> usize {
         self.camera.width * self.camera.height
     }
 
     /// What reaches one block.
-    fn layers(&self, tile: usize, block: usize) -> Layers<'_, T> {
+    pub(crate) fn layers(&self, tile: usize, block: usize) -> Layers<'_, T> {
         let list = &self.tiles.lists[tile];
         Layers {
             list: &list.blocks[list.begins[block] as usize..list.begins[block + 1] as usize],
@@ -62,7 +63,7 @@ impl<T: Real> CompositeInput<'_, T> {
     /// The image's pixels in tile `tile`, up to four neighbours at a time: (index in block order, index in
     /// the image, number).
     #[inline(always)]
-    fn runs(&self, tile: usize) -> impl Iterator<Item = (usize, usize, usize)> + use<T> {
+    pub(crate) fn runs(&self, tile: usize) -> impl Iterator<Item = (usize, usize, usize)> + use<T> {
         let (top, left) = (
             tile / self.tiles.columns * TILE,
             tile % self.tiles.columns * TILE,
@@ -83,32 +84,6 @@ pub struct Composited<T> {
     depths: Vec<[u32; TILE_BLOCKS]>,
     /// Transmittance after the last layer, tile by tile in block order.
     transmittance: Vec<T>,
-}
-
-/// Counts of the work done, for reports and tests.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Work {
-    /// (Gaussian, tile) pairs.
-    pub pairs: u64,
-    /// Blocks evaluated by the forward pass, and again by the backward pass.
-    pub blocks: u64,
-    /// Blocks in which a pixel changed.
-    pub hit_blocks: u64,
-    /// (Gaussian, pixel) pairs that were blended.
-    pub pixels: u64,
-}
-
-impl Work {
-    /// The sum.
-    #[must_use]
-    pub fn plus(self, other: Self) -> Self {
-        Self {
-            pairs: self.pairs + other.pairs,
-            blocks: self.blocks + other.blocks,
-            hit_blocks: self.hit_blocks + other.hit_blocks,
-            pixels: self.pixels + other.pixels,
-        }
-    }
 }
 
 /// Call a function for the number of channels: the common ones are compiled for it.
@@ -209,7 +184,10 @@ pub fn forward<T: Real>(
             depths,
             transmittance,
         },
-        work,
+        Work {
+            channels: channels as u64,
+            ..work
+        },
     ))
 }
 
@@ -226,6 +204,7 @@ fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     let list = &input.tiles.lists[tile];
     list.fetch();
     let mut work = Work {
+        tiles: u64::from(!list.records.is_empty()),
         pairs: list.records.len() as u64,
         ..Work::default()
     };
@@ -238,8 +217,8 @@ fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
         let blended = for_vectors!(simd: S, T, D, E, blend(grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
         work.blocks += blended.layers as u64;
-        work.hit_blocks += blended.changed;
-        work.pixels += blended.pixels;
+        work.changed_blocks += blended.changed;
+        work.blended += blended.pixels;
     }
     work
 }
@@ -277,7 +256,7 @@ pub struct GeometryGrads<'a, T> {
     pub absolute: Option<&'a mut [T]>,
 }
 
-/// VJP of [`forward`].
+/// VJP of [`forward`]. Tiles and blocks whose pixels have no cotangent that is not 0 are left out.
 ///
 /// # Errors
 /// When the length of an array does not fit; nothing is written then.
@@ -286,7 +265,7 @@ pub fn backward<T: Real>(
     composited: &Composited<T>,
     v: &CompositeCotangents<T>,
     grads: CompositeGrads<T>,
-) -> Result<(), Error> {
+) -> Result<Work, Error> {
     input.check()?;
     let (n, channels, tiles) = (input.projection.splats.len(), input.channels(), input.tiles);
     check_len("v_render_colors", v.image, input.pixels() * channels)?;
@@ -298,7 +277,7 @@ pub fn backward<T: Real>(
         background_vjp(input, composited, v, background);
     }
     if grads.geometry.is_none() && grads.colors.is_none() {
-        return Ok(());
+        return Ok(Work::default());
     }
     let absolute = grads
         .geometry
@@ -308,7 +287,7 @@ pub fn backward<T: Real>(
     let grid = Grid::new();
     let level = Level::new();
     let degree = input.projection.tuning.exp2_degree;
-    let pair_grads: Vec<_> = (0..tiles.lists.len())
+    let (pair_grads, work): (Vec<_>, Vec<_>) = (0..tiles.lists.len())
         .into_par_iter()
         .map_init(
             || Scratch {
@@ -321,8 +300,9 @@ pub fn backward<T: Real>(
                 ))
             },
         )
-        .collect();
-    gather(input, &pair_grads, columns, n, grads.geometry, grads.colors)
+        .unzip();
+    gather(input, &pair_grads, columns, n, grads.geometry, grads.colors)?;
+    Ok(work.into_iter().fold(Work::default(), Work::plus))
 }
 
 /// Layout of one pair's gradients: moments, colours, absolute gradients.
@@ -346,7 +326,7 @@ struct Scratch<T> {
     layers: Vec<T>,
 }
 
-/// Gradients of a tile's pairs, by index; empty if all are zero.
+/// Gradients of a tile's pairs, by index, and the work that they took; empty if all are zero.
 #[inline(always)]
 fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     simd: S,
@@ -357,14 +337,21 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     tile: usize,
     columns: Columns,
     scratch: &mut Scratch<T>,
-) -> Vec<T> {
+) -> (Vec<T>, Work) {
+    let mut work = Work::default();
+    let list = &input.tiles.lists[tile];
+    if list.records.is_empty() {
+        return (Vec::new(), work);
+    }
     let channels = if D > 0 { D } else { columns.channels };
     let mut transmittance = [T::ZERO; TILE_PIXELS];
     let mut behind = [T::ZERO; TILE_PIXELS];
     scratch.v_colors.iter_mut().for_each(|c| c.fill(T::ZERO));
-    let mut any = false;
+    // The blocks with a cotangent that is not 0: bit b for block b.
+    let mut wanted = 0u16;
     for (p, pixel, n) in input.runs(tile) {
         transmittance[p..p + n].fill(T::ONE);
+        let mut any = false;
         let image = &v.image[pixel * channels..(pixel + n) * channels];
         for (c, v_color) in scratch.v_colors[..channels].iter_mut().enumerate() {
             for (k, v_color) in v_color[p..p + n].iter_mut().enumerate() {
@@ -372,28 +359,36 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
                 any |= *v_color != T::ZERO;
             }
         }
-        if input.background.is_none() && v.alphas.is_none() {
-            continue;
-        }
-        // Behind the last layer: the background, and the alpha, which is 1 - T.
-        for k in 0..n {
-            let v_alpha = v.alphas.map_or(0.0, |a| a[pixel + k].to_f64());
-            any |= v_alpha != 0.0;
-            let mut sum = -v_alpha;
-            for (v_color, b) in scratch.v_colors.iter().zip(input.background.unwrap_or(&[])) {
-                sum += v_color[p + k].to_f64() * b.to_f64();
+        if input.background.is_some() || v.alphas.is_some() {
+            // Behind the last layer: the background, and the alpha, which is 1 - T.
+            for k in 0..n {
+                let v_alpha = v.alphas.map_or(0.0, |a| a[pixel + k].to_f64());
+                any |= v_alpha != 0.0;
+                let mut sum = -v_alpha;
+                for (v_color, b) in scratch.v_colors.iter().zip(input.background.unwrap_or(&[])) {
+                    sum += v_color[p + k].to_f64() * b.to_f64();
+                }
+                behind[p + k] = T::from_f64(sum);
             }
-            behind[p + k] = T::from_f64(sum);
+        }
+        wanted |= u16::from(any) << (p / BLOCK_PIXELS);
+        work.alpha_cotangents += if v.alphas.is_some() { n as u64 } else { 0 };
+    }
+    // Block by block: what each layer contributes. Where there is no cotangent, that is 0.
+    let mut depths = composited.depths[tile];
+    for (block, depth) in depths.iter_mut().enumerate() {
+        if wanted >> block & 1 == 0 {
+            work.skipped_blocks += u64::from(std::mem::take(depth));
         }
     }
-    if !any {
-        return Vec::new();
-    }
-    let list = &input.tiles.lists[tile];
-    list.fetch();
-    // Block by block: what each layer contributes.
-    let depths = &composited.depths[tile];
     let total: u32 = depths.iter().sum();
+    work.backward_blocks = u64::from(total);
+    if wanted == 0 {
+        work.skipped_tiles = 1;
+        return (Vec::new(), work);
+    }
+    work.backward_tiles = 1;
+    list.fetch();
     if scratch.layers.len() < total as usize * LAYER {
         scratch.layers.resize(total as usize * LAYER, T::ZERO);
     }
@@ -436,7 +431,7 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
         }
         sums.finish::<D>(columns.absolute, out);
     }
-    out
+    (out, work)
 }
 
 /// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.

@@ -155,6 +155,18 @@ pub(crate) struct GeometryGrad<S: Simd> {
     pub scale: V3<Wide<S>>,
 }
 
+impl<S: Simd> GeometryGrad<S> {
+    #[inline(always)]
+    pub fn zero(simd: S) -> Self {
+        let zero = splat(simd, 0.0);
+        Self {
+            mean: V3::new(zero, zero, zero),
+            quat: [zero; 4],
+            scale: V3::new(zero, zero, zero),
+        }
+    }
+}
+
 /// Gradient of the camera, a sum per lane.
 pub(crate) struct CameraGradLanes<S: Simd> {
     rotation: [V3<Wide<S>>; 3],

@@ -9,6 +9,7 @@ use crate::{
     constants::{ALPHA_MAX, BLOCK, BLOCK_PIXELS, BLOCKS_PER_SIDE, TILE, TILE_BLOCKS, TILE_PIXELS},
     project::Splat,
     real::{Lanes, Real},
+    tuning::EXP2_DEGREE,
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
 
@@ -369,6 +370,53 @@ pub(crate) fn blend<S: Simd, T: Real, const D: usize, const E: usize, const V: u
         store::<S, T, V>(&mut color[at..], sum);
     }
     counts
+}
+
+/// Raise `largest` to the weights of the layers in one block (V vectors): for each record of the tile as many
+/// numbers as a vector has lanes, whose maximum is the record's. `transmittance` is 1 in the pixels that count,
+/// 0 in the others. Decides as `blend` does.
+#[inline(always)]
+pub(crate) fn weigh<S: Simd, T: Real, const V: usize>(
+    simd: S,
+    grid: &Grid<T>,
+    block: usize,
+    layers: Layers<T>,
+    transmittance: &[T],
+    largest: &mut [T],
+) {
+    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
+    let at = block * BLOCK_PIXELS;
+    let (x, y) = (
+        load::<S, T, V>(simd, &grid.x[at..]),
+        load::<S, T, V>(simd, &grid.y[at..]),
+    );
+    let (floor, least) = (splat(layers.floor), splat(layers.least));
+    let (one, zero) = (splat(T::ONE), splat(T::ZERO));
+    let mut open = load::<S, T, V>(simd, transmittance);
+    for part in layers.list.chunks(STRIDE) {
+        for &k in part {
+            let k = k as usize;
+            let wide = Wide::<S, T>::new(simd, &layers.records[k]);
+            let out = &mut largest[k * width::<S, T>()..(k + 1) * width::<S, T>()];
+            let mut most = Lanes::<T, S>::from_slice(simd, out);
+            for j in 0..V {
+                let alpha = wide.alpha::<EXP2_DEGREE>(simd, x[j], y[j]);
+                let opaque = alpha.simd_ge(floor);
+                let next = open[j] * (one - alpha);
+                let blended = opaque & next.simd_gt(least);
+                most = most.max(blended.select(open[j] * alpha, zero));
+                open[j] = opaque.select(blended.select(next, zero), open[j]);
+            }
+            most.store_slice(out);
+        }
+        let mut unfinished = 0;
+        for open in open {
+            unfinished |= open.simd_gt(zero).to_bitmask();
+        }
+        if unfinished == 0 {
+            break;
+        }
+    }
 }
 
 /// Sums over the pixels of a tile for one Gaussian; the order of the fields is the order in memory.

@@ -23,6 +23,8 @@ mod python;
 mod python_loss;
 #[cfg(feature = "python")]
 mod python_pictures;
+#[cfg(feature = "python")]
+mod python_weights;
 pub mod real;
 pub mod render;
 pub mod scene;
@@ -32,5 +34,7 @@ pub mod synthetic;
 pub mod threads;
 pub mod tiles;
 pub mod tuning;
+pub mod weights;
+pub mod work;
 
 pub use error::Error;

@@ -10,9 +10,11 @@ use crate::{
     scene::{Colors, Gaussians, Harmonics},
     sh,
     tuning::{Spans, Tuning},
+    work::Work,
 };
 use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdMask, dispatch};
 use rayon::prelude::*;
+use std::slice::from_ref;
 
 /// Options of the projection; the defaults are gsplat's.
 #[derive(Debug, Clone, Copy)]
@@ -326,7 +328,7 @@ pub fn forward<T: Real>(
     options: &ProjectOptions,
     projection: &mut Projection,
     out: ProjectOut<T>,
-) {
+) -> Work {
     let n = gaussians.len();
     if projection.splats.len() != n {
         projection.splats = rayon::iter::repeat_n(Splat::default(), n).collect();
@@ -374,11 +376,12 @@ pub fn forward<T: Real>(
         .enumerate()
         .collect();
     let level = Level::new();
-    jobs.into_par_iter().for_each(|(chunk, (splats, keys, mut out))| {
+    let work = jobs.into_par_iter().map(|(chunk, (splats, keys, mut out))| {
         dispatch!(level, simd => forward_chunk(
             simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, splats, keys, &mut out
-        ));
+        ))
     });
+    work.reduce(Work::default, Work::plus)
 }
 
 /// Project the Gaussians `begin..begin + splats.len()`.
@@ -393,7 +396,11 @@ fn forward_chunk<S: Simd, T: Real>(
     splats: &mut [Splat],
     keys: &mut [f64],
     out: &mut ProjectOut<T>,
-) {
+) -> Work {
+    let mut work = Work {
+        gaussians: splats.len() as u64,
+        ..Work::default()
+    };
     let camera_lanes = CameraLanes::new(
         simd,
         camera,
@@ -430,6 +437,7 @@ fn forward_chunk<S: Simd, T: Real>(
         }
         match colors {
             Colors::Harmonics(h) if keep != 0 => {
+                work.harmonics += (rows * sh::count(h.degree)) as u64;
                 harmonics.read(simd, h, first);
                 let d = narrow3::<T>(&group.direction);
                 let mut rgb = [Column::ZERO; 3];
@@ -464,6 +472,7 @@ fn forward_chunk<S: Simd, T: Real>(
                 }
             }
         }
+        work.projected += u64::from(keep.count_ones());
         let splats = &mut splats[start..start + rows];
         for (lane, splat) in splats.iter_mut().enumerate() {
             *splat = if keep >> lane & 1 == 1 {
@@ -489,6 +498,7 @@ fn forward_chunk<S: Simd, T: Real>(
         let conic = [&kept(a, keep), &kept(b, keep), &kept(c, keep)];
         columns::write(conic, rows_of(out.conics, 3, start, rows));
     }
+    work
 }
 
 /// The values of the Gaussians in a set, 0 elsewhere.
@@ -536,15 +546,15 @@ fn finite<T: Real>(values: &[T]) -> bool {
     values.iter().all(|x| x.to_f64().is_finite())
 }
 
-/// Cotangents of the projection's outputs, all dense over N.
+/// Cotangents of the projection's outputs, all dense over N. `None` is 0.
 #[derive(Debug, Clone, Copy)]
 pub struct ProjectCotangents<'a, T> {
     /// Of `means2d`, [N, 2].
-    pub means2d: &'a [T],
+    pub means2d: Option<&'a [T]>,
     /// Whitened gradient of the 2D covariance (E_uu, E_uv, E_vv), [N, 3]; see `geometry.rs`.
-    pub whitened: &'a [T],
+    pub whitened: Option<&'a [T]>,
     /// Of `opacities`, [N].
-    pub opacities: &'a [T],
+    pub opacities: Option<&'a [T]>,
     /// Of `depths`, [N].
     pub depths: Option<&'a [T]>,
     /// Of `conics`, [N, 3].
@@ -553,8 +563,76 @@ pub struct ProjectCotangents<'a, T> {
     pub colors: Option<&'a [T]>,
 }
 
-/// Gradients to fill; `None` is not computed. They hold zeros before: what belongs to a culled Gaussian, or to
-/// a harmonic above the degree in use, is left as it is.
+/// The cotangents of a group, a column per number.
+struct Cotangents<T> {
+    means2d: [Column<T>; 2],
+    whitened: [Column<T>; 3],
+    opacities: Column<T>,
+    depths: Column<T>,
+    conics: [Column<T>; 3],
+    colors: [Column<T>; 3],
+}
+
+impl<T: Real> Cotangents<T> {
+    const ZERO: Self = Self {
+        means2d: [Column::ZERO; 2],
+        whitened: [Column::ZERO; 3],
+        opacities: Column::ZERO,
+        depths: Column::ZERO,
+        conics: [Column::ZERO; 3],
+        colors: [Column::ZERO; 3],
+    };
+
+    #[inline(always)]
+    fn read<S: Simd>(&mut self, simd: S, v: &ProjectCotangents<T>, first: usize) {
+        if let Some(v) = v.means2d {
+            columns::read(simd, v, first, &mut self.means2d);
+        }
+        if let Some(v) = v.whitened {
+            columns::read(simd, v, first, &mut self.whitened);
+        }
+        if let Some(v) = v.opacities {
+            self.opacities.load(v, first);
+        }
+        if let Some(v) = v.depths {
+            self.depths.load(v, first);
+        }
+        if let Some(v) = v.conics {
+            columns::read(simd, v, first, &mut self.conics);
+        }
+        if let Some(v) = v.colors {
+            columns::read(simd, v, first, &mut self.colors);
+        }
+    }
+
+    /// Gaussians of the group with a cotangent that is not 0.
+    #[inline(always)]
+    fn nonzero(&self) -> u16 {
+        let mut any = [false; GROUP];
+        for columns in [
+            &self.means2d[..],
+            &self.whitened,
+            from_ref(&self.opacities),
+            from_ref(&self.depths),
+            &self.conics,
+            &self.colors,
+        ] {
+            for column in columns {
+                for (any, v) in any.iter_mut().zip(&column.0) {
+                    *any |= *v != T::ZERO;
+                }
+            }
+        }
+        let mut set = 0;
+        for (lane, any) in any.iter().enumerate() {
+            set |= u16::from(*any) << lane;
+        }
+        set
+    }
+}
+
+/// Gradients to fill; `None` is not computed. They hold zeros before: what belongs to a culled Gaussian or to
+/// one without a cotangent, or to a harmonic above the degree in use, is left as it is.
 #[derive(Debug, Default)]
 pub struct GaussianGrads<'a, T> {
     /// [N, 3]
@@ -581,7 +659,8 @@ fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T
 }
 
 /// Vector-Jacobian product of [`forward`]: fills `grads` and returns the gradient of the camera (of its
-/// centre alone unless `camera_wanted`).
+/// centre alone unless `camera_wanted`). Groups of 16 Gaussians without a cotangent are left out, and so is the
+/// geometry where the colours alone have cotangents.
 ///
 /// `projection` must be the one that `forward` filled from the same inputs.
 pub fn backward<T: Real>(
@@ -593,7 +672,7 @@ pub fn backward<T: Real>(
     v: &ProjectCotangents<T>,
     grads: GaussianGrads<T>,
     camera_wanted: bool,
-) -> CameraGrad {
+) -> (CameraGrad, Work) {
     let n = gaussians.len();
     let (row, rest_row) = harmonics.map_or((0, 0), Harmonics::rows);
     let jobs: Vec<_> = chunks(grads.means, n, 3)
@@ -605,7 +684,7 @@ pub fn backward<T: Real>(
         .zip(chunks(grads.harmonics_rest, n, rest_row))
         .collect();
     let level = Level::new();
-    let parts: Vec<CameraGrad> = jobs
+    let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()
         .map(|(chunk, (((((means, quats), scales), opacities), harmonics_grad), harmonics_rest))| {
@@ -615,9 +694,10 @@ pub fn backward<T: Real>(
             ))
         })
         .collect();
-    parts.iter().fold(CameraGrad::ZERO, |mut sum, part| {
+    let start = (CameraGrad::ZERO, Work::default());
+    parts.iter().fold(start, |(mut sum, work), (part, more)| {
         sum.add(part);
-        sum
+        (sum, work.plus(*more))
     })
 }
 
@@ -634,7 +714,7 @@ fn backward_chunk<S: Simd, T: Real>(
     begin: usize,
     mut grads: GaussianGrads<T>,
     camera_wanted: bool,
-) -> CameraGrad {
+) -> (CameraGrad, Work) {
     let zero = splat_lanes(simd, 0.0);
     let camera_lanes = CameraLanes::new(
         simd,
@@ -646,9 +726,13 @@ fn backward_chunk<S: Simd, T: Real>(
     let center = splat3(simd, camera.center);
     let mut camera_grad = CameraGradLanes::zero(simd);
     let mut inputs = Inputs::ZERO;
-    let (mut v_means2d, mut v_whitened) = ([Column::ZERO; 2], [Column::ZERO; 3]);
-    let (mut v_opacities, mut v_depths) = (Column::ZERO, Column::ZERO);
-    let (mut v_conics, mut v_rgb) = ([Column::ZERO; 3], [Column::ZERO; 3]);
+    let mut cotangents = Cotangents::ZERO;
+    let geometry_wanted = v.means2d.is_some()
+        || v.whitened.is_some()
+        || v.opacities.is_some()
+        || v.depths.is_some()
+        || v.conics.is_some();
+    let mut work = Work::default();
     let mut colors = ColorGroup::ZERO;
     let mut out = GradColumns::<T>::ZERO;
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
@@ -662,19 +746,14 @@ fn backward_chunk<S: Simd, T: Real>(
         if visible == 0 {
             continue;
         }
+        cotangents.read(simd, v, first);
+        if visible & cotangents.nonzero() == 0 {
+            continue;
+        }
         inputs.read(simd, gaussians, first);
-        columns::read(simd, v.means2d, first, &mut v_means2d);
-        columns::read(simd, v.whitened, first, &mut v_whitened);
-        v_opacities.load(v.opacities, first);
-        if let Some(d) = v.depths {
-            v_depths.load(d, first);
-        }
-        if let Some(c) = v.conics {
-            columns::read(simd, c, first, &mut v_conics);
-        }
         let mut v_colors = None;
-        if let (Some(h), Some(v)) = (harmonics, v.colors) {
-            columns::read(simd, v, first, &mut v_rgb);
+        if let (Some(h), true) = (harmonics, v.colors.is_some()) {
+            work.backward_harmonics += (rows * sh::count(h.degree)) as u64;
             colors.coefficients.read(simd, h, first);
             let (means, directions) = (&inputs.means, &mut colors.directions);
             for at in (0..GROUP).step_by(lanes::<S>()) {
@@ -686,44 +765,52 @@ fn backward_chunk<S: Simd, T: Real>(
                 directions[2].set(simd, at, d.z);
                 colors.inverses.set(simd, at, valid.select(inverse, zero));
             }
-            colors.backward(simd, h.degree, &v_rgb, visible);
+            colors.backward(simd, h.degree, &cotangents.colors, visible);
             v_colors = Some(h);
         }
+        work.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
         for at in (0..GROUP).step_by(lanes::<S>()) {
-            let mut g = inputs.geometry(simd, at, &camera_lanes);
-            // Lanes that were culled for another reason, or lie beyond the end, are not valid here.
-            g.valid = lanes_in(simd, visible, at);
-            let v_opacity = v_opacities.wide(simd, at);
-            let mut v_input_opacity = v_opacity;
-            let mut whitened = wide3(simd, &v_whitened, at);
-            if v.conics.is_some() {
-                whitened = whitened + g.whiten_conic(simd, wide3(simd, &v_conics, at));
+            // Not those that were culled, nor those beyond the end.
+            let valid = lanes_in(simd, visible, at);
+            let mut grad = GeometryGrad::zero(simd);
+            let mut v_input_opacity = zero;
+            if geometry_wanted {
+                let mut g = inputs.geometry(simd, at, &camera_lanes);
+                g.valid = valid;
+                let v_opacity = cotangents.opacities.wide(simd, at);
+                v_input_opacity = v_opacity;
+                let mut whitened = wide3(simd, &cotangents.whitened, at);
+                if v.conics.is_some() {
+                    whitened = whitened + g.whiten_conic(simd, wide3(simd, &cotangents.conics, at));
+                }
+                if options.antialiased {
+                    let v_compensation = v_opacity * inputs.opacities.wide(simd, at);
+                    whitened =
+                        whitened + g.whiten_compensation(simd, &camera_lanes, v_compensation);
+                    v_input_opacity = v_opacity * g.compensation();
+                }
+                let [x, y] = &cotangents.means2d;
+                let cotangent = Cotangent {
+                    mean2d: [x.wide(simd, at), y.wide(simd, at)],
+                    whitened,
+                    depth: cotangents.depths.wide(simd, at),
+                };
+                grad = g.vjp(
+                    simd,
+                    &cotangent,
+                    &camera_lanes,
+                    camera_wanted.then_some(&mut camera_grad),
+                );
             }
-            if options.antialiased {
-                let v_compensation = v_opacity * inputs.opacities.wide(simd, at);
-                whitened = whitened + g.whiten_compensation(simd, &camera_lanes, v_compensation);
-                v_input_opacity = v_opacity * g.compensation();
-            }
-            let cotangent = Cotangent {
-                mean2d: [v_means2d[0].wide(simd, at), v_means2d[1].wide(simd, at)],
-                whitened,
-                depth: v_depths.wide(simd, at),
-            };
-            let mut grad = g.vjp(
-                simd,
-                &cotangent,
-                &camera_lanes,
-                camera_wanted.then_some(&mut camera_grad),
-            );
             if v_colors.is_some() {
                 // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
                 let d = wide3(simd, &colors.directions, at);
-                let v_d = wide3(simd, &colors.v_directions, at).only(g.valid, zero);
+                let v_d = wide3(simd, &colors.v_directions, at).only(valid, zero);
                 let v_mean = (v_d - d.by(d.dot(v_d))).by(colors.inverses.wide(simd, at));
                 grad.mean = grad.mean + v_mean;
                 camera_grad.center = camera_grad.center - v_mean;
             }
-            out.set(simd, at, &grad, v_input_opacity, g.valid, zero);
+            out.set(simd, at, &grad, v_input_opacity, valid, zero);
         }
         let GradColumns {
             means: [x, y, z],
@@ -760,7 +847,7 @@ fn backward_chunk<S: Simd, T: Real>(
             buffer.write(simd, in_rest, out, rest_row, rows);
         }
     }
-    camera_grad.sum()
+    (camera_grad.sum(), work)
 }
 
 /// Gradients of a group in the type of the inputs.

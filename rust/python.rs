@@ -4,7 +4,7 @@
 use crate::{
     camera::Camera,
     composite::{
-        self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads, Work,
+        self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads,
     },
     error::Error,
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
@@ -13,6 +13,7 @@ use crate::{
     threads,
     tiles::{self, Tiles},
     tuning::{Spans, Tuning},
+    work::Work,
 };
 use numpy::{
     Element, IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn,
@@ -21,6 +22,7 @@ use numpy::{
 use pyo3::{exceptions::PyValueError, prelude::*};
 use rayon::prelude::*;
 use std::{
+    collections::HashMap,
     ffi::{c_int, c_long},
     time::Instant,
 };
@@ -138,13 +140,17 @@ fn some<T>(wanted: bool, data: &mut [T]) -> Option<&mut [T]> {
 
 /// The projection of N Gaussians into C cameras.
 #[pyclass(frozen, module = "hqgs._rust")]
-struct Frame {
-    cameras: Vec<Camera>,
-    projections: Vec<Projection>,
+pub(crate) struct Frame {
+    pub cameras: Vec<Camera>,
+    pub projections: Vec<Projection>,
     options: ProjectOptions,
     n: usize,
     sh_degree: Option<usize>,
+    work: Work,
 }
+
+/// The counts of [`Work`] by name.
+type Counts = HashMap<&'static str, u64>;
 
 /// Tile lists and replay state of a composited frame.
 #[pyclass(frozen, module = "hqgs._rust")]
@@ -167,6 +173,12 @@ impl Frame {
     fn height(&self) -> usize {
         self.cameras.first().map_or(0, |c| c.height)
     }
+
+    /// Counts of the projection.
+    #[getter]
+    fn counts(&self) -> Counts {
+        self.work.entries().collect()
+    }
 }
 
 /// One camera's tile lists and replay state.
@@ -185,7 +197,7 @@ impl Composite {
     /// (pairs, blocks evaluated, blocks with a change): the work of the forward pass.
     #[getter]
     fn work(&self) -> (u64, u64, u64) {
-        (self.work.pairs, self.work.blocks, self.work.hit_blocks)
+        (self.work.pairs, self.work.blocks, self.work.changed_blocks)
     }
 
     /// Wall-clock seconds that the tile lists took.
@@ -197,7 +209,13 @@ impl Composite {
     /// (Gaussian, pixel) pairs that were blended.
     #[getter]
     fn blended(&self) -> u64 {
-        self.work.pixels
+        self.work.blended
+    }
+
+    /// Counts of the forward pass.
+    #[getter]
+    fn counts(&self) -> Counts {
+        self.work.entries().collect()
     }
 }
 
@@ -359,7 +377,7 @@ fn project_as<'py, T: Scalar>(
         None => arrays.channels(gaussians.len(), cameras.len())?,
     };
     let (n, c) = (gaussians.len(), cameras.len());
-    let (projections, out) = py.detach(|| {
+    let (projections, work, out) = py.detach(|| {
         threads::install(|| {
             let mut means2d = zeros::<T>(true, 2 * c * n);
             let mut depths = zeros::<T>(true, c * n);
@@ -369,6 +387,7 @@ fn project_as<'py, T: Scalar>(
             let color_row = if harmonics.is_some() { 3 * n } else { 0 };
             let mut colors = zeros::<T>(true, c * color_row);
             let mut projections = Vec::with_capacity(c);
+            let mut work = Work::default();
             for (i, camera) in cameras.iter().enumerate() {
                 let mut projection = Projection::default();
                 let out = ProjectOut {
@@ -379,7 +398,7 @@ fn project_as<'py, T: Scalar>(
                     opacities: &mut opacities[i * n..(i + 1) * n],
                     colors: &mut colors[i * color_row..(i + 1) * color_row],
                 };
-                project::forward(
+                let more = project::forward(
                     &gaussians,
                     harmonics.as_ref().map_or_else(
                         || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
@@ -391,9 +410,11 @@ fn project_as<'py, T: Scalar>(
                     out,
                 );
                 projections.push(projection);
+                work = work.plus(more);
             }
             (
                 projections,
+                work,
                 (means2d, depths, conics, radii, opacities, colors),
             )
         })
@@ -404,6 +425,7 @@ fn project_as<'py, T: Scalar>(
         options,
         n,
         sh_degree,
+        work,
     };
     let (means2d, depths, conics, radii, opacities, colors) = out;
     Ok((
@@ -520,9 +542,9 @@ type Inputs<'py> = (
 
 /// means2d, whitened, opacities, depths, conics, colors
 type Cotangents<'py> = (
-    Bound<'py, PyAny>,
-    Bound<'py, PyAny>,
-    Bound<'py, PyAny>,
+    Option<Bound<'py, PyAny>>,
+    Option<Bound<'py, PyAny>>,
+    Option<Bound<'py, PyAny>>,
     Option<Bound<'py, PyAny>>,
     Option<Bound<'py, PyAny>>,
     Option<Bound<'py, PyAny>>,
@@ -536,6 +558,7 @@ type ProjectGrads<'py, T> = (
     Out<'py, T>,
     Out<'py, T>,
     Out<'py, f64>,
+    Counts,
 );
 
 fn project_backward_as<'py, T: Scalar>(
@@ -556,9 +579,9 @@ fn project_backward_as<'py, T: Scalar>(
     )?;
     let gaussians = arrays.gaussians()?;
     let harmonics = arrays.harmonics(frame.sh_degree)?;
-    let v_means2d = Array::<T>::new("v_means2d", &v.0)?;
-    let v_whitened = Array::<T>::new("v_whitened", &v.1)?;
-    let v_opacities = Array::<T>::new("v_opacities", &v.2)?;
+    let v_means2d = optional::<T>("v_means2d", v.0.as_ref())?;
+    let v_whitened = optional::<T>("v_whitened", v.1.as_ref())?;
+    let v_opacities = optional::<T>("v_opacities", v.2.as_ref())?;
     let v_depths = optional::<T>("v_depths", v.3.as_ref())?;
     let v_conics = optional::<T>("v_conics", v.4.as_ref())?;
     let v_colors = optional::<T>("v_colors", v.5.as_ref())?;
@@ -567,9 +590,9 @@ fn project_backward_as<'py, T: Scalar>(
         Ok(a.as_ref().map(|a| a.shape().iter().product()))
     };
     for (name, rows, got) in [
-        ("v_means2d", 2, Some(v_means2d.slice()?.len())),
-        ("v_whitened", 3, Some(v_whitened.slice()?.len())),
-        ("v_opacities", 1, Some(v_opacities.slice()?.len())),
+        ("v_means2d", 2, part(&v_means2d)?),
+        ("v_whitened", 3, part(&v_whitened)?),
+        ("v_opacities", 1, part(&v_opacities)?),
         ("v_depths", 1, part(&v_depths)?),
         ("v_conics", 3, part(&v_conics)?),
         ("v_colors", 3, part(&v_colors)?),
@@ -584,9 +607,9 @@ fn project_backward_as<'py, T: Scalar>(
         }
     }
     let slices = (
-        v_means2d.slice()?,
-        v_whitened.slice()?,
-        v_opacities.slice()?,
+        v_means2d.as_ref().map(Array::slice).transpose()?,
+        v_whitened.as_ref().map(Array::slice).transpose()?,
+        v_opacities.as_ref().map(Array::slice).transpose()?,
         v_depths.as_ref().map(Array::slice).transpose()?,
         v_conics.as_ref().map(Array::slice).transpose()?,
         v_colors.as_ref().map(Array::slice).transpose()?,
@@ -615,11 +638,12 @@ fn project_backward_as<'py, T: Scalar>(
             };
             let mut sums = fresh();
             let mut viewmats = Vec::with_capacity(16 * c);
+            let mut work = Work::default();
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let cotangents = ProjectCotangents {
-                    means2d: &slices.0[2 * i * n..2 * (i + 1) * n],
-                    whitened: &slices.1[3 * i * n..3 * (i + 1) * n],
-                    opacities: &slices.2[i * n..(i + 1) * n],
+                    means2d: slices.0.map(|s| &s[2 * i * n..2 * (i + 1) * n]),
+                    whitened: slices.1.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
+                    opacities: slices.2.map(|s| &s[i * n..(i + 1) * n]),
                     depths: slices.3.map(|s| &s[i * n..(i + 1) * n]),
                     conics: slices.4.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
                     colors: slices.5.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
@@ -638,7 +662,7 @@ fn project_backward_as<'py, T: Scalar>(
                     harmonics: some(want_harmonics, sh),
                     harmonics_rest: some(want_rest, rest),
                 };
-                let camera_grad = project::backward(
+                let (camera_grad, more) = project::backward(
                     &gaussians,
                     harmonics.as_ref(),
                     camera,
@@ -648,6 +672,7 @@ fn project_backward_as<'py, T: Scalar>(
                     grads,
                     want_viewmats,
                 );
+                work = work.plus(more);
                 viewmats.extend(camera_grad.viewmat(camera));
                 if i == 0 {
                     sums = one;
@@ -657,10 +682,10 @@ fn project_backward_as<'py, T: Scalar>(
                     }
                 }
             }
-            (sums, viewmats)
+            (sums, viewmats, work)
         })
     });
-    let ([means, quats, scales, opacities, sh, rest], viewmats) = out;
+    let ([means, quats, scales, opacities, sh, rest], viewmats, work) = out;
     Ok((
         want_means.then(|| means.into_pyarray(py)),
         want_quats.then(|| quats.into_pyarray(py)),
@@ -669,6 +694,7 @@ fn project_backward_as<'py, T: Scalar>(
         want_harmonics.then(|| sh.into_pyarray(py)),
         want_rest.then(|| rest.into_pyarray(py)),
         want_viewmats.then(|| viewmats.into_pyarray(py)),
+        work.entries().collect(),
     ))
 }
 
@@ -810,6 +836,7 @@ type CompositeOut<'py, T> = (
     Out<'py, T>,
     Out<'py, T>,
     Out<'py, T>,
+    Counts,
 );
 
 fn composite_backward_as<'py, T: Scalar>(
@@ -862,6 +889,7 @@ fn composite_backward_as<'py, T: Scalar>(
             let mut absolute = zeros::<T>(want_geometry && want_absolute, 2 * c * n);
             let mut v_colors = zeros::<T>(want_colors, channels * c * n);
             let mut v_background = zeros::<T>(want_background, channels * c);
+            let mut work = Work::default();
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let input = CompositeInput {
                     projection: &frame.projections[i],
@@ -900,7 +928,8 @@ fn composite_backward_as<'py, T: Scalar>(
                         None
                     },
                 };
-                composite::backward(&input, &views[i].composited, &cotangents, grads)?;
+                let more = composite::backward(&input, &views[i].composited, &cotangents, grads)?;
+                work = work.plus(more);
             }
             Ok((
                 means2d,
@@ -909,10 +938,11 @@ fn composite_backward_as<'py, T: Scalar>(
                 absolute,
                 v_colors,
                 v_background,
+                work,
             ))
         })
     })?;
-    let (means2d, whitened, opacities, absolute, v_colors, v_background) = out;
+    let (means2d, whitened, opacities, absolute, v_colors, v_background, work) = out;
     Ok((
         want_geometry.then(|| means2d.into_pyarray(py)),
         want_geometry.then(|| whitened.into_pyarray(py)),
@@ -920,6 +950,7 @@ fn composite_backward_as<'py, T: Scalar>(
         (want_geometry && want_absolute).then(|| absolute.into_pyarray(py)),
         want_colors.then(|| v_colors.into_pyarray(py)),
         want_background.then(|| v_background.into_pyarray(py)),
+        work.entries().collect(),
     ))
 }
 
@@ -959,5 +990,6 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
     crate::python_loss::register(m)?;
-    crate::python_pictures::register(m)
+    crate::python_pictures::register(m)?;
+    crate::python_weights::register(m)
 }

@@ -1,7 +1,7 @@
 //! The Python binding of the loss and of the optimizer; the rasterizer's is `python.rs`.
 
 use crate::{
-    adam::{self, AdamArrays, AdamOptions},
+    adam::{self, AdamArrays, AdamOptions, Selection},
     error::Error,
     loss::{self, LossScratch, Sample},
     python::{Array, is_f32},
@@ -156,7 +156,8 @@ fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
     Ok(value?)
 }
 
-/// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`.
+/// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
+/// many of the K alone are updated.
 #[pyfunction]
 fn adam_step(
     param: &Bound<'_, PyAny>,
@@ -166,6 +167,7 @@ fn adam_step(
     step: u64,
     options: (f64, f64, f64, f64),
     visible: Option<&Bound<'_, PyAny>>,
+    used: Option<usize>,
 ) -> PyResult<()> {
     let (lr, beta1, beta2, eps) = options;
     let options = AdamOptions {
@@ -179,7 +181,8 @@ fn adam_step(
     } else {
         adam_step_as::<f64>
     };
-    update([param, exp_avg, exp_avg_sq], grad, step, &options, visible)
+    let in_place = [param, exp_avg, exp_avg_sq];
+    update(in_place, grad, step, &options, visible, used)
 }
 
 fn adam_step_as<T: Real + Element>(
@@ -188,6 +191,7 @@ fn adam_step_as<T: Real + Element>(
     step: u64,
     options: &AdamOptions,
     visible: Option<&Bound<'_, PyAny>>,
+    used: Option<usize>,
 ) -> PyResult<()> {
     let py = grad.py();
     let shape = Array::<T>::new("param", in_place[0])?.shape().to_vec();
@@ -217,14 +221,23 @@ fn adam_step_as<T: Real + Element>(
         )
         .into());
     }
-    let visible = visible.as_ref().map(Array::slice).transpose()?;
+    if let Some(used) = used.filter(|used| shape.len() < 2 || *used > shape[1]) {
+        let message = format!("cannot update {used} columns of {shape:?}");
+        return Err(Error::new("used", message).into());
+    }
+    let width: usize = shape.iter().skip(1).product();
+    let selection = Selection {
+        visible: visible.as_ref().map(Array::slice).transpose()?,
+        width,
+        used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
+    };
     let arrays = AdamArrays {
         param: param.as_slice_mut()?,
         grad: grad.slice()?,
         exp_avg: exp_avg.as_slice_mut()?,
         exp_avg_sq: exp_avg_sq.as_slice_mut()?,
     };
-    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, visible)))?)
+    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))?)
 }
 
 /// Borrow a C-contiguous array of `shape` to write to it.

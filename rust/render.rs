@@ -142,9 +142,9 @@ pub fn backward<T: Real>(
         viewmat: [0.0; 16],
     };
     let cotangents = ProjectCotangents {
-        means2d: &means2d,
-        whitened: &whitened,
-        opacities: &v_opacities,
+        means2d: Some(&means2d),
+        whitened: Some(&whitened),
+        opacities: Some(&v_opacities),
         depths: None,
         conics: None,
         colors: Some(&colors),
@@ -157,7 +157,7 @@ pub fn backward<T: Real>(
         harmonics: Some(&mut out.harmonics),
         harmonics_rest: None,
     };
-    let camera_grad = project::backward(
+    let (camera_grad, _) = project::backward(
         gaussians,
         Some(harmonics),
         camera,

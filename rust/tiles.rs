@@ -169,7 +169,8 @@ pub fn tile_spans(splat: &Splat, exact: bool, mut f: impl FnMut(usize, usize, us
     }
 }
 
-/// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry.
+/// Bin the visible Gaussians into tiles, with the colours [N, channels] that they carry; there may be no
+/// channels where only weights are asked for.
 ///
 /// # Errors
 /// When there are more than [`MAX_PAIRS`] (Gaussian, tile) pairs.
@@ -417,14 +418,12 @@ fn list<S: Simd, T: Real>(
     }
     order_ties(projection, keys, records, &mut list.places);
     shapes.resize(n);
-    for (k, (place, out)) in list
-        .places
-        .iter()
-        .zip(list.colors.chunks_exact_mut(channels))
-        .enumerate()
-    {
+    for (k, place) in list.places.iter().enumerate() {
         let place = *place as usize;
-        copy_color(out, &colors[place * channels..(place + 1) * channels]);
+        copy_color(
+            &mut list.colors[k * channels..(k + 1) * channels],
+            &colors[place * channels..(place + 1) * channels],
+        );
         shapes.set(k, &records[place]);
         list.records.push(records[place]);
     }

@@ -3,7 +3,7 @@
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::{
-    adam::{self, AdamArrays, AdamOptions},
+    adam::{self, AdamArrays, AdamOptions, Selection},
     composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, GeometryGrads},
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
     scene::{Colors, Harmonics},
@@ -106,9 +106,9 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         });
     });
     let cotangents = ProjectCotangents {
-        means2d: &v_means2d,
-        whitened: &v_whitened,
-        opacities: &v_opacities,
+        means2d: Some(&v_means2d),
+        whitened: Some(&v_whitened),
+        opacities: Some(&v_opacities),
         depths: None,
         conics: None,
         colors: Some(&v_colors),
@@ -162,6 +162,11 @@ fn optimizer(c: &mut Criterion) {
         group.sample_size(20);
         for (name, visible) in [("all", None), ("visible", Some(&visible[..]))] {
             let mut step = 0;
+            let selection = Selection {
+                visible,
+                width: NUMBERS,
+                used: NUMBERS,
+            };
             group.bench_function(BenchmarkId::new(name, n), |b| {
                 b.iter(|| {
                     step += 1;
@@ -171,7 +176,7 @@ fn optimizer(c: &mut Criterion) {
                         exp_avg: &mut exp_avg,
                         exp_avg_sq: &mut exp_avg_sq,
                     };
-                    adam::step(arrays, step, &options, visible).expect("right lengths");
+                    adam::step(arrays, step, &options, &selection).expect("right lengths");
                 });
             });
         }

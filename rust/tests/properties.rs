@@ -188,9 +188,9 @@ impl Scene {
         let (mut g_means, mut g_quats, mut g_scales) = (zeros(3 * n), zeros(4 * n), zeros(3 * n));
         let (mut g_opacities, mut g_harmonics) = (zeros(n), zeros(3 * STORED * n));
         let cotangents = ProjectCotangents {
-            means2d: &v_means2d,
-            whitened: &whitened,
-            opacities: &v_shown,
+            means2d: Some(&v_means2d),
+            whitened: Some(&whitened),
+            opacities: Some(&v_shown),
             depths: Some(&v_depths),
             conics: Some(&v_conics),
             colors: Some(&v_colors),
@@ -203,7 +203,7 @@ impl Scene {
             harmonics: harmonics.is_some().then_some(&mut g_harmonics[..]),
             harmonics_rest: None,
         };
-        let g_camera = project::backward(
+        let (g_camera, _) = project::backward(
             &gaussians,
             harmonics.as_ref(),
             &camera,

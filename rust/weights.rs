@@ -1,0 +1,218 @@
+//! The largest blending weight of each Gaussian: how much it matters to the pixel that it matters to most.
+//!
+//! The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it, the factor of its
+//! colour in the image. The kernel decides as the compositor does, and evaluates no colour.
+
+use crate::{
+    composite::CompositeInput,
+    constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
+    error::{Error, check_len},
+    kernel::{self, Grid},
+    real::{Lanes, Real},
+};
+use fearless_simd::{Level, Simd, SimdBase, dispatch};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// The largest weight of each Gaussian over the pixels of an image, [N]; 0 for one that no pixel blends.
+///
+/// `mask` [H, W] says which pixels count; None: all of them. The tile lists need no channels, and the
+/// background plays no part. The power of 2 is always that of the default tuning. A maximum is the same in any
+/// order, so that the bits depend on no number of threads.
+///
+/// # Errors
+/// When the length of the mask does not fit.
+pub fn largest<T: Real>(input: &CompositeInput<T>, mask: Option<&[bool]>) -> Result<Vec<T>, Error> {
+    if let Some(mask) = mask {
+        check_len("mask", mask, input.pixels())?;
+    }
+    let n = input.projection.splats.len();
+    // The bits of a number that is not negative are ordered as the number is.
+    let most: Vec<AtomicU64> = (0..n).into_par_iter().map(|_| AtomicU64::new(0)).collect();
+    let grid = Grid::new();
+    let level = Level::new();
+    (0..input.tiles.lists.len())
+        .into_par_iter()
+        .for_each_init(Vec::new, |lanes, tile| {
+            dispatch!(level, simd => largest_of_tile(simd, input, &grid, mask, tile, lanes, &most));
+        });
+    Ok(most
+        .into_par_iter()
+        .map(|bits| T::from_f64(f64::from_bits(bits.into_inner())))
+        .collect())
+}
+
+/// Raise `most` to the weights of one tile. `lanes` is a buffer.
+#[inline(always)]
+fn largest_of_tile<S: Simd, T: Real>(
+    simd: S,
+    input: &CompositeInput<T>,
+    grid: &Grid<T>,
+    mask: Option<&[bool]>,
+    tile: usize,
+    lanes: &mut Vec<T>,
+    most: &[AtomicU64],
+) {
+    let list = &input.tiles.lists[tile];
+    if list.records.is_empty() {
+        return;
+    }
+    // A pixel that does not count is finished before it begins, as one outside the image.
+    let mut open = [T::ZERO; TILE_PIXELS];
+    for (p, pixel, n) in input.runs(tile) {
+        for k in 0..n {
+            if mask.is_none_or(|mask| mask[pixel + k]) {
+                open[p + k] = T::ONE;
+            }
+        }
+    }
+    let width = Lanes::<T, S>::LEN;
+    lanes.clear();
+    lanes.resize(list.records.len() * width, T::ZERO);
+    for block in 0..TILE_BLOCKS {
+        let open = &open[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
+        if open.iter().all(|x| *x == T::ZERO) {
+            continue;
+        }
+        let layers = input.layers(tile, block);
+        match BLOCK_PIXELS / width {
+            1 => kernel::weigh::<S, T, 1>(simd, grid, block, layers, open, lanes),
+            2 => kernel::weigh::<S, T, 2>(simd, grid, block, layers, open, lanes),
+            4 => kernel::weigh::<S, T, 4>(simd, grid, block, layers, open, lanes),
+            8 => kernel::weigh::<S, T, 8>(simd, grid, block, layers, open, lanes),
+            _ => unreachable!("vectors have 2 to 16 lanes"),
+        }
+    }
+    for (record, lanes) in list.records.iter().zip(lanes.chunks_exact(width)) {
+        let mut weight = 0.0f64;
+        for lane in lanes {
+            weight = weight.max(lane.to_f64());
+        }
+        let most = &most[record.gaussian as usize];
+        if weight.to_bits() > most.load(Ordering::Relaxed) {
+            most.fetch_max(weight.to_bits(), Ordering::Relaxed);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        project::{self, ProjectOptions, ProjectOut, Projection},
+        scene::Colors,
+        synthetic::Synthetic,
+        tiles::{self, Tiles},
+    };
+    use rayon::ThreadPoolBuilder;
+
+    fn binned<T: Real>(s: &Synthetic<T>) -> (Projection, Tiles<T>) {
+        let n = s.opacities.len();
+        let zeros = |n: usize| vec![T::ZERO; n];
+        let (mut means2d, mut depths, mut conics) = (zeros(2 * n), zeros(n), zeros(3 * n));
+        let (mut opacities, mut radii) = (zeros(n), vec![0; 2 * n]);
+        let mut projection = Projection::default();
+        project::forward(
+            &s.gaussians(),
+            Colors::Channels(&[], 0),
+            &s.camera,
+            &ProjectOptions::default(),
+            &mut projection,
+            ProjectOut {
+                means2d: &mut means2d,
+                depths: &mut depths,
+                conics: &mut conics,
+                radii: &mut radii,
+                opacities: &mut opacities,
+                colors: &mut [],
+            },
+        );
+        let tiles = tiles::bin(&projection, &[], 0, &s.camera).unwrap();
+        (projection, tiles)
+    }
+
+    fn weights<T: Real>(s: &Synthetic<T>, mask: Option<&[bool]>) -> Result<Vec<T>, Error> {
+        let (projection, tiles) = binned(s);
+        let input = CompositeInput {
+            projection: &projection,
+            tiles: &tiles,
+            camera: &s.camera,
+            background: None,
+        };
+        largest(&input, mask)
+    }
+
+    /// By the definition: every Gaussian at every pixel, in depth order.
+    fn brute_force(s: &Synthetic<f64>, mask: Option<&[bool]>) -> Vec<f64> {
+        let (projection, _) = binned(s);
+        let mut order: Vec<usize> = (0..s.opacities.len())
+            .filter(|&i| projection.splats[i].visible())
+            .collect();
+        order.sort_by(|&a, &b| projection.depths[a].total_cmp(&projection.depths[b]));
+        let mut most = vec![0.0f64; s.opacities.len()];
+        for pixel in 0..s.camera.width * s.camera.height {
+            if mask.is_some_and(|mask| !mask[pixel]) {
+                continue;
+            }
+            let (x, y) = (pixel % s.camera.width, pixel / s.camera.width);
+            let mut t = 1.0;
+            for &i in &order {
+                let splat = &projection.splats[i];
+                let [fs, fm, ft] = splat.factors;
+                let (dx, dy) = (
+                    x as f64 + 0.5 - splat.mean[0],
+                    y as f64 + 0.5 - splat.mean[1],
+                );
+                let (u, v) = (fs * (dx - fm * dy), ft * dy);
+                let alpha = (splat.opacity * (-0.5 * (u * u + v * v)).exp()).min(0.99);
+                if alpha < 1.0 / 255.0 {
+                    continue;
+                }
+                if t * (1.0 - alpha) <= 0.999e-4 {
+                    break;
+                }
+                most[i] = most[i].max(t * alpha);
+                t *= 1.0 - alpha;
+            }
+        }
+        most
+    }
+
+    #[test]
+    fn weights_follow_the_definition() {
+        for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
+            let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
+            let some: Vec<bool> = (0..width * height).map(|i| i * 7 % 11 < 4).collect();
+            for mask in [None, Some(&some[..])] {
+                let expected = brute_force(&s, mask);
+                assert!(expected.iter().any(|w| *w > 0.1));
+                for (i, (a, b)) in weights(&s, mask).unwrap().iter().zip(&expected).enumerate() {
+                    assert!((a - b).abs() < 1e-13, "seed {seed}, {i}: {a}, not {b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let s = Synthetic::<f32>::new(5000, 150, 97, 1).unwrap();
+        let run = |threads| {
+            let pool = ThreadPoolBuilder::new().num_threads(threads);
+            pool.build().unwrap().install(|| weights(&s, None).unwrap())
+        };
+        let one = run(1);
+        for threads in [2, 3, 7] {
+            assert!(run(threads) == one, "{threads} threads");
+        }
+    }
+
+    #[test]
+    fn no_gaussians_and_no_pixels_that_count() {
+        let empty = Synthetic::<f32>::new(0, 20, 20, 1).unwrap();
+        assert!(weights(&empty, None).unwrap().is_empty());
+        let s = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
+        let none = weights(&s, Some(&[false; 400])).unwrap();
+        assert!(none.len() == 50 && none.iter().all(|w| *w == 0.0));
+        assert_eq!(weights(&s, Some(&[true; 399])).unwrap_err().name, "mask");
+    }
+}
