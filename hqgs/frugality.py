@@ -23,6 +23,7 @@ from hqgs.config import TrainConfig
 from hqgs.data.images import area_downscale
 from hqgs.densify import DensifyConfig, Growth, cut_harmonics
 from hqgs.gaussians import Gaussians
+from hqgs.harmonics import folded
 from hqgs.left_out import LeftOut
 from hqgs.methods.base import Method
 from hqgs.render import render_view
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 10, 4, 10  # of the training views; with fewer none is held back
 TOLERANCE = 0.02  # dB on the held-back photos that leaving one thing out may cost
-FINEST = 1.5  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
+FINEST = 2.0  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
 BAND_CHECK = 0.3  # of the run, at the earliest: when the harmonics are tried
@@ -52,7 +53,7 @@ class State:
     degree: int  # of the harmonics, at most
     released: int = 0  # the iteration that ended growth
     refused: int = 0  # growth of Gaussians that are too fine
-    best: float = -math.inf  # PSNR on the held-back photos
+    best: float = -1e3  # dB, on the held-back photos
     best_at: int = 0
     decisions: float = 0.0  # seconds that the trials took
     records: list[dict[str, Any]] = field(default_factory=list)  # of `LeftOut`
@@ -134,7 +135,7 @@ class Frugality:
                 0,
                 LeftOut(
                     f"finer Gaussians, {self.state.refused} times",
-                    f"they had at most {FINEST} px of the photo that sees them best (1 standard deviation)",
+                    f"they had at most {FINEST:g} px of the photo that sees them best (1 standard deviation)",
                 ),
             )
         return found
@@ -210,11 +211,13 @@ class Frugality:
         shown = self._shown(gaussians)
         whole = self._psnr(trainer, shown)
         for degree in range(gaussians.sh_degree):
-            cost = whole - self._psnr(trainer, shown, degree)
+            fewer = folded(gaussians, self.views, degree)
+            colors = {"sh0": fewer.sh0, "shN": fewer.shN}
+            cost = whole - self._psnr(trainer, Gaussians(**(shown.named() | colors)))
             if cost <= TOLERANCE:
                 numbers = gaussians.shN.shape[1] - ((degree + 1) ** 2 - 1)
                 self.state.degree = degree
-                cut_harmonics(gaussians, trainer.optimizer, degree)
+                cut_harmonics(gaussians, trainer.optimizer, **colors)
                 self._note(
                     trainer,
                     LeftOut(
@@ -262,14 +265,13 @@ class Frugality:
         with torch.no_grad():
             return self.method.modulate(gaussians).detached()
 
-    def _psnr(self, trainer: Trainer, gaussians: Gaussians, degree: int | None = None) -> float:
+    def _psnr(self, trainer: Trainer, gaussians: Gaussians) -> float:
         """Of the held-back photos as the method compares them; known noise does not count.
 
         `gaussians` are those to rasterize.
         """
         config, iteration = self.config, trainer.iteration
-        active = min(gaussians.sh_degree, iteration // config.sh_interval)
-        degree = active if degree is None else min(active, degree)
+        degree = min(gaussians.sh_degree, iteration // config.sh_interval)
         errors = []
         with torch.no_grad():
             for view in self.held:

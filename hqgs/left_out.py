@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 AUTO, NONE = "auto", "none"
 ITEMS = {
@@ -14,6 +15,7 @@ ITEMS = {
     "resolution": "full resolution in the first part of the run",
     "iterations": "the rest of a run that has stopped improving",
 }
+COSTLY = ("resolution",)  # saves little and may cost much: only where it is asked for
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,10 @@ class LeftOut:
     memory_mb: float | None = None  # saved
     bytes: int | None = None  # of the scene file saved
     cost_db: float | None = None  # lost in PSNR on training photos that were held back; below 0: gained
+
+    def known(self) -> dict[str, Any]:
+        """The fields that are known, as plain JSON values."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def format_left_out(items: Sequence[LeftOut]) -> str:
@@ -45,9 +51,9 @@ def format_left_out(items: Sequence[LeftOut]) -> str:
 
 
 def parse_leave_out(text: str) -> tuple[str, ...]:
-    """The items of "auto" (all), "none" or a list with commas, in the order of ITEMS; ValueError else."""
+    """The items of "auto" (all but COSTLY), "none" or a list with commas, in the order of ITEMS."""
     if text == AUTO:
-        return tuple(ITEMS)
+        return tuple(item for item in ITEMS if item not in COSTLY)
     names = set() if text == NONE else {name.strip() for name in text.split(",")}
     check_items(names)
     return tuple(item for item in ITEMS if item in names)

@@ -57,7 +57,7 @@ class RunResult:
     peak_rss_mb: float | None
     history: list[dict[str, Any]]  # {"iteration", "seconds", "psnr", "ssim"}: held-out means while training
     length: int  # iterations of the whole run; fewer were done where it was stopped
-    left_out: list[dict[str, Any]]  # `LeftOut`
+    left_out: list[dict[str, Any]]  # `LeftOut.known`
     decision_seconds: float  # of `seconds`: to find out what may be left out
     scene_bytes: int  # of scene.ply
     config: dict[str, Any]

@@ -166,7 +166,7 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         peak_rss_mb=peak_rss_mb(),
         history=trainer.history,
         length=trainer.length,
-        left_out=[asdict(item) for item in left_out],
+        left_out=[item.known() for item in left_out],
         decision_seconds=trainer.frugality.state.decisions,
         scene_bytes=(out / PLY).stat().st_size,
         config=asdict(config),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hqgs.camera import View
+from hqgs.camera import Camera, View
 from hqgs.gaussians import Gaussians
 
 MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
@@ -24,19 +24,24 @@ def photo_pixels(means: Tensor, views: list[View]) -> Tensor:
     best = torch.full((len(means),), torch.inf, dtype=torch.float64)
     means = means.detach().double()
     for view in views:
-        camera = view.camera
-        viewmat, K = torch.from_numpy(camera.viewmat), camera.K
-        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
-        seen = (
-            (z > NEAREST)
-            & (x.abs() * K[0, 0] < MARGIN * camera.width / 2 * z)
-            & (y.abs() * K[1, 1] < MARGIN * camera.height / 2 * z)
-        )
-        size = z / max(K[0, 0], K[1, 1])
+        depth, seen = in_picture(means, view.camera)
+        size = depth / max(view.camera.K[0, 0], view.camera.K[1, 1])
         best = torch.where(seen & (size < best), size, best)
     seen = torch.isfinite(best)
     best[~seen] = best[seen].median() if seen.any() else 0.0
     return best
+
+
+def in_picture(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """View-space depths [N] of means [N, 3] (float64), and whether they are in the picture, bool [N]."""
+    viewmat, K = torch.from_numpy(camera.viewmat), camera.K
+    x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
+    seen = (
+        (z > NEAREST)
+        & (x.abs() * K[0, 0] < MARGIN * camera.width / 2 * z)
+        & (y.abs() * K[1, 1] < MARGIN * camera.height / 2 * z)
+    )
+    return z, seen
 
 
 def enlarge(gaussians: Gaussians, smallest: Tensor) -> Gaussians:

@@ -1,0 +1,203 @@
+"""What a run leaves out by itself: each decision on a scene made for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
+
+import hqgs
+import hqgs.frugality as module
+from hqgs.camera import Scene
+from hqgs.config import TrainConfig
+from hqgs.densify import DensifyConfig
+from hqgs.frugality import COARSE_PART, smaller
+from hqgs.left_out import ITEMS, LeftOut, format_left_out, parse_leave_out
+from hqgs.run import train
+from hqgs.train import Trainer
+
+VIEWS = 13  # one is a test view; of twelve, one is held back
+STILL = DensifyConfig(start=10_000, reset_every=10_000)
+
+
+def run(scene: Scene, iterations: int, *items: str, **changes: object) -> Trainer:
+    trainer = Trainer(scene, tiny_config(iterations, leave_out=items, **changes))
+    while trainer.iteration < trainer.length:
+        trainer.step()
+    return trainer
+
+
+def bits(trainer: Trainer) -> dict[str, bytes]:
+    return {name: t.detach().numpy().tobytes() for name, t in trainer.gaussians.named().items()}
+
+
+def test_the_items_by_name() -> None:
+    assert parse_leave_out("auto") == tuple(item for item in ITEMS if item != "resolution")
+    assert parse_leave_out("none") == ()
+    assert parse_leave_out("harmonics, photos") == ("photos", "harmonics")
+    with pytest.raises(ValueError, match="there is no 'colour'; there are: auto, none, or some of photos"):
+        parse_leave_out("photos,colour")
+    with pytest.raises(ValueError, match="there is no 'colour'"):
+        TrainConfig(leave_out=("colour",))
+
+
+def test_with_nothing_to_leave_out_all_photos_are_trained_at_full_size() -> None:
+    trainer = Trainer(tiny_scene(VIEWS), tiny_config(24))
+    seen = [trainer.step().view for _ in range(24)]
+    assert {view.name for view in seen} == {view.name for view in trainer.scene.train}
+    assert {view.camera.width for view in seen} == {WIDTH}
+    assert trainer.frugality.left_out() == []
+    assert trainer.length == 24
+
+
+def test_some_photos_are_held_back_until_growth_ends() -> None:
+    trainer = Trainer(tiny_scene(VIEWS), tiny_config(60, leave_out=("weight",)))
+    names = [trainer.step().view.name for _ in range(60)]
+    held = {view.name for view in trainer.frugality.held}
+    stop = trainer.config.densify.stop
+    assert len(held) == 1
+    assert not held & set(names[:stop])
+    assert set(names[stop:]) == {view.name for view in trainer.scene.train}
+
+
+def test_few_photos_are_never_held_back() -> None:
+    trainer = run(tiny_scene(9), 30, "weight", "harmonics")
+    assert trainer.frugality.held == []
+    assert trainer.frugality.left_out() == []
+
+
+def test_fine_gaussians_do_not_grow() -> None:
+    everything, coarse = run(tiny_scene(), 30), run(tiny_scene(), 30, "growth")
+    assert len(coarse.gaussians) < len(everything.gaussians)
+    refused = coarse.frugality.state.refused
+    assert refused > 0
+    assert coarse.frugality.left_out()[0].what == f"finer Gaussians, {refused} times"
+
+
+def shaded(scene: Scene) -> Scene:
+    """The scene as a surface would show it whose brightness follows the camera to the right."""
+    views = [
+        replace(v, image=(v.image * np.clip(0.6 + v.camera.center[0], 0, 1)).astype(np.uint8))
+        for v in scene.train
+    ]
+    return replace(scene, train=views)
+
+
+@pytest.mark.parametrize("view_dependent", [False, True])
+def test_bands_go_where_the_held_back_photos_do_not_ask_for_them(view_dependent: bool) -> None:
+    scene = tiny_scene(VIEWS, num_points=150)
+    trainer = run(shaded(scene) if view_dependent else scene, 400, "harmonics", densify=STILL, lr_shN=2.5e-3)
+    found = trainer.frugality.left_out()
+    if view_dependent:
+        assert trainer.gaussians.sh_degree >= 1
+    else:
+        assert trainer.gaussians.sh_degree == 0
+        assert [item.what for item in found] == ["harmonics above degree 0"]
+        assert found[0].bytes == 4 * 45 * len(trainer.gaussians)
+        assert found[0].cost_db is not None
+        assert found[0].cost_db <= module.TOLERANCE
+        assert found[0].seconds is not None
+
+
+def test_what_no_photo_shows_goes_when_growth_ends() -> None:
+    scene = tiny_scene(VIEWS)
+    behind = scene.points + np.array([0, 0, -50], np.float32)
+    scene = replace(
+        scene,
+        points=np.concatenate([scene.points, behind]),
+        point_colors=np.concatenate([scene.point_colors] * 2),
+    )
+    trainer = run(scene, 60, "weight", densify=replace(STILL, stop=40))
+    assert (trainer.gaussians.means[:, 2] > 0).all()
+    (item,) = trainer.frugality.left_out()
+    assert item.what.endswith("of 80 Gaussians")
+    assert item.bytes == (80 - len(trainer.gaussians)) * 4 * 59
+
+
+def test_the_first_part_is_trained_at_half_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SMALLEST_SIDE", 8)
+    trainer = Trainer(tiny_scene(), tiny_config(20, leave_out=("resolution",)))
+    shapes = [tuple(trainer.step().render.shape) for _ in range(20)]
+    end = round(COARSE_PART * 20)
+    assert shapes == [(HEIGHT // 2, WIDTH // 2, 3)] * end + [(HEIGHT, WIDTH, 3)] * (20 - end)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_a_smaller_view_shows_the_same_in_the_mean(dtype: type) -> None:
+    view = tiny_scene().train[0]
+    image = view.image if dtype == np.uint8 else view.image.astype(np.float32) / 255
+    small = smaller(replace(view, image=image))
+    assert small.image.dtype == dtype
+    assert small.image.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    blocks = image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).astype(np.float64).mean((1, 3))
+    assert np.abs(small.image - blocks).max() <= (0.5 if dtype == np.uint8 else 1e-6)
+    np.testing.assert_allclose(small.camera.K[:2], view.camera.K[:2] / 2)
+
+
+def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CHECKS", 10)
+    monkeypatch.setattr(module, "PATIENCE", 40)
+    scene = tiny_scene(VIEWS)
+    trainer = Trainer(
+        scene, tiny_config(5_000, leave_out=("iterations",), lr_means=1e-7, lr_means_final=1e-9)
+    )
+    rates = []
+    while trainer.iteration < trainer.length:
+        trainer.step()
+        rates.append(next(g["lr"] for g in trainer.optimizer.param_groups if g["name"] == "means"))
+    state = trainer.frugality.state
+    assert trainer.iteration == state.length < 2_000
+    assert state.released == pytest.approx(state.length / 1.5, abs=1)
+    assert trainer.densifier.config.stop <= state.released
+    assert rates[-1] == pytest.approx(trainer.extent * 1e-9)
+    assert all(b <= a for a, b in pairwise(rates))
+    assert trainer.frugality.left_out()[0].what == f"iterations {state.length + 1} to 5000"
+
+
+def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SMALLEST_SIDE", 8)
+    items = ("growth", "weight", "harmonics", "resolution")
+    scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
+    whole = Trainer(scene, config)
+    for k in range(60):
+        whole.step()
+        if k in (10, 30, 50):
+            whole.save(tmp_path / f"{k}.safetensors")
+    for k in (10, 30, 50):
+        again = Trainer(scene, config)
+        again.restore(tmp_path / f"{k}.safetensors")
+        while again.iteration < again.length:
+            again.step()
+        assert bits(again) == bits(whole)
+        told = [item.what for item in again.frugality.left_out()]
+        assert told == [item.what for item in whole.frugality.left_out()]
+
+
+def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
+    result = train(tiny_scene(VIEWS), tiny_config(leave_out=("growth",)), tmp_path, progress=False)
+    assert result.left_out[0]["what"].startswith("finer Gaussians")
+    assert 0 <= result.decision_seconds < result.seconds
+    assert result.scene_bytes == (tmp_path / "scene.ply").stat().st_size
+
+
+def test_the_table() -> None:
+    assert format_left_out([]) == ""
+    items = [LeftOut("a", "not needed", seconds=1.6, bytes=2_500_000, cost_db=0.01), LeftOut("bcd", "no use")]
+    assert format_left_out(items) == (
+        "left out:\n  a    2 s, 2.5 MB, -0.01 dB  not needed\n  bcd                         no use"
+    )
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    before, results = hqgs.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            hqgs.set_num_threads(threads)
+            results.append(bits(run(tiny_scene(VIEWS), 40, "growth", "weight", "harmonics")))
+    finally:
+        hqgs.set_num_threads(before)
+    assert results[0] == results[1]
