@@ -52,14 +52,14 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     most = len(scene.train) - max(LEAST_KEPT, (len(scene.train) + 1) // 2)
     if most <= 0:
         return scene, []
-    bad = {view.name: _bad_values(view) for view in scene.train}
+    bad = [_bad_values(view) for view in scene.train]
     drops = [
-        _Drop(view, "it holds NaN or Inf", f"{bad[view.name]} of {view.image.size} values")
-        for view in scene.train
-        if bad[view.name]
+        _Drop(view, "it holds NaN or Inf", f"{count} of {view.image.size} values")
+        for view, count in zip(scene.train, bad, strict=True)
+        if count
     ]
     notes: list[str] = []
-    sound = [view for view in scene.train if not bad[view.name]]
+    sound = [view for view, count in zip(scene.train, bad, strict=True) if not count]
     if sound:
         drops += _needless(sound, scene.points, notes)
     if len(drops) > most:
@@ -68,8 +68,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
         drops = drops[:most]
     if not drops and not notes:
         return scene, []
-    gone = {drop.view.name for drop in drops}
-    train = [view for view in scene.train if view.name not in gone]
+    train = [view for view in scene.train if not any(view is drop.view for drop in drops)]
     left_out = [
         LeftOut(f"training photo {d.view.name}", d.why, d.evidence, memory_mb=d.view.image.nbytes / 1e6)
         for d in drops
@@ -78,8 +77,8 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
 
 
 def _bad_values(view: View) -> int:
-    photos = [photo for photo in (view.image, view.low) if photo is not None and photo.dtype != np.uint8]
-    return sum(int((~np.isfinite(photo)).sum()) for photo in photos)
+    photos = (view.image, view.low)
+    return sum(int((~np.isfinite(p)).sum()) for p in photos if p is not None and p.dtype != np.uint8)
 
 
 def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[_Drop]:
@@ -135,7 +134,7 @@ def _empty(
         )
         evidence = (
             f"its colour is {', '.join(f'{c:.0f}' for c in look.colour)} with a standard deviation of "
-            f"{look.spread:.1f} levels; {others} of {len(peers[k])} others of the same points show something"
+            f"{look.spread:.1f} levels; {others} of {len(peers[k])} photos of its points show something"
         )
         drops[k] = _Drop(view, f"it is all {name}", evidence)
     return drops

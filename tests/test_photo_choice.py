@@ -33,7 +33,7 @@ def waves() -> tuple[NDArray[np.float64], ...]:
     return frequency * np.cos(angle), frequency * np.sin(angle), phase, 1.6 / (frequency * STEP) ** 0.3
 
 
-def paint(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def paint(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
     """Levels [H, W, 3] of the plane at columns x [W] and rows y [H]."""
     along, across, phase, height = waves()
     column, row = np.outer(along, x) + phase[:, None], np.outer(y, across)  # of sin(column + row), expanded
@@ -132,7 +132,7 @@ def test_blurred_photo_stays_where_no_other_looks() -> None:
     """It sees a strip of 30 px that no other photo shows."""
     aside = blurred(4)(view_at("aside.png", 36 * STEP, 0))
     clean = clean_scene()
-    strip = clean.points[:60] + np.float32([60 * STEP, 0, 0])
+    strip = clean.points[:60] + np.array([60 * STEP, 0, 0], np.float32)
     scene = replace(clean, train=[*clean.train, aside], points=np.concatenate([clean.points, strip]))
     assert left_out(scene) == []
     note = choose_photos(scene)[0].notes[-1]
@@ -143,7 +143,7 @@ def test_blurred_photo_stays_where_no_other_looks() -> None:
 def test_three_sharper_photos_must_see_the_same() -> None:
     """Far from the ring: two companions do not suffice, three do."""
     ring = clean_scene()
-    points = np.concatenate([ring.points, ring.points + np.float32([900 * STEP, 0, 0])])
+    points = np.concatenate([ring.points, ring.points + np.array([900 * STEP, 0, 0], np.float32)])
     far = [view_at(f"far_{k}.png", (900 + 3 * k) * STEP, 0) for k in range(4)]
     far[0] = blurred(4)(far[0])
     for companions, gone in ((2, []), (3, ["far_0.png"])):
