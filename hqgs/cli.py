@@ -149,7 +149,7 @@ def _train(args: argparse.Namespace) -> int:
                 )
             if args.threads is not None:
                 hqgs.set_num_threads(args.threads)
-            scene = _scene(args, cache=args.out / "scene", sfm=args.sfm)
+            scene = _scene(args, args.out / "scene", args.sfm, skip_unreadable="photos" in config.leave_out)
             if degradation.steps:
                 scene = degrade_scene(scene, degradation, config.seed)
             if args.sfm and (scene.source != "photos" or degradation.steps):
@@ -214,9 +214,11 @@ def _config(args: argparse.Namespace) -> TrainConfig:
     return config if args.eval_every is None else replace(config, eval_every=args.eval_every)
 
 
-def _scene(args: argparse.Namespace, cache: Path | None, sfm: bool = False) -> Scene:
+def _scene(
+    args: argparse.Namespace, cache: Path | None, sfm: bool = False, skip_unreadable: bool = False
+) -> Scene:
     if args.scene != EMBEDDED:
-        return load_scene(args.scene, downscale=args.downscale, reconstruct=sfm)
+        return load_scene(args.scene, args.downscale, reconstruct=sfm, skip_unreadable=skip_unreadable)
     if not args.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {args.downscale}")
     width, height = (round(size / args.downscale) for size in EMBEDDED_SIZE)

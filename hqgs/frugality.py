@@ -1,8 +1,8 @@
 """What a run leaves out by itself, decided while it trains, from training photos that are held back.
 
-A few training photos are held back until growth ends. What may go is tried on them: the scene is rendered
-without it, and it goes where that costs no more than TOLERANCE dB. Test views are never looked at. Then the
-photos come back and all are trained on to the end.
+A few training photos are held back at first. Whether harmonics may go, and whether the run still improves, is
+tried on them: what costs no more than TOLERANCE dB goes. Then they come back, early enough that the scene can
+still grow where only they look. Test views are never looked at.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ from hqgs.weights import largest_weights
 if TYPE_CHECKING:
     from hqgs.train import Trainer  # which itself imports this module
 
-HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 10, 4, 10  # of the training views; with fewer none is held back
-TOLERANCE = 0.02  # dB on the held-back photos that leaving one thing out may cost
+HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
+TOLERANCE = 0.02  # dB that leaving one thing out may cost
+TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
 FINEST = 2.0  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
-BAND_CHECK = 0.3  # of the run, at the earliest: when the harmonics are tried
+BAND_CHECK = 0.3  # of the run: when the harmonics are tried
+BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
 BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
-REST = 0.5  # of what came before it: the part of a shortened run without growth
+REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 WINDOW = 50  # steps before and after a decision that tell what it saves
 
 
@@ -51,7 +53,7 @@ class State:
     length: int
     held: bool  # the photos are held back still
     degree: int  # of the harmonics, at most
-    released: int = 0  # the iteration that ended growth
+    released: int = 0  # the iteration after which they came back
     refused: int = 0  # growth of Gaussians that are too fine
     best: float = -1e3  # dB, on the held-back photos
     best_at: int = 0
@@ -67,9 +69,10 @@ class Frugality:
         self.items = set(config.leave_out)
         if not method.as_photographed:
             self.items -= {"growth", "resolution"}
-        ask = self.items & {"weight", "harmonics", "iterations"}
-        count = min(MOST_HELD, round(HELD_SHARE * len(views))) if len(views) >= FEWEST_VIEWS and ask else 0
-        places = np.linspace(0, len(views), 2 * count + 1)[1::2].astype(int).tolist()
+        count = 0
+        if self.items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
+            count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
+        places = _spread(len(views), count)
         self.held = [views[k] for k in places]
         self.trained = [view for k, view in enumerate(views) if k not in places]
         self.state = State(config.iterations, bool(count), config.sh_degree)
@@ -97,6 +100,13 @@ class Frugality:
         start = state.released / total  # what follows is squeezed into the shortened rest
         return start + (1 - start) * (iteration - state.released) / (state.length - state.released)
 
+    def degree(self, iteration: int) -> int:
+        """Of the harmonics that are trained: it rises with the iterations."""
+        interval = self.config.sh_interval
+        if "harmonics" in self.items:
+            interval = min(interval, max(1, int(BAND_INTERVAL * self.config.iterations)))
+        return min(self.state.degree, iteration // interval)
+
     def finest(self, iteration: int) -> Callable[[Tensor], Tensor] | None:
         """Sizes [N], world units, of Gaussians at means [N, 3] that are fine enough; None: no limit."""
         if "growth" not in self.items:
@@ -115,6 +125,8 @@ class Frugality:
         started = time.perf_counter()
         if state.held:
             self._decide(trainer, iteration)
+        if "weight" in self.items and iteration == trainer.densifier.config.stop:
+            self._decide_weight(trainer)
         state.decisions += time.perf_counter() - started
 
     def left_out(self) -> list[LeftOut]:
@@ -149,7 +161,9 @@ class Frugality:
     def densify_config(self) -> DensifyConfig:
         """The configuration of growth, which a shortened run ends sooner."""
         config = self.config.densify
-        return replace(config, stop=min(config.stop, self.state.released)) if self.state.released else config
+        if self.state.length == self.config.iterations:
+            return config
+        return replace(config, stop=min(config.stop, math.ceil((1 + REST / 2) * self.state.released)))
 
     def state_dict(self) -> dict[str, Any]:
         return asdict(self.state)
@@ -157,6 +171,10 @@ class Frugality:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.state = State(**state)
         self._open = []
+
+    @property
+    def _band_check(self) -> int:
+        return max(1, min(round(BAND_CHECK * self.config.iterations), self.config.densify.stop - 1))
 
     @property
     def _coarse_end(self) -> int:
@@ -175,32 +193,30 @@ class Frugality:
 
     def _decide(self, trainer: Trainer, iteration: int) -> None:
         config, state = self.config, self.state
-        if "iterations" in self.items and iteration % CHECKS == 0 and not self._is_coarse(iteration):
-            now = self._psnr(trainer, self._shown(trainer.gaussians))
+        if "harmonics" in self.items and iteration == self._band_check:
+            self._decide_harmonics(trainer)
+        if "iterations" not in self.items:
+            if iteration == self._band_check:
+                self._release(trainer, iteration)
+            return
+        if iteration % CHECKS == 0 and not self._is_coarse(iteration):
+            now = self._psnr(trainer, self._shown(trainer.gaussians), self.held)
             if now > state.best + BETTER:
                 state.best, state.best_at = now, iteration
             if iteration - state.best_at >= PATIENCE:
                 state.length = min(config.iterations, math.ceil((1 + REST) * iteration))
-                self._note(
-                    trainer,
-                    LeftOut(
-                        f"iterations {state.length + 1} to {config.iterations}",
-                        "the held-back photos stopped improving",
-                        f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}",
-                    ),
+                what = f"iterations {state.length + 1} to {config.iterations}"
+                evidence = (
+                    f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}"
                 )
+                left = LeftOut(what, "the held-back photos stopped improving", evidence)
+                self._note(left, trainer)
                 self._release(trainer, iteration)
-                return
-        check = max((config.sh_degree + 1) * config.sh_interval, round(BAND_CHECK * config.iterations))
-        if "harmonics" in self.items and iteration == min(check, config.densify.stop - 1):
-            self._decide_harmonics(trainer)
-        if iteration == config.densify.stop:
+        if iteration == config.densify.stop and state.held:
             self._release(trainer, iteration)
 
     def _release(self, trainer: Trainer, iteration: int) -> None:
-        """Growth is over: what carries no picture goes, and the held-back photos come back."""
-        if "weight" in self.items:
-            self._decide_weight(trainer)
+        """The held-back photos come back."""
         self.state.held = False
         self.state.released = iteration
         trainer.densifier.config = self.densify_config
@@ -209,26 +225,24 @@ class Frugality:
         """The fewest bands that lose no more than TOLERANCE against all of them."""
         gaussians = trainer.gaussians
         shown = self._shown(gaussians)
-        whole = self._psnr(trainer, shown)
+        whole = self._psnr(trainer, shown, self.held)
         for degree in range(gaussians.sh_degree):
             fewer = folded(gaussians, self.views, degree)
             colors = {"sh0": fewer.sh0, "shN": fewer.shN}
-            cost = whole - self._psnr(trainer, Gaussians(**(shown.named() | colors)))
+            cost = whole - self._psnr(trainer, Gaussians(**(shown.named() | colors)), self.held)
             if cost <= TOLERANCE:
                 numbers = gaussians.shN.shape[1] - ((degree + 1) ** 2 - 1)
                 self.state.degree = degree
                 cut_harmonics(gaussians, trainer.optimizer, **colors)
-                self._note(
-                    trainer,
-                    LeftOut(
-                        f"harmonics above degree {degree}",
-                        f"the {len(self.held)} held-back photos do not ask for them",
-                        f"{whole:.2f} dB with them, {whole - cost:.2f} dB without",
-                        memory_mb=4 * 12e-6 * numbers * len(gaussians),
-                        bytes=12 * numbers * len(gaussians),
-                        cost_db=cost,
-                    ),
+                left = LeftOut(
+                    f"harmonics above degree {degree}",
+                    f"the {len(self.held)} held-back photos do not ask for them",
+                    f"{whole:.2f} dB with them, {whole - cost:.2f} dB without",
+                    memory_mb=4 * 12e-6 * numbers * len(gaussians),
+                    bytes=12 * numbers * len(gaussians),
+                    cost_db=cost,
                 )
+                self._note(left, trainer)
                 return
 
     def _decide_weight(self, trainer: Trainer) -> None:
@@ -236,28 +250,27 @@ class Frugality:
         gaussians = trainer.gaussians
         shown = self._shown(gaussians)
         weights = largest_weights(shown, self.views)
-        whole = self._psnr(trainer, shown)
+        tried = [self.views[k] for k in _spread(len(self.views), min(TRIED, len(self.views)))]
+        whole = self._psnr(trainer, shown, tried)
         for limit in WEIGHTS:
             faint = weights < limit
             count = int(faint.sum())
             if not 0 < count < len(gaussians):
                 continue
             rest = Gaussians(**{name: tensor[~faint] for name, tensor in shown.named().items()})
-            cost = whole - self._psnr(trainer, rest)
+            cost = whole - self._psnr(trainer, rest, tried)
             if cost <= TOLERANCE:
                 row = sum(tensor[:1].numel() for tensor in gaussians.named().values())
                 trainer.remove(faint)
-                self._note(
-                    trainer,
-                    LeftOut(
-                        f"{count} of {count + len(trainer.gaussians)} Gaussians",
-                        f"no photo shows them with a blending weight of {limit:g}",
-                        f"{whole:.2f} dB on the held-back photos with them, {whole - cost:.2f} dB without",
-                        memory_mb=4 * 4e-6 * row * count,
-                        bytes=4 * row * count,
-                        cost_db=cost,
-                    ),
+                left = LeftOut(
+                    f"{count} of {count + len(trainer.gaussians)} Gaussians",
+                    f"no photo shows them with a blending weight of {limit:g}",
+                    f"{whole:.2f} dB on {len(tried)} photos with them, {whole - cost:.2f} dB without",
+                    memory_mb=4 * 4e-6 * row * count,
+                    bytes=4 * row * count,
+                    cost_db=cost,
                 )
+                self._note(left, trainer)
                 return
 
     def _shown(self, gaussians: Gaussians) -> Gaussians:
@@ -265,24 +278,24 @@ class Frugality:
         with torch.no_grad():
             return self.method.modulate(gaussians).detached()
 
-    def _psnr(self, trainer: Trainer, gaussians: Gaussians) -> float:
-        """Of the held-back photos as the method compares them; known noise does not count.
+    def _psnr(self, trainer: Trainer, gaussians: Gaussians, views: list[View]) -> float:
+        """Of these photos as the method compares them; known noise does not count.
 
         `gaussians` are those to rasterize.
         """
-        config, iteration = self.config, trainer.iteration
-        degree = min(gaussians.sh_degree, iteration // config.sh_interval)
+        iteration, background = trainer.iteration, self.config.background
+        degree = min(gaussians.sh_degree, self.degree(iteration))
         errors = []
         with torch.no_grad():
-            for view in self.held:
+            for view in views:
                 view = self._sized(view, iteration)
-                render, _ = render_view(gaussians, view.camera, degree, config.background)
+                render, _ = render_view(gaussians, view.camera, degree, background)
                 image, photo, mask = self.method.compared(render, view)
                 difference = (image - photo).square()
                 errors.append(float((difference if mask is None else difference[mask]).double().mean()))
         return -10 * math.log10(max(float(np.mean(errors)) - self.method.noise**2, 1e-10))
 
-    def _note(self, trainer: Trainer, item: LeftOut) -> None:
+    def _note(self, item: LeftOut, trainer: Trainer) -> None:
         self.state.records.append(asdict(item))
         if len(self._seconds) == WINDOW and item.seconds is None:
             self._open.append((len(self.state.records) - 1, trainer.iteration, float(np.mean(self._seconds))))
@@ -293,6 +306,11 @@ class Frugality:
             index, start, before = self._open.pop(0)
             saved = before - float(np.mean(self._seconds))
             self.state.records[index]["seconds"] = saved * (self.state.length - start)
+
+
+def _spread(size: int, count: int) -> list[int]:
+    """`count` of `size` places, evenly spread."""
+    return np.linspace(0, size, 2 * count + 1)[1::2].astype(int).tolist()
 
 
 def smaller(view: View) -> View:

@@ -221,7 +221,7 @@ class Trainer:
 
     def _active_degree(self) -> int:
         """Of the harmonics: it rises with the iterations."""
-        return min(self.gaussians.sh_degree, self.iteration // self.config.sh_interval)
+        return min(self.gaussians.sh_degree, self.frugality.degree(self.iteration))
 
     def _set_rates(self) -> None:
         """Exponential decay of the means' rate over the run; the others are constant. Harmonics above the
