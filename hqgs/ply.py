@@ -2,7 +2,7 @@
 
 One vertex per Gaussian, float32: x y z, f_dc_0..2, f_rest_* (all red coefficients, then green, then blue; 0,
 9, 24 or 45 of them for the SH degrees 0 to 3), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z). Readers
-find columns by their names; the normals of 3DGS, which are all zero, are not written (nor are they by gsplat).
+find columns by their names; the normals of 3DGS, which are all zero, are not written (nor does gsplat).
 """
 
 from __future__ import annotations

@@ -197,8 +197,8 @@ def _fraction(means: Array, scales: Array) -> int:
     outside = (largest < -LOG_OFFSET) | (largest > end)
     if outside.mean() > MISFIT_SHARE:
         raise ValueError(
-            f"scales: the largest scale of {outside.sum():,} of {len(means):,} Gaussians is not in SPZ's range "
-            f"of {math.exp(-LOG_OFFSET):.2g} to {math.exp(end):.3g} world units; write a PLY file"
+            f"scales: the largest scale of {outside.sum():,} of {len(means):,} Gaussians is not in the range "
+            f"of SPZ, {math.exp(-LOG_OFFSET):.2g} to {math.exp(end):.3g} world units; write a PLY file"
         )
     smallest = float(np.quantile(largest, MISFIT_SHARE, method="lower"))
     size = math.exp(min(max(smallest, -LOG_OFFSET), end))
@@ -208,9 +208,8 @@ def _fraction(means: Array, scales: Array) -> int:
     error = 0.5 * 2.0**-fraction
     if fraction < 0 or error > COARSE * size:
         raise ValueError(
-            f"means: SPZ has 24 bits for a position, so in a scene that reaches {farthest:.3g} world units from "
-            f"the origin the error is {error:.2g}, but 1 % of the Gaussians are no larger than {size:.2g}; write "
-            "a PLY file"
+            f"means: SPZ has 24 bits for a position, so {farthest:.3g} world units from the origin the error "
+            f"is {error:.2g}, but 1 % of the Gaussians are no larger than {size:.2g}; write a PLY file"
         )
     return fraction
 
