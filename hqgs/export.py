@@ -136,7 +136,9 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]
     steps: list[Step] = []
     g = gaussians.detached()
     n = len(g)
-    finite = torch.stack([t.reshape(n, -1).isfinite().all(dim=1) for t in g.named().values()]).all(dim=0)
+    finite = torch.stack(
+        [t.isfinite().reshape(n, math.prod(t.shape[1:])).all(dim=1) for t in g.named().values()]
+    ).all(dim=0)
     visible = (g.activated_opacities() >= ALPHA_MIN) & (g.quats.square().sum(dim=1) >= QUAT_NORM2_MIN)
     for keep, others, why in (
         (finite, n, "they hold NaN or Inf"),

@@ -41,7 +41,7 @@ def add_parser(commands: argparse._SubParsersAction[Any], run: Callable[[argpars
         nargs=2,
         default=DEFAULTS.sh_bits,
         metavar="B",
-        help="spz: of the harmonics of degree 1, and of degrees 2 and 3 (5 4)",
+        help="spz: of the harmonics of degree 1, and of degrees 2 and 3 (8 8)",
     )
     add(
         "--band-tolerance",

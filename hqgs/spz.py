@@ -14,7 +14,7 @@ What a value that was written and read back may differ by, float32 rounding asid
 | quats | three components of 10 bits | 0.005 rad of rotation | all |
 | opacities | 8 bits | 0.5 / 255 | 0 to 1 |
 | sh0 | 8 bits | 1/76.5, a colour change of 0.0037 | -3.33 to 3.33, colours from -0.44 to 1.44 |
-| shN | 8 bits, of which the first B are used | 2^-B | -1 to 1 - 2^-7 |
+| shN | 8 bits, of which the first B are used | 2^-B | -0.992 to 0.992 |
 
 Values outside a range become its end; `SpzFile.clipped` counts them.
 """
@@ -42,7 +42,7 @@ VERSION = 3
 MAX_GAUSSIANS = 10_000_000  # Niantic's reader takes no more
 GZIP = 31  # zlib's number for a stream with a gzip header
 MAX_RATIO = 1032  # deflate packs no better
-SH_BITS = (5, 4)  # of degree 1, of degrees 2 and 3: the format's own choice
+SH_BITS = (8, 8)  # of degree 1, of degrees 2 and 3; less rounds small values that many Gaussians share to 0
 
 LIMIT = (1 << 23) - 1  # of a 24-bit number; its negative is used alike
 MAX_FRACTION = 23  # bits: a step of 1.2e-7, what float32 can tell apart at 1
@@ -103,7 +103,7 @@ def encode_spz(gaussians: Gaussians, sh_bits: tuple[int, int] = SH_BITS) -> SpzF
     with np.errstate(invalid="ignore", divide="ignore"):
         arrays["quats"] = np.roll(arrays["quats"] / norm, -1, axis=1)  # x y z w
     n = len(gaussians)
-    finite = np.all([np.isfinite(a.reshape(n, -1)).all(axis=1) for a in arrays.values()], axis=0)
+    finite = np.all([np.isfinite(a).all(axis=tuple(range(1, a.ndim))) for a in arrays.values()], axis=0)
     arrays = {name: a[finite] for name, a in arrays.items()}
     means = FLIP_MEANS * arrays["means"]
     fraction = _fraction(means, arrays["scales"])

@@ -33,8 +33,8 @@ from hqgs.synthetic.scene import HEIGHT, WIDTH
 
 EMBEDDED = "embedded"
 NORMALS = 3 * 4  # bytes a Gaussian: what 3DGS writes and `hqgs.ply` does not
-TOLERANCES = (0.0, 0.004, 0.016, 0.064)
-BITS = ((8, 8), (5, 4))  # of the harmonics
+TOLERANCES = (0.0, 0.004, 0.016)
+BITS = ((8, 8), (5, 4))  # of the harmonics; the second is what Niantic's writer takes
 
 
 @dataclass(frozen=True)
