@@ -163,8 +163,8 @@ def raw_values(data: bytes) -> Gaussians:
 
 
 def test_a_trained_scene_loses_next_to_nothing(tmp_path: Path) -> None:
-    trainer = Trainer(tiny_scene(), tiny_config(60))
-    for _ in range(60):
+    trainer = Trainer(tiny_scene(), tiny_config(100))
+    for _ in range(100):
         trainer.step()
     g = trainer.gaussians.detached()
     write_spz(tmp_path / "a.spz", g)

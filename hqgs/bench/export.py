@@ -116,7 +116,7 @@ def table(result: dict[str, Any]) -> str:
             f"{row['bytes'] / 1e6:.3f}",
             f"{100 * row['bytes'] / result['ply_of_3dgs_bytes']:.1f}",
             f"{row['psnr']:.3f}",
-            f"{-row['cost_db']:+.3f}",
+            f"{0.0 - row['cost_db']:+.3f}",
             "same" if row["psnr_to_original"] is None else f"{row['psnr_to_original']:.1f}",
             f"{255 * row['largest_change']:.1f}",
             "yes" if row["pareto"] else "",
@@ -150,6 +150,8 @@ def chart(result: dict[str, Any]) -> Figure:
     axes.plot(*zip(*front, strict=True), color="black", lw=1.0, zorder=1, label="Pareto front")
     axes.axhline(result["psnr"], color="#999999", lw=0.8, ls=":", label="the Gaussians as trained")
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
     axes.set(xlabel="file (MB)", ylabel="held-out PSNR (dB)", title=f"{result['scene']}: size against error")
     axes.grid(color="#dddddd", linewidth=0.7, which="both")
     axes.spines[["top", "right"]].set_visible(False)
