@@ -22,6 +22,8 @@ from hqgs.degrade import check_new_folder, degrade_scene, write_degraded_scene
 from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene, format_diagnosis
 from hqgs.exits import BAD_INPUT, fail
+from hqgs.export_cli import add_parser as add_export_parser
+from hqgs.export_cli import run_export
 from hqgs.files import write_json
 from hqgs.left_out import AUTO as LEAVE_OUT
 from hqgs.left_out import ITEMS, NONE, LeftOut, format_left_out, parse_leave_out
@@ -114,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_photos(diagnose)
     diagnose.add_argument("--out", type=Path, metavar="FILE", help="also write the diagnosis as JSON")
 
+    add_export_parser(commands, _export)
     add_bench_parser(commands)
     return parser
 
@@ -197,6 +200,10 @@ def _diagnose(args: argparse.Namespace) -> int:
         return fail(1, f"{args.out}: {error}")
     print(format_diagnosis(diagnosis))
     return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    return run_export(args, lambda: None if args.scene is None else _scene(args, cache=None))
 
 
 def _config(args: argparse.Namespace) -> TrainConfig:

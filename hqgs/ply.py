@@ -1,7 +1,8 @@
 """Scenes as PLY files in the layout of 3DGS, which the common viewers read.
 
-One vertex per Gaussian, float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (all red coefficients, then
-green, then blue), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z).
+One vertex per Gaussian, float32: x y z, f_dc_0..2, f_rest_* (all red coefficients, then green, then blue; 0,
+9, 24 or 45 of them for the SH degrees 0 to 3), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z). Readers
+find columns by their names; the normals of 3DGS, which are all zero, are not written (nor does gsplat).
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from hqgs.gaussians import MAX_SH_DEGREE, Gaussians
 MAX_HEADER_BYTES = 1 << 16
 REST_COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]  # 0, 9, 24, 45
 MEANS = ["x", "y", "z"]
-NORMALS = ["nx", "ny", "nz"]
 DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 SCALES = ["scale_0", "scale_1", "scale_2"]
 QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
@@ -33,7 +33,6 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> int:
     rest = tensors["shN"].transpose(0, 2, 1).reshape(n, 3 * tensors["shN"].shape[1])
     columns = [
         (MEANS, tensors["means"]),
-        (NORMALS, np.zeros((n, 3), np.float32)),
         (DC, tensors["sh0"][:, 0]),
         ([f"f_rest_{i}" for i in range(rest.shape[1])], rest),
         (["opacity"], tensors["opacities"][:, None]),

@@ -1,0 +1,76 @@
+"""`hqgs bench export`: every file is measured as it is read back, and the front is the front."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from tiny_scene import tiny_scene
+
+from hqgs import cli
+from hqgs.bench import export as bench
+from hqgs.export import held_out_psnr, held_out_renders, read_scene_file
+
+
+def call(*arguments: str | Path) -> int:
+    return cli.main(["bench", "export", *map(str, arguments)])
+
+
+def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(bench, "embedded_scene", lambda *args: asked.append(args) or tiny_scene())
+    assert call("--quick", "--threads", "1", "--out", tmp_path) == 0
+    assert asked == [(tmp_path / "scene", 42, 32)]
+    report = json.loads((tmp_path / "export.json").read_text(encoding="utf-8"))
+    result = report["results"]
+    files = {row["name"]: row for row in result["files"]}
+    assert list(files) == list(bench.variants())
+    scene, trained = tiny_scene(), read_scene_file(tmp_path / "export")
+    assert result["psnr"] == pytest.approx(held_out_psnr(scene, held_out_renders(scene, trained)))
+    assert result["gaussians"] == len(trained)
+    assert report["settings"]["iterations"] == 20
+
+    exact = files["ply, degree 3"]
+    assert (exact["cost_db"], exact["largest_change"], exact["psnr_to_original"]) == (0, 0, None)
+    assert result["ply_of_3dgs_bytes"] == exact["bytes"] + 12 * len(trained)
+    assert exact["bytes"] == (tmp_path / "export" / "scene.ply").stat().st_size
+    sizes = [files[f"ply, degree {d}"]["bytes"] for d in (3, 2, 1, 0)]
+    assert sizes == sorted(sizes, reverse=True)
+    fine, coarse = (files[f"spz, {bits} bits, tolerance 0"] for bits in ("8 and 8", "5 and 4"))
+    assert coarse["bytes"] <= fine["bytes"] < exact["bytes"] / 3
+    assert abs(fine["cost_db"]) < 0.1
+    for row in files.values():
+        assert row["psnr"] == pytest.approx(result["psnr"] - row["cost_db"])
+        assert 0 <= row["largest_change"] < 0.2
+
+    text = capsys.readouterr().out
+    assert all(name in text for name in files)
+    with Image.open(tmp_path / "export_size.png") as chart:
+        assert chart.size == (1200, 750)
+    assert not list(tmp_path.glob("tmp*"))
+
+
+def test_the_front_holds_what_no_other_beats_in_both() -> None:
+    pairs = [(10, 30.0), (5, 29.0), (5, 28.0), (7, 28.5), (1, 20.0), (1, 20.0), (12, 30.0)]
+    rows = [{"bytes": size, "psnr": value} for size, value in pairs]
+    assert bench.pareto(rows) == [True, True, False, False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
+        (["--run-folder", "x"], "--run-folder and --scene go together"),
+        (["--iterations", "0"], "iterations is 0, wanted at least 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: list[str],
+    message: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(bench, "embedded_scene", lambda *_: tiny_scene())
+    assert call(*arguments, "--out", tmp_path) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
