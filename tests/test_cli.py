@@ -83,7 +83,7 @@ def test_sfm_replaces_poses_and_points_once(
     report = SfmReport(5, ["lost.png"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, None)
     seen: list[Any] = []
 
-    def load(path: str, downscale: float, reconstruct: bool) -> Scene:
+    def load(path: str, downscale: float, reconstruct: bool, skip_unreadable: bool) -> Scene:
         seen.append(reconstruct)
         return replace(tiny_scene(), source=source)
 

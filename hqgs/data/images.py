@@ -8,7 +8,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pycolmap
@@ -24,7 +23,7 @@ MAX_WORKERS = 4  # each holds a few photos at their stored size
 
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
 _DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
-Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
+Pixels = NDArray[np.uint8] | NDArray[np.float32]
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
 
 
@@ -181,7 +180,9 @@ def area_downscale(
 
 def _as(image: Pixels, values: NDArray[np.float64]) -> Pixels:
     """The values as the image's type; whole numbers are rounded."""
-    return (np.rint(values).clip(0, 255) if image.dtype == np.uint8 else values).astype(image.dtype)
+    if image.dtype == np.uint8:
+        return np.rint(values).clip(0, 255).astype(np.uint8)
+    return values.astype(np.float32)
 
 
 def _area_sum(image: Pixels | NDArray[np.uint8], height: int, width: int) -> NDArray[np.float64]:
