@@ -49,13 +49,14 @@ def largest_weights(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
 @torch.no_grad()
 def _largest(gaussians: Gaussians, views: Iterable[tuple[Camera, NDArray[np.bool_] | None]]) -> Tensor:
     tensors = gaussians.means, gaussians.quats, gaussians.activated_scales(), gaussians.activated_opacities()
-    inputs = [tensor.contiguous().numpy() for tensor in tensors]
-    no_colors = np.empty((len(gaussians), 0), inputs[0].dtype)
+    means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in tensors)
+    no_colors = np.empty((len(gaussians), 0), means.dtype)
     largest = torch.zeros_like(gaussians.opacities)
     for camera, mask in views:
         viewmat, K = (np.ascontiguousarray(m[None], np.float64) for m in (camera.viewmat, camera.K))
+        size = camera.width, camera.height
         frame, *_ = _rust.project_forward(
-            *inputs, no_colors, None, viewmat, K, camera.width, camera.height, OPTIONS, None
+            means, quats, scales, opacities, no_colors, None, viewmat, K, *size, OPTIONS, None
         )
         counted = None if mask is None else np.ascontiguousarray(mask[None])
         weights = _rust.blending_weights(frame, counted, largest.dtype == torch.float64)

@@ -210,6 +210,7 @@ def test_the_gradient_of_the_harmonics_alone_is_that_of_all() -> None:
     for s in (some, every):
         forward(s)[0].square().sum().backward()
     assert some.colors.grad is not None
+    assert every.colors.grad is not None
     assert torch.equal(some.colors.grad, every.colors.grad)
 
 
