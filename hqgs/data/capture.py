@@ -98,7 +98,7 @@ def inside(root: Path, name: str, what: str) -> Path:
     it resolves to only where that is outside.
     """
     if "\0" in name:
-        raise ValueError(f"{what} {name!r} is no path")
+        raise ValueError(f"{what} {name!r} is no path in {root}")
     path = Path(os.path.normpath(root / name))
     if not path.is_relative_to(root):
         path = path.resolve()

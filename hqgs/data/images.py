@@ -22,7 +22,10 @@ SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
 MAX_WORKERS = 4  # each holds a few photos at their stored size
 
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
-_DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError)
+_DECODE_ERRORS = (
+    *(OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError),
+    MemoryError,  # Pillow reads as many bytes as a chunk says it has
+)
 Pixels = NDArray[np.uint8] | NDArray[np.float32]
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
 

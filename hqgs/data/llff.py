@@ -78,7 +78,7 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
     try:
         # Mapped, not read: the header's shape is then held against the file's size before memory is taken.
         rows = np.lib.format.open_memmap(path, mode="r")
-    except (ValueError, OSError, TypeError, OverflowError, tokenize.TokenError) as e:
+    except (ValueError, OSError, TypeError, OverflowError, SyntaxError, tokenize.TokenError) as e:
         raise ValueError(f"cannot read {path}: {e}") from e
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or rows.dtype.kind != "f":
         raise ValueError(f"{path}: expected floats of shape [N, 17], got {rows.dtype} {list(rows.shape)}")
