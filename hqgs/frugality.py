@@ -40,6 +40,7 @@ FINEST = 2.0  # px of the photo that sees a Gaussian best: with a larger standar
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
+FOLDED = 16  # views, at most, from which the folded bands are to look as before
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
 BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
@@ -226,8 +227,9 @@ class Frugality:
         gaussians = trainer.gaussians
         shown = self._shown(gaussians)
         whole = self._psnr(trainer, shown, self.held)
+        some = [self.views[k] for k in _spread(len(self.views), min(FOLDED, len(self.views)))]
         for degree in range(gaussians.sh_degree):
-            fewer = folded(gaussians, self.views, degree)
+            fewer = folded(gaussians, some, degree)
             colors = {"sh0": fewer.sh0, "shN": fewer.shN}
             cost = whole - self._psnr(trainer, Gaussians(**(shown.named() | colors)), self.held)
             if cost <= TOLERANCE:

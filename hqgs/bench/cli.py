@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import hqgs
-from hqgs.bench import accuracy, endurance, export, quality, speed, stability, training
+from hqgs.bench import accuracy, endurance, export, frugality, quality, speed, stability, training
 from hqgs.bench.output import Benchmark, command_line, write_results
 from hqgs.exits import BAD_INPUT, fail
 from hqgs.train import TrainingError
@@ -16,6 +16,7 @@ BENCHMARKS: dict[str, Benchmark] = {
     "accuracy": accuracy.BENCHMARK,
     "endurance": endurance.BENCHMARK,
     "export": export.BENCHMARK,
+    "frugality": frugality.BENCHMARK,
     "quality": quality.BENCHMARK,
     "speed": speed.BENCHMARK,
     "stability": stability.BENCHMARK,

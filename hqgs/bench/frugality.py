@@ -1,0 +1,245 @@
+"""`hqgs bench frugality`: what leaving out saves and costs, one thing at a time and all that is automatic."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import hqgs
+from hqgs.bench.output import Benchmark, Report, markdown_table
+from hqgs.bench.quality_scenes import load_scenes
+from hqgs.camera import Scene
+from hqgs.checkpoint import scene_fingerprint
+from hqgs.config import TrainConfig
+from hqgs.files import write_json
+from hqgs.left_out import AUTO, ITEMS, NONE, parse_leave_out
+from hqgs.machine import peak_rss_mb, reset_peak_rss
+from hqgs.ply import write_ply
+from hqgs.synthetic.scene import HEIGHT, WIDTH
+from hqgs.train import Trainer
+
+ROWS = (NONE, *ITEMS, AUTO)
+TIME, BYTES, MEAN_DB, WORST_DB, DECISION = 0.5, 1 / 3, 0.05, 0.15, 0.02  # the targets, against "none"
+
+
+@dataclass(frozen=True)
+class FrugalityConfig:
+    """What is trained."""
+
+    iterations: int = 7_000
+    downscale: float = 2.0
+    seed: int = 0
+    rows: tuple[str, ...] = ROWS
+    embedded: tuple[int, int, int] = (WIDTH, HEIGHT, 24)
+
+
+QUICK = FrugalityConfig(iterations=30, downscale=1.0, rows=(NONE, "growth", AUTO), embedded=(64, 48, 14))
+
+
+def train_config(row: str, config: FrugalityConfig) -> TrainConfig:
+    """A number of iterations means that number, except in the row that tries to do with fewer."""
+    items = parse_leave_out(row)
+    if row == AUTO:
+        items = tuple(item for item in items if item != "iterations")
+    return TrainConfig(iterations=config.iterations, seed=config.seed, leave_out=items).scaled()
+
+
+def run_row(row: str, scene: Scene, config: FrugalityConfig) -> dict[str, Any]:
+    """Train one row; what came of it, as plain JSON values."""
+    resets = reset_peak_rss()
+    clock = time.process_time()
+    trainer = Trainer(scene, train_config(row, config))
+    while trainer.iteration < trainer.length:
+        trainer.step()
+    cpu = time.process_time() - clock
+    peak = peak_rss_mb() if resets else None
+    trainer.evaluate()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.ply"
+        write_ply(path, trainer.method.modulate(trainer.gaussians))
+        size = path.stat().st_size
+    last = trainer.history[-1]
+    return {
+        "scene": scene.name,
+        "row": row,
+        "photo": [scene.test[0].camera.width, scene.test[0].camera.height],
+        "psnr": last["psnr"],
+        "ssim": last["ssim"],
+        "iterations": trainer.iteration,
+        "seconds": trainer.seconds,
+        "cpu_seconds": cpu,  # with the choice of photos; tells a busy machine from a slow run
+        "decision_seconds": trainer.frugality.state.decisions,
+        "peak_rss_mb": peak,
+        "gaussians": len(trainer.gaussians),
+        "sh_degree": trainer.gaussians.sh_degree,
+        "bytes": size,
+        "left_out": [i.known() for i in [*trainer.photos_left_out, *trainer.frugality.left_out()]],
+    }
+
+
+def against_none(runs: Sequence[dict[str, Any]], row: str) -> dict[str, Any] | None:
+    """Means over the scenes of a row's ratios and differences to "none"; None where no scene has both."""
+    base = {run["scene"]: run for run in runs if run["row"] == NONE}
+    pairs = [(run, base[run["scene"]]) for run in runs if run["row"] == row and run["scene"] in base]
+    if not pairs:
+        return None
+    gains = [run["psnr"] - other["psnr"] for run, other in pairs]
+    return {
+        "scenes": len(pairs),
+        "cpu_seconds": float(np.mean([a["cpu_seconds"] / b["cpu_seconds"] for a, b in pairs])),
+        "bytes": float(np.mean([a["bytes"] / b["bytes"] for a, b in pairs])),
+        "gaussians": float(np.mean([a["gaussians"] / b["gaussians"] for a, b in pairs])),
+        "psnr": float(np.mean(gains)),
+        "worst_psnr": float(min(gains)),
+        "ssim": float(np.mean([a["ssim"] - b["ssim"] for a, b in pairs])),
+        "decision_share": float(np.mean([a["decision_seconds"] / a["seconds"] for a, _ in pairs])),
+    }
+
+
+def verdict(summary: dict[str, Any]) -> dict[str, bool]:
+    """Which of the targets the row reaches."""
+    return {
+        "time": summary["cpu_seconds"] <= TIME,
+        "bytes": summary["bytes"] <= BYTES,
+        "mean PSNR": summary["psnr"] >= -MEAN_DB,
+        "worst PSNR": summary["worst_psnr"] >= -WORST_DB,
+        "decisions": summary["decision_share"] <= DECISION,
+    }
+
+
+def tables(runs: Sequence[dict[str, Any]], config: FrugalityConfig) -> list[str]:
+    body = []
+    for run in runs:
+        share = run["decision_seconds"] / run["seconds"]
+        body.append(
+            [
+                f"{run['scene']}, {run['row']}",
+                f"{run['psnr']:.2f}",
+                f"{run['ssim']:.4f}",
+                f"{run['cpu_seconds']:.0f}",
+                f"{100 * share:.1f} %",
+                "-" if run["peak_rss_mb"] is None else f"{run['peak_rss_mb']:.0f}",
+                f"{run['gaussians']:,d}",
+                str(run["sh_degree"]),
+                f"{run['bytes'] / 1e6:.2f}",
+            ]
+        )
+    head = ["left out", "PSNR (dB)", "SSIM", "CPU s", "decisions", "peak (MB)", "Gaussians", "degree", "MB"]
+    title = f"{config.iterations:,} iterations, photos at 1/{config.downscale:g}, held-out views"
+    found = [markdown_table(title, head, body)]
+    rows = [(row, s) for row in config.rows if row != NONE and (s := against_none(runs, row)) is not None]
+    if rows:
+        body = [
+            [
+                row,
+                f"{s['psnr']:+.2f}",
+                f"{s['worst_psnr']:+.2f}",
+                f"{s['ssim']:+.4f}",
+                f"{s['cpu_seconds']:.2f}",
+                f"{s['bytes']:.2f}",
+                f"{s['gaussians']:.2f}",
+            ]
+            for row, s in rows
+        ]
+        head = ["left out", "PSNR (dB)", "worst scene", "SSIM", "CPU time", "bytes", "Gaussians"]
+        found.append(markdown_table("Against none: mean differences and ratios over the scenes", head, body))
+    return found
+
+
+def chart(runs: Sequence[dict[str, Any]]) -> Figure:
+    """PSNR gained against the share of the CPU time, and against the share of the bytes; a mark a run."""
+    figure = Figure(figsize=(9, 4.2), dpi=150, layout="constrained")
+    base = {run["scene"]: run for run in runs if run["row"] == NONE}
+    rows = [row for row in ROWS if row != NONE and any(run["row"] == row for run in runs)]
+    for axes, (name, label) in zip(
+        figure.subplots(1, 2, sharey=True), (("cpu_seconds", "CPU time"), ("bytes", "bytes")), strict=True
+    ):
+        for k, row in enumerate(rows):
+            points = [
+                (run[name] / base[run["scene"]][name], run["psnr"] - base[run["scene"]]["psnr"])
+                for run in runs
+                if run["row"] == row and run["scene"] in base
+            ]
+            if points:
+                size = 60 if row == AUTO else 30
+                axes.scatter(*zip(*points, strict=True), label=row, s=size, color=f"C{k}")
+        axes.axhline(0, color="#888888", linewidth=0.8)
+        axes.set_xlabel(f"{label}, nothing left out = 1")
+        axes.set_xlim(left=0)
+        axes.grid(color="#dddddd", linewidth=0.7)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.axes[0].set_ylabel("held-out PSNR gained (dB)")
+    if rows:
+        figure.axes[0].legend(frameon=False, fontsize=8, title="left out")
+    return figure
+
+
+def run(args: argparse.Namespace) -> Report:
+    """Train what is not finished, row after row of a scene; each is kept as soon as it is done."""
+    config = QUICK if args.quick else FrugalityConfig()
+    changes = {n: v for n in ("iterations", "downscale", "seed") if (v := getattr(args, n)) is not None}
+    config = replace(config, **changes, **({"rows": tuple(args.rows)} if args.rows else {}))
+    if unknown := [row for row in config.rows if row not in ROWS]:
+        raise ValueError(f"rows: there is no {unknown[0]!r}; there are: {', '.join(ROWS)}")
+    if not config.downscale >= 1:
+        raise ValueError(f"downscale must be at least 1, got {config.downscale}")
+    for row in config.rows:
+        train_config(row, config)  # refuses bad settings before the work
+    scenes = load_scenes(args.scene, config.downscale, config.embedded, args.out / "scene", args.validate)
+    runs = []
+    for scene in scenes:
+        for row in config.rows:
+            facts = {
+                "version": hqgs.__version__,
+                "config": asdict(train_config(row, config)),
+                "scene": scene_fingerprint(scene),
+            }
+            digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
+            path = args.out / "frugality" / f"{scene.name}-{row}-{digest}.json"
+            if path.is_file():
+                runs.append(json.loads(path.read_text(encoding="utf-8")))
+                continue
+            print(f"bench frugality: {scene.name}, {row}", file=sys.stderr, flush=True)
+            runs.append(run_row(row, scene, config))
+            write_json(path, runs[-1])
+    summaries = {row: s for row in config.rows if row != NONE and (s := against_none(runs, row))}
+    found = tables(runs, config)
+    results: dict[str, Any] = {"runs": runs, "against_none": summaries}
+    if AUTO in summaries:
+        reached = verdict(summaries[AUTO])
+        results["targets"] = reached
+        words = [f"{name}: {'reached' if ok else 'MISSED'}" for name, ok in reached.items()]
+        found.append(f"Targets of {AUTO}: {', '.join(words)}.")
+    settings = asdict(config) | {"scenes": [scene.name for scene in scenes], "validate": args.validate}
+    return Report(settings=settings, results=results, tables=found, figures={"gains": chart(runs)})
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--scene",
+        nargs="+",
+        type=Path,
+        default=[Path("embedded")],
+        metavar="SCENE",
+        help="folders (%(default)s)",
+    )
+    add("--rows", nargs="+", metavar="ROW", help=f"only these of: {', '.join(ROWS)}")
+    add("--iterations", type=int, metavar="N", help="training steps of each run (7000, with --quick 30)")
+    add("--downscale", type=float, metavar="F", help="divide the photos' sides by F (2, with --quick 1)")
+    add("--seed", type=int, metavar="S", help="of the training (0)")
+    add("--validate", action="store_true", help="judge by held-back training photos: to tune")
+
+
+BENCHMARK = Benchmark("what leaving out saves and costs, one thing at a time", add_options, run)
