@@ -208,8 +208,8 @@ def _export(args: argparse.Namespace) -> int:
 
 def _config(args: argparse.Namespace) -> TrainConfig:
     leave_out = parse_leave_out(args.leave_out)
-    if args.iterations is not None and args.leave_out == LEAVE_OUT:
-        leave_out = tuple(item for item in leave_out if item != "iterations")  # a number means that number
+    if args.iterations is None and args.leave_out == LEAVE_OUT:
+        leave_out = (*leave_out, "iterations")
     config = TrainConfig(
         iterations=TrainConfig.iterations if args.iterations is None else args.iterations,
         leave_out=leave_out,

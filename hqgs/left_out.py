@@ -15,7 +15,7 @@ ITEMS = {
     "resolution": "full resolution in the first part of the run",
     "iterations": "the rest of a run that has stopped improving",
 }
-COSTLY = ("resolution",)  # saves little and may cost much: only where it is asked for
+ASKED_FOR = ("resolution", "iterations")  # not automatic: the first costs, a number of iterations means it
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ def format_left_out(items: Sequence[LeftOut]) -> str:
 
 
 def parse_leave_out(text: str) -> tuple[str, ...]:
-    """The items of "auto" (all but COSTLY), "none" or a list with commas, in the order of ITEMS."""
+    """The items of "auto" (all but ASKED_FOR), "none" or a list with commas, in the order of ITEMS."""
     if text == AUTO:
-        return tuple(item for item in ITEMS if item not in COSTLY)
+        return tuple(item for item in ITEMS if item not in ASKED_FOR)
     names = set() if text == NONE else {name.strip() for name in text.split(",")}
     check_items(names)
     return tuple(item for item in ITEMS if item in names)

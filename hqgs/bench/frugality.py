@@ -48,11 +48,9 @@ QUICK = FrugalityConfig(iterations=30, downscale=1.0, rows=(NONE, "growth", AUTO
 
 
 def train_config(row: str, config: FrugalityConfig) -> TrainConfig:
-    """A number of iterations means that number, except in the row that tries to do with fewer."""
-    items = parse_leave_out(row)
-    if row == AUTO:
-        items = tuple(item for item in items if item != "iterations")
-    return TrainConfig(iterations=config.iterations, seed=config.seed, leave_out=items).scaled()
+    return TrainConfig(
+        iterations=config.iterations, seed=config.seed, leave_out=parse_leave_out(row)
+    ).scaled()
 
 
 def run_row(row: str, scene: Scene, config: FrugalityConfig) -> dict[str, Any]:
