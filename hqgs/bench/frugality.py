@@ -44,7 +44,7 @@ class FrugalityConfig:
     embedded: tuple[int, int, int] = (WIDTH, HEIGHT, 24)
 
 
-QUICK = FrugalityConfig(iterations=30, downscale=1.0, rows=(NONE, "growth", AUTO), embedded=(64, 48, 14))
+QUICK = FrugalityConfig(iterations=30, downscale=1.0, rows=(NONE, "growth", AUTO), embedded=(48, 36, 12))
 
 
 def train_config(row: str, config: FrugalityConfig) -> TrainConfig:
