@@ -70,6 +70,8 @@ class Frugality:
         self.items = set(config.leave_out)
         if not method.as_photographed:
             self.items -= {"growth", "resolution"}
+        if min(min(v.camera.width, v.camera.height) for v in views) < COARSE_FACTOR * SMALLEST_SIDE:
+            self.items -= {"resolution"}
         count = 0
         if self.items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
@@ -185,8 +187,7 @@ class Frugality:
         return iteration <= self._coarse_end
 
     def _sized(self, view: View, iteration: int) -> View:
-        camera = view.camera
-        if not self._is_coarse(iteration) or min(camera.width, camera.height) < COARSE_FACTOR * SMALLEST_SIDE:
+        if not self._is_coarse(iteration):
             return view
         if view.name not in self._small:
             self._small[view.name] = smaller(view)
