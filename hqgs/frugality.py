@@ -68,8 +68,8 @@ class Frugality:
     def __init__(self, config: TrainConfig, views: list[View], method: Method) -> None:
         self.config, self.method, self.views = config, method, views
         self.items = set(config.leave_out)
-        if not method.as_photographed:
-            self.items -= {"growth", "resolution"}
+        if not method.as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
+            self.items &= {"photos", "iterations"}
         if min(min(v.camera.width, v.camera.height) for v in views) < COARSE_FACTOR * SMALLEST_SIDE:
             self.items -= {"resolution"}
         count = 0

@@ -17,6 +17,7 @@ from hqgs.config import TrainConfig
 from hqgs.densify import DensifyConfig
 from hqgs.frugality import COARSE_PART, smaller
 from hqgs.left_out import LeftOut, format_left_out, parse_leave_out
+from hqgs.methods.hqgs import HQGSConfig
 from hqgs.run import train
 from hqgs.train import Trainer
 
@@ -69,6 +70,14 @@ def test_few_photos_are_never_held_back() -> None:
     trainer = run(tiny_scene(9), 30, "harmonics")
     assert trainer.frugality.held == []
     assert trainer.frugality.left_out() == []
+
+
+def test_degraded_photos_have_a_budget_of_their_own() -> None:
+    scene, items = tiny_scene(VIEWS), ("photos", "growth", "weight", "harmonics", "resolution", "iterations")
+    noisy = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:20"), leave_out=items)
+    assert Trainer(scene, noisy).frugality.items == {"photos", "iterations"}
+    clean = replace(noisy, hqgs=HQGSConfig(formation="none"))
+    assert Trainer(scene, clean).frugality.items == set(items) - {"resolution"}  # too small for that
 
 
 def test_fine_gaussians_do_not_grow() -> None:
