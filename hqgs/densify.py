@@ -76,7 +76,6 @@ class Growth:
     cloned: int = 0
     split: int = 0
     pruned: int = 0
-    reset: bool = False
     refused: int = 0  # Gaussians that would have grown but are too fine
 
 
@@ -116,7 +115,7 @@ class Densifier:
         optimizer: Optimizer,
         finest: Callable[[Tensor], Tensor] | None = None,
     ) -> Growth:
-        """Grow, prune and reset, as far as the schedule asks for it after this iteration (1, 2, ...).
+        """Grow and prune, as far as the schedule asks for it after this iteration (1, 2, ...).
 
         `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` gives for means [N, 3]
         the largest scales [N], world units, of Gaussians that are too fine to be cloned or split.
@@ -130,10 +129,18 @@ class Densifier:
             pruned = self._prune(iteration, gaussians, optimizer)
             self.grad_sum = torch.zeros(len(gaussians))
             self.count = torch.zeros(len(gaussians))
-        reset = iteration % c.reset_every == 0
-        if reset:
-            reset_opacities(gaussians, optimizer, c.reset_opacity)
-        return Growth(cloned, split, pruned, reset, refused)
+        return Growth(cloned, split, pruned, refused)
+
+    def reset(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> bool:
+        """Cut the opacities where the schedule asks for it; whether it did.
+
+        To be called before the next step, not after the one that it is due at: what is looked at or written
+        in between is the scene before its opacities are cut, and a run that ends there keeps it.
+        """
+        due = 0 < iteration < self.config.stop and iteration % self.config.reset_every == 0
+        if due:
+            reset_opacities(gaussians, optimizer, self.config.reset_opacity)
+        return due
 
     def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> None:
         """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay."""

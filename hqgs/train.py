@@ -77,6 +77,7 @@ class Trainer:
         """Train on one view."""
         started = time.perf_counter()
         config = self.config
+        self.densifier.reset(self.iteration, self.gaussians, self.optimizer)
         self.iteration += 1
         view = self.frugality.view(self.iteration)
         self._set_rates()

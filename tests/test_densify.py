@@ -220,7 +220,10 @@ def test_reset_cuts_the_opacities_and_forgets_their_moments_alone() -> None:
     with torch.no_grad():
         g.opacities[1] = math.log(0.007 / 0.993)
     d = densifier(g)
-    assert d.update(35, g, optimizer) == Growth(reset=True)
+    assert d.update(35, g, optimizer) == Growth()
+    assert not d.reset(34, g, optimizer)
+    assert g.activated_opacities().detach().amax() > 0.01
+    assert d.reset(35, g, optimizer)
     np.testing.assert_allclose(g.activated_opacities().detach().numpy(), [0.01, 0.007, 0.01], rtol=1e-5)
     assert not optimizer.state[g.opacities]["exp_avg"].any()
     assert not optimizer.state[g.opacities]["exp_avg_sq"].any()
@@ -259,7 +262,7 @@ def test_the_schedule() -> None:
         see(d, [1.0] * len(g))
         growth = d.update(iteration, g, optimizer)
         grown += [iteration] if growth.cloned else []
-        resets += [iteration] if growth.reset else []
+        resets += [iteration] if d.reset(iteration, g, optimizer) else []
     assert grown == [30, 40, 50, 60]
     assert resets == [25, 50]
 
