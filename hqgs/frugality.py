@@ -136,23 +136,11 @@ class Frugality:
         """What was left out, in the order of the decisions."""
         found = [LeftOut(**record) for record in self.state.records]
         if self._coarse_end:
-            size = f"1/{COARSE_FACTOR} of the sides"
-            found.insert(
-                0,
-                LeftOut(
-                    f"full resolution in the first {self._coarse_end} iterations",
-                    f"a scene takes shape at {size}",
-                    None,
-                ),
-            )
+            what = f"full resolution in the first {self._coarse_end} iterations"
+            found.insert(0, LeftOut(what, f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"))
         if self.state.refused:
-            found.insert(
-                0,
-                LeftOut(
-                    f"finer Gaussians, {self.state.refused} times",
-                    f"they had at most {FINEST:g} px of the photo that sees them best (1 standard deviation)",
-                ),
-            )
+            why = f"they had at most {FINEST:g} px of the photo that sees them best (1 standard deviation)"
+            found.insert(0, LeftOut(f"finer Gaussians, {self.state.refused} times", why))
         return found
 
     @property
@@ -211,7 +199,8 @@ class Frugality:
                 evidence = (
                     f"best {state.best:.2f} dB at iteration {state.best_at}, {now:.2f} dB at {iteration}"
                 )
-                left = LeftOut(what, "the held-back photos stopped improving", evidence)
+                saved = float(np.mean(self._seconds)) * (config.iterations - state.length)
+                left = LeftOut(what, "the held-back photos stopped improving", evidence, seconds=saved)
                 self._note(left, trainer)
                 self._release(trainer, iteration)
         if iteration == config.densify.stop and state.held:
@@ -308,7 +297,7 @@ class Frugality:
         while self._open and iteration >= self._open[0][1] + WINDOW:
             index, start, before = self._open.pop(0)
             saved = before - float(np.mean(self._seconds))
-            self.state.records[index]["seconds"] = saved * (self.state.length - start)
+            self.state.records[index]["seconds"] = max(saved, 0.0) * (self.state.length - start)
 
 
 def _spread(size: int, count: int) -> list[int]:

@@ -167,7 +167,10 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
     assert trainer.densifier.config.stop == pytest.approx(1.25 * state.released, abs=1)
     assert rates[-1] == pytest.approx(trainer.extent * 1e-9)
     assert all(b <= a for a, b in pairwise(rates))
-    assert trainer.frugality.left_out()[0].what == f"iterations {state.length + 1} to 3000"
+    item = trainer.frugality.left_out()[0]
+    assert item.what == f"iterations {state.length + 1} to 3000"
+    assert item.seconds is not None
+    assert item.seconds > 0.1 * trainer.seconds  # more iterations than were done
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
