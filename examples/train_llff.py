@@ -1,4 +1,4 @@
-"""Train a scene with 3DGS, without what it does not need, and look at the result.
+"""Train a scene with plain 3DGS and look at the result.
 
     python examples/train_llff.py                 # the scene that is built in, under 5 minutes on 2 cores
     python examples/train_llff.py FOLDER          # a COLMAP, LLFF or nerfstudio folder
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hqgs.config import TrainConfig
 from hqgs.data import load_scene
-from hqgs.left_out import AUTO, LeftOut, format_left_out, parse_leave_out
+from hqgs.left_out import NONE, LeftOut, format_left_out, parse_leave_out
 from hqgs.report import read_report
 from hqgs.run import train
 from hqgs.synthetic import embedded_scene
@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="default: outputs/ and the scene's name")
     parser.add_argument("--downscale", type=float, default=1.0, help="divide the photos' sides by this")
     parser.add_argument("--method", default="3dgs")
-    parser.add_argument("--leave-out", default=AUTO, help="auto, none, or a list (%(default)s)")
+    parser.add_argument("--leave-out", default=NONE, help="auto, none, or a list (%(default)s)")
     args = parser.parse_args()
 
     out = args.out or Path("outputs", "embedded" if args.scene is None else args.scene.resolve().name)
@@ -41,7 +41,8 @@ def main() -> None:
     print(f"{result.gaussians} Gaussians after {result.iterations} iterations in {result.seconds:.0f} s")
     for name, value in read_report(out / "report.json")["metrics"]["mean"].items():
         print(f"{name:>10}  {'-' if value is None else format(value, '.4f')}")
-    print(format_left_out([LeftOut(**item) for item in result.left_out]))
+    if table := format_left_out([LeftOut(**item) for item in result.left_out]):
+        print(table)
     print(f"pictures: {out / 'comparison'}")
 
 

@@ -40,6 +40,7 @@ FINEST = 2.0  # px of the photo that sees a Gaussian best: with a larger standar
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
+EARLIEST = 2_000  # iterations before which they cannot tell yet
 FOLDED = 16  # views, at most, from which the folded bands are to look as before
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
 BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
@@ -72,6 +73,8 @@ class Frugality:
             self.items &= {"photos", "iterations"}
         if min(min(v.camera.width, v.camera.height) for v in views) < COARSE_FACTOR * SMALLEST_SIDE:
             self.items -= {"resolution"}
+        if self._band_check >= config.densify.stop:  # a run that is too short to tell
+            self.items -= {"harmonics"}
         count = 0
         if self.items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
@@ -165,7 +168,7 @@ class Frugality:
 
     @property
     def _band_check(self) -> int:
-        return max(1, min(round(BAND_CHECK * self.config.iterations), self.config.densify.stop - 1))
+        return max(EARLIEST, round(BAND_CHECK * self.config.iterations), 1)
 
     @property
     def _coarse_end(self) -> int:

@@ -25,6 +25,12 @@ VIEWS = 13  # one is a test view; of twelve, one is held back
 STILL = DensifyConfig(start=10_000, reset_every=10_000)
 
 
+@pytest.fixture(autouse=True)
+def early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of a few steps decide on the harmonics too."""
+    monkeypatch.setattr(module, "EARLIEST", 1)
+
+
 def run(scene: Scene, iterations: int, *items: str, **changes: object) -> Trainer:
     trainer = Trainer(scene, tiny_config(iterations, leave_out=items, **changes))
     while trainer.iteration < trainer.length:
@@ -107,6 +113,16 @@ def test_bands_go_where_the_held_back_photos_do_not_ask_for_them() -> None:
     assert item.cost_db is not None
     assert item.cost_db <= module.TOLERANCE
     assert item.seconds is not None
+
+
+def test_a_short_run_keeps_its_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "EARLIEST", 2_000)
+    for iterations in (200, 2_900):
+        trainer = Trainer(tiny_scene(VIEWS), TrainConfig(iterations, leave_out=("harmonics",)).scaled())
+        assert trainer.frugality.items == set()
+        assert trainer.frugality.held == []
+    config = TrainConfig(3_100, leave_out=("harmonics",)).scaled()
+    assert Trainer(tiny_scene(VIEWS), config).frugality.items == {"harmonics"}
 
 
 def test_bands_stay_where_the_view_matters() -> None:
