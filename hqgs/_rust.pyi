@@ -5,6 +5,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+Maybe = Array | None
 
 class Frame:
     """The projection of N Gaussians into C cameras."""
@@ -48,18 +49,9 @@ def project_forward(
 def project_backward(
     frame: Frame,
     inputs: tuple[Array, Array, Array, Array, Array | None, Array | None],
-    cotangents: tuple[Array | None, Array | None, Array | None, Array | None, Array | None, Array | None],
+    cotangents: tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe],
     wanted: list[bool],
-) -> tuple[
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    dict[str, int],
-]: ...
+) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...
 def composite_forward(
     frame: Frame, colors: Array, backgrounds: Array | None, channels: int
 ) -> tuple[Composite, Array, Array]: ...
@@ -72,15 +64,7 @@ def composite_backward(
     v_alphas: Array | None,
     channels: int,
     wanted: list[bool],
-) -> tuple[
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    Array | None,
-    dict[str, int],
-]: ...
+) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...
 def blending_weights(frame: Frame, mask: Array | None, double: bool) -> Array: ...
 def photometric(
     render: Array, target: Array, mask: Array | None, lambda_dssim: float, want_grad: bool

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -32,6 +32,8 @@ from hqgs.weights import largest_weights
 
 if TYPE_CHECKING:
     from hqgs.train import Trainer  # which itself imports this module
+
+T = TypeVar("T")
 
 HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
 TOLERANCE = 0.02  # dB that leaving one thing out may cost
@@ -53,9 +55,8 @@ class State:
     """What a checkpoint must hold. `length`: iterations of the run as far as it is known."""
 
     length: int
-    held: bool  # the photos are held back still
     degree: int  # of the harmonics, at most
-    released: int = 0  # the iteration after which they came back
+    released: int = 0  # the iteration after which the held-back photos came back; 0: not yet
     refused: int = 0  # growth of Gaussians that are too fine
     best: float = -1e3  # dB, on the held-back photos
     best_at: int = 0
@@ -78,13 +79,18 @@ class Frugality:
         count = 0
         if self.items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
-        places = _spread(len(views), count)
+        places = _spread(range(len(views)), count)
         self.held = [views[k] for k in places]
         self.trained = [view for k, view in enumerate(views) if k not in places]
-        self.state = State(config.iterations, bool(count), config.sh_degree)
+        self.state = State(config.iterations, config.sh_degree)
         self._small: dict[str, View] = {}
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # of the last steps
         self._open: list[tuple[int, int, float]] = []  # records that wait for what they saved
+
+    @property
+    def holds(self) -> bool:
+        """Whether photos are held back now."""
+        return bool(self.held) and not self.state.released
 
     @property
     def length(self) -> int:
@@ -93,7 +99,7 @@ class Frugality:
 
     def view(self, iteration: int) -> View:
         """The view of a step. Each epoch visits all views once, in an order of its own."""
-        views = self.trained if self.state.held else self.views
+        views = self.trained if self.holds else self.views
         epoch, index = divmod(iteration - 1, len(views))
         order = np.random.default_rng([self.config.seed, epoch]).permutation(len(views))
         return self._sized(views[order[index]], iteration)
@@ -129,7 +135,7 @@ class Frugality:
         if not self.items:
             return
         started = time.perf_counter()
-        if state.held:
+        if self.holds:
             self._decide(trainer, iteration)
         if "weight" in self.items and iteration == trainer.densifier.config.stop:
             self._decide_weight(trainer)
@@ -206,12 +212,11 @@ class Frugality:
                 left = LeftOut(what, "the held-back photos stopped improving", evidence, seconds=saved)
                 self._note(left, trainer)
                 self._release(trainer, iteration)
-        if iteration == config.densify.stop and state.held:
+        if iteration == config.densify.stop and self.holds:
             self._release(trainer, iteration)
 
     def _release(self, trainer: Trainer, iteration: int) -> None:
         """The held-back photos come back."""
-        self.state.held = False
         self.state.released = iteration
         trainer.densifier.config = self.densify_config
 
@@ -220,7 +225,7 @@ class Frugality:
         gaussians = trainer.gaussians
         shown = self._shown(gaussians)
         whole = self._psnr(trainer, shown, self.held)
-        some = [self.views[k] for k in _spread(len(self.views), min(FOLDED, len(self.views)))]
+        some = _spread(self.views, FOLDED)
         for degree in range(gaussians.sh_degree):
             fewer = folded(gaussians, some, degree)
             colors = {"sh0": fewer.sh0, "shN": fewer.shN}
@@ -245,7 +250,7 @@ class Frugality:
         gaussians = trainer.gaussians
         shown = self._shown(gaussians)
         weights = largest_weights(shown, self.views)
-        tried = [self.views[k] for k in _spread(len(self.views), min(TRIED, len(self.views)))]
+        tried = _spread(self.views, TRIED)
         whole = self._psnr(trainer, shown, tried)
         for limit in WEIGHTS:
             faint = weights < limit
@@ -303,9 +308,10 @@ class Frugality:
             self.state.records[index]["seconds"] = max(saved, 0.0) * (self.state.length - start)
 
 
-def _spread(size: int, count: int) -> list[int]:
-    """`count` of `size` places, evenly spread."""
-    return np.linspace(0, size, 2 * count + 1)[1::2].astype(int).tolist()
+def _spread(items: Sequence[T], count: int) -> list[T]:
+    """`count` of the items at most, evenly spread."""
+    count = min(count, len(items))
+    return [items[k] for k in np.linspace(0, len(items), 2 * count + 1)[1::2].astype(int)]
 
 
 def smaller(view: View) -> View:

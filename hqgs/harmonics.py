@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from hqgs.camera import View
-from hqgs.gaussians import Gaussians
+from hqgs.gaussians import SH_C0, Gaussians
 from hqgs.smallest import in_picture
 
 RIDGE = 1e-2  # weight of the old coefficients beside the mean over the views
@@ -19,7 +19,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     Order and signs are those of 3DGS (docs/conventions.md).
     """
     x, y, z = directions.unbind(-1)
-    rows = [torch.full_like(x, 0.28209479177387814)]
+    rows = [torch.full_like(x, SH_C0)]
     if degree > 0:
         rows += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree > 1:
