@@ -48,6 +48,15 @@ BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained,
 BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 WINDOW = 50  # steps before and after a decision that tell what it saves
+RULES = {  # what a result depends on beside the configuration
+    "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
+    "tolerance": (TOLERANCE, TRIED, FOLDED),
+    "growth": FINEST,
+    "resolution": (COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE),
+    "weight": WEIGHTS,
+    "harmonics": (BAND_CHECK, EARLIEST, BAND_INTERVAL),
+    "iterations": (BETTER, PATIENCE, CHECKS, REST),
+}
 
 
 @dataclass

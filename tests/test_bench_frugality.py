@@ -19,15 +19,16 @@ def call(*arguments: str | Path) -> int:
 
 def run_of(scene: str, row: str, **changes: Any) -> dict[str, Any]:
     values = {"psnr": 30.0, "ssim": 0.9, "cpu_seconds": 100.0, "seconds": 100.0, "decision_seconds": 0.0}
-    return {"scene": scene, "row": row, "gaussians": 1000, "bytes": 3000} | values | changes
+    return {"scene": scene, "row": row, "seed": 0, "gaussians": 1000, "bytes": 3000} | values | changes
 
 
 def test_the_rows() -> None:
     config = FrugalityConfig()
-    assert train_config("none", config).leave_out == ()
-    assert train_config("iterations", config).leave_out == ("iterations",)
-    assert train_config("auto", config).leave_out == ("photos", "growth", "weight", "harmonics")
-    assert all(train_config(row, config).iterations == 7_000 for row in config.rows)
+    assert train_config("none", config, 0).leave_out == ()
+    assert train_config("iterations", config, 0).leave_out == ("iterations",)
+    assert train_config("auto", config, 3).leave_out == ("photos", "growth", "weight", "harmonics")
+    assert train_config("auto", config, 3).seed == 3
+    assert all(train_config(row, config, 0).iterations == 7_000 for row in config.rows)
 
 
 def test_means_and_the_worst_scene_against_none() -> None:
@@ -59,6 +60,17 @@ def test_means_and_the_worst_scene_against_none() -> None:
         assert missed == [name]
 
 
+def test_the_worst_scene_is_the_mean_of_its_seeds() -> None:
+    runs = [run_of("a", "none", seed=seed) for seed in (0, 1)]
+    runs += [run_of("a", "auto", seed=0, psnr=29.6), run_of("a", "auto", seed=1, psnr=30.2)]
+    runs += [run_of("b", "none"), run_of("b", "auto", psnr=30.3)]
+    found = against_none(runs, "auto")
+    assert found is not None
+    assert (found["scenes"], found["runs"]) == (2, 3)
+    assert found["worst_psnr"] == pytest.approx(-0.1)
+    assert found["psnr"] == pytest.approx(0.1)
+
+
 def test_a_quick_run_is_written_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -78,9 +90,15 @@ def test_a_quick_run_is_written_and_kept(
     monkeypatch.setattr(frugality, "run_row", never)
     assert call("--quick", "--out", tmp_path, "--iterations", "8", "--rows", "none", "auto") == 0
 
+    next((tmp_path / "frugality").glob("*-none-s0-*")).write_text("[", encoding="utf-8")
+    assert call("--quick", "--out", tmp_path, "--iterations", "8", "--rows", "none", "auto") == 2
+    assert "is damaged" in capsys.readouterr().err
+
 
 def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--rows", "colour", "--out", tmp_path) == 2
     assert "rows: there is no 'colour'; there are: none, photos" in capsys.readouterr().err
+    assert call("--seeds", "0", "--out", tmp_path) == 2
+    assert "seeds must be at least 1, got 0" in capsys.readouterr().err
     assert call("--downscale", "0.5", "--out", tmp_path) == 2
     assert "downscale must be at least 1, got 0.5" in capsys.readouterr().err

@@ -133,7 +133,7 @@ def test_culling_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     loose = replace(studio())
     bound = np.full((len(loose.casters), 3), np.inf)
     loose.__dict__["lamp_boxes"] = (-bound, bound)  # every caster may shade every block
-    monkeypatch.setattr(shading, "studio", lambda: loose)
+    monkeypatch.setattr(shading, "studio", lambda gloss: loose)
     assert (render_view(camera, samples=1) == photo).all()
 
 
@@ -174,6 +174,19 @@ def test_highlight_moves_with_the_view_and_paper_does_not() -> None:
     assert np.ptp(seen["paper"], axis=0).max() < 10
 
 
+def test_gloss_holds_for_every_surface() -> None:
+    """Without it the highlight is gone; with it the plaster wall shines as well."""
+    camera = embedded_cameras(126, 94)[0]
+    matte, plain, glossy = (render_view(camera, 1, gloss=gloss).astype(int) for gloss in (0.0, None, 1.0))
+    ball = next(s for s in studio().surfaces if s.occludes == 0.27)
+    u, v, _ = (int(x) for x in project(camera, np.array(ball.center)))
+    area = slice(v - 8, v + 8), slice(u - 8, u + 8), 1  # green: the ball is red
+    assert (plain - matte)[area].max() > 80
+    assert (glossy - matte)[area].max() > 80
+    assert np.abs(plain - matte)[:20, :20].max() == 0  # the plaster of the wall has no gloss of its own
+    assert np.abs(glossy - matte)[:20, :20].max() > 10
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -192,6 +205,8 @@ def test_bad_arguments(change: dict[str, object], message: str) -> None:
 def test_bad_scene_arguments() -> None:
     with pytest.raises(ValueError, match="num_views must be at least 2"):
         embedded_scene(num_views=1)
+    with pytest.raises(ValueError, match="gloss must be at least 0 and finite, got -1"):
+        embedded_scene(gloss=-1.0)
     with pytest.raises(ValueError, match="got 0 x 378"):
         embedded_scene(width=0)
     with pytest.raises(FileExistsError):
@@ -269,16 +284,16 @@ def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     def cast(views: list[View], _: float) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
         return *surface_points(views, 60), "cast"
 
-    def counting(camera: Camera, threads: int | None = None) -> NDArray[np.uint8]:
+    def counting(camera: Camera, threads: int | None, gloss: float | None) -> NDArray[np.uint8]:
         rendered.append(camera)
-        return render_view(camera, 1, threads)
+        return render_view(camera, 1, threads, gloss)
 
     monkeypatch.setattr(scene, "render_view", counting)
     monkeypatch.setattr(scene, "sfm_points", cast)
 
-    def make(width: int = 40) -> tuple[Scene, int]:
+    def make(width: int = 40, gloss: float | None = None) -> tuple[Scene, int]:
         before = len(rendered)
-        made = embedded_scene(tmp_path / "cache", width, 30, num_views=10)
+        made = embedded_scene(tmp_path / "cache", width, 30, num_views=10, gloss=gloss)
         return made, len(rendered) - before
 
     first, cost = make()
@@ -305,6 +320,7 @@ def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert cost == 10
         assert same_scene(first, remade)
     assert make()[1] == 0
+    assert make(gloss=0.5)[1] == 10
     other, cost = make(width=44)
     assert cost == 10
     assert other.train[0].image.shape == (30, 44, 3)

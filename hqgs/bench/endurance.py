@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from hqgs.bench.output import Benchmark, Report, markdown_table
+from hqgs.bench.output import Benchmark, Report, kept, markdown_table
 from hqgs.camera import Scene
 from hqgs.config import TrainConfig
 from hqgs.densify import DensifyConfig
@@ -217,16 +216,12 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
 
 
 def finished(path: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
-    """The result of a case that is done; ValueError where the file is another one's."""
-    if not path.is_file():
+    """The result of a case that is done; ValueError where the file is damaged or another one's."""
+    if (found := kept(path)) is None:
         return None
-    try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}; remove it, and the case is repeated") from error
-    if not isinstance(kept, dict) or kept.get("settings") != settings:
+    if found.get("settings") != settings:
         raise ValueError(f"{path} holds a case with other settings; choose another --out")
-    return kept["result"]
+    return found["result"]
 
 
 def run(args: argparse.Namespace) -> Report:

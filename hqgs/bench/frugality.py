@@ -17,12 +17,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import hqgs
-from hqgs.bench.output import Benchmark, Report, markdown_table
-from hqgs.bench.quality_scenes import load_scenes
+from hqgs.bench.output import Benchmark, Report, kept, markdown_table
+from hqgs.bench.quality_scenes import BUILT_IN, EMBEDDED, load_scenes
 from hqgs.camera import Scene
 from hqgs.checkpoint import scene_fingerprint
 from hqgs.config import TrainConfig
 from hqgs.files import write_json
+from hqgs.frugality import RULES
 from hqgs.left_out import AUTO, ITEMS, NONE, parse_leave_out
 from hqgs.machine import peak_rss_mb, reset_peak_rss
 from hqgs.ply import write_ply
@@ -39,7 +40,7 @@ class FrugalityConfig:
 
     iterations: int = 7_000
     downscale: float = 2.0
-    seed: int = 0
+    seeds: int = 1
     rows: tuple[str, ...] = ROWS
     embedded: tuple[int, int, int] = (WIDTH, HEIGHT, 24)
 
@@ -47,17 +48,15 @@ class FrugalityConfig:
 QUICK = FrugalityConfig(iterations=30, downscale=1.0, rows=(NONE, "growth", AUTO), embedded=(48, 36, 12))
 
 
-def train_config(row: str, config: FrugalityConfig) -> TrainConfig:
-    return TrainConfig(
-        iterations=config.iterations, seed=config.seed, leave_out=parse_leave_out(row)
-    ).scaled()
+def train_config(row: str, config: FrugalityConfig, seed: int) -> TrainConfig:
+    return TrainConfig(iterations=config.iterations, seed=seed, leave_out=parse_leave_out(row)).scaled()
 
 
-def run_row(row: str, scene: Scene, config: FrugalityConfig) -> dict[str, Any]:
+def run_row(row: str, scene: Scene, config: TrainConfig) -> dict[str, Any]:
     """Train one row; what came of it, as plain JSON values."""
     resets = reset_peak_rss()
     clock = time.process_time()
-    trainer = Trainer(scene, train_config(row, config))
+    trainer = Trainer(scene, config)
     while trainer.iteration < trainer.length:
         trainer.step()
     cpu = time.process_time() - clock
@@ -71,6 +70,7 @@ def run_row(row: str, scene: Scene, config: FrugalityConfig) -> dict[str, Any]:
     return {
         "scene": scene.name,
         "row": row,
+        "seed": config.seed,
         "photo": [scene.test[0].camera.width, scene.test[0].camera.height],
         "psnr": last["psnr"],
         "ssim": last["ssim"],
@@ -86,20 +86,32 @@ def run_row(row: str, scene: Scene, config: FrugalityConfig) -> dict[str, Any]:
     }
 
 
+def paired(runs: Sequence[dict[str, Any]], row: str) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """The runs of a row, each with the one of the same scene and seed that left nothing out."""
+    base = {(run["scene"], run["seed"]): run for run in runs if run["row"] == NONE}
+    wanted = [(run, (run["scene"], run["seed"])) for run in runs if run["row"] == row]
+    return [(run, base[key]) for run, key in wanted if key in base]
+
+
 def against_none(runs: Sequence[dict[str, Any]], row: str) -> dict[str, Any] | None:
-    """Means over the scenes of a row's ratios and differences to "none"; None where no scene has both."""
-    base = {run["scene"]: run for run in runs if run["row"] == NONE}
-    pairs = [(run, base[run["scene"]]) for run in runs if run["row"] == row and run["scene"] in base]
-    if not pairs:
+    """Means over scenes and seeds of a row's ratios and differences to "none"; None where no run has both.
+
+    The worst scene is the one whose mean over the seeds is lowest.
+    """
+    if not (pairs := paired(runs, row)):
         return None
-    gains = [run["psnr"] - other["psnr"] for run, other in pairs]
+    gains: dict[str, list[float]] = {}
+    for run, other in pairs:
+        gains.setdefault(run["scene"], []).append(run["psnr"] - other["psnr"])
+    means = [float(np.mean(of_scene)) for of_scene in gains.values()]
     return {
-        "scenes": len(pairs),
+        "scenes": len(gains),
+        "runs": len(pairs),
         "cpu_seconds": float(np.mean([a["cpu_seconds"] / b["cpu_seconds"] for a, b in pairs])),
         "bytes": float(np.mean([a["bytes"] / b["bytes"] for a, b in pairs])),
         "gaussians": float(np.mean([a["gaussians"] / b["gaussians"] for a, b in pairs])),
-        "psnr": float(np.mean(gains)),
-        "worst_psnr": float(min(gains)),
+        "psnr": float(np.mean(means)),
+        "worst_psnr": min(means),
         "ssim": float(np.mean([a["ssim"] - b["ssim"] for a, b in pairs])),
         "decision_share": float(np.mean([a["decision_seconds"] / a["seconds"] for a, _ in pairs])),
     }
@@ -118,23 +130,30 @@ def verdict(summary: dict[str, Any]) -> dict[str, bool]:
 
 def tables(runs: Sequence[dict[str, Any]], config: FrugalityConfig) -> list[str]:
     body = []
-    for run in runs:
-        share = run["decision_seconds"] / run["seconds"]
+    for scene, row in dict.fromkeys((run["scene"], run["row"]) for run in runs):
+        same = [run for run in runs if (run["scene"], run["row"]) == (scene, row)]
+
+        def mean(name: str, same: list[dict[str, Any]] = same) -> float:
+            return float(np.mean([run[name] for run in same]))
+
+        psnrs = [run["psnr"] for run in same]
         body.append(
             [
-                f"{run['scene']}, {run['row']}",
-                f"{run['psnr']:.2f}",
-                f"{run['ssim']:.4f}",
-                f"{run['cpu_seconds']:.0f}",
-                f"{100 * share:.1f} %",
-                "-" if run["peak_rss_mb"] is None else f"{run['peak_rss_mb']:.0f}",
-                f"{run['gaussians']:,d}",
-                str(run["sh_degree"]),
-                f"{run['bytes'] / 1e6:.2f}",
+                f"{scene}, {row}",
+                f"{mean('psnr'):.2f}" + (f" ± {np.ptp(psnrs) / 2:.2f}" if len(same) > 1 else ""),
+                f"{mean('ssim'):.4f}",
+                f"{mean('cpu_seconds'):.0f}",
+                f"{100 * mean('decision_seconds') / mean('seconds'):.1f} %",
+                "-" if any(run["peak_rss_mb"] is None for run in same) else f"{mean('peak_rss_mb'):.0f}",
+                f"{mean('gaussians'):,.0f}",
+                "/".join(str(degree) for degree in sorted({run["sh_degree"] for run in same})),
+                f"{mean('bytes') / 1e6:.2f}",
             ]
         )
     head = ["left out", "PSNR (dB)", "SSIM", "CPU s", "decisions", "peak (MB)", "Gaussians", "degree", "MB"]
     title = f"{config.iterations:,} iterations, photos at 1/{config.downscale:g}, held-out views"
+    if config.seeds > 1:
+        title += f", {config.seeds} seeds (± half the range)"
     found = [markdown_table(title, head, body)]
     rows = [(row, s) for row in config.rows if row != NONE and (s := against_none(runs, row)) is not None]
     if rows:
@@ -158,21 +177,16 @@ def tables(runs: Sequence[dict[str, Any]], config: FrugalityConfig) -> list[str]
 def chart(runs: Sequence[dict[str, Any]]) -> Figure:
     """PSNR gained against the share of the CPU time, and against the share of the bytes; a mark a run."""
     figure = Figure(figsize=(9, 4.2), dpi=150, layout="constrained")
-    base = {run["scene"]: run for run in runs if run["row"] == NONE}
-    rows = [row for row in ROWS if row != NONE and any(run["row"] == row for run in runs)]
+    rows = [row for row in ROWS if row != NONE and paired(runs, row)]
     for axes, (name, label) in zip(
         figure.subplots(1, 2, sharey=True), (("cpu_seconds", "CPU time"), ("bytes", "bytes")), strict=True
     ):
         for k, row in enumerate(rows):
-            points = [
-                (run[name] / base[run["scene"]][name], run["psnr"] - base[run["scene"]]["psnr"])
-                for run in runs
-                if run["row"] == row and run["scene"] in base
-            ]
-            if points:
-                size = 60 if row == AUTO else 30
-                axes.scatter(*zip(*points, strict=True), label=row, s=size, color=f"C{k}")
+            points = [(run[name] / none[name], run["psnr"] - none["psnr"]) for run, none in paired(runs, row)]
+            size = 60 if row == AUTO else 30
+            axes.scatter(*zip(*points, strict=True), label=row, s=size, color=f"C{k}")
         axes.axhline(0, color="#888888", linewidth=0.8)
+        axes.axvline(1, color="#888888", linewidth=0.8)
         axes.set_xlabel(f"{label}, nothing left out = 1")
         axes.set_xlim(left=0)
         axes.grid(color="#dddddd", linewidth=0.7)
@@ -186,31 +200,34 @@ def chart(runs: Sequence[dict[str, Any]]) -> Figure:
 def run(args: argparse.Namespace) -> Report:
     """Train what is not finished, row after row of a scene; each is kept as soon as it is done."""
     config = QUICK if args.quick else FrugalityConfig()
-    changes = {n: v for n in ("iterations", "downscale", "seed") if (v := getattr(args, n)) is not None}
+    changes = {n: v for n in ("iterations", "downscale", "seeds") if (v := getattr(args, n)) is not None}
     config = replace(config, **changes, **({"rows": tuple(args.rows)} if args.rows else {}))
     if unknown := [row for row in config.rows if row not in ROWS]:
         raise ValueError(f"rows: there is no {unknown[0]!r}; there are: {', '.join(ROWS)}")
     if not config.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {config.downscale}")
-    for row in config.rows:
-        train_config(row, config)  # refuses bad settings before the work
+    if config.seeds < 1:
+        raise ValueError(f"seeds must be at least 1, got {config.seeds}")
+    cells = [
+        (row, train_config(row, config, seed)) for row in config.rows for seed in range(config.seeds)
+    ]  # refuses bad settings before the work
     scenes = load_scenes(args.scene, config.downscale, config.embedded, args.out / "scene", args.validate)
     runs = []
     for scene in scenes:
-        for row in config.rows:
-            facts = {
-                "version": hqgs.__version__,
-                "config": asdict(train_config(row, config)),
-                "scene": scene_fingerprint(scene),
-            }
+        fingerprint = scene_fingerprint(scene)
+        for row, training in cells:
+            facts = {"version": hqgs.__version__, "config": asdict(training), "scene": fingerprint}
+            if training.leave_out:
+                facts["rules"] = RULES
             digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
-            path = args.out / "frugality" / f"{scene.name}-{row}-{digest}.json"
-            if path.is_file():
-                runs.append(json.loads(path.read_text(encoding="utf-8")))
-                continue
-            print(f"bench frugality: {scene.name}, {row}", file=sys.stderr, flush=True)
-            runs.append(run_row(row, scene, config))
-            write_json(path, runs[-1])
+            path = args.out / "frugality" / f"{scene.name}-{row}-s{training.seed}-{digest}.json"
+            if (run := kept(path)) is None:
+                print(
+                    f"bench frugality: {scene.name}, {row}, seed {training.seed}", file=sys.stderr, flush=True
+                )
+                run = run_row(row, scene, training)
+                write_json(path, run)
+            runs.append(run)
     summaries = {row: s for row in config.rows if row != NONE and (s := against_none(runs, row))}
     found = tables(runs, config)
     results: dict[str, Any] = {"runs": runs, "against_none": summaries}
@@ -229,14 +246,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--scene",
         nargs="+",
         type=Path,
-        default=[Path("embedded")],
+        default=[EMBEDDED],
         metavar="SCENE",
-        help="folders (%(default)s)",
+        help=f"folders, or of: {', '.join(map(str, BUILT_IN))}, which are built in (%(default)s)",
     )
     add("--rows", nargs="+", metavar="ROW", help=f"only these of: {', '.join(ROWS)}")
     add("--iterations", type=int, metavar="N", help="training steps of each run (7000, with --quick 30)")
     add("--downscale", type=float, metavar="F", help="divide the photos' sides by F (2, with --quick 1)")
-    add("--seed", type=int, metavar="S", help="of the training (0)")
+    add("--seeds", type=int, metavar="N", help="runs of each row, with other seeds (1)")
     add("--validate", action="store_true", help="judge by held-back training photos: to tune")
 
 

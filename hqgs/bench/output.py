@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -60,6 +61,19 @@ def write_results(out: Path, name: str, command: str, report: Report) -> list[Pa
             figure.savefig(tmp)
     write_json(out / f"{stem}.json", facts)
     return [out / f"{stem}.json", *pictures]
+
+
+def kept(path: Path) -> dict[str, Any] | None:
+    """What an earlier call kept in this file; None where there is none, ValueError where it is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("it holds no object")
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
+    return found
 
 
 def command_line(args: argparse.Namespace) -> str:

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 import hqgs
+from hqgs.bench.output import kept
 from hqgs.bench.quality_protocols import Cell
 from hqgs.bench.quality_regions import count_regions
 from hqgs.camera import Scene
@@ -71,13 +72,8 @@ class RunStore:
     def read(self, key: str) -> dict[str, Any] | None:
         """The finished run, None where there is none; ValueError for a damaged file."""
         path = self._path(key)
-        if not path.is_file():
-            return None
-        try:
-            run = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
-        if not isinstance(run, dict) or run.get("key") != key:
+        run = kept(path)
+        if run is not None and run.get("key") != key:
             raise ValueError(f"{path} is not the run of that name; remove it, and the run is repeated")
         return run
 

@@ -16,15 +16,16 @@ from hqgs.sfm import sfm_scene
 from hqgs.synthetic import embedded_scene
 
 EMBEDDED = Path("embedded")  # stands for the built-in scene
+BUILT_IN = {EMBEDDED: None, Path("embedded-matte"): 0.0, Path("embedded-glossy"): 1.0}  # gloss
 VALIDATE_EVERY = 7  # every 7th training photo
 
 
 def load_scenes(
     sources: Sequence[Path], downscale: float, embedded: tuple[int, int, int], cache: Path, validate: bool
 ) -> list[Scene]:
-    """The clean scenes of these folders; `embedded` is the built-in one's width, height and views.
+    """The clean scenes of these folders; `embedded` is the built-in ones' width, height and views.
 
-    With `validate` the held-out views are gone: see `validation_split`. The built-in scene is kept in
+    With `validate` the held-out views are gone: see `validation_split`. The built-in scenes are kept in
     `cache`. Raises FileNotFoundError for a missing folder, ValueError for a bad one, for two of one name, for
     one that `hqgs degrade` wrote, and for degraded training photos where clean ones are to validate on.
     """
@@ -33,10 +34,11 @@ def load_scenes(
         raise ValueError(f"two scenes are called {twice[0]!r}; the tables could not tell them apart")
     scenes = []
     for source in sources:
-        if source == EMBEDDED:
+        if source in BUILT_IN:
             width, height = (round(size / downscale) for size in embedded[:2])
-            folder = cache / f"embedded_{width}x{height}_{embedded[2]}"
-            scene = embedded_scene(cache=folder, width=width, height=height, num_views=embedded[2])
+            folder = cache / f"{source}_{width}x{height}_{embedded[2]}"
+            made = embedded_scene(folder, width, height, num_views=embedded[2], gloss=BUILT_IN[source])
+            scene = replace(made, name=str(source))
         else:
             if (source / FILE).is_file():
                 raise ValueError(f"{source} holds degraded photos; give the folder of the clean ones")

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hqgs.bench.features import FEATURES, Feature
-from hqgs.bench.output import Benchmark, Report
+from hqgs.bench.output import Benchmark, Report, kept
 from hqgs.bench.scene import still_config
 from hqgs.bench.timing import Seconds, interleaved
 from hqgs.bench.training_report import DEFAULT, chart, compare, scene_table, verdict_table, verdicts
@@ -73,9 +73,8 @@ class Training:
         """The report of a run that is done. ValueError where the folder holds a run of another kind."""
         folder = self.folder(feature, seed)
         path = folder / REPORT
-        if not path.is_file():
+        if (report := kept(path)) is None:
             return None
-        report = json.loads(path.read_text(encoding="utf-8"))
         wanted = json.loads(json.dumps(asdict(self.train_config(feature, seed))))
         if report["config"] != wanted:
             raise ValueError(f"{folder} holds a run with another configuration; choose another --out")

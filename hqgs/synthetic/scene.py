@@ -31,30 +31,36 @@ def embedded_scene(
     num_views: int = 24,
     time_limit: float = 60.0,
     threads: int | None = None,
+    gloss: float | None = None,
 ) -> Scene:
     """A room, ray-cast from `num_views` forward-facing cameras; every 8th view is a test view.
 
     The photos are exact and clean, the cameras known, and no Gaussian is involved. Points come from the
     training photos alone (see `sfm_points`, which takes at most `time_limit` seconds before it falls back);
-    `Scene.notes` says how. With `cache`, photos and points are kept in that folder and read back next time; a
-    cache that is damaged or made by another version is made anew. Raises ValueError if the size is below
-    1 x 1 or `num_views` below 2, OSError if `cache` cannot be a folder.
+    `Scene.notes` says how. `gloss` (0 and above) gives every surface that strength of highlight, and a mirror
+    that goes with it, in place of its own: 0 is a matte room, where only the lamp shades depend on the view.
+
+    With `cache`, photos and points are kept in that folder and read back next time; a cache that is damaged
+    or made by another version is made anew. Raises ValueError if the size is below 1 x 1, `num_views` below 2
+    or `gloss` below 0, OSError if `cache` cannot be a folder.
     """
     if width < 1 or height < 1:
         raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if num_views < 2:
         raise ValueError(f"num_views must be at least 2 (one to train, one to test), got {num_views}")
+    if gloss is not None and not 0 <= gloss < math.inf:
+        raise ValueError(f"gloss must be at least 0 and finite, got {gloss}")
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
     cameras = embedded_cameras(width, height, num_views)
     names = [f"view_{k:02d}.png" for k in range(num_views)]
-    made = _read_cache(cache, cameras, names) if cache is not None else None
+    made = _read_cache(cache, cameras, names, gloss) if cache is not None else None
     if made is None:
-        photos = [render_view(camera, threads=threads) for camera in cameras]
+        photos = [render_view(camera, threads=threads, gloss=gloss) for camera in cameras]
         views = [View(*parts) for parts in zip(names, cameras, photos, strict=True)]
         points = sfm_points([v for k, v in enumerate(views) if k % 8], time_limit)
         if cache is not None:
-            _write_cache(cache, views, points)
+            _write_cache(cache, views, points, gloss)
     else:
         photos, points = made
         views = [View(*parts) for parts in zip(names, cameras, photos, strict=True)]
@@ -105,18 +111,20 @@ def look_at(
     return viewmat
 
 
-def _key(cameras: list[Camera], names: list[str]) -> dict[str, Any]:
-    """What the cached files depend on: the cameras' number and size, and the source that makes them."""
+def _key(cameras: list[Camera], names: list[str], gloss: float | None) -> dict[str, Any]:
+    """What the cached files depend on: the cameras' number and size, the gloss, and the source that makes
+    them."""
     source = b"".join(path.read_bytes() for path in [*sorted(Path(__file__).parent.glob("*.py")), PROGRAM])
     return {
         "source": hashlib.sha256(source).hexdigest(),
         "width": cameras[0].width,
         "height": cameras[0].height,
         "num_views": len(names),
+        "gloss": gloss,
     }
 
 
-def _write_cache(cache: Path, views: list[View], points: Points) -> None:
+def _write_cache(cache: Path, views: list[View], points: Points, gloss: float | None) -> None:
     """Photos and points first, the key with their checksums last, so that a key vouches for whole files."""
     for view in views:
         with atomic_path(cache / view.name) as tmp:
@@ -125,17 +133,17 @@ def _write_cache(cache: Path, views: list[View], points: Points) -> None:
         np.savez(tmp, points=points[0], colors=points[1])
     names = [view.name for view in views]
     files = {name: _checksum(cache / name) for name in [*names, "points.npz"]}
-    key = {"made": _key([view.camera for view in views], names), "files": files, "note": points[2]}
+    key = {"made": _key([view.camera for view in views], names, gloss), "files": files, "note": points[2]}
     write_json(cache / "key.json", key)
 
 
 def _read_cache(
-    cache: Path, cameras: list[Camera], names: list[str]
+    cache: Path, cameras: list[Camera], names: list[str], gloss: float | None
 ) -> tuple[list[NDArray[np.uint8]], Points] | None:
     """Photos and points, or None if anything is missing, damaged or made by another version."""
     try:
         key = json.loads((cache / "key.json").read_text(encoding="utf-8"))
-        if key["made"] != _key(cameras, names) or set(key["files"]) != {*names, "points.npz"}:
+        if key["made"] != _key(cameras, names, gloss) or set(key["files"]) != {*names, "points.npz"}:
             return None
         if any(_checksum(cache / name) != digest for name, digest in key["files"].items()):
             return None

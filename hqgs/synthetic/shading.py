@@ -17,12 +17,15 @@ from hqgs.synthetic.studio import Studio, studio
 TILE, BLOCK = 64, 8  # pixels: a tile is one job; each surface is tried on the blocks that it may cover
 
 
-def render_view(camera: Camera, samples: int = 3, threads: int | None = None) -> NDArray[np.uint8]:
+def render_view(
+    camera: Camera, samples: int = 3, threads: int | None = None, gloss: float | None = None
+) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB.
 
     A pixel is the mean of `samples`^2 rays in linear light, spread evenly over its square; use more when the
     picture is much smaller than 504 x 378. `threads` (default: the cores at hand) never changes a bit.
-    Raises ValueError if the camera's size, `samples` or `threads` is below 1 or K has a skew.
+    For `gloss` see `embedded_scene`. Raises ValueError if the camera's size, `samples` or `threads` is below
+    1 or K has a skew.
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
@@ -32,7 +35,7 @@ def render_view(camera: Camera, samples: int = 3, threads: int | None = None) ->
     def work(tile: _Tile) -> None:
         image[tile.rows, tile.cols] = tile.picture(_render_tile(tile))
 
-    _each_tile(camera, jitter, np.float32, work, threads)
+    _each_tile(camera, jitter, np.float32, work, threads, gloss)
     return image
 
 
@@ -63,8 +66,10 @@ def _sample_pattern(n: int) -> NDArray[np.float64]:
 class _Tile:
     """The rays of up to TILE x TILE pixels, in B blocks of S samples of n = BLOCK^2 pixels: [B, S, n]."""
 
-    def __init__(self, camera: Camera, x: int, y: int, jitter: NDArray[np.float64], dtype: type) -> None:
-        self.scene, self.jitter = studio(), jitter
+    def __init__(
+        self, camera: Camera, x: int, y: int, jitter: NDArray[np.float64], dtype: type, gloss: float | None
+    ) -> None:
+        self.scene, self.jitter = studio(gloss), jitter
         width, height = min(TILE, camera.width - x), min(TILE, camera.height - y)
         self.rows, self.cols = slice(y, y + height), slice(x, x + width)
         self.grid = (-(-height // BLOCK), -(-width // BLOCK))  # the last blocks may reach past the picture
@@ -104,6 +109,7 @@ def _each_tile(
     dtype: type,
     work: Callable[[_Tile], None],
     threads: int | None,
+    gloss: float | None = None,
 ) -> None:
     """Run `work` on fixed tiles that cover the picture; the tiles do not depend on the threads."""
     if camera.width < 1 or camera.height < 1:
@@ -115,7 +121,7 @@ def _each_tile(
 
     def job(corner: tuple[int, int]) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # rays parallel to a side
-            work(_Tile(camera, *corner, jitter, dtype))
+            work(_Tile(camera, *corner, jitter, dtype, gloss))
 
     corners = [(x, y) for y in range(0, camera.height, TILE) for x in range(0, camera.width, TILE)]
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:  # more would wait for Python
