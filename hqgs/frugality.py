@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,27 +24,21 @@ from hqgs.config import TrainConfig
 from hqgs.data.images import area_downscale
 from hqgs.densify import DensifyConfig, Growth, cut_harmonics
 from hqgs.gaussians import Gaussians
-from hqgs.harmonics import folded
 from hqgs.left_out import LeftOut
 from hqgs.methods.base import Method
 from hqgs.render import render_view
 from hqgs.smallest import photo_pixels
-from hqgs.weights import largest_weights
+from hqgs.trials import FOLDED, TOLERANCE, WEIGHTS, fewest_bands, fewest_gaussians, spread
 
 if TYPE_CHECKING:
     from hqgs.train import Trainer  # which itself imports this module
 
-T = TypeVar("T")
-
 HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
-TOLERANCE = 0.02  # dB that leaving one thing out may cost
 TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
 FINEST = 2.0  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
-WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
 EARLIEST = 2_000  # iterations before which they cannot tell yet
-FOLDED = 16  # views, at most, from which the folded bands are to look as before
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
 BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
@@ -88,7 +83,7 @@ class Frugality:
         count = 0
         if self.items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
-        places = _spread(range(len(views)), count)
+        places = spread(range(len(views)), count)
         self.held = [views[k] for k in places]
         self.trained = [view for k, view in enumerate(views) if k not in places]
         self.state = State(config.iterations, config.sh_degree)
@@ -230,57 +225,44 @@ class Frugality:
         trainer.densifier.config = self.densify_config
 
     def _decide_harmonics(self, trainer: Trainer) -> None:
-        """The fewest bands that lose no more than TOLERANCE against all of them."""
         gaussians = trainer.gaussians
-        shown = self._shown(gaussians)
-        whole = self._psnr(trainer, shown, self.held)
-        some = _spread(self.views, FOLDED)
-        for degree in range(gaussians.sh_degree):
-            fewer = folded(gaussians, some, degree)
-            colors = {"sh0": fewer.sh0, "shN": fewer.shN}
-            cost = whole - self._psnr(trainer, Gaussians(**(shown.named() | colors)), self.held)
-            if cost <= TOLERANCE:
-                numbers = gaussians.shN.shape[1] - ((degree + 1) ** 2 - 1)
-                self.state.degree = degree
-                cut_harmonics(gaussians, trainer.optimizer, **colors)
-                left = LeftOut(
-                    f"harmonics above degree {degree}",
-                    f"the {len(self.held)} held-back photos do not ask for them",
-                    f"{whole:.2f} dB with them, {whole - cost:.2f} dB without",
-                    memory_mb=4 * 12e-6 * numbers * len(gaussians),
-                    bytes=12 * numbers * len(gaussians),
-                    cost_db=cost,
-                )
-                self._note(left, trainer)
-                return
+        fewer = fewest_bands(
+            gaussians, self._shown(gaussians), self.views, partial(self._psnr, trainer, views=self.held)
+        )
+        if fewer is None:
+            return
+        numbers = gaussians.shN.shape[1] - fewer.colors["shN"].shape[1]
+        self.state.degree = fewer.degree
+        cut_harmonics(gaussians, trainer.optimizer, **fewer.colors)
+        left = LeftOut(
+            f"harmonics above degree {fewer.degree}",
+            f"the {len(self.held)} held-back photos do not ask for them",
+            fewer.evidence,
+            memory_mb=4 * 12e-6 * numbers * len(gaussians),
+            bytes=12 * numbers * len(gaussians),
+            cost_db=fewer.cost,
+        )
+        self._note(left, trainer)
 
     def _decide_weight(self, trainer: Trainer) -> None:
-        """The highest limit of the blending weight that loses no more than TOLERANCE."""
         gaussians = trainer.gaussians
-        shown = self._shown(gaussians)
-        weights = largest_weights(shown, self.views)
-        tried = _spread(self.views, TRIED)
-        whole = self._psnr(trainer, shown, tried)
-        for limit in WEIGHTS:
-            faint = weights < limit
-            count = int(faint.sum())
-            if not 0 < count < len(gaussians):
-                continue
-            rest = Gaussians(**{name: tensor[~faint] for name, tensor in shown.named().items()})
-            cost = whole - self._psnr(trainer, rest, tried)
-            if cost <= TOLERANCE:
-                row = sum(tensor[:1].numel() for tensor in gaussians.named().values())
-                trainer.remove(faint)
-                left = LeftOut(
-                    f"{count} of {count + len(trainer.gaussians)} Gaussians",
-                    f"no photo shows them with a blending weight of {limit:g}",
-                    f"{whole:.2f} dB on {len(tried)} photos with them, {whole - cost:.2f} dB without",
-                    memory_mb=4 * 4e-6 * row * count,
-                    bytes=4 * row * count,
-                    cost_db=cost,
-                )
-                self._note(left, trainer)
-                return
+        tried = spread(self.views, TRIED)
+        psnr = partial(self._psnr, trainer, views=tried)
+        fewer = fewest_gaussians(self._shown(gaussians), self.views, psnr)
+        if fewer is None:
+            return
+        total, count = len(gaussians), int(fewer.faint.sum())
+        row = sum(tensor[:1].numel() for tensor in gaussians.named().values())
+        trainer.remove(fewer.faint)
+        left = LeftOut(
+            f"{count} of {total} Gaussians",
+            f"no photo shows them with a blending weight of {fewer.limit:g}",
+            f"on {len(tried)} photos {fewer.evidence}",
+            memory_mb=4 * 4e-6 * row * count,
+            bytes=4 * row * count,
+            cost_db=fewer.cost,
+        )
+        self._note(left, trainer)
 
     def _shown(self, gaussians: Gaussians) -> Gaussians:
         """As they are rasterized, without a gradient history."""
@@ -315,12 +297,6 @@ class Frugality:
             index, start, before = self._open.pop(0)
             saved = before - float(np.mean(self._seconds))
             self.state.records[index]["seconds"] = max(saved, 0.0) * (self.state.length - start)
-
-
-def _spread(items: Sequence[T], count: int) -> list[T]:
-    """`count` of the items at most, evenly spread."""
-    count = min(count, len(items))
-    return [items[k] for k in np.linspace(0, len(items), 2 * count + 1)[1::2].astype(int)]
 
 
 def smaller(view: View) -> View:
