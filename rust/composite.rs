@@ -4,6 +4,7 @@ use crate::{
     camera::Camera,
     constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
+    fresh::Fresh,
     kernel::{self, ABSOLUTE, Adjoint, Grid, LAYER, Layers, MOMENTS, Pixels, Sums, UNIT},
     project::{Projection, Splat},
     real::{Lanes, Real},
@@ -13,7 +14,7 @@ use crate::{
 };
 use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
-use std::hint::black_box;
+use std::{hint::black_box, iter::repeat_n};
 
 /// Everything that both passes read.
 #[derive(Debug, Clone, Copy)]
@@ -77,6 +78,19 @@ impl<T: Real> CompositeInput<'_, T> {
     }
 }
 
+/// One view.
+#[derive(Debug)]
+pub struct Image<T> {
+    /// [H, W, channels]
+    pub image: Vec<T>,
+    /// [H, W]
+    pub alphas: Vec<T>,
+    /// For the backward pass.
+    pub composited: Composited<T>,
+    /// Counts.
+    pub work: Work,
+}
+
 /// What the backward pass replays.
 #[derive(Debug, Default)]
 pub struct Composited<T> {
@@ -124,43 +138,47 @@ macro_rules! for_vectors {
     };
 }
 
-/// Composite all tiles into `image` [H, W, channels] and `alphas` [H, W].
+/// Composite all tiles.
 ///
 /// # Errors
-/// When the length of an array does not fit; nothing is written then.
-pub fn forward<T: Real>(
-    input: &CompositeInput<T>,
-    image: &mut [T],
-    alphas: &mut [T],
-) -> Result<(Composited<T>, Work), Error> {
+/// When the length of an array does not fit.
+pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
     input.check()?;
-    check_len("render_colors", image, input.pixels() * input.channels())?;
-    check_len("render_alphas", alphas, input.pixels())?;
     let (tiles, channels) = (input.tiles, input.channels());
     let count = tiles.columns * tiles.rows;
     let mut depths = vec![[0; TILE_BLOCKS]; count];
-    let mut transmittance = vec![T::ZERO; count * TILE_PIXELS];
-    let mut colors = vec![[T::ZERO; TILE_PIXELS]; count * channels];
+    let mut transmittance = Fresh::new(count * TILE_PIXELS);
+    let mut colors = Fresh::new(count * channels);
     let grid = Grid::new();
     let level = Level::new();
     let degree = input.projection.tuning.exp2_degree;
     let work = depths
         .par_iter_mut()
-        .zip(transmittance.par_chunks_mut(TILE_PIXELS))
-        .zip(colors.par_chunks_mut(channels))
+        .zip(transmittance.cut(repeat_n(TILE_PIXELS, count)))
+        .zip(colors.cut(repeat_n(channels, count)))
         .enumerate()
         .map(|(tile, ((depths, transmittance), colors))| {
+            let transmittance = transmittance.fill(T::ZERO);
+            let colors = colors.fill([T::ZERO; TILE_PIXELS]);
             dispatch!(level, simd => for_alpha!(
                 channels, degree, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
             ))
         })
         .reduce(Work::default, Work::plus);
-    let width = input.camera.width;
+    let (transmittance, colors) = (transmittance.finish(), colors.finish());
+    let (width, height) = (input.camera.width, input.camera.height);
+    let (mut image, mut alphas) = (
+        Fresh::new(width * height * channels),
+        Fresh::new(width * height),
+    );
+    let pixels = (0..tiles.rows).map(|row| TILE.min(height - row * TILE) * width);
     image
-        .par_chunks_mut(TILE * width * channels)
-        .zip(alphas.par_chunks_mut(TILE * width))
+        .cut(pixels.clone().map(|n| n * channels))
+        .into_par_iter()
+        .zip(alphas.cut(pixels))
         .enumerate()
         .for_each(|(row, (image, alphas))| {
+            let (image, alphas) = (image.fill(T::ZERO), alphas.fill(T::ZERO));
             let base = row * TILE * width;
             for tile in row * tiles.columns..(row + 1) * tiles.columns {
                 let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
@@ -179,16 +197,18 @@ pub fn forward<T: Real>(
                 }
             }
         });
-    Ok((
-        Composited {
+    Ok(Image {
+        image: image.finish(),
+        alphas: alphas.finish(),
+        composited: Composited {
             depths,
             transmittance,
         },
-        Work {
+        work: Work {
             channels: channels as u64,
             ..work
         },
-    ))
+    })
 }
 
 #[inline(always)]
@@ -232,58 +252,69 @@ pub struct CompositeCotangents<'a, T> {
     pub alphas: Option<&'a [T]>,
 }
 
-/// Gradients of the compositor's inputs, all [N, ...], zeroed by the caller. `None` is not computed.
-#[derive(Debug, Default)]
-pub struct CompositeGrads<'a, T> {
-    /// Gradients of the geometry.
-    pub geometry: Option<GeometryGrads<'a, T>>,
-    /// Of `colors`, [N, channels].
-    pub colors: Option<&'a mut [T]>,
-    /// Of `background`, [channels].
-    pub background: Option<&'a mut [T]>,
+/// Which gradients [`backward`] is to compute.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Wanted {
+    /// Those with respect to what the projection computed.
+    pub geometry: bool,
+    /// With them, the sums of the absolute gradients.
+    pub absolute: bool,
+    /// Of the colours.
+    pub colors: bool,
+    /// Of the background.
+    pub background: bool,
 }
 
-/// Gradients with respect to what the projection computed.
-#[derive(Debug)]
-pub struct GeometryGrads<'a, T> {
+/// Gradients of the compositor's inputs; empty where not wanted.
+#[derive(Debug, Default)]
+pub struct CompositeGrads<T> {
     /// Of `means2d`, [N, 2].
-    pub means2d: &'a mut [T],
+    pub means2d: Vec<T>,
     /// Whitened gradient of the 2D covariance, [N, 3]; see `geometry.rs`.
-    pub whitened: &'a mut [T],
+    pub whitened: Vec<T>,
     /// Of `opacities`, [N].
-    pub opacities: &'a mut [T],
+    pub opacities: Vec<T>,
     /// Sum over the pixels of the absolute gradient of `means2d`, [N, 2].
-    pub absolute: Option<&'a mut [T]>,
+    pub absolute: Vec<T>,
+    /// Of `colors`, [N, channels].
+    pub colors: Vec<T>,
+    /// Of `background`, [channels].
+    pub background: Vec<T>,
+    /// Counts.
+    pub work: Work,
 }
 
 /// VJP of [`forward`]. Tiles and blocks whose pixels have no cotangent that is not 0 are left out.
 ///
 /// # Errors
-/// When the length of an array does not fit; nothing is written then.
+/// When the length of an array does not fit.
 pub fn backward<T: Real>(
     input: &CompositeInput<T>,
     composited: &Composited<T>,
     v: &CompositeCotangents<T>,
-    grads: CompositeGrads<T>,
-) -> Result<Work, Error> {
+    wanted: Wanted,
+) -> Result<CompositeGrads<T>, Error> {
     input.check()?;
-    let (n, channels, tiles) = (input.projection.splats.len(), input.channels(), input.tiles);
+    let (channels, tiles) = (input.channels(), input.tiles);
     check_len("v_render_colors", v.image, input.pixels() * channels)?;
     if let Some(alphas) = v.alphas {
         check_len("v_render_alphas", alphas, input.pixels())?;
     }
-    if let Some(background) = grads.background {
-        check_len("v_backgrounds", background, channels)?;
-        background_vjp(input, composited, v, background);
+    let background = if wanted.background {
+        background_vjp(input, composited, v)
+    } else {
+        Vec::new()
+    };
+    let columns = Columns {
+        absolute: wanted.geometry && wanted.absolute,
+        channels,
+    };
+    if !wanted.geometry && !wanted.colors {
+        return Ok(CompositeGrads {
+            background,
+            ..CompositeGrads::default()
+        });
     }
-    if grads.geometry.is_none() && grads.colors.is_none() {
-        return Ok(Work::default());
-    }
-    let absolute = grads
-        .geometry
-        .as_ref()
-        .is_some_and(|g| g.absolute.is_some());
-    let columns = Columns { absolute, channels };
     let grid = Grid::new();
     let level = Level::new();
     let degree = input.projection.tuning.exp2_degree;
@@ -301,8 +332,11 @@ pub fn backward<T: Real>(
             },
         )
         .unzip();
-    gather(input, &pair_grads, columns, n, grads.geometry, grads.colors)?;
-    Ok(work.into_iter().fold(Work::default(), Work::plus))
+    Ok(CompositeGrads {
+        background,
+        work: work.into_iter().fold(Work::default(), Work::plus),
+        ..gather(input, &pair_grads, columns, wanted)
+    })
 }
 
 /// Layout of one pair's gradients: moments, colours, absolute gradients.
@@ -439,62 +473,65 @@ fn gather<T: Real>(
     input: &CompositeInput<T>,
     pair_grads: &[Vec<T>],
     columns: Columns,
-    n: usize,
-    geometry: Option<GeometryGrads<T>>,
-    colors: Option<&mut [T]>,
-) -> Result<(), Error> {
-    let channels = columns.channels;
-    let (mut means2d, mut whitened, mut opacities, mut absolute) = (None, None, None, None);
-    if let Some(g) = geometry {
-        check_len("v_means2d", g.means2d, 2 * n)?;
-        check_len("v_whitened", g.whitened, 3 * n)?;
-        check_len("v_opacities", g.opacities, n)?;
-        (means2d, whitened, opacities, absolute) = (
-            Some(g.means2d),
-            Some(g.whitened),
-            Some(g.opacities),
-            g.absolute,
-        );
-    }
-    if let Some(colors) = &colors {
-        check_len("v_colors", colors, channels * n)?;
-    }
+    wanted: Wanted,
+) -> CompositeGrads<T> {
     let chunks = &input.tiles.chunks;
-    let level = Level::new();
+    let channels = columns.channels;
+    let rows = [
+        (wanted.geometry, 2),
+        (wanted.geometry, 3),
+        (wanted.geometry, 1),
+        (columns.absolute, ABSOLUTE),
+        (wanted.colors, channels),
+    ]
+    .map(|(wanted, row)| if wanted { row } else { 0 });
+    let n = input.projection.splats.len();
+    let mut arrays = rows.map(|row| Fresh::new(row * n));
+    let cut = |array, row| Fresh::cut(array, chunks.iter().map(|c| (c.end - c.begin) * row));
+    let [means2d, whitened, opacities, absolute, colors] = &mut arrays;
     let jobs: Vec<_> = chunks
         .iter()
-        .zip(rows(means2d, chunks, 2))
-        .zip(rows(whitened, chunks, 3))
-        .zip(rows(opacities, chunks, 1))
-        .zip(rows(absolute, chunks, 2))
-        .zip(rows(colors, chunks, channels))
-        .map(
-            |(((((chunk, means2d), whitened), opacities), absolute), colors)| Gather {
-                chunk,
-                means2d,
-                whitened,
-                opacities,
-                absolute,
-                colors,
-            },
-        )
+        .zip(cut(means2d, rows[0]))
+        .zip(cut(whitened, rows[1]))
+        .zip(cut(opacities, rows[2]))
+        .zip(cut(absolute, rows[3]))
+        .zip(cut(colors, rows[4]))
         .collect();
-    jobs.into_par_iter().for_each(|job| {
-        dispatch!(level, simd => for_channels!(
-            channels, gather_chunk, simd, T, (input, pair_grads, columns, job)
-        ));
-    });
-    Ok(())
+    let level = Level::new();
+    jobs.into_par_iter().for_each(
+        |(((((chunk, means2d), whitened), opacities), absolute), colors)| {
+            let out = Gather {
+                chunk,
+                means2d: means2d.fill(T::ZERO),
+                whitened: whitened.fill(T::ZERO),
+                opacities: opacities.fill(T::ZERO),
+                absolute: absolute.fill(T::ZERO),
+                colors: colors.fill(T::ZERO),
+            };
+            dispatch!(level, simd => for_channels!(
+                channels, gather_chunk, simd, T, (input, pair_grads, columns, out)
+            ));
+        },
+    );
+    let [means2d, whitened, opacities, absolute, colors] = arrays.map(Fresh::finish);
+    CompositeGrads {
+        means2d,
+        whitened,
+        opacities,
+        absolute,
+        colors,
+        ..CompositeGrads::default()
+    }
 }
 
-/// The outputs of one chunk.
+/// The outputs of one chunk: empty where not wanted, zeros before.
 struct Gather<'a, T> {
     chunk: &'a Chunk,
-    means2d: Option<&'a mut [T]>,
-    whitened: Option<&'a mut [T]>,
-    opacities: Option<&'a mut [T]>,
-    absolute: Option<&'a mut [T]>,
-    colors: Option<&'a mut [T]>,
+    means2d: &'a mut [T],
+    whitened: &'a mut [T],
+    opacities: &'a mut [T],
+    absolute: &'a mut [T],
+    colors: &'a mut [T],
 }
 
 impl<T: Real> Gather<'_, T> {
@@ -509,32 +546,26 @@ impl<T: Real> Gather<'_, T> {
         absolute: &[f64],
     ) {
         let i = i - self.chunk.begin;
-        write(&mut self.colors, i, colors);
+        write(self.colors, i, colors);
         let [s, m, t] = splat.factors;
         // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
         let (wu, wv) = (moments[1] / UNIT, moments[2] / UNIT);
-        write(&mut self.means2d, i, &[-s * wu, s * m * wu - t * wv]);
+        write(self.means2d, i, &[-s * wu, s * m * wu - t * wv]);
         // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
         let k = -0.5 / (UNIT * UNIT);
-        write(
-            &mut self.whitened,
-            i,
-            &[k * moments[3], k * moments[4], k * moments[5]],
-        );
+        let whitened = [k * moments[3], k * moments[4], k * moments[5]];
+        write(self.whitened, i, &whitened);
         // sigma enters as opacity exp(-sigma)
-        write(&mut self.opacities, i, &[-moments[0] / splat.opacity]);
-        write(
-            &mut self.absolute,
-            i,
-            &[s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)],
-        );
+        write(self.opacities, i, &[-moments[0] / splat.opacity]);
+        let absolute = [s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)];
+        write(self.absolute, i, &absolute);
     }
 }
 
 /// Row `i` of an output, if it is wanted.
 #[inline(always)]
-fn write<T: Real>(out: &mut Option<&mut [T]>, i: usize, values: &[f64]) {
-    if let Some(out) = out {
+fn write<T: Real>(out: &mut [T], i: usize, values: &[f64]) {
+    if !out.is_empty() {
         for (o, v) in out[i * values.len()..].iter_mut().zip(values) {
             *o = T::from_f64(*v);
         }
@@ -615,39 +646,12 @@ fn add<T: Real>(sums: &mut [f64], grads: &[T]) {
     }
 }
 
-/// Split `data` into consecutive pieces of the given lengths.
-fn split<T>(mut data: &mut [T], lengths: impl Iterator<Item = usize>) -> Vec<&mut [T]> {
-    lengths
-        .map(|n| {
-            let (head, tail) = std::mem::take(&mut data).split_at_mut(n);
-            data = tail;
-            head
-        })
-        .collect()
-}
-
-/// Split an optional array of `row` numbers per Gaussian into the ranges of `chunks`.
-fn rows<'a, T>(
-    data: Option<&'a mut [T]>,
-    chunks: &[Chunk],
-    row: usize,
-) -> Vec<Option<&'a mut [T]>> {
-    match data {
-        Some(d) => split(d, chunks.iter().map(|c| (c.end - c.begin) * row))
-            .into_iter()
-            .map(Some)
-            .collect(),
-        None => chunks.iter().map(|_| None).collect(),
-    }
-}
-
 /// Gradient of the background: the sum of transmittance times cotangent, tile by tile in order.
 fn background_vjp<T: Real>(
     input: &CompositeInput<T>,
     composited: &Composited<T>,
     v: &CompositeCotangents<T>,
-    out: &mut [T],
-) {
+) -> Vec<T> {
     let channels = input.channels();
     let parts: Vec<Vec<f64>> = composited
         .transmittance
@@ -665,7 +669,7 @@ fn background_vjp<T: Real>(
             sums
         })
         .collect();
-    for (c, out) in out.iter_mut().enumerate() {
-        *out = T::from_f64(parts.iter().map(|p| p[c]).sum());
-    }
+    (0..channels)
+        .map(|c| T::from_f64(parts.iter().map(|p| p[c]).sum()))
+        .collect()
 }

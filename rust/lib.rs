@@ -12,6 +12,7 @@ mod columns;
 pub mod composite;
 pub mod constants;
 pub mod error;
+mod fresh;
 mod geometry;
 mod kernel;
 mod lanes;

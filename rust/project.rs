@@ -4,6 +4,7 @@ use crate::{
     camera::{Camera, CameraGrad},
     columns::{self, Column, GROUP, MAX_COLUMNS, Rows, get3, wide3},
     constants::{EPS2D, FACTOR_MAX, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK, SUPPORT_SLACK, TILE},
+    fresh::{Blank, Fresh},
     geometry::{CameraGradLanes, CameraLanes, Cotangent, Geometry, GeometryGrad},
     lanes::{V3, Wide, lanes, ln, splat as splat_lanes, splat3},
     real::{Lanes, Real},
@@ -67,6 +68,15 @@ impl Splat {
     pub fn visible(&self) -> bool {
         self.opacity > 0.0
     }
+
+    /// Alpha at (x, y) by the definition, for the tests.
+    #[cfg(test)]
+    pub fn alpha(&self, x: f64, y: f64) -> f64 {
+        let [s, m, t] = self.factors;
+        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
+        let (u, v) = (s * (dx - m * dy), t * dy);
+        (self.opacity * (-0.5 * (u * u + v * v)).exp()).min(0.99)
+    }
 }
 
 /// What the later stages need of the projection of N Gaussians.
@@ -80,21 +90,44 @@ pub struct Projection {
     pub tuning: Tuning,
 }
 
-/// Arrays that the projection fills; zeros where a Gaussian is culled.
+/// What the projection gives; zeros where a Gaussian is culled.
 #[derive(Debug)]
-pub struct ProjectOut<'a, T> {
+pub struct Projected<T> {
+    /// For the later stages.
+    pub projection: Projection,
     /// Centres in pixels, [N, 2].
-    pub means2d: &'a mut [T],
+    pub means2d: Vec<T>,
     /// View-space depth, [N].
-    pub depths: &'a mut [T],
+    pub depths: Vec<T>,
     /// Inverse covariance (xx, xy, yy), [N, 3].
-    pub conics: &'a mut [T],
+    pub conics: Vec<T>,
     /// Radii of the support in pixels, rounded up, [N, 2].
-    pub radii: &'a mut [i32],
+    pub radii: Vec<i32>,
     /// Opacities, compensated if antialiased, [N].
-    pub opacities: &'a mut [T],
+    pub opacities: Vec<T>,
     /// Colours from the spherical harmonics, [N, 3]; empty without them.
-    pub colors: &'a mut [T],
+    pub colors: Vec<T>,
+    /// Counts.
+    pub work: Work,
+}
+
+/// What one job fills of it; zeros before.
+struct ForwardChunk<'a, T> {
+    splats: &'a mut [Splat],
+    /// The depths of `Projection`.
+    keys: &'a mut [f64],
+    means2d: &'a mut [T],
+    depths: &'a mut [T],
+    conics: &'a mut [T],
+    radii: &'a mut [i32],
+    opacities: &'a mut [T],
+    colors: &'a mut [T],
+}
+
+/// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.
+fn chunks<T: Copy>(array: &mut Fresh<T>, n: usize, row: usize) -> Vec<Blank<'_, T>> {
+    let rows = |c| PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
+    array.cut((0..n.div_ceil(PROJECT_CHUNK)).map(|c| rows(c) * row))
 }
 
 /// The geometry of a group of Gaussians, one column per number.
@@ -326,65 +359,68 @@ pub fn forward<T: Real>(
     colors: Colors<T>,
     camera: &Camera,
     options: &ProjectOptions,
-    projection: &mut Projection,
-    out: ProjectOut<T>,
-) -> Work {
+) -> Projected<T> {
     let n = gaussians.len();
-    if projection.splats.len() != n {
-        projection.splats = rayon::iter::repeat_n(Splat::default(), n).collect();
-    }
-    projection.depths.resize(n, 0.0);
-    projection.tuning = options.tuning;
-    let color_channels = if matches!(colors, Colors::Harmonics(_)) {
-        3
-    } else {
-        0
+    let channels = match colors {
+        Colors::Harmonics(_) => 3,
+        Colors::Channels(..) => 0,
     };
-    let mut out_colors = out.colors;
-    let color_chunks = (0..n.div_ceil(PROJECT_CHUNK)).map(|c| {
-        let rows = PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
-        let (head, tail) = std::mem::take(&mut out_colors).split_at_mut(rows * color_channels);
-        out_colors = tail;
-        head
-    });
-    let jobs: Vec<_> = projection
-        .splats
-        .chunks_mut(PROJECT_CHUNK)
-        .zip(projection.depths.chunks_mut(PROJECT_CHUNK))
-        .zip(out.means2d.chunks_mut(2 * PROJECT_CHUNK))
-        .zip(out.depths.chunks_mut(PROJECT_CHUNK))
-        .zip(out.conics.chunks_mut(3 * PROJECT_CHUNK))
-        .zip(out.radii.chunks_mut(2 * PROJECT_CHUNK))
-        .zip(out.opacities.chunks_mut(PROJECT_CHUNK))
-        .zip(color_chunks)
-        .map(
-            |(((((((splats, keys), means2d), depths), conics), radii), opacities), colors)| {
-                (
-                    splats,
-                    keys,
-                    ProjectOut {
-                        means2d,
-                        depths,
-                        conics,
-                        radii,
-                        opacities,
-                        colors,
-                    },
-                )
-            },
-        )
-        .enumerate()
+    let (mut splats, mut keys) = (Fresh::new(n), Fresh::new(n));
+    let (mut means2d, mut depths) = (Fresh::new(2 * n), Fresh::new(n));
+    let (mut conics, mut radii) = (Fresh::new(3 * n), Fresh::new(2 * n));
+    let (mut opacities, mut rgb) = (Fresh::new(n), Fresh::new(channels * n));
+    let jobs: Vec<_> = chunks(&mut splats, n, 1)
+        .into_iter()
+        .zip(chunks(&mut keys, n, 1))
+        .zip(chunks(&mut means2d, n, 2))
+        .zip(chunks(&mut depths, n, 1))
+        .zip(chunks(&mut conics, n, 3))
+        .zip(chunks(&mut radii, n, 2))
+        .zip(chunks(&mut opacities, n, 1))
+        .zip(chunks(&mut rgb, n, channels))
         .collect();
     let level = Level::new();
-    let work = jobs.into_par_iter().map(|(chunk, (splats, keys, mut out))| {
-        dispatch!(level, simd => forward_chunk(
-            simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, splats, keys, &mut out
-        ))
-    });
-    work.reduce(Work::default, Work::plus)
+    let work = jobs
+        .into_par_iter()
+        .enumerate()
+        .map(
+            |(
+                chunk,
+                (((((((splats, keys), means2d), depths), conics), radii), opacities), rgb),
+            )| {
+                let out = ForwardChunk {
+                    splats: splats.fill(Splat::default()),
+                    keys: keys.fill(0.0),
+                    means2d: means2d.fill(T::ZERO),
+                    depths: depths.fill(T::ZERO),
+                    conics: conics.fill(T::ZERO),
+                    radii: radii.fill(0),
+                    opacities: opacities.fill(T::ZERO),
+                    colors: rgb.fill(T::ZERO),
+                };
+                dispatch!(level, simd => forward_chunk(
+                    simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, out
+                ))
+            },
+        )
+        .reduce(Work::default, Work::plus);
+    Projected {
+        projection: Projection {
+            splats: splats.finish(),
+            depths: keys.finish(),
+            tuning: options.tuning,
+        },
+        means2d: means2d.finish(),
+        depths: depths.finish(),
+        conics: conics.finish(),
+        radii: radii.finish(),
+        opacities: opacities.finish(),
+        colors: rgb.finish(),
+        work,
+    }
 }
 
-/// Project the Gaussians `begin..begin + splats.len()`.
+/// Project the Gaussians from `begin` on, as many as `out` has.
 #[inline(always)]
 fn forward_chunk<S: Simd, T: Real>(
     simd: S,
@@ -393,12 +429,11 @@ fn forward_chunk<S: Simd, T: Real>(
     camera: &Camera,
     options: &ProjectOptions,
     begin: usize,
-    splats: &mut [Splat],
-    keys: &mut [f64],
-    out: &mut ProjectOut<T>,
+    out: ForwardChunk<T>,
 ) -> Work {
+    let count = out.splats.len();
     let mut work = Work {
-        gaussians: splats.len() as u64,
+        gaussians: count as u64,
         ..Work::default()
     };
     let camera_lanes = CameraLanes::new(
@@ -412,8 +447,8 @@ fn forward_chunk<S: Simd, T: Real>(
     let mut inputs = Inputs::ZERO;
     let mut group = Group::ZERO;
     let mut harmonics = Coefficients::ZERO;
-    for start in (0..splats.len()).step_by(GROUP) {
-        let rows = GROUP.min(splats.len() - start);
+    for start in (0..count).step_by(GROUP) {
+        let rows = GROUP.min(count - start);
         let first = begin + start;
         inputs.read(simd, gaussians, first);
         let mut keep = 0u16;
@@ -462,7 +497,7 @@ fn forward_chunk<S: Simd, T: Real>(
                 let [r, g, b] = &rgb;
                 columns::write([&r.0, &g.0, &b.0], rows_of(out.colors, 3, start, rows));
             }
-            Colors::Harmonics(_) => rows_of(out.colors, 3, start, rows).fill(T::ZERO),
+            Colors::Harmonics(_) => {}
             Colors::Channels(data, channels) => {
                 for lane in 0..rows {
                     let i = first + lane;
@@ -473,16 +508,17 @@ fn forward_chunk<S: Simd, T: Real>(
             }
         }
         work.projected += u64::from(keep.count_ones());
-        let splats = &mut splats[start..start + rows];
+        if keep == 0 {
+            continue;
+        }
+        let splats = &mut out.splats[start..start + rows];
         for (lane, splat) in splats.iter_mut().enumerate() {
-            *splat = if keep >> lane & 1 == 1 {
-                group.splat(lane)
-            } else {
-                Splat::default()
-            };
+            if keep >> lane & 1 == 1 {
+                *splat = group.splat(lane);
+            }
         }
         let depth = kept::<f64>(&group.depth, keep);
-        keys[start..start + rows].copy_from_slice(&depth[..rows]);
+        out.keys[start..start + rows].copy_from_slice(&depth[..rows]);
         let depth = kept(&group.depth, keep);
         columns::write([&depth], rows_of(out.depths, 1, start, rows));
         let opacity = kept(&group.opacity, keep);
@@ -631,38 +667,88 @@ impl<T: Real> Cotangents<T> {
     }
 }
 
-/// Gradients to fill; `None` is not computed. They hold zeros before: what belongs to a culled Gaussian or to
-/// one without a cotangent, or to a harmonic above the degree in use, is left as it is.
-#[derive(Debug, Default)]
-pub struct GaussianGrads<'a, T> {
-    /// [N, 3]
-    pub means: Option<&'a mut [T]>,
-    /// [N, 4]
-    pub quats: Option<&'a mut [T]>,
-    /// [N, 3]
-    pub scales: Option<&'a mut [T]>,
-    /// [N]
-    pub opacities: Option<&'a mut [T]>,
-    /// As `Harmonics::coefficients`.
-    pub harmonics: Option<&'a mut [T]>,
-    /// As `Harmonics::rest`.
-    pub harmonics_rest: Option<&'a mut [T]>,
+/// Which gradients [`backward`] is to compute.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Wanted {
+    /// Of the means.
+    pub means: bool,
+    /// Of the quaternions.
+    pub quats: bool,
+    /// Of the scales.
+    pub scales: bool,
+    /// Of the opacities.
+    pub opacities: bool,
+    /// Of `Harmonics::coefficients`.
+    pub harmonics: bool,
+    /// Of `Harmonics::rest`.
+    pub harmonics_rest: bool,
+    /// Of the whole pose of the camera, not only of its centre.
+    pub camera: bool,
 }
 
-/// Split an optional array of `n` rows into chunks of `PROJECT_CHUNK` rows.
-fn chunks<T>(data: Option<&mut [T]>, n: usize, row: usize) -> Vec<Option<&mut [T]>> {
-    match data {
-        Some(d) if row > 0 => d.chunks_mut(PROJECT_CHUNK * row).map(Some).collect(),
-        // No rows of the higher degrees still means one part for each chunk.
-        _ => (0..n.div_ceil(PROJECT_CHUNK)).map(|_| None).collect(),
+/// Gradients of the projection's inputs; empty where not wanted. Zeros for a Gaussian that is culled or without
+/// a cotangent, and for harmonics above the degree in use.
+#[derive(Debug)]
+pub struct GaussianGrads<T> {
+    /// [N, 3]
+    pub means: Vec<T>,
+    /// [N, 4]
+    pub quats: Vec<T>,
+    /// [N, 3]
+    pub scales: Vec<T>,
+    /// [N]
+    pub opacities: Vec<T>,
+    /// As `Harmonics::coefficients`.
+    pub harmonics: Vec<T>,
+    /// As `Harmonics::rest`.
+    pub harmonics_rest: Vec<T>,
+    /// Of the camera.
+    pub camera: CameraGrad,
+    /// Counts.
+    pub work: Work,
+}
+
+/// What one job fills of it: empty where not wanted.
+struct BackwardChunk<'a, T> {
+    means: Blank<'a, T>,
+    quats: Blank<'a, T>,
+    scales: Blank<'a, T>,
+    opacities: Blank<'a, T>,
+    harmonics: Blank<'a, T>,
+    harmonics_rest: Blank<'a, T>,
+    /// Numbers per Gaussian, in that order.
+    rows: [usize; 6],
+}
+
+/// The part of one group, zeros before.
+struct BackwardGroup<'a, T> {
+    means: &'a mut [T],
+    quats: &'a mut [T],
+    scales: &'a mut [T],
+    opacities: &'a mut [T],
+    harmonics: &'a mut [T],
+    harmonics_rest: &'a mut [T],
+}
+
+impl<'a, T: Real> BackwardChunk<'a, T> {
+    #[inline(always)]
+    fn group(&mut self, rows: usize) -> BackwardGroup<'a, T> {
+        let [means, quats, scales, opacities, harmonics, rest] = self.rows.map(|row| row * rows);
+        BackwardGroup {
+            means: self.means.next(means, T::ZERO),
+            quats: self.quats.next(quats, T::ZERO),
+            scales: self.scales.next(scales, T::ZERO),
+            opacities: self.opacities.next(opacities, T::ZERO),
+            harmonics: self.harmonics.next(harmonics, T::ZERO),
+            harmonics_rest: self.harmonics_rest.next(rest, T::ZERO),
+        }
     }
 }
 
-/// Vector-Jacobian product of [`forward`]: fills `grads` and returns the gradient of the camera (of its
-/// centre alone unless `camera_wanted`). Groups of 16 Gaussians without a cotangent are left out, and so is the
-/// geometry where the colours alone have cotangents.
+/// Vector-Jacobian product of [`forward`]. Groups of 16 Gaussians without a cotangent are left out, and so is
+/// the geometry where the colours alone have cotangents.
 ///
-/// `projection` must be the one that `forward` filled from the same inputs.
+/// `projection` must be the one that `forward` made from the same inputs.
 pub fn backward<T: Real>(
     gaussians: &Gaussians<T>,
     harmonics: Option<&Harmonics<T>>,
@@ -670,35 +756,64 @@ pub fn backward<T: Real>(
     options: &ProjectOptions,
     projection: &Projection,
     v: &ProjectCotangents<T>,
-    grads: GaussianGrads<T>,
-    camera_wanted: bool,
-) -> (CameraGrad, Work) {
+    wanted: Wanted,
+) -> GaussianGrads<T> {
     let n = gaussians.len();
     let (row, rest_row) = harmonics.map_or((0, 0), Harmonics::rows);
-    let jobs: Vec<_> = chunks(grads.means, n, 3)
+    let rows = [
+        (wanted.means, 3),
+        (wanted.quats, 4),
+        (wanted.scales, 3),
+        (wanted.opacities, 1),
+        (wanted.harmonics, row),
+        (wanted.harmonics_rest, rest_row),
+    ]
+    .map(|(wanted, row)| if wanted { row } else { 0 });
+    let mut arrays = rows.map(|row| Fresh::<T>::new(row * n));
+    let [means, quats, scales, opacities, sh, rest] = &mut arrays;
+    let jobs: Vec<_> = chunks(means, n, rows[0])
         .into_iter()
-        .zip(chunks(grads.quats, n, 4))
-        .zip(chunks(grads.scales, n, 3))
-        .zip(chunks(grads.opacities, n, 1))
-        .zip(chunks(grads.harmonics, n, row))
-        .zip(chunks(grads.harmonics_rest, n, rest_row))
+        .zip(chunks(quats, n, rows[1]))
+        .zip(chunks(scales, n, rows[2]))
+        .zip(chunks(opacities, n, rows[3]))
+        .zip(chunks(sh, n, rows[4]))
+        .zip(chunks(rest, n, rows[5]))
         .collect();
     let level = Level::new();
     let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, (((((means, quats), scales), opacities), harmonics_grad), harmonics_rest))| {
-            let grads = GaussianGrads { means, quats, scales, opacities, harmonics: harmonics_grad, harmonics_rest };
+        .map(|(chunk, (((((means, quats), scales), opacities), sh), rest))| {
+            let out = BackwardChunk {
+                means,
+                quats,
+                scales,
+                opacities,
+                harmonics: sh,
+                harmonics_rest: rest,
+                rows,
+            };
             dispatch!(level, simd => backward_chunk(
-                simd, gaussians, harmonics, camera, options, projection, v, chunk * PROJECT_CHUNK, grads, camera_wanted
+                simd, gaussians, harmonics, camera, options, projection, v, chunk * PROJECT_CHUNK, out, wanted.camera
             ))
         })
         .collect();
-    let start = (CameraGrad::ZERO, Work::default());
-    parts.iter().fold(start, |(mut sum, work), (part, more)| {
-        sum.add(part);
-        (sum, work.plus(*more))
-    })
+    let (mut camera_grad, mut work) = (CameraGrad::ZERO, Work::default());
+    for (part, more) in &parts {
+        camera_grad.add(part);
+        work = work.plus(*more);
+    }
+    let [means, quats, scales, opacities, sh, rest] = arrays.map(Fresh::finish);
+    GaussianGrads {
+        means,
+        quats,
+        scales,
+        opacities,
+        harmonics: sh,
+        harmonics_rest: rest,
+        camera: camera_grad,
+        work,
+    }
 }
 
 /// VJP of the Gaussians of one chunk.
@@ -712,7 +827,7 @@ fn backward_chunk<S: Simd, T: Real>(
     projection: &Projection,
     v: &ProjectCotangents<T>,
     begin: usize,
-    mut grads: GaussianGrads<T>,
+    mut chunk: BackwardChunk<T>,
     camera_wanted: bool,
 ) -> (CameraGrad, Work) {
     let zero = splat_lanes(simd, 0.0);
@@ -738,7 +853,7 @@ fn backward_chunk<S: Simd, T: Real>(
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
     for first in (begin..end).step_by(GROUP) {
         let rows = GROUP.min(end - first);
-        let start = first - begin;
+        let grads = chunk.group(rows);
         let mut visible = 0u16;
         for (lane, depth) in projection.depths[first..first + rows].iter().enumerate() {
             visible |= u16::from(*depth > 0.0) << lane;
@@ -818,17 +933,17 @@ fn backward_chunk<S: Simd, T: Real>(
             scales: [s0, s1, s2],
             opacities,
         } = &out;
-        if let Some(out) = &mut grads.means {
-            columns::write([&x.0, &y.0, &z.0], rows_of(out, 3, start, rows));
+        if !grads.means.is_empty() {
+            columns::write([&x.0, &y.0, &z.0], grads.means);
         }
-        if let Some(out) = &mut grads.quats {
-            columns::write([&q0.0, &q1.0, &q2.0, &q3.0], rows_of(out, 4, start, rows));
+        if !grads.quats.is_empty() {
+            columns::write([&q0.0, &q1.0, &q2.0, &q3.0], grads.quats);
         }
-        if let Some(out) = &mut grads.scales {
-            columns::write([&s0.0, &s1.0, &s2.0], rows_of(out, 3, start, rows));
+        if !grads.scales.is_empty() {
+            columns::write([&s0.0, &s1.0, &s2.0], grads.scales);
         }
-        if let Some(out) = &mut grads.opacities {
-            columns::write([&opacities.0], rows_of(out, 1, start, rows));
+        if !grads.opacities.is_empty() {
+            columns::write([&opacities.0], grads.opacities);
         }
         let Some(h) = v_colors else {
             continue;
@@ -838,13 +953,11 @@ fn backward_chunk<S: Simd, T: Real>(
         let v_coefficients = &colors.v_coefficients[..used];
         let (in_first, in_rest) = v_coefficients.split_at(if h.rest.is_some() { 3 } else { used });
         let buffer = &mut colors.coefficients.rows;
-        if let Some(out) = &mut grads.harmonics {
-            let out = rows_of(out, row, start, rows);
-            buffer.write(simd, in_first, out, row, rows);
+        if !grads.harmonics.is_empty() {
+            buffer.write(simd, in_first, grads.harmonics, row, rows);
         }
-        if let (Some(out), false) = (&mut grads.harmonics_rest, in_rest.is_empty()) {
-            let out = rows_of(out, rest_row, start, rows);
-            buffer.write(simd, in_rest, out, rest_row, rows);
+        if !grads.harmonics_rest.is_empty() && !in_rest.is_empty() {
+            buffer.write(simd, in_rest, grads.harmonics_rest, rest_row, rows);
         }
     }
     (camera_grad.sum(), work)

@@ -3,11 +3,9 @@
 
 use crate::{
     camera::Camera,
-    composite::{
-        self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads,
-    },
+    composite::{self, CompositeCotangents, CompositeInput, Composited},
     error::Error,
-    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
+    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, Projection},
     real::Real,
     scene::{Colors, Gaussians, Harmonics},
     threads,
@@ -20,7 +18,6 @@ use numpy::{
     PyUntypedArrayMethods,
 };
 use pyo3::{exceptions::PyValueError, prelude::*};
-use rayon::prelude::*;
 use std::{
     collections::HashMap,
     ffi::{c_int, c_long},
@@ -105,28 +102,6 @@ pub(crate) fn is_f32(value: &Bound<'_, PyAny>) -> bool {
     value.cast::<PyArrayDyn<f32>>().is_ok()
 }
 
-/// Numbers of a vector that are set to zero by one thread.
-const ZEROS: usize = 1 << 15;
-
-/// Zeros if wanted, else an empty vector. A large one is made by all threads: for each Gaussian there are more
-/// of them than any stage has of other numbers to write.
-fn zeros<T: Real>(wanted: bool, n: usize) -> Vec<T> {
-    const BLOCK: usize = 64;
-    let n = if wanted { n } else { 0 };
-    if n < 2 * ZEROS {
-        return vec![T::ZERO; n];
-    }
-    let mut blocks = Vec::new();
-    (0..n.div_ceil(BLOCK))
-        .into_par_iter()
-        .with_min_len(ZEROS / BLOCK)
-        .map(|_| [T::ZERO; BLOCK])
-        .collect_into_vec(&mut blocks);
-    let mut zeros = blocks.into_flattened();
-    zeros.truncate(n);
-    zeros
-}
-
 /// Add the gradient from another camera; it stays finite.
 fn accumulate<T: Real>(sum: &mut [T], part: &[T]) {
     for (s, p) in sum.iter_mut().zip(part) {
@@ -134,8 +109,12 @@ fn accumulate<T: Real>(sum: &mut [T], part: &[T]) {
     }
 }
 
-fn some<T>(wanted: bool, data: &mut [T]) -> Option<&mut [T]> {
-    wanted.then_some(data)
+/// One array after the other, [C, ...].
+fn join<T: Copy>(mut parts: Vec<Vec<T>>) -> Vec<T> {
+    match parts.len() {
+        1 => parts.remove(0),
+        _ => parts.concat(),
+    }
 }
 
 /// The projection of N Gaussians into C cameras.
@@ -376,49 +355,33 @@ fn project_as<'py, T: Scalar>(
         Some(_) => (&[][..], 0),
         None => arrays.channels(gaussians.len(), cameras.len())?,
     };
-    let (n, c) = (gaussians.len(), cameras.len());
-    let (projections, work, out) = py.detach(|| {
+    let n = gaussians.len();
+    let outs: Vec<_> = py.detach(|| {
         threads::install(|| {
-            let mut means2d = zeros::<T>(true, 2 * c * n);
-            let mut depths = zeros::<T>(true, c * n);
-            let mut conics = zeros::<T>(true, 3 * c * n);
-            let mut radii = vec![0i32; 2 * c * n];
-            let mut opacities = zeros::<T>(true, c * n);
-            let color_row = if harmonics.is_some() { 3 * n } else { 0 };
-            let mut colors = zeros::<T>(true, c * color_row);
-            let mut projections = Vec::with_capacity(c);
-            let mut work = Work::default();
-            for (i, camera) in cameras.iter().enumerate() {
-                let mut projection = Projection::default();
-                let out = ProjectOut {
-                    means2d: &mut means2d[2 * i * n..2 * (i + 1) * n],
-                    depths: &mut depths[i * n..(i + 1) * n],
-                    conics: &mut conics[3 * i * n..3 * (i + 1) * n],
-                    radii: &mut radii[2 * i * n..2 * (i + 1) * n],
-                    opacities: &mut opacities[i * n..(i + 1) * n],
-                    colors: &mut colors[i * color_row..(i + 1) * color_row],
-                };
-                let more = project::forward(
-                    &gaussians,
-                    harmonics.as_ref().map_or_else(
-                        || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
-                        Colors::Harmonics,
-                    ),
-                    camera,
-                    &options,
-                    &mut projection,
-                    out,
+            let project = |(i, camera)| {
+                let colors = harmonics.as_ref().map_or_else(
+                    || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
+                    Colors::Harmonics,
                 );
-                projections.push(projection);
-                work = work.plus(more);
-            }
-            (
-                projections,
-                work,
-                (means2d, depths, conics, radii, opacities, colors),
-            )
+                project::forward(&gaussians, colors, camera, &options)
+            };
+            cameras.iter().enumerate().map(project).collect()
         })
     });
+    let mut work = Work::default();
+    let (mut projections, mut radii) = (Vec::new(), Vec::new());
+    let (mut means2d, mut depths, mut conics) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut opacities, mut colors) = (Vec::new(), Vec::new());
+    for out in outs {
+        work = work.plus(out.work);
+        projections.push(out.projection);
+        means2d.push(out.means2d);
+        depths.push(out.depths);
+        conics.push(out.conics);
+        radii.push(out.radii);
+        opacities.push(out.opacities);
+        colors.push(out.colors);
+    }
     let frame = Frame {
         cameras,
         projections,
@@ -427,15 +390,14 @@ fn project_as<'py, T: Scalar>(
         sh_degree,
         work,
     };
-    let (means2d, depths, conics, radii, opacities, colors) = out;
     Ok((
         frame,
-        means2d.into_pyarray(py),
-        depths.into_pyarray(py),
-        conics.into_pyarray(py),
-        radii.into_pyarray(py),
-        opacities.into_pyarray(py),
-        colors.into_pyarray(py),
+        join(means2d).into_pyarray(py),
+        join(depths).into_pyarray(py),
+        join(conics).into_pyarray(py),
+        join(radii).into_pyarray(py),
+        join(opacities).into_pyarray(py),
+        join(colors).into_pyarray(py),
     ))
 }
 
@@ -615,30 +577,27 @@ fn project_backward_as<'py, T: Scalar>(
         v_colors.as_ref().map(Array::slice).transpose()?,
     );
     let [
-        want_means,
-        want_quats,
-        want_scales,
-        want_opacities,
-        want_harmonics,
-        want_rest,
-        want_viewmats,
+        means,
+        quats,
+        scales,
+        opacities,
+        harmonics_wanted,
+        harmonics_rest,
+        camera,
     ] = wanted;
-    let (row, rest_row) = harmonics.as_ref().map_or((0, 0), Harmonics::rows);
-    let out = py.detach(|| {
+    let wanted = project::Wanted {
+        means,
+        quats,
+        scales,
+        opacities,
+        harmonics: harmonics_wanted,
+        harmonics_rest,
+        camera,
+    };
+    let (sums, viewmats) = py.detach(|| {
         threads::install(|| {
-            let fresh = || {
-                [
-                    zeros::<T>(want_means, 3 * n),
-                    zeros::<T>(want_quats, 4 * n),
-                    zeros::<T>(want_scales, 3 * n),
-                    zeros::<T>(want_opacities, n),
-                    zeros::<T>(want_harmonics, row * n),
-                    zeros::<T>(want_rest, rest_row * n),
-                ]
-            };
-            let mut sums = fresh();
+            let mut sums: Option<GaussianGrads<T>> = None;
             let mut viewmats = Vec::with_capacity(16 * c);
-            let mut work = Work::default();
             for (i, camera) in frame.cameras.iter().enumerate() {
                 let cotangents = ProjectCotangents {
                     means2d: slices.0.map(|s| &s[2 * i * n..2 * (i + 1) * n]),
@@ -648,53 +607,44 @@ fn project_backward_as<'py, T: Scalar>(
                     conics: slices.4.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
                     colors: slices.5.map(|s| &s[3 * i * n..3 * (i + 1) * n]),
                 };
-                let mut one = if i == 0 {
-                    std::mem::take(&mut sums)
-                } else {
-                    fresh()
-                };
-                let [means, quats, scales, opacities, sh, rest] = &mut one;
-                let grads = GaussianGrads {
-                    means: some(want_means, means),
-                    quats: some(want_quats, quats),
-                    scales: some(want_scales, scales),
-                    opacities: some(want_opacities, opacities),
-                    harmonics: some(want_harmonics, sh),
-                    harmonics_rest: some(want_rest, rest),
-                };
-                let (camera_grad, more) = project::backward(
+                let grads = project::backward(
                     &gaussians,
                     harmonics.as_ref(),
                     camera,
                     &frame.options,
                     &frame.projections[i],
                     &cotangents,
-                    grads,
-                    want_viewmats,
+                    wanted,
                 );
-                work = work.plus(more);
-                viewmats.extend(camera_grad.viewmat(camera));
-                if i == 0 {
-                    sums = one;
-                } else {
-                    for (sum, part) in sums.iter_mut().zip(&one) {
-                        accumulate(sum, part);
+                viewmats.extend(grads.camera.viewmat(camera));
+                match &mut sums {
+                    None => sums = Some(grads),
+                    Some(sums) => {
+                        accumulate(&mut sums.means, &grads.means);
+                        accumulate(&mut sums.quats, &grads.quats);
+                        accumulate(&mut sums.scales, &grads.scales);
+                        accumulate(&mut sums.opacities, &grads.opacities);
+                        accumulate(&mut sums.harmonics, &grads.harmonics);
+                        accumulate(&mut sums.harmonics_rest, &grads.harmonics_rest);
+                        sums.work = sums.work.plus(grads.work);
                     }
                 }
             }
-            (sums, viewmats, work)
+            (sums, viewmats)
         })
     });
-    let ([means, quats, scales, opacities, sh, rest], viewmats, work) = out;
+    let grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
     Ok((
-        want_means.then(|| means.into_pyarray(py)),
-        want_quats.then(|| quats.into_pyarray(py)),
-        want_scales.then(|| scales.into_pyarray(py)),
-        want_opacities.then(|| opacities.into_pyarray(py)),
-        want_harmonics.then(|| sh.into_pyarray(py)),
-        want_rest.then(|| rest.into_pyarray(py)),
-        want_viewmats.then(|| viewmats.into_pyarray(py)),
-        work.entries().collect(),
+        wanted.means.then(|| grads.means.into_pyarray(py)),
+        wanted.quats.then(|| grads.quats.into_pyarray(py)),
+        wanted.scales.then(|| grads.scales.into_pyarray(py)),
+        wanted.opacities.then(|| grads.opacities.into_pyarray(py)),
+        wanted.harmonics.then(|| grads.harmonics.into_pyarray(py)),
+        wanted
+            .harmonics_rest
+            .then(|| grads.harmonics_rest.into_pyarray(py)),
+        wanted.camera.then(|| viewmats.into_pyarray(py)),
+        grads.work.entries().collect(),
     ))
 }
 
@@ -758,9 +708,7 @@ fn composite_as<'py, T: Scalar>(
     check_colors(frame, colors, backgrounds, channels)?;
     let (state, image, alphas) = py.detach(|| {
         threads::install(|| -> Result<_, Error> {
-            let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
-            let mut image = zeros::<T>(true, frame.cameras.len() * pixels * channels);
-            let mut alphas = zeros::<T>(true, frame.cameras.len() * pixels);
+            let (mut images, mut alphas) = (Vec::new(), Vec::new());
             let (mut views, mut total, mut bin_seconds) = (Vec::new(), Work::default(), 0.0);
             for (i, (camera, projection)) in
                 frame.cameras.iter().zip(&frame.projections).enumerate()
@@ -779,12 +727,11 @@ fn composite_as<'py, T: Scalar>(
                     camera,
                     background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 };
-                let (composited, work) = composite::forward(
-                    &input,
-                    &mut image[i * pixels * channels..(i + 1) * pixels * channels],
-                    &mut alphas[i * pixels..(i + 1) * pixels],
-                )?;
-                total = total.plus(work);
+                let view = composite::forward(&input)?;
+                total = total.plus(view.work);
+                images.push(view.image);
+                alphas.push(view.alphas);
+                let composited = view.composited;
                 views.push(View { tiles, composited });
             }
             Ok((
@@ -793,8 +740,8 @@ fn composite_as<'py, T: Scalar>(
                     work: total,
                     bin_seconds,
                 },
-                image,
-                alphas,
+                join(images),
+                join(alphas),
             ))
         })
     })?;
@@ -861,7 +808,7 @@ fn composite_backward_as<'py, T: Scalar>(
     check_colors(frame, colors, backgrounds, channels)?;
     let v_image = v_image.slice()?;
     let v_alphas = v_alphas.as_ref().map(Array::slice).transpose()?;
-    let (n, c) = (frame.n, frame.cameras.len());
+    let c = frame.cameras.len();
     let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
     for (name, got, expected) in [
         ("v_render_colors", v_image.len(), c * pixels * channels),
@@ -880,17 +827,16 @@ fn composite_backward_as<'py, T: Scalar>(
             .into());
         }
     }
-    let [want_geometry, want_absolute, want_colors, want_background] = wanted;
-    let out = py.detach(|| {
-        threads::install(|| -> Result<_, Error> {
-            let mut means2d = zeros::<T>(want_geometry, 2 * c * n);
-            let mut whitened = zeros::<T>(want_geometry, 3 * c * n);
-            let mut opacities = zeros::<T>(want_geometry, c * n);
-            let mut absolute = zeros::<T>(want_geometry && want_absolute, 2 * c * n);
-            let mut v_colors = zeros::<T>(want_colors, channels * c * n);
-            let mut v_background = zeros::<T>(want_background, channels * c);
-            let mut work = Work::default();
-            for (i, camera) in frame.cameras.iter().enumerate() {
+    let [geometry, absolute, want_colors, background] = wanted;
+    let wanted = composite::Wanted {
+        geometry,
+        absolute,
+        colors: want_colors,
+        background,
+    };
+    let outs: Vec<_> = py.detach(|| {
+        threads::install(|| {
+            let backward = |(i, camera): (usize, _)| {
                 let input = CompositeInput {
                     projection: &frame.projections[i],
                     tiles: &views[i].tiles,
@@ -901,55 +847,31 @@ fn composite_backward_as<'py, T: Scalar>(
                     image: &v_image[i * pixels * channels..(i + 1) * pixels * channels],
                     alphas: v_alphas.map(|a| &a[i * pixels..(i + 1) * pixels]),
                 };
-                let geometry = if want_geometry {
-                    Some(GeometryGrads {
-                        means2d: &mut means2d[2 * i * n..2 * (i + 1) * n],
-                        whitened: &mut whitened[3 * i * n..3 * (i + 1) * n],
-                        opacities: &mut opacities[i * n..(i + 1) * n],
-                        absolute: if want_absolute {
-                            Some(&mut absolute[2 * i * n..2 * (i + 1) * n])
-                        } else {
-                            None
-                        },
-                    })
-                } else {
-                    None
-                };
-                let grads = CompositeGrads {
-                    geometry,
-                    colors: if want_colors {
-                        Some(&mut v_colors[i * n * channels..(i + 1) * n * channels])
-                    } else {
-                        None
-                    },
-                    background: if want_background {
-                        Some(&mut v_background[i * channels..(i + 1) * channels])
-                    } else {
-                        None
-                    },
-                };
-                let more = composite::backward(&input, &views[i].composited, &cotangents, grads)?;
-                work = work.plus(more);
-            }
-            Ok((
-                means2d,
-                whitened,
-                opacities,
-                absolute,
-                v_colors,
-                v_background,
-                work,
-            ))
+                composite::backward(&input, &views[i].composited, &cotangents, wanted)
+            };
+            let cameras = frame.cameras.iter().enumerate();
+            cameras.map(backward).collect::<Result<_, Error>>()
         })
     })?;
-    let (means2d, whitened, opacities, absolute, v_colors, v_background, work) = out;
+    let mut work = Work::default();
+    let (mut means2d, mut whitened, mut opacities) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut absolutes, mut v_colors, mut v_background) = (Vec::new(), Vec::new(), Vec::new());
+    for out in outs {
+        work = work.plus(out.work);
+        means2d.push(out.means2d);
+        whitened.push(out.whitened);
+        opacities.push(out.opacities);
+        absolutes.push(out.absolute);
+        v_colors.push(out.colors);
+        v_background.push(out.background);
+    }
     Ok((
-        want_geometry.then(|| means2d.into_pyarray(py)),
-        want_geometry.then(|| whitened.into_pyarray(py)),
-        want_geometry.then(|| opacities.into_pyarray(py)),
-        (want_geometry && want_absolute).then(|| absolute.into_pyarray(py)),
-        want_colors.then(|| v_colors.into_pyarray(py)),
-        want_background.then(|| v_background.into_pyarray(py)),
+        geometry.then(|| join(means2d).into_pyarray(py)),
+        geometry.then(|| join(whitened).into_pyarray(py)),
+        geometry.then(|| join(opacities).into_pyarray(py)),
+        (geometry && absolute).then(|| join(absolutes).into_pyarray(py)),
+        want_colors.then(|| join(v_colors).into_pyarray(py)),
+        background.then(|| join(v_background).into_pyarray(py)),
         work.entries().collect(),
     ))
 }

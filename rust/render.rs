@@ -3,10 +3,8 @@
 use crate::{
     Error,
     camera::Camera,
-    composite::{
-        self, CompositeCotangents, CompositeGrads, CompositeInput, Composited, GeometryGrads,
-    },
-    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
+    composite::{self, CompositeCotangents, CompositeInput, Composited, Image},
+    project::{self, ProjectCotangents, ProjectOptions, Projected, Projection},
     real::Real,
     scene::{Colors, Gaussians, Harmonics},
     tiles::{self, Tiles},
@@ -56,36 +54,25 @@ pub fn forward<T: Real>(
     let n = gaussians.len();
     gaussians.check()?;
     harmonics.check(n)?;
-    let mut projection = Projection::default();
-    let zeros = |n: usize| vec![T::ZERO; n];
-    let (mut means2d, mut depths, mut conics) = (zeros(2 * n), zeros(n), zeros(3 * n));
-    let (mut opacities, mut colors, mut radii) = (zeros(n), zeros(3 * n), vec![0; 2 * n]);
-    let out = ProjectOut {
-        means2d: &mut means2d,
-        depths: &mut depths,
-        conics: &mut conics,
-        radii: &mut radii,
-        opacities: &mut opacities,
-        colors: &mut colors,
-    };
-    project::forward(
-        gaussians,
-        Colors::Harmonics(harmonics),
-        camera,
-        options,
-        &mut projection,
-        out,
-    );
+    let Projected {
+        projection,
+        radii,
+        colors,
+        ..
+    } = project::forward(gaussians, Colors::Harmonics(harmonics), camera, options);
     let tiles = tiles::bin(&projection, &colors, 3, camera)?;
-    let pixels = camera.width * camera.height;
-    let (mut image, mut alphas) = (zeros(3 * pixels), zeros(pixels));
     let input = CompositeInput {
         projection: &projection,
         tiles: &tiles,
         camera,
         background: None,
     };
-    let (composited, _) = composite::forward(&input, &mut image, &mut alphas)?;
+    let Image {
+        image,
+        alphas,
+        composited,
+        ..
+    } = composite::forward(&input)?;
     Ok(Rendered {
         image,
         alphas,
@@ -108,67 +95,58 @@ pub fn backward<T: Real>(
     rendered: &Rendered<T>,
     v_image: &[T],
 ) -> Result<Gradients<T>, Error> {
-    let n = gaussians.len();
-    let zeros = |n: usize| vec![T::ZERO; n];
-    let (mut means2d, mut whitened) = (zeros(2 * n), zeros(3 * n));
-    let (mut v_opacities, mut colors) = (zeros(n), zeros(3 * n));
     let input = CompositeInput {
         projection: &rendered.projection,
         tiles: &rendered.tiles,
         camera,
         background: None,
     };
-    let grads = CompositeGrads {
-        geometry: Some(GeometryGrads {
-            means2d: &mut means2d,
-            whitened: &mut whitened,
-            opacities: &mut v_opacities,
-            absolute: None,
-        }),
-        colors: Some(&mut colors),
-        background: None,
-    };
     let v = CompositeCotangents {
         image: v_image,
         alphas: None,
     };
-    composite::backward(&input, &rendered.composited, &v, grads)?;
-    let mut out = Gradients {
-        means: zeros(3 * n),
-        quats: zeros(4 * n),
-        scales: zeros(3 * n),
-        opacities: zeros(n),
-        harmonics: zeros(harmonics.coefficients.len()),
-        viewmat: [0.0; 16],
+    let wanted = composite::Wanted {
+        geometry: true,
+        colors: true,
+        ..composite::Wanted::default()
     };
+    let composited = composite::backward(&input, &rendered.composited, &v, wanted)?;
     let cotangents = ProjectCotangents {
-        means2d: Some(&means2d),
-        whitened: Some(&whitened),
-        opacities: Some(&v_opacities),
+        means2d: Some(&composited.means2d),
+        whitened: Some(&composited.whitened),
+        opacities: Some(&composited.opacities),
         depths: None,
         conics: None,
-        colors: Some(&colors),
+        colors: Some(&composited.colors),
     };
-    let grads = GaussianGrads {
-        means: Some(&mut out.means),
-        quats: Some(&mut out.quats),
-        scales: Some(&mut out.scales),
-        opacities: Some(&mut out.opacities),
-        harmonics: Some(&mut out.harmonics),
-        harmonics_rest: None,
+    let wanted = project::Wanted {
+        means: true,
+        quats: true,
+        scales: true,
+        opacities: true,
+        harmonics: true,
+        harmonics_rest: false,
+        camera: true,
     };
-    let (camera_grad, _) = project::backward(
+    let harmonics = Some(harmonics);
+    let projection = &rendered.projection;
+    let grads = project::backward(
         gaussians,
-        Some(harmonics),
+        harmonics,
         camera,
         options,
-        &rendered.projection,
+        projection,
         &cotangents,
-        grads,
-        true,
+        wanted,
     );
-    out.viewmat = camera_grad.viewmat(camera);
-    Ok(out)
+    Ok(Gradients {
+        viewmat: grads.camera.viewmat(camera),
+        means: grads.means,
+        quats: grads.quats,
+        scales: grads.scales,
+        opacities: grads.opacities,
+        harmonics: grads.harmonics,
+    })
 }
 
 #[cfg(test)]
@@ -259,14 +237,7 @@ mod tests {
             for x in 0..s.camera.width {
                 let (mut t, mut rgb) = (1.0, [0.0; 3]);
                 for &i in &order {
-                    let splat = &r.projection.splats[i];
-                    let [fs, fm, ft] = splat.factors;
-                    let (dx, dy) = (
-                        x as f64 + 0.5 - splat.mean[0],
-                        y as f64 + 0.5 - splat.mean[1],
-                    );
-                    let (u, v) = (fs * (dx - fm * dy), ft * dy);
-                    let alpha = (splat.opacity * (-0.5 * (u * u + v * v)).exp()).min(0.99);
+                    let alpha = r.projection.splats[i].alpha(x as f64 + 0.5, y as f64 + 0.5);
                     if alpha < ALPHA_MIN {
                         continue;
                     }

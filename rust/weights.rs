@@ -99,7 +99,7 @@ fn largest_of_tile<S: Simd, T: Real>(
 mod tests {
     use super::*;
     use crate::{
-        project::{self, ProjectOptions, ProjectOut, Projection},
+        project::{self, ProjectOptions, Projection},
         scene::Colors,
         synthetic::Synthetic,
         tiles::{self, Tiles},
@@ -107,26 +107,9 @@ mod tests {
     use rayon::ThreadPoolBuilder;
 
     fn binned<T: Real>(s: &Synthetic<T>) -> (Projection, Tiles<T>) {
-        let n = s.opacities.len();
-        let zeros = |n: usize| vec![T::ZERO; n];
-        let (mut means2d, mut depths, mut conics) = (zeros(2 * n), zeros(n), zeros(3 * n));
-        let (mut opacities, mut radii) = (zeros(n), vec![0; 2 * n]);
-        let mut projection = Projection::default();
-        project::forward(
-            &s.gaussians(),
-            Colors::Channels(&[], 0),
-            &s.camera,
-            &ProjectOptions::default(),
-            &mut projection,
-            ProjectOut {
-                means2d: &mut means2d,
-                depths: &mut depths,
-                conics: &mut conics,
-                radii: &mut radii,
-                opacities: &mut opacities,
-                colors: &mut [],
-            },
-        );
+        let none = Colors::Channels(&[], 0);
+        let options = ProjectOptions::default();
+        let projection = project::forward(&s.gaussians(), none, &s.camera, &options).projection;
         let tiles = tiles::bin(&projection, &[], 0, &s.camera).unwrap();
         (projection, tiles)
     }
@@ -157,14 +140,7 @@ mod tests {
             let (x, y) = (pixel % s.camera.width, pixel / s.camera.width);
             let mut t = 1.0;
             for &i in &order {
-                let splat = &projection.splats[i];
-                let [fs, fm, ft] = splat.factors;
-                let (dx, dy) = (
-                    x as f64 + 0.5 - splat.mean[0],
-                    y as f64 + 0.5 - splat.mean[1],
-                );
-                let (u, v) = (fs * (dx - fm * dy), ft * dy);
-                let alpha = (splat.opacity * (-0.5 * (u * u + v * v)).exp()).min(0.99);
+                let alpha = projection.splats[i].alpha(x as f64 + 0.5, y as f64 + 0.5);
                 if alpha < 1.0 / 255.0 {
                     continue;
                 }

@@ -4,8 +4,8 @@
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::{
     adam::{self, AdamArrays, AdamOptions, Selection},
-    composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, GeometryGrads},
-    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
+    composite::{self, CompositeCotangents, CompositeInput},
+    project::{self, ProjectCotangents, ProjectOptions, Projected},
     scene::{Colors, Harmonics},
     synthetic::Synthetic,
     tiles,
@@ -39,32 +39,22 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         degree: 3,
     };
     let options = ProjectOptions::default();
-    let (mut means2d, mut depths, mut conics) =
-        (vec![0f32; 2 * n], vec![0f32; n], vec![0f32; 3 * n]);
-    let (mut radii, mut opacities, mut colors) = (vec![0; 2 * n], vec![0f32; n], vec![0f32; 3 * n]);
-    let mut projection = Projection::default();
+    let project = || {
+        project::forward(
+            &gaussians,
+            Colors::Harmonics(&harmonics),
+            &s.camera,
+            &options,
+        )
+    };
     let mut group = c.benchmark_group(name);
     group.sample_size(20);
     group.bench_function(BenchmarkId::new("project", n), |b| {
-        b.iter(|| {
-            let out = ProjectOut {
-                means2d: &mut means2d,
-                depths: &mut depths,
-                conics: &mut conics,
-                radii: &mut radii,
-                opacities: &mut opacities,
-                colors: &mut colors,
-            };
-            project::forward(
-                &gaussians,
-                Colors::Harmonics(&harmonics),
-                &s.camera,
-                &options,
-                &mut projection,
-                out,
-            );
-        });
+        b.iter(project);
     });
+    let Projected {
+        projection, colors, ..
+    } = project();
     group.bench_function(BenchmarkId::new("bin and order", n), |b| {
         b.iter(|| tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs"));
     });
@@ -76,65 +66,54 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         background: None,
     };
     let pixels = s.camera.width * s.camera.height;
-    let (mut image, mut alphas) = (vec![0f32; 3 * pixels], vec![0f32; pixels]);
     group.bench_function(BenchmarkId::new("composite", n), |b| {
-        b.iter(|| composite::forward(&input, &mut image, &mut alphas).expect("right lengths"));
+        b.iter(|| composite::forward(&input).expect("right lengths"));
     });
-    let (composited, work) =
-        composite::forward(&input, &mut image, &mut alphas).expect("right lengths");
-    println!("{name}, {n} Gaussians: {work:?}");
+    let view = composite::forward(&input).expect("right lengths");
+    println!("{name}, {n} Gaussians: {:?}", view.work);
     let v_image: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
-    let (mut v_means2d, mut v_whitened) = (vec![0f32; 2 * n], vec![0f32; 3 * n]);
-    let (mut v_opacities, mut v_colors) = (vec![0f32; n], vec![0f32; 3 * n]);
     let v = CompositeCotangents {
         image: &v_image,
         alphas: None,
     };
+    let wanted = composite::Wanted {
+        geometry: true,
+        colors: true,
+        ..composite::Wanted::default()
+    };
+    let backward =
+        || composite::backward(&input, &view.composited, &v, wanted).expect("right lengths");
     group.bench_function(BenchmarkId::new("composite backward", n), |b| {
-        b.iter(|| {
-            let grads = CompositeGrads {
-                geometry: Some(GeometryGrads {
-                    means2d: &mut v_means2d,
-                    whitened: &mut v_whitened,
-                    opacities: &mut v_opacities,
-                    absolute: None,
-                }),
-                colors: Some(&mut v_colors),
-                background: None,
-            };
-            composite::backward(&input, &composited, &v, grads).expect("right lengths");
-        });
+        b.iter(backward);
     });
+    let grads = backward();
     let cotangents = ProjectCotangents {
-        means2d: Some(&v_means2d),
-        whitened: Some(&v_whitened),
-        opacities: Some(&v_opacities),
+        means2d: Some(&grads.means2d),
+        whitened: Some(&grads.whitened),
+        opacities: Some(&grads.opacities),
         depths: None,
         conics: None,
-        colors: Some(&v_colors),
+        colors: Some(&grads.colors),
     };
-    let (mut g_means, mut g_quats, mut g_scales) =
-        (vec![0f32; 3 * n], vec![0f32; 4 * n], vec![0f32; 3 * n]);
-    let (mut g_opacities, mut g_harmonics) = (vec![0f32; n], vec![0f32; 48 * n]);
+    let wanted = project::Wanted {
+        means: true,
+        quats: true,
+        scales: true,
+        opacities: true,
+        harmonics: true,
+        ..project::Wanted::default()
+    };
+    let (camera, harmonics) = (&s.camera, Some(&harmonics));
     group.bench_function(BenchmarkId::new("project backward", n), |b| {
         b.iter(|| {
-            let grads = GaussianGrads {
-                means: Some(&mut g_means),
-                quats: Some(&mut g_quats),
-                scales: Some(&mut g_scales),
-                opacities: Some(&mut g_opacities),
-                harmonics: Some(&mut g_harmonics),
-                harmonics_rest: None,
-            };
             project::backward(
                 &gaussians,
-                Some(&harmonics),
-                &s.camera,
+                harmonics,
+                camera,
                 &options,
                 &projection,
                 &cotangents,
-                grads,
-                false,
+                wanted,
             )
         });
     });

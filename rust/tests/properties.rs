@@ -4,8 +4,8 @@
 
 use hqgs::{
     camera::Camera,
-    composite::{self, CompositeCotangents, CompositeGrads, CompositeInput, GeometryGrads},
-    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, ProjectOut, Projection},
+    composite::{self, CompositeCotangents, CompositeInput},
+    project::{self, ProjectCotangents, ProjectOptions},
     real::Real,
     scene::{Colors, Gaussians, Harmonics},
     tiles,
@@ -123,33 +123,16 @@ impl Scene {
             degree,
         });
         let background = flat::<T, _>(&[self.background]);
-        let zeros = |n: usize| vec![T::ZERO; n];
-        let (mut means2d, mut conics) = (zeros(2 * n), zeros(3 * n));
-        let (mut depths, mut shown, mut rgb) = (zeros(n), zeros(n), zeros(3 * n));
-        let mut radii = vec![0; 2 * n];
-        let mut projection = Projection::default();
-        project::forward(
-            &gaussians,
-            harmonics
-                .as_ref()
-                .map_or(Colors::Channels(&given, 3), Colors::Harmonics),
-            &camera,
-            &self.options,
-            &mut projection,
-            ProjectOut {
-                means2d: &mut means2d,
-                depths: &mut depths,
-                conics: &mut conics,
-                radii: &mut radii,
-                opacities: &mut shown,
-                colors: if harmonics.is_some() {
-                    &mut rgb
-                } else {
-                    &mut []
-                },
-            },
-        );
-        let colors = if harmonics.is_some() { &rgb } else { &given };
+        let given_colors = harmonics
+            .as_ref()
+            .map_or(Colors::Channels(&given, 3), Colors::Harmonics);
+        let projected = project::forward(&gaussians, given_colors, &camera, &self.options);
+        let (projection, radii) = (projected.projection, projected.radii);
+        let colors = if harmonics.is_some() {
+            &projected.colors
+        } else {
+            &given
+        };
         let tiles = tiles::bin(&projection, colors, 3, &camera).expect("few pairs");
         let input = CompositeInput {
             projection: &projection,
@@ -158,81 +141,72 @@ impl Scene {
             background: Some(&background),
         };
         let pixels = WIDTH * HEIGHT;
-        let (mut image, mut alphas) = (zeros(3 * pixels), zeros(pixels));
-        let (composited, _) = composite::forward(&input, &mut image, &mut alphas).expect("lengths");
+        let view = composite::forward(&input).expect("lengths");
 
         let wave = |n: usize| -> Vec<T> {
             let values = (0..n).map(|i| (1.0 + i as f64 * 0.37).sin());
             values.map(T::from_f64).collect()
         };
         let (v_image, v_alphas) = (wave(3 * pixels), wave(pixels));
-        let (mut v_means2d, mut absolute, mut whitened) =
-            (zeros(2 * n), zeros(2 * n), zeros(3 * n));
-        let (mut v_shown, mut v_colors, mut v_background) = (zeros(n), zeros(3 * n), zeros(3));
         let v = CompositeCotangents {
             image: &v_image,
             alphas: Some(&v_alphas),
         };
-        let grads = CompositeGrads {
-            geometry: Some(GeometryGrads {
-                means2d: &mut v_means2d,
-                whitened: &mut whitened,
-                opacities: &mut v_shown,
-                absolute: Some(&mut absolute),
-            }),
-            colors: Some(&mut v_colors),
-            background: Some(&mut v_background),
+        let wanted = composite::Wanted {
+            geometry: true,
+            absolute: true,
+            colors: true,
+            background: true,
         };
-        composite::backward(&input, &composited, &v, grads).expect("lengths");
+        let composited =
+            composite::backward(&input, &view.composited, &v, wanted).expect("lengths");
         let (v_depths, v_conics) = (vec![T::ONE; n], vec![T::ONE; 3 * n]);
-        let (mut g_means, mut g_quats, mut g_scales) = (zeros(3 * n), zeros(4 * n), zeros(3 * n));
-        let (mut g_opacities, mut g_harmonics) = (zeros(n), zeros(3 * STORED * n));
         let cotangents = ProjectCotangents {
-            means2d: Some(&v_means2d),
-            whitened: Some(&whitened),
-            opacities: Some(&v_shown),
+            means2d: Some(&composited.means2d),
+            whitened: Some(&composited.whitened),
+            opacities: Some(&composited.opacities),
             depths: Some(&v_depths),
             conics: Some(&v_conics),
-            colors: Some(&v_colors),
+            colors: Some(&composited.colors),
         };
-        let grads = GaussianGrads {
-            means: Some(&mut g_means),
-            quats: Some(&mut g_quats),
-            scales: Some(&mut g_scales),
-            opacities: Some(&mut g_opacities),
-            harmonics: harmonics.is_some().then_some(&mut g_harmonics[..]),
-            harmonics_rest: None,
+        let wanted = project::Wanted {
+            means: true,
+            quats: true,
+            scales: true,
+            opacities: true,
+            harmonics: harmonics.is_some(),
+            harmonics_rest: false,
+            camera: true,
         };
-        let (g_camera, _) = project::backward(
+        let grads = project::backward(
             &gaussians,
             harmonics.as_ref(),
             &camera,
             &self.options,
             &projection,
             &cotangents,
-            grads,
-            true,
+            wanted,
         );
         let (g_colors, row) = if harmonics.is_some() {
-            (g_harmonics, 3 * STORED)
+            (&grads.harmonics, 3 * STORED)
         } else {
-            (v_colors, 3)
+            (&composited.colors, 3)
         };
         let rows = (0..n).map(|i| Row {
             radii: [radii[2 * i], radii[2 * i + 1]],
-            means: g_means[3 * i..3 * i + 3].to_vec(),
-            quats: g_quats[4 * i..4 * i + 4].to_vec(),
-            scales: g_scales[3 * i..3 * i + 3].to_vec(),
-            opacity: g_opacities[i],
+            means: grads.means[3 * i..3 * i + 3].to_vec(),
+            quats: grads.quats[4 * i..4 * i + 4].to_vec(),
+            scales: grads.scales[3 * i..3 * i + 3].to_vec(),
+            opacity: grads.opacities[i],
             colors: g_colors[row * i..row * (i + 1)].to_vec(),
         });
         Output {
             gaussians: rows.collect(),
             depths: projection.depths,
-            image,
-            alphas,
-            background: v_background,
-            camera: g_camera.viewmat(&camera),
+            image: view.image,
+            alphas: view.alphas,
+            background: composited.background,
+            camera: grads.camera.viewmat(&camera),
         }
     }
 }

@@ -1,0 +1,153 @@
+//! New vectors whose chunks are set by the jobs that fill them, while they are in the cache of one core. To set
+//! a large vector to zero before that would be one more pass through memory, which costs more than the
+//! arithmetic on it.
+
+use std::{
+    mem::MaybeUninit,
+    sync::atomic::{AtomicUsize, Ordering},
+};
+
+/// A vector in the making.
+#[derive(Debug)]
+pub(crate) struct Fresh<T> {
+    memory: Vec<T>,
+    len: usize,
+    /// Elements that were set since the last cut.
+    set: AtomicUsize,
+}
+
+/// A piece of a vector in the making, from its first element on that is not yet set.
+#[derive(Debug)]
+pub(crate) struct Blank<'a, T> {
+    memory: &'a mut [MaybeUninit<T>],
+    /// Elements that were set.
+    done: usize,
+    set: &'a AtomicUsize,
+}
+
+impl<T: Copy> Fresh<T> {
+    pub fn new(len: usize) -> Self {
+        Self {
+            memory: Vec::with_capacity(len),
+            len,
+            set: AtomicUsize::new(0),
+        }
+    }
+
+    /// Cut into consecutive pieces, as many as there are lengths and elements.
+    pub fn cut(&mut self, lengths: impl Iterator<Item = usize>) -> Vec<Blank<'_, T>> {
+        self.set = AtomicUsize::new(0); // an earlier cut does not count: the same pieces could be set twice
+        let set = &self.set;
+        let mut rest = &mut self.memory.spare_capacity_mut()[..self.len];
+        lengths
+            .map(|n| {
+                let (memory, tail) = std::mem::take(&mut rest).split_at_mut(n);
+                rest = tail;
+                Blank {
+                    memory,
+                    done: 0,
+                    set,
+                }
+            })
+            .collect()
+    }
+
+    /// The vector. Every piece must have been set.
+    #[allow(unsafe_code)]
+    pub fn finish(mut self) -> Vec<T> {
+        assert_eq!(*self.set.get_mut(), self.len, "a piece was not set");
+        // SAFETY: `new` made room for `len` elements. The pieces of one cut do not overlap, and each counts an
+        // element once, after it was set; together they count `len`, so that all are set.
+        unsafe { self.memory.set_len(self.len) };
+        self.memory
+    }
+}
+
+impl<'a, T: Copy> Blank<'a, T> {
+    /// Set every element that is left.
+    #[inline(always)]
+    pub fn fill(mut self, value: T) -> &'a mut [T] {
+        self.next(self.memory.len(), value)
+    }
+
+    /// Set the next `n` elements.
+    #[inline(always)]
+    #[allow(unsafe_code)]
+    pub fn next(&mut self, n: usize, value: T) -> &'a mut [T] {
+        let (memory, rest) = std::mem::take(&mut self.memory).split_at_mut(n);
+        self.memory = rest;
+        memory.fill(MaybeUninit::new(value));
+        self.done += n;
+        // SAFETY: every element was just set, and `MaybeUninit<T>` has the layout of `T`.
+        unsafe { &mut *(std::ptr::from_mut(memory) as *mut [T]) }
+    }
+}
+
+impl<T> Drop for Blank<'_, T> {
+    fn drop(&mut self) {
+        self.set.fetch_add(self.done, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rayon::prelude::*;
+
+    #[test]
+    fn pieces_become_one_vector() {
+        for lengths in [vec![], vec![0], vec![3, 0, 4], vec![1; 1000]] {
+            let mut fresh = Fresh::new(lengths.iter().sum());
+            let pieces = fresh.cut(lengths.iter().copied());
+            assert_eq!(pieces.len(), lengths.len());
+            pieces.into_par_iter().enumerate().for_each(|(k, piece)| {
+                let mut piece = piece;
+                let first = piece.next(lengths[k] / 2, k as f64);
+                let rest = piece.fill(0.5);
+                assert_eq!(first.len() + rest.len(), lengths[k]);
+                assert!(rest.iter().all(|x| *x == 0.5));
+                rest.fill(k as f64);
+            });
+            let expected: Vec<f64> = lengths
+                .iter()
+                .enumerate()
+                .flat_map(|(k, n)| vec![k as f64; *n])
+                .collect();
+            assert_eq!(fresh.finish(), expected);
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "a piece was not set")]
+    fn a_piece_that_was_not_set_is_found() {
+        let mut fresh = Fresh::new(5);
+        fresh.cut([2, 3].into_iter()).pop().unwrap().fill(1u8);
+        fresh.finish();
+    }
+
+    #[test]
+    #[should_panic(expected = "a piece was not set")]
+    fn a_piece_that_was_set_in_part_is_found() {
+        let mut fresh = Fresh::new(5);
+        for mut piece in fresh.cut([2, 3].into_iter()) {
+            piece.next(2, 1u8);
+        }
+        fresh.finish();
+    }
+
+    #[test]
+    #[should_panic(expected = "a piece was not set")]
+    fn setting_one_piece_in_two_cuts_is_not_enough() {
+        let mut fresh = Fresh::new(4);
+        for _ in 0..2 {
+            fresh.cut([2, 2].into_iter()).pop().unwrap().fill(1u8);
+        }
+        fresh.finish();
+    }
+
+    #[test]
+    #[should_panic]
+    fn more_than_there_is_cannot_be_cut() {
+        Fresh::<u8>::new(4).cut([2, 3].into_iter());
+    }
+}
