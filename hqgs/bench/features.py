@@ -33,6 +33,7 @@ class Feature:
     by_default: bool  # whether the product has it on
     switch: Callable[[], Any] = nullcontext  # a context manager: inside it the other choice is in place
     config: Callable[[TrainConfig], TrainConfig] = lambda config: config
+    refinable: bool = True  # False: it is about how Gaussians start, which trained ones cannot tell
 
 
 @contextmanager
@@ -134,6 +135,7 @@ FEATURES = (
         "degree 3 from the start",
         True,
         config=lambda config: replace(config, sh_interval=1),
+        refinable=False,
     ),
     Feature("all threads", "1 thread", True, partial(_threads, 1)),
     Feature("selective Adam", "on", False, config=lambda config: replace(config, selective_adam=True)),

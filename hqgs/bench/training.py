@@ -98,7 +98,7 @@ class Training:
             report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
         return {name: report[name] for name in ("seed", "seconds", "gaussians", "history")} | {
             "psnr": report["history"][-1]["psnr"],
-            "refined_psnr": self.refined(feature, seed),
+            "refined_psnr": self.refined(feature, seed) if feature.refinable else None,
         }
 
     def refined(self, feature: Feature, seed: int) -> float:

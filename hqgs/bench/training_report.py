@@ -21,8 +21,8 @@ def compare(runs: dict[str, list[dict[str, Any]]], steps: dict[str, list[Seconds
     """One row for each feature, from runs that hold `psnr`, `refined_psnr` and `seconds`.
 
     `costs_db`: what the fast choice costs in held-out PSNR, run by run with the same seed, and
-    `refined_costs_db` the same of the Gaussians that were grown once and trained on; `cost_db` and
-    `refined_cost_db` their means. `speedup`: of the fast choice, over the other one.
+    `refined_costs_db` the same of the Gaussians that were grown once and trained on, empty where they cannot
+    tell; `cost_db` and `refined_cost_db` their means. `speedup`: of the fast choice, over the other one.
     """
     default = runs[DEFAULT.name]
     rows = []
@@ -30,7 +30,7 @@ def compare(runs: dict[str, list[dict[str, Any]]], steps: dict[str, list[Seconds
         other = runs[feature.name]
         sign = 1 if feature.by_default else -1
         costs, refined = (
-            [sign * (b[name] - a[name]) for a, b in zip(default, other, strict=True)]
+            [sign * (b[name] - a[name]) for a, b in zip(default, other, strict=True) if b[name] is not None]
             for name in ("psnr", "refined_psnr")
         )
         seconds = [(b["seconds"] / a["seconds"]) ** sign for a, b in zip(default, other, strict=True)]
@@ -47,7 +47,7 @@ def compare(runs: dict[str, list[dict[str, Any]]], steps: dict[str, list[Seconds
                 "costs_db": costs,
                 "cost_db": float(np.mean(costs)),
                 "refined_costs_db": refined,
-                "refined_cost_db": float(np.mean(refined)),
+                "refined_cost_db": float(np.mean(refined)) if refined else None,
                 "speedup_run": float(np.mean(seconds)),
                 "speedup_step": median_ratio(rounds, [{"total": 1.0}] * len(rounds)),
                 "speedup_step_quartiles": quartiles(rounds),
@@ -75,12 +75,14 @@ def verdicts(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         }
         for kind in ("", "refined_"):
             costs = [cost for row in rows for cost in row[f"{kind}costs_db"]]
-            entry[f"{kind}cost_db"] = float(np.mean([row[f"{kind}cost_db"] for row in rows]))
+            entry[f"{kind}cost_db"] = float(np.mean(costs)) if costs else None
             entry[f"{kind}standard_error_db"] = (
                 float(np.std(costs, ddof=1) / np.sqrt(len(costs))) if costs[1:] else None
             )
         sure = entry["cost_db"] - SURE * (entry["standard_error_db"] or 0.0)
-        entry["passed"] = not feature.by_default or max(sure, entry["refined_cost_db"]) <= LIMIT_DB
+        refined = entry["refined_cost_db"]
+        within = sure <= LIMIT_DB and (refined is None or refined <= LIMIT_DB)
+        entry["passed"] = not feature.by_default or within
         found.append(entry)
     return found
 
@@ -99,7 +101,7 @@ def scene_table(scene: dict[str, Any]) -> str:
             row["other"],
             f"{row['psnr']:.3f}",
             f"{row['cost_db']:+.3f}",
-            f"{row['refined_cost_db']:+.3f}",
+            "-" if row["refined_cost_db"] is None else f"{row['refined_cost_db']:+.3f}",
             f"{row['speedup_run']:.2f}",
             f"{row['speedup_step']:.2f}",
             " to ".join(f"{q:.2f}" for q in row["speedup_step_quartiles"]),
@@ -131,6 +133,8 @@ def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _with_error(row: dict[str, Any], kind: str) -> str:
+    if row[f"{kind}cost_db"] is None:
+        return "-"
     error = row[f"{kind}standard_error_db"]
     return f"{row[f'{kind}cost_db']:+.3f}" + ("" if error is None else f" ± {error:.3f}")
 
