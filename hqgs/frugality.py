@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
 TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
-FINEST = 2.0  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
+FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
 EARLIEST = 2_000  # iterations before which they cannot tell yet
