@@ -189,6 +189,7 @@ def chart(runs: Sequence[dict[str, Any]]) -> Figure:
         axes.axvline(1, color="#888888", linewidth=0.8)
         axes.set_xlabel(f"{label}, nothing left out = 1")
         axes.set_xlim(left=0)
+        axes.set_axisbelow(True)
         axes.grid(color="#dddddd", linewidth=0.7)
         axes.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("held-out PSNR gained (dB)")
