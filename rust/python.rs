@@ -109,8 +109,12 @@ fn accumulate<T: Real>(sum: &mut [T], part: &[T]) {
     }
 }
 
-/// One array after the other, [C, ...].
-fn join<T: Copy>(mut parts: Vec<Vec<T>>) -> Vec<T> {
+/// One array of every camera's outputs, one after the other, [C, ...].
+fn join<O, T: Copy>(outs: &mut [O], array: impl Fn(&mut O) -> &mut Vec<T>) -> Vec<T> {
+    let mut parts: Vec<_> = outs
+        .iter_mut()
+        .map(|out| std::mem::take(array(out)))
+        .collect();
     match parts.len() {
         1 => parts.remove(0),
         _ => parts.concat(),
@@ -356,7 +360,7 @@ fn project_as<'py, T: Scalar>(
         None => arrays.channels(gaussians.len(), cameras.len())?,
     };
     let n = gaussians.len();
-    let outs: Vec<_> = py.detach(|| {
+    let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
             let project = |(i, camera)| {
                 let colors = harmonics.as_ref().map_or_else(
@@ -368,36 +372,30 @@ fn project_as<'py, T: Scalar>(
             cameras.iter().enumerate().map(project).collect()
         })
     });
-    let mut work = Work::default();
-    let (mut projections, mut radii) = (Vec::new(), Vec::new());
-    let (mut means2d, mut depths, mut conics) = (Vec::new(), Vec::new(), Vec::new());
-    let (mut opacities, mut colors) = (Vec::new(), Vec::new());
-    for out in outs {
-        work = work.plus(out.work);
-        projections.push(out.projection);
-        means2d.push(out.means2d);
-        depths.push(out.depths);
-        conics.push(out.conics);
-        radii.push(out.radii);
-        opacities.push(out.opacities);
-        colors.push(out.colors);
-    }
+    let means2d = join(&mut outs, |out| &mut out.means2d);
+    let depths = join(&mut outs, |out| &mut out.depths);
+    let conics = join(&mut outs, |out| &mut out.conics);
+    let radii = join(&mut outs, |out| &mut out.radii);
+    let opacities = join(&mut outs, |out| &mut out.opacities);
+    let colors = join(&mut outs, |out| &mut out.colors);
     let frame = Frame {
         cameras,
-        projections,
+        work: outs
+            .iter()
+            .fold(Work::default(), |sum, out| sum.plus(out.work)),
+        projections: outs.into_iter().map(|out| out.projection).collect(),
         options,
         n,
         sh_degree,
-        work,
     };
     Ok((
         frame,
-        join(means2d).into_pyarray(py),
-        join(depths).into_pyarray(py),
-        join(conics).into_pyarray(py),
-        join(radii).into_pyarray(py),
-        join(opacities).into_pyarray(py),
-        join(colors).into_pyarray(py),
+        means2d.into_pyarray(py),
+        depths.into_pyarray(py),
+        conics.into_pyarray(py),
+        radii.into_pyarray(py),
+        opacities.into_pyarray(py),
+        colors.into_pyarray(py),
     ))
 }
 
@@ -740,8 +738,8 @@ fn composite_as<'py, T: Scalar>(
                     work: total,
                     bin_seconds,
                 },
-                join(images),
-                join(alphas),
+                join(&mut images, |image| image),
+                join(&mut alphas, |alphas| alphas),
             ))
         })
     })?;
@@ -834,7 +832,7 @@ fn composite_backward_as<'py, T: Scalar>(
         colors: want_colors,
         background,
     };
-    let outs: Vec<_> = py.detach(|| {
+    let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
             let backward = |(i, camera): (usize, _)| {
                 let input = CompositeInput {
@@ -853,25 +851,22 @@ fn composite_backward_as<'py, T: Scalar>(
             cameras.map(backward).collect::<Result<_, Error>>()
         })
     })?;
-    let mut work = Work::default();
-    let (mut means2d, mut whitened, mut opacities) = (Vec::new(), Vec::new(), Vec::new());
-    let (mut absolutes, mut v_colors, mut v_background) = (Vec::new(), Vec::new(), Vec::new());
-    for out in outs {
-        work = work.plus(out.work);
-        means2d.push(out.means2d);
-        whitened.push(out.whitened);
-        opacities.push(out.opacities);
-        absolutes.push(out.absolute);
-        v_colors.push(out.colors);
-        v_background.push(out.background);
-    }
+    let work = outs
+        .iter()
+        .fold(Work::default(), |sum, out| sum.plus(out.work));
+    let means2d = join(&mut outs, |out| &mut out.means2d);
+    let whitened = join(&mut outs, |out| &mut out.whitened);
+    let opacities = join(&mut outs, |out| &mut out.opacities);
+    let absolutes = join(&mut outs, |out| &mut out.absolute);
+    let v_colors = join(&mut outs, |out| &mut out.colors);
+    let v_background = join(&mut outs, |out| &mut out.background);
     Ok((
-        geometry.then(|| join(means2d).into_pyarray(py)),
-        geometry.then(|| join(whitened).into_pyarray(py)),
-        geometry.then(|| join(opacities).into_pyarray(py)),
-        (geometry && absolute).then(|| join(absolutes).into_pyarray(py)),
-        want_colors.then(|| join(v_colors).into_pyarray(py)),
-        background.then(|| join(v_background).into_pyarray(py)),
+        geometry.then(|| means2d.into_pyarray(py)),
+        geometry.then(|| whitened.into_pyarray(py)),
+        geometry.then(|| opacities.into_pyarray(py)),
+        (geometry && absolute).then(|| absolutes.into_pyarray(py)),
+        want_colors.then(|| v_colors.into_pyarray(py)),
+        background.then(|| v_background.into_pyarray(py)),
         work.entries().collect(),
     ))
 }
