@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 
@@ -62,6 +64,8 @@ def test_the_gil_is_released() -> None:
             time.sleep(0.001)
 
     thread = threading.Thread(target=tick)
+    threads = hqgs.get_num_threads()
+    hqgs.set_num_threads(1)  # many would be too fast to tell
     thread.start()
     try:
         started = time.perf_counter()
@@ -70,8 +74,33 @@ def test_the_gil_is_released() -> None:
     finally:
         done.set()
         thread.join()
+        hqgs.set_num_threads(threads)
     assert ended - started > 0.05, "too fast to tell"
     assert sum(started < t < ended for t in ticks) >= 5
+
+
+FAULTS = """
+import resource, time
+from hqgs.bench.inputs import make_inputs
+from hqgs.bench.rasterizer import RasterPass
+
+raster = RasterPass(make_inputs(30_000))
+for wait in (0, 0, 0, 1.5, 0):
+    time.sleep(wait)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    raster.run()
+    raster.clear()
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts the page faults of Linux")
+def test_freed_buffers_are_kept_for_the_next_iteration() -> None:
+    """Longer than the second after which the allocator would give them back. In a process of its own: what
+    earlier tests have freed may go at any time."""
+    run = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
+    first, *_, waited, after = map(int, run.stdout.split())
+    assert max(waited, after) < first / 4
 
 
 def test_threads_can_be_set_and_zero_is_refused() -> None:
