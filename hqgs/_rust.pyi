@@ -42,13 +42,13 @@ def project_forward(
     ks: Array,
     width: int,
     height: int,
-    options: tuple[float, float, float, float, bool],
+    options: tuple[float, float, float, float, bool, bool],
     sh_degree: int | None,
     knobs: tuple[float, float, str, bool, int] | None = None,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
 def project_backward(
     frame: Frame,
-    inputs: tuple[Array, Array, Array, Array, Array | None, Array | None],
+    inputs: tuple[Array, Array, Array, Array],
     cotangents: tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe],
     wanted: list[bool],
 ) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...

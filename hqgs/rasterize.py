@@ -106,7 +106,10 @@ def rasterization(
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
     _check_colors(colors, rest, n, c, sh_degree)
 
-    options = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
+    leaves = (means, colors, rest, viewmats)
+    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in leaves)
+    numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
+    options = (*numbers, rasterize_mode == "antialiased", differentiable)
     frame, means2d, link, depths, conics, radii, alphas_in, sh_colors = _Project.apply(
         means,
         quats,
@@ -116,7 +119,7 @@ def rasterization(
         rest,
         viewmats.to(torch.float64),
         Ks.detach().to(torch.float64),
-        (int(width), int(height), (*options, rasterize_mode == "antialiased"), sh_degree),
+        (int(width), int(height), options, sh_degree),
     )
     channels: Tensor = sh_colors if sh_degree is not None else colors
     if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
@@ -242,7 +245,6 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, colors, rest, viewmats, Ks, config):
         width, height, options, sh_degree = config
-        harmonics = colors if sh_degree is not None else None
         inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
         frame, *arrays = _rust.project_forward(
             *inputs, _optional(rest), _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
@@ -251,13 +253,14 @@ class _Project(torch.autograd.Function):
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
         if is_counting():
             add_counts(frame.counts)
-        ctx.frame, ctx.shapes = frame, (n, c)
-        ctx.save_for_backward(means, quats, scales, opacities, harmonics, rest)
+        ctx.frame, ctx.shapes, ctx.has_harmonics = frame, (n, c), sh_degree is not None
+        ctx.sh_shapes = [() if t is None else tuple(t.shape) for t in (colors, rest)]
+        ctx.save_for_backward(means, quats, scales, opacities)
         ctx.set_materialize_grads(False)
         link = means2d.new_zeros(()).expand(c, n, 3)
         means2d, depths, conics = means2d.view(c, n, 2), depths.view(c, n), conics.view(c, n, 3)
         radii, alphas = radii.view(c, n, 2), alphas.view(c, n)
-        sh_colors = sh_colors.view(c, n, 3) if harmonics is not None else sh_colors
+        sh_colors = sh_colors.view(c, n, 3) if ctx.has_harmonics else sh_colors
         # What depends on no tensor that requires a gradient gets no cotangent, so that none is computed.
         needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:7]
         constant = [radii]
@@ -271,22 +274,14 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads):
         _, v_means2d, v_link, v_depths, v_conics, _, v_alphas, v_colors = grads
-        means, quats, scales, opacities, harmonics, rest = ctx.saved_tensors
+        means, quats, scales, opacities = ctx.saved_tensors
         n, c = ctx.shapes
         needs = list(ctx.needs_input_grad[:7])
-        if harmonics is None:
+        if not ctx.has_harmonics:
             v_colors = None
-
         *v_inputs, counts = _rust.project_backward(
             ctx.frame,
-            (
-                _numpy(means),
-                _numpy(quats),
-                _numpy(scales),
-                _numpy(opacities),
-                _optional(harmonics),
-                _optional(rest),
-            ),
+            (_numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities)),
             (
                 _optional(v_means2d),
                 _optional(v_link),
@@ -302,8 +297,7 @@ class _Project(torch.autograd.Function):
         if v_inputs[6] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[6].clip(-limit, limit, out=v_inputs[6])
-        sh_shapes = [() if t is None else tuple(t.shape) for t in (harmonics, rest)]
-        shapes = [(n, 3), (n, 4), (n, 3), (n,), *sh_shapes, (c, 4, 4)]
+        shapes = [(n, 3), (n, 4), (n, 3), (n,), *ctx.sh_shapes, (c, 4, 4)]
         return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None)
 
 

@@ -19,7 +19,8 @@ OPTIONS = (
     0.0,
     0.3,
     False,
-)  # near, far, radius_clip, eps2d, antialiased: as `render_view` renders
+    False,
+)  # near, far, radius_clip, eps2d, antialiased, as `render_view` renders; differentiable
 
 
 def blending_weights(gaussians: Gaussians, camera: Camera) -> Tensor:

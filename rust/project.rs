@@ -30,6 +30,8 @@ pub struct ProjectOptions {
     pub eps2d: f64,
     /// Scale the opacity so that the low-pass does not brighten small Gaussians.
     pub antialiased: bool,
+    /// Keep what [`backward`] needs of the harmonics.
+    pub differentiable: bool,
     /// What trades accuracy for time, in this and the later stages.
     pub tuning: Tuning,
 }
@@ -42,6 +44,7 @@ impl Default for ProjectOptions {
             radius_clip: 0.0,
             eps2d: EPS2D,
             antialiased: false,
+            differentiable: true,
             tuning: Tuning::default(),
         }
     }
@@ -90,6 +93,24 @@ pub struct Projection {
     pub tuning: Tuning,
 }
 
+/// How the colours from harmonics change, for [`backward`]: with it the coefficients, which are most of a
+/// scene's memory, are read by the forward pass alone.
+#[derive(Debug)]
+pub struct Shading<T> {
+    /// As `Harmonics::rows`.
+    rows: (usize, usize),
+    /// As `Harmonics::degree`.
+    degree: usize,
+    /// For each group of Gaussians the derivatives of its colours; none at degree 0.
+    slopes: Vec<Slopes<T>>,
+    /// For each group and channel the Gaussians whose colour is clamped at 0.
+    clamped: Vec<[u16; 3]>,
+}
+
+/// Derivatives of channel c along axis a of the unit vector from the camera centre, at 3 c + a, as if its three
+/// numbers were free.
+type Slopes<T> = [Column<T>; 9];
+
 /// What the projection gives; zeros where a Gaussian is culled.
 #[derive(Debug)]
 pub struct Projected<T> {
@@ -107,6 +128,8 @@ pub struct Projected<T> {
     pub opacities: Vec<T>,
     /// Colours from the spherical harmonics, [N, 3]; empty without them.
     pub colors: Vec<T>,
+    /// How they change, if asked for.
+    pub shading: Option<Shading<T>>,
     /// Counts.
     pub work: Work,
 }
@@ -122,12 +145,22 @@ struct ForwardChunk<'a, T> {
     radii: &'a mut [i32],
     opacities: &'a mut [T],
     colors: &'a mut [T],
+    /// Empty where not asked for.
+    slopes: &'a mut [Slopes<T>],
+    clamped: &'a mut [[u16; 3]],
 }
 
 /// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.
 fn chunks<T: Copy>(array: &mut Fresh<T>, n: usize, row: usize) -> Vec<Blank<'_, T>> {
     let rows = |c| PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
     array.cut((0..n.div_ceil(PROJECT_CHUNK)).map(|c| rows(c) * row))
+}
+
+/// The same for an array with one entry for each group of n Gaussians, or none for n = 0.
+fn group_chunks<T: Copy>(array: &mut Fresh<T>, n: usize, jobs: usize) -> Vec<Blank<'_, T>> {
+    const GROUPS: usize = PROJECT_CHUNK / GROUP;
+    let groups = n.div_ceil(GROUP);
+    array.cut((0..jobs).map(|c| groups.saturating_sub(c * GROUPS).min(GROUPS)))
 }
 
 /// The geometry of a group of Gaussians, one column per number.
@@ -228,6 +261,30 @@ fn evaluate<S: Simd, T: Real>(
         rgb[2] = y.mul_add(coefficients[3 * k + 2].get(simd, at), rgb[2]);
     }
     rgb
+}
+
+/// Derivatives of the colours of the Gaussians `at..` of a group.
+#[inline(always)]
+fn slope<S: Simd, T: Real>(
+    simd: S,
+    degree: usize,
+    coefficients: &[Column<T>; MAX_COLUMNS],
+    direction: V3<Lanes<T, S>>,
+    at: usize,
+    out: &mut Slopes<T>,
+) {
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+    for (channel, out) in out.chunks_exact_mut(3).enumerate() {
+        let mut weights = [zero; sh::MAX_COUNT];
+        for (k, weight) in weights.iter_mut().enumerate().take(sh::count(degree)) {
+            *weight = coefficients[3 * k + channel].get(simd, at);
+        }
+        let g = sh::basis_vjp::<S, T>(simd, degree, direction, &weights);
+        for (out, g) in out.iter_mut().zip([g.x, g.y, g.z]) {
+            // One that overflowed would make NaN of a cotangent of 0.
+            out.set(simd, at, g.is_finite().select(g, zero));
+        }
+    }
 }
 
 /// The lanes of a group in a bit set, as 1 or 0.
@@ -361,14 +418,18 @@ pub fn forward<T: Real>(
     options: &ProjectOptions,
 ) -> Projected<T> {
     let n = gaussians.len();
-    let channels = match colors {
-        Colors::Harmonics(_) => 3,
-        Colors::Channels(..) => 0,
+    let (channels, sloped, clamped) = match colors {
+        Colors::Harmonics(h) if options.differentiable => (3, if h.degree > 0 { n } else { 0 }, n),
+        Colors::Harmonics(_) => (3, 0, 0),
+        Colors::Channels(..) => (0, 0, 0),
     };
     let (mut splats, mut keys) = (Fresh::new(n), Fresh::new(n));
     let (mut means2d, mut depths) = (Fresh::new(2 * n), Fresh::new(n));
     let (mut conics, mut radii) = (Fresh::new(3 * n), Fresh::new(2 * n));
     let (mut opacities, mut rgb) = (Fresh::new(n), Fresh::new(channels * n));
+    let mut slopes = Fresh::new(sloped.div_ceil(GROUP));
+    let mut clamps = Fresh::new(clamped.div_ceil(GROUP));
+    let count = n.div_ceil(PROJECT_CHUNK);
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))
@@ -378,6 +439,8 @@ pub fn forward<T: Real>(
         .zip(chunks(&mut radii, n, 2))
         .zip(chunks(&mut opacities, n, 1))
         .zip(chunks(&mut rgb, n, channels))
+        .zip(group_chunks(&mut slopes, sloped, count))
+        .zip(group_chunks(&mut clamps, clamped, count))
         .collect();
     let level = Level::new();
     let work = jobs
@@ -386,7 +449,13 @@ pub fn forward<T: Real>(
         .map(
             |(
                 chunk,
-                (((((((splats, keys), means2d), depths), conics), radii), opacities), rgb),
+                (
+                    (
+                        (((((((splats, keys), means2d), depths), conics), radii), opacities), rgb),
+                        slopes,
+                    ),
+                    clamped,
+                ),
             )| {
                 let out = ForwardChunk {
                     splats: splats.fill(Splat::default()),
@@ -397,6 +466,8 @@ pub fn forward<T: Real>(
                     radii: radii.fill(0),
                     opacities: opacities.fill(T::ZERO),
                     colors: rgb.fill(T::ZERO),
+                    slopes: slopes.fill([Column::ZERO; 9]),
+                    clamped: clamped.fill([0; 3]),
                 };
                 dispatch!(level, simd => forward_chunk(
                     simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, out
@@ -416,6 +487,15 @@ pub fn forward<T: Real>(
         radii: radii.finish(),
         opacities: opacities.finish(),
         colors: rgb.finish(),
+        shading: match colors {
+            Colors::Harmonics(h) if options.differentiable => Some(Shading {
+                rows: h.rows(),
+                degree: h.degree,
+                slopes: slopes.finish(),
+                clamped: clamps.finish(),
+            }),
+            _ => None,
+        },
         work,
     }
 }
@@ -487,6 +567,16 @@ fn forward_chunk<S: Simd, T: Real>(
                     keep &= !(lanes as u16) | (finite.to_bitmask() as u16) << at;
                     for (rgb, value) in rgb.iter_mut().zip(values) {
                         rgb.set(simd, at, value.simd_gt(zero).select(value, zero));
+                    }
+                    if let Some(clamped) = out.clamped.get_mut(start / GROUP) {
+                        for (clamped, value) in clamped.iter_mut().zip(values) {
+                            let negative = (!value.simd_ge(zero)).to_bitmask() as u16;
+                            *clamped |= negative << at;
+                        }
+                    }
+                    if let Some(slopes) = out.slopes.get_mut(start / GROUP) {
+                        let d = get3(simd, &d, at);
+                        slope(simd, h.degree, &harmonics.columns, d, at, slopes);
                     }
                 }
                 for column in &mut rgb {
@@ -748,10 +838,10 @@ impl<'a, T: Real> BackwardChunk<'a, T> {
 /// Vector-Jacobian product of [`forward`]. Groups of 16 Gaussians without a cotangent are left out, and so is
 /// the geometry where the colours alone have cotangents.
 ///
-/// `projection` must be the one that `forward` made from the same inputs.
+/// `projection` and `shading` must be those that `forward` made from the same inputs.
 pub fn backward<T: Real>(
     gaussians: &Gaussians<T>,
-    harmonics: Option<&Harmonics<T>>,
+    shading: Option<&Shading<T>>,
     camera: &Camera,
     options: &ProjectOptions,
     projection: &Projection,
@@ -759,7 +849,7 @@ pub fn backward<T: Real>(
     wanted: Wanted,
 ) -> GaussianGrads<T> {
     let n = gaussians.len();
-    let (row, rest_row) = harmonics.map_or((0, 0), Harmonics::rows);
+    let (row, rest_row) = shading.map_or((0, 0), |s| s.rows);
     let rows = [
         (wanted.means, 3),
         (wanted.quats, 4),
@@ -794,7 +884,7 @@ pub fn backward<T: Real>(
                 rows,
             };
             dispatch!(level, simd => backward_chunk(
-                simd, gaussians, harmonics, camera, options, projection, v, chunk * PROJECT_CHUNK, out, wanted.camera
+                simd, gaussians, shading, camera, options, projection, v, chunk * PROJECT_CHUNK, out, wanted.camera
             ))
         })
         .collect();
@@ -821,7 +911,7 @@ pub fn backward<T: Real>(
 fn backward_chunk<S: Simd, T: Real>(
     simd: S,
     gaussians: &Gaussians<T>,
-    harmonics: Option<&Harmonics<T>>,
+    shading: Option<&Shading<T>>,
     camera: &Camera,
     options: &ProjectOptions,
     projection: &Projection,
@@ -867,9 +957,8 @@ fn backward_chunk<S: Simd, T: Real>(
         }
         inputs.read(simd, gaussians, first);
         let mut v_colors = None;
-        if let (Some(h), true) = (harmonics, v.colors.is_some()) {
-            work.backward_harmonics += (rows * sh::count(h.degree)) as u64;
-            colors.coefficients.read(simd, h, first);
+        if let (Some(shading), true) = (shading, v.colors.is_some()) {
+            work.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
             let (means, directions) = (&inputs.means, &mut colors.directions);
             for at in (0..GROUP).step_by(lanes::<S>()) {
                 let (d, inverse) = direction(simd, wide3(simd, means, at), center);
@@ -880,8 +969,8 @@ fn backward_chunk<S: Simd, T: Real>(
                 directions[2].set(simd, at, d.z);
                 colors.inverses.set(simd, at, valid.select(inverse, zero));
             }
-            colors.backward(simd, h.degree, &cotangents.colors, visible);
-            v_colors = Some(h);
+            colors.backward(simd, shading, first / GROUP, &cotangents.colors, visible);
+            v_colors = Some(shading);
         }
         work.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
         for at in (0..GROUP).step_by(lanes::<S>()) {
@@ -945,14 +1034,14 @@ fn backward_chunk<S: Simd, T: Real>(
         if !grads.opacities.is_empty() {
             columns::write([&opacities.0], grads.opacities);
         }
-        let Some(h) = v_colors else {
+        let Some(shading) = v_colors else {
             continue;
         };
-        let (row, rest_row) = h.rows();
-        let used = 3 * sh::count(h.degree);
+        let (row, rest_row) = shading.rows;
+        let used = 3 * sh::count(shading.degree);
         let v_coefficients = &colors.v_coefficients[..used];
-        let (in_first, in_rest) = v_coefficients.split_at(if h.rest.is_some() { 3 } else { used });
-        let buffer = &mut colors.coefficients.rows;
+        let (in_first, in_rest) = v_coefficients.split_at(used.min(row));
+        let buffer = &mut colors.buffer;
         if !grads.harmonics.is_empty() {
             buffer.write(simd, in_first, grads.harmonics, row, rows);
         }
@@ -1006,23 +1095,23 @@ impl<T: Real> GradColumns<T> {
     }
 }
 
-/// The colours of a group and their gradients, a column per number.
+/// What the gradients of a group's colours need, a column per number.
 struct ColorGroup<T> {
-    coefficients: Coefficients<T>,
     v_coefficients: [Column<T>; 3 * sh::MAX_COUNT],
     /// Unit vectors from the camera centre, and one over the distances.
     directions: [Column<f64>; 3],
     inverses: Column<f64>,
     v_directions: [Column<T>; 3],
+    buffer: Rows<T>,
 }
 
 impl<T: Real> ColorGroup<T> {
     const ZERO: Self = Self {
-        coefficients: Coefficients::ZERO,
         v_coefficients: [Column::ZERO; 3 * sh::MAX_COUNT],
         directions: [Column::ZERO; 3],
         inverses: Column::ZERO,
         v_directions: [Column::ZERO; 3],
+        buffer: Rows::ZERO,
     };
 
     /// Gradients of the coefficients and of the directions, from that of the colours.
@@ -1030,48 +1119,36 @@ impl<T: Real> ColorGroup<T> {
     fn backward<S: Simd>(
         &mut self,
         simd: S,
-        degree: usize,
+        shading: &Shading<T>,
+        group: usize,
         v_colors: &[Column<T>; 3],
         visible: u16,
     ) {
-        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
         let d = narrow3::<T>(&self.directions);
-        let mut v_visible = *v_colors;
-        for column in &mut v_visible {
+        let mut v_open = *v_colors;
+        for (column, clamped) in v_open.iter_mut().zip(shading.clamped[group]) {
+            let open = visible & !clamped;
             for (lane, x) in column.0.iter_mut().enumerate() {
-                *x = if visible >> lane & 1 == 1 {
-                    *x
-                } else {
-                    T::ZERO
-                };
+                *x = if open >> lane & 1 == 1 { *x } else { T::ZERO };
             }
         }
         for at in (0..GROUP).step_by(Lanes::<T, S>::LEN) {
-            let d = get3(simd, &d, at);
-            let basis = sh::basis::<S, T>(simd, degree, d);
-            let rgb = evaluate(simd, degree, &self.coefficients.columns, &basis, at);
-            // Zero gradient where the colour is clamped at 0.
-            let v = get3(simd, &v_visible, at);
-            let v = [
-                rgb[0].simd_ge(zero).select(v.x, zero),
-                rgb[1].simd_ge(zero).select(v.y, zero),
-                rgb[2].simd_ge(zero).select(v.z, zero),
-            ];
-            let mut weights = [zero; sh::MAX_COUNT];
-            for k in 0..sh::count(degree) {
-                let [r, g, b] = [3 * k, 3 * k + 1, 3 * k + 2];
-                let c = &self.coefficients.columns;
-                let along = v[0] * c[r].get(simd, at);
-                let along = v[1].mul_add(c[g].get(simd, at), along);
-                weights[k] = v[2].mul_add(c[b].get(simd, at), along);
-                self.v_coefficients[r].set(simd, at, basis[k] * v[0]);
-                self.v_coefficients[g].set(simd, at, basis[k] * v[1]);
-                self.v_coefficients[b].set(simd, at, basis[k] * v[2]);
+            let v = v_open.map(|v| v.get(simd, at));
+            let basis = sh::basis::<S, T>(simd, shading.degree, get3(simd, &d, at));
+            for (k, y) in basis.iter().enumerate().take(sh::count(shading.degree)) {
+                for (channel, v) in v.iter().enumerate() {
+                    self.v_coefficients[3 * k + channel].set(simd, at, *y * *v);
+                }
             }
-            let v_d = sh::basis_vjp::<S, T>(simd, degree, d, &weights);
-            self.v_directions[0].set(simd, at, v_d.x);
-            self.v_directions[1].set(simd, at, v_d.y);
-            self.v_directions[2].set(simd, at, v_d.z);
+            let Some(slopes) = shading.slopes.get(group) else {
+                continue; // degree 0: `v_directions` stay 0
+            };
+            for (axis, v_direction) in self.v_directions.iter_mut().enumerate() {
+                let along = v[0] * slopes[axis].get(simd, at);
+                let along = v[1].mul_add(slopes[3 + axis].get(simd, at), along);
+                let along = v[2].mul_add(slopes[6 + axis].get(simd, at), along);
+                v_direction.set(simd, at, along);
+            }
         }
     }
 }

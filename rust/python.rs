@@ -5,7 +5,7 @@ use crate::{
     camera::Camera,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
     error::Error,
-    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, Projection},
+    project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, Projection, Shading},
     real::Real,
     scene::{Colors, Gaussians, Harmonics},
     threads,
@@ -19,6 +19,7 @@ use numpy::{
 };
 use pyo3::{exceptions::PyValueError, prelude::*};
 use std::{
+    any::Any,
     collections::HashMap,
     ffi::{c_int, c_long},
     time::Instant,
@@ -128,8 +129,19 @@ pub(crate) struct Frame {
     pub projections: Vec<Projection>,
     options: ProjectOptions,
     n: usize,
-    sh_degree: Option<usize>,
+    /// Of each camera; a `Vec<Option<Shading<T>>>`.
+    shadings: AnyType,
     work: Work,
+}
+
+/// Something for one of the scalar types.
+type AnyType = Box<dyn Any + Send + Sync>;
+
+/// What was stored for type T.
+fn of_type<'a, V: 'static>(stored: &'a AnyType, name: &str) -> PyResult<&'a V> {
+    stored
+        .downcast_ref()
+        .ok_or_else(|| Error::new(name, "dtype differs from the forward pass").into())
 }
 
 /// The counts of [`Work`] by name.
@@ -138,7 +150,8 @@ type Counts = HashMap<&'static str, u64>;
 /// Tile lists and replay state of a composited frame.
 #[pyclass(frozen, module = "hqgs._rust")]
 struct Composite {
-    state: State,
+    /// Of each camera; a `Vec<View<T>>`.
+    views: AnyType,
     work: Work,
     bin_seconds: f64,
 }
@@ -170,11 +183,6 @@ struct View<T> {
     composited: Composited<T>,
 }
 
-enum State {
-    F32(Vec<View<f32>>),
-    F64(Vec<View<f64>>),
-}
-
 #[pymethods]
 impl Composite {
     /// (pairs, blocks evaluated, blocks with a change): the work of the forward pass.
@@ -203,30 +211,9 @@ impl Composite {
 }
 
 /// A scalar type that the binding offers.
-trait Scalar: Real + Element {
-    fn wrap(state: Vec<View<Self>>) -> State;
-    fn unwrap(state: &State) -> PyResult<&[View<Self>]>;
-}
-
-macro_rules! scalar {
-    ($type:ty, $variant:ident) => {
-        impl Scalar for $type {
-            fn wrap(state: Vec<View<Self>>) -> State {
-                State::$variant(state)
-            }
-            fn unwrap(state: &State) -> PyResult<&[View<Self>]> {
-                match state {
-                    State::$variant(s) => Ok(s),
-                    _ => Err(PyValueError::new_err(
-                        "colors: dtype differs from the forward pass",
-                    )),
-                }
-            }
-        }
-    };
-}
-scalar!(f32, F32);
-scalar!(f64, F64);
+trait Scalar: Real + Element {}
+impl Scalar for f32 {}
+impl Scalar for f64 {}
 
 /// Call the generic function for the dtype of an array.
 macro_rules! by_dtype {
@@ -300,17 +287,18 @@ fn project_forward<'py>(
     ks: &Bound<'py, PyAny>,
     width: usize,
     height: usize,
-    options: (f64, f64, f64, f64, bool),
+    options: (f64, f64, f64, f64, bool, bool),
     sh_degree: Option<usize>,
     knobs: Option<Knobs>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let (near_plane, far_plane, radius_clip, eps2d, antialiased) = options;
+    let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
     let options = ProjectOptions {
         near_plane,
         far_plane,
         radius_clip,
         eps2d,
         antialiased,
+        differentiable,
         tuning: tuning(knobs)?,
     };
     by_dtype!(
@@ -347,19 +335,23 @@ fn project_as<'py, T: Scalar>(
     sh_degree: Option<usize>,
 ) -> PyResult<Projected<'py, T>> {
     let py = means.py();
-    let arrays = Arrays::<T>::new(means, quats, scales, opacities, Some(colors), rest)?;
+    let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
+    let colors = Array::<T>::new("colors", colors)?;
+    let rest = optional::<T>("colors", rest)?;
     let (viewmats, ks) = (
         Array::<f64>::new("viewmats", viewmats)?,
         Array::<f64>::new("Ks", ks)?,
     );
     let cameras = cameras(viewmats.slice()?, ks.slice()?, width, height)?;
     let gaussians = arrays.gaussians()?;
-    let harmonics = arrays.harmonics(sh_degree)?;
+    let n = gaussians.len();
+    let harmonics = sh_degree
+        .map(|degree| harmonics(&colors, rest.as_ref(), n, degree))
+        .transpose()?;
     let (channel_data, channels) = match harmonics {
         Some(_) => (&[][..], 0),
-        None => arrays.channels(gaussians.len(), cameras.len())?,
+        None => channels_of(&colors, n, cameras.len())?,
     };
-    let n = gaussians.len();
     let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
             let project = |(i, camera)| {
@@ -383,10 +375,14 @@ fn project_as<'py, T: Scalar>(
         work: outs
             .iter()
             .fold(Work::default(), |sum, out| sum.plus(out.work)),
+        shadings: Box::new(
+            outs.iter_mut()
+                .map(|out| out.shading.take())
+                .collect::<Vec<_>>(),
+        ),
         projections: outs.into_iter().map(|out| out.projection).collect(),
         options,
         n,
-        sh_degree,
     };
     Ok((
         frame,
@@ -405,8 +401,6 @@ struct Arrays<'py, T: Element> {
     quats: Array<'py, T>,
     scales: Array<'py, T>,
     opacities: Array<'py, T>,
-    colors: Option<Array<'py, T>>,
-    rest: Option<Array<'py, T>>,
 }
 
 impl<'py, T: Scalar> Arrays<'py, T> {
@@ -415,16 +409,12 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         quats: &Bound<'py, PyAny>,
         scales: &Bound<'py, PyAny>,
         opacities: &Bound<'py, PyAny>,
-        colors: Optional<'_, 'py>,
-        rest: Optional<'_, 'py>,
     ) -> PyResult<Self> {
         Ok(Self {
             means: Array::new("means", means)?,
             quats: Array::new("quats", quats)?,
             scales: Array::new("scales", scales)?,
             opacities: Array::new("opacities", opacities)?,
-            colors: optional("colors", colors)?,
-            rest: optional("colors", rest)?,
         })
     }
 
@@ -438,42 +428,44 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         gaussians.check()?;
         Ok(gaussians)
     }
+}
 
-    /// The colours as channels: the data and their number.
-    fn channels(&self, n: usize, cameras: usize) -> PyResult<(&[T], usize)> {
-        let Some(array) = &self.colors else {
-            return Ok((&[], 0));
-        };
-        let (data, channels) = (array.slice()?, array.shape().last().copied().unwrap_or(0));
-        if data.len() != n * channels && data.len() != cameras * n * channels {
-            return Err(Error::shape(
-                "colors",
-                format!("[{n}, D] or [{cameras}, {n}, D]"),
-                format!("{:?}", array.shape()),
-            )
-            .into());
-        }
-        Ok((data, channels))
+/// Colours as channels: the data and their number.
+fn channels_of<'a, T: Scalar>(
+    colors: &'a Array<'_, T>,
+    n: usize,
+    cameras: usize,
+) -> PyResult<(&'a [T], usize)> {
+    let (data, channels) = (colors.slice()?, colors.shape().last().copied().unwrap_or(0));
+    if data.len() != n * channels && data.len() != cameras * n * channels {
+        return Err(Error::shape(
+            "colors",
+            format!("[{n}, D] or [{cameras}, {n}, D]"),
+            format!("{:?}", colors.shape()),
+        )
+        .into());
     }
+    Ok((data, channels))
+}
 
-    fn harmonics(&self, degree: Option<usize>) -> PyResult<Option<Harmonics<'_, T>>> {
-        let (Some(array), Some(degree)) = (&self.colors, degree) else {
-            return Ok(None);
-        };
-        let count = |array: &Array<'py, T>| match array.shape() {
-            &[_, k, 3] => Ok(k),
-            other => Err(Error::shape("colors", "[N, K, 3]", format!("{other:?}"))),
-        };
-        let higher = self.rest.as_ref().map_or(Ok(0), count)?;
-        let harmonics = Harmonics {
-            coefficients: array.slice()?,
-            rest: self.rest.as_ref().map(Array::slice).transpose()?,
-            stored: count(array)? + higher,
-            degree,
-        };
-        harmonics.check(self.opacities.slice()?.len())?;
-        Ok(Some(harmonics))
-    }
+fn harmonics<'a, T: Scalar>(
+    colors: &'a Array<'_, T>,
+    rest: Option<&'a Array<'_, T>>,
+    n: usize,
+    degree: usize,
+) -> PyResult<Harmonics<'a, T>> {
+    let count = |array: &Array<'_, T>| match array.shape() {
+        &[_, k, 3] => Ok(k),
+        other => Err(Error::shape("colors", "[N, K, 3]", format!("{other:?}"))),
+    };
+    let harmonics = Harmonics {
+        coefficients: colors.slice()?,
+        rest: rest.map(Array::slice).transpose()?,
+        stored: count(colors)? + rest.map_or(Ok(0), count)?,
+        degree,
+    };
+    harmonics.check(n)?;
+    Ok(harmonics)
 }
 
 /// VJP of `project_forward`.
@@ -490,14 +482,12 @@ fn project_backward<'py>(
     )
 }
 
-/// means, quats, scales, opacities, colors, rest
+/// means, quats, scales, opacities
 type Inputs<'py> = (
     Bound<'py, PyAny>,
     Bound<'py, PyAny>,
     Bound<'py, PyAny>,
     Bound<'py, PyAny>,
-    Option<Bound<'py, PyAny>>,
-    Option<Bound<'py, PyAny>>,
 );
 
 /// means2d, whitened, opacities, depths, conics, colors
@@ -529,16 +519,9 @@ fn project_backward_as<'py, T: Scalar>(
 ) -> PyResult<ProjectGrads<'py, T>> {
     let py = frame.py();
     let frame = frame.get();
-    let arrays = Arrays::<T>::new(
-        &inputs.0,
-        &inputs.1,
-        &inputs.2,
-        &inputs.3,
-        inputs.4.as_ref(),
-        inputs.5.as_ref(),
-    )?;
+    let arrays = Arrays::<T>::new(&inputs.0, &inputs.1, &inputs.2, &inputs.3)?;
     let gaussians = arrays.gaussians()?;
-    let harmonics = arrays.harmonics(frame.sh_degree)?;
+    let shadings = of_type::<Vec<Option<Shading<T>>>>(&frame.shadings, "means")?;
     let v_means2d = optional::<T>("v_means2d", v.0.as_ref())?;
     let v_whitened = optional::<T>("v_whitened", v.1.as_ref())?;
     let v_opacities = optional::<T>("v_opacities", v.2.as_ref())?;
@@ -565,6 +548,9 @@ fn project_backward_as<'py, T: Scalar>(
             )
             .into());
         }
+    }
+    if v_colors.is_some() && shadings.iter().any(Option::is_none) {
+        return Err(Error::new("v_colors", "the forward pass was not to be differentiated").into());
     }
     let slices = (
         v_means2d.as_ref().map(Array::slice).transpose()?,
@@ -607,7 +593,7 @@ fn project_backward_as<'py, T: Scalar>(
                 };
                 let grads = project::backward(
                     &gaussians,
-                    harmonics.as_ref(),
+                    shadings[i].as_ref(),
                     camera,
                     &frame.options,
                     &frame.projections[i],
@@ -734,7 +720,7 @@ fn composite_as<'py, T: Scalar>(
             }
             Ok((
                 Composite {
-                    state: T::wrap(views),
+                    views: Box::new(views),
                     work: total,
                     bin_seconds,
                 },
@@ -796,7 +782,7 @@ fn composite_backward_as<'py, T: Scalar>(
 ) -> PyResult<CompositeOut<'py, T>> {
     let py = colors.py();
     let (frame, composite) = (frame.get(), composite.get());
-    let views = T::unwrap(&composite.state)?;
+    let views = of_type::<Vec<View<T>>>(&composite.views, "colors")?;
     let colors = Array::<T>::new("colors", colors)?;
     let backgrounds = optional::<T>("backgrounds", backgrounds)?;
     let v_image = Array::<T>::new("v_render_colors", v_image)?;

@@ -4,7 +4,7 @@ use crate::{
     Error,
     camera::Camera,
     composite::{self, CompositeCotangents, CompositeInput, Composited, Image},
-    project::{self, ProjectCotangents, ProjectOptions, Projected, Projection},
+    project::{self, ProjectCotangents, ProjectOptions, Projected, Projection, Shading},
     real::Real,
     scene::{Colors, Gaussians, Harmonics},
     tiles::{self, Tiles},
@@ -20,6 +20,7 @@ pub struct Rendered<T> {
     /// Radii in pixels, [N, 2]; 0 where culled.
     pub radii: Vec<i32>,
     projection: Projection,
+    shading: Option<Shading<T>>,
     tiles: Tiles<T>,
     composited: Composited<T>,
 }
@@ -58,6 +59,7 @@ pub fn forward<T: Real>(
         projection,
         radii,
         colors,
+        shading,
         ..
     } = project::forward(gaussians, Colors::Harmonics(harmonics), camera, options);
     let tiles = tiles::bin(&projection, &colors, 3, camera)?;
@@ -78,6 +80,7 @@ pub fn forward<T: Real>(
         alphas,
         radii,
         projection,
+        shading,
         tiles,
         composited,
     })
@@ -89,7 +92,6 @@ pub fn forward<T: Real>(
 /// When `v_image` has the wrong length.
 pub fn backward<T: Real>(
     gaussians: &Gaussians<T>,
-    harmonics: &Harmonics<T>,
     camera: &Camera,
     options: &ProjectOptions,
     rendered: &Rendered<T>,
@@ -128,11 +130,10 @@ pub fn backward<T: Real>(
         harmonics_rest: false,
         camera: true,
     };
-    let harmonics = Some(harmonics);
     let projection = &rendered.projection;
     let grads = project::backward(
         gaussians,
-        harmonics,
+        rendered.shading.as_ref(),
         camera,
         options,
         projection,
@@ -187,15 +188,7 @@ mod tests {
 
     fn gradients<T: Real>(s: &Synthetic<T>, r: &Rendered<T>) -> Gradients<T> {
         let options = ProjectOptions::default();
-        backward(
-            &s.gaussians(),
-            &harmonics(s),
-            &s.camera,
-            &options,
-            r,
-            &cotangent(s),
-        )
-        .unwrap()
+        backward(&s.gaussians(), &s.camera, &options, r, &cotangent(s)).unwrap()
     }
 
     #[test]
@@ -277,7 +270,7 @@ mod tests {
         };
         let (g, h) = (s.gaussians(), harmonics(s));
         let r = forward(&g, &h, &s.camera, &options).unwrap();
-        let v = backward(&g, &h, &s.camera, &options, &r, &cotangent(s)).unwrap();
+        let v = backward(&g, &s.camera, &options, &r, &cotangent(s)).unwrap();
         (r, v)
     }
 

@@ -53,7 +53,10 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         b.iter(project);
     });
     let Projected {
-        projection, colors, ..
+        projection,
+        colors,
+        shading,
+        ..
     } = project();
     group.bench_function(BenchmarkId::new("bin and order", n), |b| {
         b.iter(|| tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs"));
@@ -103,12 +106,12 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         harmonics: true,
         ..project::Wanted::default()
     };
-    let (camera, harmonics) = (&s.camera, Some(&harmonics));
+    let (camera, shading) = (&s.camera, shading.as_ref());
     group.bench_function(BenchmarkId::new("project backward", n), |b| {
         b.iter(|| {
             project::backward(
                 &gaussians,
-                harmonics,
+                shading,
                 camera,
                 &options,
                 &projection,

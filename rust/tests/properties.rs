@@ -180,7 +180,7 @@ impl Scene {
         };
         let grads = project::backward(
             &gaussians,
-            harmonics.as_ref(),
+            projected.shading.as_ref(),
             &camera,
             &self.options,
             &projection,
