@@ -18,6 +18,7 @@ class WorkCounts:
     gaussians: int = 0  # given to it
     projected: int = 0  # of them kept; the others are culled
     harmonics: int = 0  # basis functions evaluated, one for each Gaussian and function; in groups of 16
+    slopes: int = 0  # Gaussians whose colours' derivatives were kept; in groups of 16
     # Compositing.
     tiles: int = 0  # with Gaussians
     channels: int = 0  # of the images

@@ -174,8 +174,8 @@ pub(crate) fn read<S: Simd, T: Real, const C: usize>(
 /// Most columns that are read or written at once, rounded up so that each block of them is a whole vector.
 pub(crate) const MAX_COLUMNS: usize = 64;
 
-/// The rows of a group, on their way between an array and columns: memory is read and written in the order of
-/// its addresses, which the processor fetches ahead; blocks of columns would jump from row to row.
+/// The rows of a group, on their way from an array to columns: memory is read in the order of its addresses,
+/// which the processor fetches ahead; blocks of columns would jump from row to row.
 pub(crate) struct Rows<T>([[T; MAX_COLUMNS]; GROUP]);
 
 impl<T: Real> Rows<T> {
@@ -214,43 +214,34 @@ impl<T: Real> Rows<T> {
             read_block(simd, rows, MAX_COLUMNS, 0, at, &mut out[at..at + n]);
         }
     }
+}
 
-    /// Write columns as the first numbers of the first `rows` rows of an array with `row` numbers per row.
-    #[inline(always)]
-    pub fn write<S: Simd>(
-        &mut self,
-        simd: S,
-        columns: &[Column<T>],
-        out: &mut [T],
-        row: usize,
-        rows: usize,
-    ) {
-        let n = Lanes::<T, S>::LEN;
-        let count = columns.len();
-        if count < n {
-            for (i, out) in out.chunks_exact_mut(row).take(rows).enumerate() {
-                for (x, column) in out.iter_mut().zip(columns) {
-                    *x = column.0[i];
-                }
-            }
-            return;
-        }
-        // The last block overlaps the one before it.
-        for block in (0..count).step_by(n) {
-            let block = block.min(count - n);
-            let columns = &columns[block..block + n];
-            for at in (0..GROUP).step_by(n) {
-                let m = transpose(sixteen!(i => columns[i % n].get(simd, at)));
-                for (row, m) in self.0[at..at + n].iter_mut().zip(&m[..n]) {
-                    m.store_slice(&mut row[block..block + n]);
-                }
+/// Write columns as the first numbers of the 16 rows of an array with `row` numbers per row, in cache.
+#[inline(always)]
+pub(crate) fn write_rows<S: Simd, T: Real>(
+    simd: S,
+    columns: &[Column<T>],
+    out: &mut [T],
+    row: usize,
+) {
+    let n = Lanes::<T, S>::LEN;
+    let count = columns.len();
+    if count < n {
+        for (i, out) in out.chunks_exact_mut(row).enumerate() {
+            for (x, column) in out.iter_mut().zip(columns) {
+                *x = column.0[i];
             }
         }
-        for (from, to) in self.0.iter().zip(out.chunks_exact_mut(row)).take(rows) {
-            for block in (0..count).step_by(n) {
-                let block = block.min(count - n);
-                let x = Lanes::<T, S>::from_slice(simd, &from[block..block + n]);
-                x.store_slice(&mut to[block..block + n]);
+        return;
+    }
+    // The last block overlaps the one before it.
+    for block in (0..count).step_by(n) {
+        let block = block.min(count - n);
+        let columns = &columns[block..block + n];
+        for at in (0..GROUP).step_by(n) {
+            let m = transpose(sixteen!(i => columns[i % n].get(simd, at)));
+            for (out, m) in out[at * row..(at + n) * row].chunks_exact_mut(row).zip(&m) {
+                m.store_slice(&mut out[block..block + n]);
             }
         }
     }
@@ -300,8 +291,9 @@ mod tests {
                     }
                 }
                 let rows = GROUP.min(40 - first);
-                let out = &mut out[first * row..];
-                buffer.write(simd, &columns[..count], out, row, rows);
+                let mut group = vec![T::ZERO; GROUP * row];
+                write_rows(simd, &columns[..count], &mut group, row);
+                out[first * row..][..rows * row].copy_from_slice(&group[..rows * row]);
             }
             for (i, (x, expected)) in out.iter().zip(&data).enumerate() {
                 let expected = if i % row < count { *expected } else { T::ZERO };

@@ -553,6 +553,11 @@ fn forward_chunk<S: Simd, T: Real>(
         match colors {
             Colors::Harmonics(h) if keep != 0 => {
                 work.harmonics += (rows * sh::count(h.degree)) as u64;
+                work.slopes += if out.slopes.is_empty() {
+                    0
+                } else {
+                    rows as u64
+                };
                 harmonics.read(simd, h, first);
                 let d = narrow3::<T>(&group.direction);
                 let mut rgb = [Column::ZERO; 3];
@@ -810,27 +815,25 @@ struct BackwardChunk<'a, T> {
     rows: [usize; 6],
 }
 
-/// The part of one group, zeros before.
-struct BackwardGroup<'a, T> {
-    means: &'a mut [T],
-    quats: &'a mut [T],
-    scales: &'a mut [T],
-    opacities: &'a mut [T],
-    harmonics: &'a mut [T],
-    harmonics_rest: &'a mut [T],
-}
+impl<T: Real> BackwardChunk<'_, T> {
+    /// A buffer for the rows of one group for each output.
+    fn buffers(&self) -> [Vec<T>; 6] {
+        self.rows.map(|row| vec![T::ZERO; GROUP * row])
+    }
 
-impl<'a, T: Real> BackwardChunk<'a, T> {
+    /// Give out the first `rows` rows of the buffers.
     #[inline(always)]
-    fn group(&mut self, rows: usize) -> BackwardGroup<'a, T> {
-        let [means, quats, scales, opacities, harmonics, rest] = self.rows.map(|row| row * rows);
-        BackwardGroup {
-            means: self.means.next(means, T::ZERO),
-            quats: self.quats.next(quats, T::ZERO),
-            scales: self.scales.next(scales, T::ZERO),
-            opacities: self.opacities.next(opacities, T::ZERO),
-            harmonics: self.harmonics.next(harmonics, T::ZERO),
-            harmonics_rest: self.harmonics_rest.next(rest, T::ZERO),
+    fn put(&mut self, buffers: &[Vec<T>; 6], rows: usize) {
+        let outs = [
+            &mut self.means,
+            &mut self.quats,
+            &mut self.scales,
+            &mut self.opacities,
+            &mut self.harmonics,
+            &mut self.harmonics_rest,
+        ];
+        for ((out, buffer), row) in outs.into_iter().zip(buffers).zip(self.rows) {
+            out.put(&buffer[..row * rows]);
         }
     }
 }
@@ -940,19 +943,22 @@ fn backward_chunk<S: Simd, T: Real>(
     let mut work = Work::default();
     let mut colors = ColorGroup::ZERO;
     let mut out = GradColumns::<T>::ZERO;
+    let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
+    let [_, _, _, _, row, rest_row] = chunk.rows;
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
     for first in (begin..end).step_by(GROUP) {
         let rows = GROUP.min(end - first);
-        let grads = chunk.group(rows);
         let mut visible = 0u16;
         for (lane, depth) in projection.depths[first..first + rows].iter().enumerate() {
             visible |= u16::from(*depth > 0.0) << lane;
         }
         if visible == 0 {
+            chunk.put(&zeros, rows);
             continue;
         }
         cotangents.read(simd, v, first);
         if visible & cotangents.nonzero() == 0 {
+            chunk.put(&zeros, rows);
             continue;
         }
         inputs.read(simd, gaussians, first);
@@ -1022,32 +1028,23 @@ fn backward_chunk<S: Simd, T: Real>(
             scales: [s0, s1, s2],
             opacities,
         } = &out;
-        if !grads.means.is_empty() {
-            columns::write([&x.0, &y.0, &z.0], grads.means);
+        let [means, quats, scales, alphas, first_rows, rest_rows] = &mut buffers;
+        columns::write([&x.0, &y.0, &z.0], means);
+        columns::write([&q0.0, &q1.0, &q2.0, &q3.0], quats);
+        columns::write([&s0.0, &s1.0, &s2.0], scales);
+        columns::write([&opacities.0], alphas);
+        if let Some(shading) = v_colors {
+            let used = 3 * sh::count(shading.degree);
+            let in_first = used.min(shading.rows.0);
+            let (v_first, v_rest) = colors.v_coefficients[..used].split_at(in_first);
+            if row > 0 {
+                columns::write_rows(simd, v_first, first_rows, row);
+            }
+            if rest_row > 0 {
+                columns::write_rows(simd, v_rest, rest_rows, rest_row);
+            }
         }
-        if !grads.quats.is_empty() {
-            columns::write([&q0.0, &q1.0, &q2.0, &q3.0], grads.quats);
-        }
-        if !grads.scales.is_empty() {
-            columns::write([&s0.0, &s1.0, &s2.0], grads.scales);
-        }
-        if !grads.opacities.is_empty() {
-            columns::write([&opacities.0], grads.opacities);
-        }
-        let Some(shading) = v_colors else {
-            continue;
-        };
-        let (row, rest_row) = shading.rows;
-        let used = 3 * sh::count(shading.degree);
-        let v_coefficients = &colors.v_coefficients[..used];
-        let (in_first, in_rest) = v_coefficients.split_at(used.min(row));
-        let buffer = &mut colors.buffer;
-        if !grads.harmonics.is_empty() {
-            buffer.write(simd, in_first, grads.harmonics, row, rows);
-        }
-        if !grads.harmonics_rest.is_empty() && !in_rest.is_empty() {
-            buffer.write(simd, in_rest, grads.harmonics_rest, rest_row, rows);
-        }
+        chunk.put(&buffers, rows);
     }
     (camera_grad.sum(), work)
 }
@@ -1102,7 +1099,6 @@ struct ColorGroup<T> {
     directions: [Column<f64>; 3],
     inverses: Column<f64>,
     v_directions: [Column<T>; 3],
-    buffer: Rows<T>,
 }
 
 impl<T: Real> ColorGroup<T> {
@@ -1111,7 +1107,6 @@ impl<T: Real> ColorGroup<T> {
         directions: [Column::ZERO; 3],
         inverses: Column::ZERO,
         v_directions: [Column::ZERO; 3],
-        buffer: Rows::ZERO,
     };
 
     /// Gradients of the coefficients and of the directions, from that of the colours.

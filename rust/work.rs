@@ -32,6 +32,8 @@ counts! {
     projected,
     /// Spherical harmonics that were evaluated: (degree + 1)^2 for each Gaussian of a group with a kept one.
     harmonics,
+    /// Gaussians of these groups whose colours' slopes were kept for the backward pass.
+    slopes,
     /// Tiles with Gaussians.
     tiles,
     /// Channels composited, for each camera.

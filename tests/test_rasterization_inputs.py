@@ -128,6 +128,21 @@ def test_extreme_finite_numbers_stay_finite(value: float, dtype: torch.dtype) ->
 
 
 @both_dtypes
+def test_a_slope_that_overflows_does_not_spoil_the_gradient(dtype: torch.dtype) -> None:
+    """On the axis this harmonic is 0, and so is the cotangent of its channel; its slope is infinite."""
+    scene = frontal([2.0, 3.0], dtype)
+    colors = torch.zeros(2, 16, 3, dtype=dtype)
+    colors[:, 0] = 0.5
+    colors[0, 11, 1] = torch.finfo(dtype).max
+    leaves = replace(scene, colors=colors).with_grad(*GAUSSIANS)
+    render, _, _ = hqgs.rasterization(**leaves.arguments(sh_degree=3))
+    assert render.isfinite().all()
+    render[..., 0].sum().backward()
+    for name in GAUSSIANS:
+        assert getattr(leaves, name).grad.isfinite().all(), name
+
+
+@both_dtypes
 def test_no_gaussians(dtype: torch.dtype) -> None:
     scene = random_scene(4, 20, 15, cameras=2, seed=0, dtype=dtype).pick(torch.arange(0))
     render, alphas, meta, gradients = backward(scene)

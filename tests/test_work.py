@@ -107,12 +107,28 @@ def test_bands_above_the_degree_are_not_evaluated(degree: int, apart: bool) -> N
     assert not s.colors.grad[:, bands:].any()
 
 
+@pytest.mark.parametrize(
+    ("names", "degree", "kept"),
+    [((), 3, False), (("opacities",), 3, False), (ALL, 0, False), (("colors",), 1, True), (ALL, 3, True)],
+)
+def test_slopes_of_the_colours_are_kept_for_a_gradient_alone(
+    names: tuple[str, ...], degree: int, kept: bool
+) -> None:
+    s = scene(*names, sh_degree=3)
+    counts = forward(s, sh_degree=degree)[2]
+    assert counts.projected > 0
+    assert counts.slopes * (degree + 1) ** 2 == (counts.harmonics if kept else 0)
+    with torch.no_grad():
+        assert forward(s, sh_degree=degree)[2].slopes == 0
+
+
 def test_harmonics_of_culled_gaussians_are_not_evaluated() -> None:
     s = scene(sh_degree=2)
     s.viewmats[0, 2, 3] -= 1000  # everything is behind the camera
     counts = forward(s)[2]
     assert counts.gaussians == N
-    assert counts.projected == counts.harmonics == counts.pairs == counts.tiles == counts.blocks == 0
+    assert counts.projected == counts.harmonics == counts.slopes == 0
+    assert counts.pairs == counts.tiles == counts.blocks == 0
 
 
 def test_gaussians_outside_the_frustum_make_no_pairs() -> None:
