@@ -106,10 +106,7 @@ def rasterization(
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
     _check_colors(colors, rest, n, c, sh_degree)
 
-    leaves = (means, colors, rest, viewmats)
-    differentiable = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in leaves)
-    numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
-    options = (*numbers, rasterize_mode == "antialiased", differentiable)
+    options = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
     frame, means2d, link, depths, conics, radii, alphas_in, sh_colors = _Project.apply(
         means,
         quats,
@@ -119,7 +116,8 @@ def rasterization(
         rest,
         viewmats.to(torch.float64),
         Ks.detach().to(torch.float64),
-        (int(width), int(height), options, sh_degree),
+        (int(width), int(height), (*options, rasterize_mode == "antialiased"), sh_degree),
+        torch.is_grad_enabled(),
     )
     channels: Tensor = sh_colors if sh_degree is not None else colors
     if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
@@ -243,8 +241,11 @@ class _Project(torch.autograd.Function):
     covariance in whitened form, which stays of order 1 however thin a Gaussian is."""
 
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, colors, rest, viewmats, Ks, config):
+    def forward(ctx: Any, means, quats, scales, opacities, colors, rest, viewmats, Ks, config, enabled):
         width, height, options, sh_degree = config
+        needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:7]
+        colors_vary = needs_means or needs_viewmats or needs_harmonics or needs_rest
+        options = (*options, enabled and colors_vary)
         inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
         frame, *arrays = _rust.project_forward(
             *inputs, _optional(rest), _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
@@ -262,11 +263,10 @@ class _Project(torch.autograd.Function):
         radii, alphas = radii.view(c, n, 2), alphas.view(c, n)
         sh_colors = sh_colors.view(c, n, 3) if ctx.has_harmonics else sh_colors
         # What depends on no tensor that requires a gradient gets no cotangent, so that none is computed.
-        needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:7]
         constant = [radii]
         if not (needs_means or needs_viewmats or any(geometry)):
             constant += [means2d, link, depths, conics, alphas]
-        if not (needs_means or needs_viewmats or needs_harmonics or needs_rest):
+        if not colors_vary:
             constant.append(sh_colors)
         ctx.mark_non_differentiable(*constant)
         return frame, means2d, link, depths, conics, radii, alphas, sh_colors
@@ -298,7 +298,7 @@ class _Project(torch.autograd.Function):
             limit = torch.finfo(means.dtype).max
             v_inputs[6].clip(-limit, limit, out=v_inputs[6])
         shapes = [(n, 3), (n, 4), (n, 3), (n,), *ctx.sh_shapes, (c, 4, 4)]
-        return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None)
+        return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None, None)
 
 
 class _Composite(torch.autograd.Function):

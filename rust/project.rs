@@ -156,11 +156,11 @@ fn chunks<T: Copy>(array: &mut Fresh<T>, n: usize, row: usize) -> Vec<Blank<'_, 
     array.cut((0..n.div_ceil(PROJECT_CHUNK)).map(|c| rows(c) * row))
 }
 
-/// The same for an array with one entry for each group of n Gaussians, or none for n = 0.
-fn group_chunks<T: Copy>(array: &mut Fresh<T>, n: usize, jobs: usize) -> Vec<Blank<'_, T>> {
+/// The same for an array with `row` entries for each group of them, of which a chunk holds a whole number.
+fn group_chunks<T: Copy>(array: &mut Fresh<T>, n: usize, row: usize) -> Vec<Blank<'_, T>> {
     const GROUPS: usize = PROJECT_CHUNK / GROUP;
-    let groups = n.div_ceil(GROUP);
-    array.cut((0..jobs).map(|c| groups.saturating_sub(c * GROUPS).min(GROUPS)))
+    let (groups, count) = (n.div_ceil(GROUP), n.div_ceil(PROJECT_CHUNK));
+    array.cut((0..count).map(|c| GROUPS.min(groups - c * GROUPS) * row))
 }
 
 /// The geometry of a group of Gaussians, one column per number.
@@ -418,18 +418,20 @@ pub fn forward<T: Real>(
     options: &ProjectOptions,
 ) -> Projected<T> {
     let n = gaussians.len();
-    let (channels, sloped, clamped) = match colors {
-        Colors::Harmonics(h) if options.differentiable => (3, if h.degree > 0 { n } else { 0 }, n),
-        Colors::Harmonics(_) => (3, 0, 0),
-        Colors::Channels(..) => (0, 0, 0),
+    let harmonics = match colors {
+        Colors::Harmonics(h) => Some(h),
+        Colors::Channels(..) => None,
     };
+    let channels = if harmonics.is_some() { 3 } else { 0 };
+    let shaded = harmonics.filter(|_| options.differentiable);
+    let clamped = usize::from(shaded.is_some());
+    let sloped = usize::from(shaded.is_some_and(|h| h.degree > 0));
+    let groups = n.div_ceil(GROUP);
     let (mut splats, mut keys) = (Fresh::new(n), Fresh::new(n));
     let (mut means2d, mut depths) = (Fresh::new(2 * n), Fresh::new(n));
     let (mut conics, mut radii) = (Fresh::new(3 * n), Fresh::new(2 * n));
     let (mut opacities, mut rgb) = (Fresh::new(n), Fresh::new(channels * n));
-    let mut slopes = Fresh::new(sloped.div_ceil(GROUP));
-    let mut clamps = Fresh::new(clamped.div_ceil(GROUP));
-    let count = n.div_ceil(PROJECT_CHUNK);
+    let (mut slopes, mut clamps) = (Fresh::new(sloped * groups), Fresh::new(clamped * groups));
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))
@@ -439,8 +441,8 @@ pub fn forward<T: Real>(
         .zip(chunks(&mut radii, n, 2))
         .zip(chunks(&mut opacities, n, 1))
         .zip(chunks(&mut rgb, n, channels))
-        .zip(group_chunks(&mut slopes, sloped, count))
-        .zip(group_chunks(&mut clamps, clamped, count))
+        .zip(group_chunks(&mut slopes, n, sloped))
+        .zip(group_chunks(&mut clamps, n, clamped))
         .collect();
     let level = Level::new();
     let work = jobs
@@ -487,15 +489,12 @@ pub fn forward<T: Real>(
         radii: radii.finish(),
         opacities: opacities.finish(),
         colors: rgb.finish(),
-        shading: match colors {
-            Colors::Harmonics(h) if options.differentiable => Some(Shading {
-                rows: h.rows(),
-                degree: h.degree,
-                slopes: slopes.finish(),
-                clamped: clamps.finish(),
-            }),
-            _ => None,
-        },
+        shading: shaded.map(|h| Shading {
+            rows: h.rows(),
+            degree: h.degree,
+            slopes: slopes.finish(),
+            clamped: clamps.finish(),
+        }),
         work,
     }
 }
@@ -805,12 +804,8 @@ pub struct GaussianGrads<T> {
 
 /// What one job fills of it: empty where not wanted.
 struct BackwardChunk<'a, T> {
-    means: Blank<'a, T>,
-    quats: Blank<'a, T>,
-    scales: Blank<'a, T>,
-    opacities: Blank<'a, T>,
-    harmonics: Blank<'a, T>,
-    harmonics_rest: Blank<'a, T>,
+    /// Of the means, quaternions, scales, opacities, harmonics and their rest.
+    outs: [Blank<'a, T>; 6],
     /// Numbers per Gaussian, in that order.
     rows: [usize; 6],
 }
@@ -824,15 +819,7 @@ impl<T: Real> BackwardChunk<'_, T> {
     /// Give out the first `rows` rows of the buffers.
     #[inline(always)]
     fn put(&mut self, buffers: &[Vec<T>; 6], rows: usize) {
-        let outs = [
-            &mut self.means,
-            &mut self.quats,
-            &mut self.scales,
-            &mut self.opacities,
-            &mut self.harmonics,
-            &mut self.harmonics_rest,
-        ];
-        for ((out, buffer), row) in outs.into_iter().zip(buffers).zip(self.rows) {
+        for ((out, buffer), row) in self.outs.iter_mut().zip(buffers).zip(self.rows) {
             out.put(&buffer[..row * rows]);
         }
     }
@@ -878,12 +865,7 @@ pub fn backward<T: Real>(
         .enumerate()
         .map(|(chunk, (((((means, quats), scales), opacities), sh), rest))| {
             let out = BackwardChunk {
-                means,
-                quats,
-                scales,
-                opacities,
-                harmonics: sh,
-                harmonics_rest: rest,
+                outs: [means, quats, scales, opacities, sh, rest],
                 rows,
             };
             dispatch!(level, simd => backward_chunk(
