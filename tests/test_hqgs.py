@@ -9,13 +9,15 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
+from scipy.fft import dctn
 from test_srgs import fine_scene
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Scene
+from hqgs.camera import Scene, as_floats
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import degrade_scene
 from hqgs.densify import DensifyConfig, select_rows
+from hqgs.jpeg_cells import tables_of_quality
 from hqgs.losses import photometric_loss
 from hqgs.methods.hqgs import HQGS, HQGSConfig, make_hqgs
 from hqgs.methods.paper import PaperHQGS
@@ -136,7 +138,8 @@ def test_masked_pixels_have_no_gradient(formation: str) -> None:
 def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
     scene = tiny_scene()
     pixels = 5 * 24 * 16
-    for formation, share in {"noise:6": 2, "noise:12": 5, "blur:0.5": 1 + np.pi, "jpeg:10": 1}.items():
+    shares = {"noise:6": 2, "noise:12": 5, "blur:0.5": 1 + np.pi, "noise:6+jpeg:10": 2}
+    for formation, share in shares.items():
         config = tiny_config(method="hqgs", hqgs=fixed(formation, gaussians_per_pixel=0.2))
         trainer = Trainer(scene, config)
         assert trainer.config.densify.max_gaussians == int(0.2 * pixels / share), formation
@@ -144,23 +147,35 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
     assert least.config.densify.max_gaussians == len(scene.points)
 
 
-@pytest.mark.parametrize(
-    ("formation", "given", "threshold"),
-    [
-        ("jpeg:10", 2e-4, 1e-4),
-        ("jpeg:10", 5e-5, 5e-5),
-        ("noise:6+jpeg:10", 2e-4, 2e-4),
-        ("blur:1", 2e-4, 2e-4),
-    ],
-)  # fmt: skip
-def test_growth_asks_for_less_where_only_the_codec_spoils(
-    formation: str, given: float, threshold: float
-) -> None:
-    config = tiny_config(method="hqgs", hqgs=fixed(formation))
-    config = replace(config, densify=replace(config.densify, grad_threshold=given))
-    trainer = Trainer(tiny_scene(), config)
-    assert trainer.config.densify.grad_threshold == threshold
-    assert Trainer(tiny_scene(), trainer.config).config == trainer.config  # fitted once is fitted
+def kept_by_the_codec(scene: Scene) -> tuple[int, int]:
+    """Luma coefficients of the training photos that are not zero, and pixels."""
+    kept = pixels = 0
+    for view in scene.train:
+        blocks = as_floats(view.image).astype(np.float64) @ (76.245, 149.685, 29.07) - 128
+        height, width = blocks.shape
+        blocks = blocks.reshape(height // 8, 8, width // 8, 8).swapaxes(1, 2)
+        steps = np.reshape(tables_of_quality(10)[0], (8, 8))
+        kept += int((np.abs(np.asarray(dctn(blocks, axes=(2, 3), norm="ortho"))) > steps / 2).sum())
+        pixels += height * width
+    return kept, pixels
+
+
+def test_under_jpeg_the_budget_and_the_growth_follow_what_the_codec_kept() -> None:
+    scene = degrade_scene(tiny_scene(), parse_degradation("jpeg:10"), 0)
+    kept, pixels = kept_by_the_codec(scene)
+    assert 0.01 * pixels < kept < 0.2 * pixels
+    config = tiny_config(method="hqgs", hqgs=fixed("jpeg:10", gaussians_per_pixel=2.0))
+    config = replace(config, densify=replace(config.densify, grad_threshold=2e-4))
+    trainer = Trainer(scene, config)
+    fitted = trainer.config.densify
+    assert fitted.max_gaussians == pytest.approx(2 * kept, rel=0.1)
+    assert fitted.grad_threshold == pytest.approx(2e-4 * np.sqrt(kept / pixels), rel=0.05)
+    assert Trainer(scene, trainer.config).config == trainer.config  # fitted once is fitted
+    lower = replace(config, densify=replace(config.densify, grad_threshold=1e-9))
+    assert Trainer(scene, lower).config.densify.grad_threshold == 1e-9
+    for formation in ("noise:6+jpeg:10", "blur:1"):
+        other = Trainer(scene, replace(config, hqgs=fixed(formation)))
+        assert other.config.densify.grad_threshold == 2e-4, formation
 
 
 def test_it_looks_by_itself_and_says_what_it_leaves_out(tmp_path: Path) -> None:

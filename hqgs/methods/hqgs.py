@@ -14,6 +14,7 @@ from torch import Tensor
 from hqgs.camera import Scene, View, as_floats
 from hqgs.data.capture import some
 from hqgs.degradations import Degradation, parse_degradation, small_side
+from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene
 from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.formation import Operator, formation
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
-JPEG_THRESHOLD = 1e-4  # at most, of growth: `DensifyConfig.grad_threshold`
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -76,8 +76,11 @@ class HQGS(Plain):
     - None of them: the loss of 3DGS.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
-      Blur and noise make a pixel count less. More Gaussians paint the noise and the ringing of deblurring.
-    - JPEG without noise: growth asks for half the gradient, since within the cells there is none.
+      Blur and noise make a pixel count less, and a photo tells no more than the coefficients that its codec
+      kept. More Gaussians paint the noise and the ringing of deblurring.
+    - JPEG without noise: growth asks for less gradient, since within the cells there is none. A share k of
+      coefficients outside their cells, of any sign, adds up to sqrt(k) of the gradient of all; the share that
+      the codec kept stands for it.
     """
 
     name = "hqgs"
@@ -118,16 +121,18 @@ class HQGS(Plain):
         """The formation that was found, and a budget of Gaussians that the photos can determine."""
         hqgs = replace(config.hqgs, formation=str(self.degradation))
         kinds = {step.kind for step in self.degradation.steps}
-        budget = config.densify.max_gaussians
+        budget, threshold = config.densify.max_gaussians, config.densify.grad_threshold
+        told = sum(self._sharp_pixels(target) for target in self._targets.values())
+        if "jpeg" in kinds and "noise" not in kinds:
+            kept = sum(self._kept(target) for target in self._targets.values())
+            pixels = sum(target.photo[..., 0].numel() for target in self._targets.values())
+            threshold = min(threshold, DensifyConfig.grad_threshold * math.sqrt(min(kept / pixels, 1.0)))
+            told = min(told, kept)
         if self.degradation.steps:
-            pixels = sum(self._sharp_pixels(target) for target in self._targets.values())
-            budget = min(budget, max(int(self.config.gaussians_per_pixel * pixels), self._least))
+            budget = min(budget, max(int(self.config.gaussians_per_pixel * told), self._least))
         method = config.method
         if method == AUTO:
             method = "hqgs" if self.degradation.steps else "3dgs"
-        threshold = config.densify.grad_threshold
-        if "jpeg" in kinds and "noise" not in kinds:
-            threshold = min(threshold, JPEG_THRESHOLD)
         densify = replace(config.densify, max_gaussians=budget, grad_threshold=threshold)
         return replace(config, method=method, hqgs=hqgs, densify=densify)
 
@@ -192,6 +197,11 @@ class HQGS(Plain):
             elif step.kind == "noise":
                 share += (value / HALVING) ** 2
         return height * width / share
+
+    @staticmethod
+    def _kept(target: Target) -> int:
+        """How many luma coefficients the photo's file holds: those that its codec did not round to zero."""
+        return 0 if target.centres is None else int(torch.count_nonzero(target.centres.luma))
 
     def _diagnose(self, scene: Scene) -> Degradation:
         diagnosis = diagnose_scene(scene)
