@@ -88,8 +88,11 @@ def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: dict[str, Any]) -> None
     rows = quick["results"]["formations"]
     assert [r["case"] for r in rows] == [
         "3dgs, 500", "hqgs, blur", "hqgs, lowres:2", "hqgs, jpeg:10", "hqgs, blur+lowres:2+jpeg:10",
+        "hqgs, paper",
     ]  # fmt: skip
-    assert [r["method"] for r in rows] == ["3dgs"] + 4 * ["hqgs"]
+    assert [r["method"] for r in rows] == ["3dgs"] + 5 * ["hqgs"]
+    assert rows[0]["over_first"] == 1
+    assert all(0.5 < r["over_first"] / (r["seconds"] / rows[0]["seconds"]) < 2 for r in rows)
     assert {r["gaussians"] for r in rows} == {500}
     assert {r["target_ms"] for r in rows} == {None}  # they hold at another size
     assert rows[0]["stages"]["method"] < rows[1]["stages"]["method"]  # no Gaussian is too small

@@ -12,7 +12,7 @@ from hqgs.bench.inputs import FAR, NEAR, RasterInputs, make_inputs
 from hqgs.camera import Camera, Scene, View
 from hqgs.config import TrainConfig
 from hqgs.densify import DensifyConfig
-from hqgs.methods.hqgs import AUTO, HQGSConfig
+from hqgs.methods.hqgs import HQGSConfig
 from hqgs.train import Trainer
 
 TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
@@ -39,9 +39,9 @@ def still_config(config: TrainConfig, n: int) -> TrainConfig:
 
 
 def make_trainer(
-    n: int, width: int, height: int, photos: int, method: str, seed: int, formation: str = AUTO
+    n: int, width: int, height: int, photos: int, method: str, seed: int, options: HQGSConfig | None = None
 ) -> Trainer:
-    """A trainer that holds the N Gaussians of `make_inputs`. `formation`: what method hqgs assumes.
+    """A trainer that holds the N Gaussians of `make_inputs`. `options`: of method hqgs.
 
     It never changes their number, but gathers the statistics for it in each step. Raises ValueError as
     `make_inputs` and `Trainer` do.
@@ -54,7 +54,7 @@ def make_trainer(
     ]
     colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
     scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
-    config = still_config(TrainConfig(method=method, seed=seed, hqgs=HQGSConfig(formation=formation)), n)
+    config = still_config(TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig()), n)
     trainer = Trainer(scene, config)
     gaussians = trainer.gaussians
     with torch.no_grad():

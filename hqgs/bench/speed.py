@@ -21,7 +21,7 @@ from hqgs.bench.scaling import measure_scaling, scaling_chart
 from hqgs.bench.scene import make_trainer, warm_up
 from hqgs.bench.step import measure_steps, whole_step
 from hqgs.methods import METHODS, check_method
-from hqgs.methods.hqgs import AUTO
+from hqgs.methods.hqgs import PAPER, HQGSConfig
 from hqgs.train import Trainer
 
 
@@ -79,12 +79,12 @@ class Speed:
     def trainers(self) -> dict[str, Trainer]:
         made = {}
         for n in self.config.step_gaussians:
-            made[f"{self.config.method}, {n:,}"] = self._trainer(n, self.config.method, AUTO)
+            made[f"{self.config.method}, {n:,}"] = self._trainer(n, self.config.method)
         return made
 
-    def _trainer(self, n: int, method: str, formation: str) -> Trainer:
+    def _trainer(self, n: int, method: str, options: HQGSConfig | None = None) -> Trainer:
         c = self.config
-        trainer = make_trainer(n, *c.size, c.step_photos, method, c.seed, formation)
+        trainer = make_trainer(n, *c.size, c.step_photos, method, c.seed, options)
         warm_up(trainer)
         return trainer
 
@@ -100,9 +100,10 @@ class Speed:
 
     def formations(self) -> None:
         n = self.config.step_gaussians[0]
-        trainers = {f"3dgs, {n:,}": self._trainer(n, "3dgs", AUTO)}
+        trainers = {f"3dgs, {n:,}": self._trainer(n, "3dgs")}
         for formation in self.config.formations:
-            trainers[f"hqgs, {formation}"] = self._trainer(n, "hqgs", formation)
+            trainers[f"hqgs, {formation}"] = self._trainer(n, "hqgs", HQGSConfig(formation=formation))
+        trainers["hqgs, paper"] = self._trainer(n, "hqgs", HQGSConfig(guidance=PAPER))
         rows = measure_steps(trainers, self.config.repeats)
         self.report.results["formations"] = rows
         self.report.tables.append(tables.steps(rows))

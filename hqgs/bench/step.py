@@ -67,6 +67,7 @@ def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[st
         cases |= {f"{name}/whole": whole_step(trainer), f"{name}/parts": step_by_parts(trainer)}
     measured = interleaved(cases, repeats)
     rows = []
+    first = measured[f"{next(iter(trainers))}/whole"]
     for name, trainer in trainers.items():
         camera = trainer.scene.train[0].camera
         method, n, size = trainer.config.method, len(trainer.gaussians), (camera.width, camera.height)
@@ -82,6 +83,7 @@ def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[st
                 "height": camera.height,
                 "seconds": median(whole),
                 "seconds_quartiles": quartiles(whole),
+                "over_first": median_ratio(whole, first),
                 "target_ms": TARGETS.get((method, n)) if size == TARGET_SIZE else None,
                 "clocked": median_ratio(parts, whole),  # how much the clocks slow the step down
                 "stages": stages,

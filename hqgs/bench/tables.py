@@ -67,6 +67,7 @@ def steps(rows: Rows) -> str:
     body = [
         ["whole step (ms)", *(_ms(r["seconds"]) for r in rows)],
         ["quartiles (ms)", *(" to ".join(map(_ms, r["seconds_quartiles"])) for r in rows)],
+        [f"over {first['case']}", *(f"{r['over_first']:.2f}" for r in rows)],
         ["target (ms)", *(str(r["target_ms"] or "") for r in rows)],
         *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
         ["with clocks / without", *(f"{r['clocked']:.2f}" for r in rows)],
