@@ -24,7 +24,7 @@ from hqgs.bench.quality_regions import count_regions, edge_robustness
 from hqgs.bench.quality_runs import RunStore
 from hqgs.bench.quality_scenes import degraded, degraded_views, load_scenes, validation_split
 from hqgs.bench.quality_summary import Group, Spread, columns, equal_time_gain, mean_of, psnr_at
-from hqgs.bench.quality_tables import one_scene
+from hqgs.bench.quality_tables import courses, one_scene
 from hqgs.camera import Camera, Scene, View
 from hqgs.checkpoint import scene_fingerprint
 from hqgs.degradations import parse_degradation
@@ -486,6 +486,20 @@ def test_each_scene_has_a_table_of_its_own() -> None:
         Group("a", "blur", seed, {"x": {"metrics": {"psnr": 20.0 + seed, "ssim": 0.5}}}) for seed in (0, 3)
     ]
     assert table(one_scene(groups, ["x"], "a"), "PSNR/SSIM, a") == {"x": {"blur": "21.50/0.500"}}
+
+
+def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
+    runs = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
+    groups = [Group("a", "blur", seed, {"x": run, "y": runs[0]}) for seed, run in enumerate(runs)]
+    way = table(
+        courses(groups, ["x", "y"]), "PSNR (dB) and seconds of training on the way, means over all runs"
+    )
+    assert way == {
+        "x": {"0": "19.00, 8 s", "1": "25.00, 18 s"},
+        "y": {"0": "20.00, 10 s", "1": "24.00, 20 s"},
+    }
+    runs[1]["history"][0]["psnr"] = None
+    assert courses(groups, ["x"]).count("–, 8 s") == 1
 
 
 def test_estimates_learn_from_finished_runs(monkeypatch: pytest.MonkeyPatch) -> None:

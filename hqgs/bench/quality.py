@@ -178,6 +178,7 @@ class Quality:
             report.tables.append(tables.one_scene(part, labels, self.what(part)))
         runs = [run for group in groups for run in group.runs.values()]
         report.tables.append(tables.training_times(numbers))
+        report.tables.append(tables.courses(groups, labels))
         report.tables.append(tables.costs(groups, labels, self.circumstances(runs)))
         report.tables.append(tables.regions(groups, labels))
         guessing = [row.label for row in protocol.rows if any(g.runs[row.label]["formation"] for g in groups)]
