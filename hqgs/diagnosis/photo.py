@@ -19,7 +19,8 @@ from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlarg
 Table = tuple[tuple[int, ...], ...]
 Photo = NDArray[np.uint8] | NDArray[np.float32]
 
-LEAST_BLUR = 0.7  # px of the small photo, a Gaussian's sigma; photos that count as sharp reach 0.6
+LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6
+SHARPER = 0.2  # px of the small photo: shrinking halves a camera's own softness or more, to 0.45 at most
 HIDING_QUALITY = 92  # from this quality on, JPEG leaves the luma's noise and spectrum as they were
 LARGEST = 1024  # px a side: more of a photo is not looked at, but for its enlargement
 FEW_BLOCKS = 1_000  # of all photos together, to look for noise in the luma alone
@@ -95,7 +96,7 @@ def inspect_photo(
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     levels = _middle(levels)
     jpeg = find_jpeg(levels, path)
-    limit = LEAST_BLUR * width / enlargement.width
+    limit = _blur_limit(LEAST_BLUR, width, enlargement)
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
     if not found.hiding and (noise := estimate_noise(levels)) is not None:
         found = replace(found, noise=noise.level, noise_limit=noise.limit)
@@ -143,7 +144,7 @@ def _with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis
         noise=hidden.noise,
         noise_limit=hidden.noise_limit,
         blur=_enlarged(Blur("gaussian", sigma, sigma, 0.0), scale),
-        blur_limit=hidden.sigma_limit * scale,
+        blur_limit=_blur_limit(hidden.sigma_limit, photo.width, photo.enlargement),
     )
 
 
@@ -155,6 +156,11 @@ def _with_blur(photo: PhotoDiagnosis, levels: Floats, hidden: Hidden | None) -> 
     return (
         photo if blur is None else replace(photo, blur=_enlarged(blur, photo.width / photo.enlargement.width))
     )
+
+
+def _blur_limit(limit: float, width: int, enlargement: Enlargement) -> float:
+    """The least blur that is told of a photo, px, where it is `limit` in one that was not enlarged."""
+    return (limit - SHARPER if enlargement.factor > 1 else limit) * width / enlargement.width
 
 
 def _enlarged(blur: Blur, scale: float) -> Blur:
