@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from hqgs import _rust
 
 
 def photometric_loss(
-    render: Tensor, target: Tensor, mask: Tensor | None = None, lambda_dssim: float = 0.2
+    render: Tensor, target: Tensor, mask: Tensor | None = None, lambda_dssim: float = 0.2, knee: float = 0.0
 ) -> Tensor:
     """(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM) of a render against a photo, a scalar.
 
@@ -27,6 +28,8 @@ def photometric_loss(
         mask: bool [H, W], True where the photo counts. L1 is the mean over these pixels. For SSIM the render
             is replaced by the target elsewhere, and the mean is over all pixels.
         lambda_dssim: weight of 1 - SSIM, in [0, 1]; at 0 SSIM is not computed.
+        knee: k in Huber's function, x^2 / (2 k) up to |x| = k and |x| - k / 2 beyond, which stands for |x|;
+            at 0 it is |x|.
 
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
@@ -45,17 +48,21 @@ def photometric_loss(
         raise ValueError(f"mask: must be bool, got {mask.dtype}")
     if not 0 <= lambda_dssim <= 1:
         raise ValueError(f"lambda_dssim: must be in [0, 1], got {lambda_dssim}")
-    return _Photometric.apply(render, target, mask, float(lambda_dssim))
+    if not 0 <= knee < math.inf:
+        raise ValueError(f"knee: must be finite and at least 0, got {knee}")
+    return _Photometric.apply(render, target, mask, float(lambda_dssim), float(knee))
 
 
 class _Photometric(torch.autograd.Function):
     """The gradient comes with the value, so the backward pass only scales it."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, mask: Tensor | None, lambda_dssim: float) -> Tensor:
+    def forward(
+        ctx: Any, render: Tensor, target: Tensor, mask: Tensor | None, lambda_dssim: float, knee: float
+    ) -> Tensor:
         counts = None if mask is None else mask.contiguous().numpy().view(np.uint8)
         x, y = render.detach().contiguous().numpy(), target.contiguous().numpy()
-        loss, _, _, grad = _rust.photometric(x, y, counts, lambda_dssim, ctx.needs_input_grad[0])
+        loss, _, _, grad = _rust.photometric(x, y, counts, lambda_dssim, knee, ctx.needs_input_grad[0])
         if grad is not None:
             ctx.save_for_backward(torch.from_numpy(grad).view(render.shape))
         return render.new_tensor(loss)
@@ -64,6 +71,6 @@ class _Photometric(torch.autograd.Function):
     @once_differentiable
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
         ctx: Any, v_loss: Tensor
-    ) -> tuple[Tensor, None, None, None]:
+    ) -> tuple[Tensor, None, None, None, None]:
         (grad,) = ctx.saved_tensors
-        return v_loss * grad, None, None, None
+        return v_loss * grad, None, None, None, None

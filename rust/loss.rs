@@ -52,7 +52,8 @@ impl<T: Real> Sample<T> for T {
 pub struct Photometric {
     /// `(1 - lambda) l1 + lambda (1 - ssim)`.
     pub loss: f64,
-    /// Mean absolute difference over the channels of the pixels that count; 0 if none does.
+    /// Mean absolute difference (or Huber's function of it) over the channels of the pixels that count; 0 if
+    /// none does.
     pub l1: f64,
     /// Mean SSIM; None where lambda is 0, as it was not computed.
     pub ssim: Option<f64>,
@@ -87,6 +88,7 @@ struct Images<'a, T, Y> {
 #[derive(Clone, Copy)]
 struct Plan {
     ssim: bool,
+    knee: f64,
     l1_scale: f64,
     ssim_scale: f64,
 }
@@ -99,8 +101,11 @@ struct Plan {
 /// 0. SSIM is still averaged over all pixels. The gradient of |x| at 0 is 0. With `lambda` 0 no SSIM is
 /// computed. NaN in the render gives a NaN loss. The same bits for any number of threads.
 ///
+/// With a `knee` k > 0, Huber's function stands for |x|: x^2 / (2 k) up to k, |x| - k / 2 beyond.
+///
 /// # Errors
-/// Names the array whose length does not match, or `lambda` outside [0, 1].
+/// Names the array whose length does not match, `lambda` outside [0, 1], or a `knee` that is negative or not
+/// finite.
 pub fn photometric<T: Real, Y: Sample<T>>(
     render: &[T],
     target: &[Y],
@@ -109,6 +114,7 @@ pub fn photometric<T: Real, Y: Sample<T>>(
     width: usize,
     channels: usize,
     lambda: f64,
+    knee: f64,
     grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Photometric, Error> {
@@ -116,6 +122,12 @@ pub fn photometric<T: Real, Y: Sample<T>>(
         return Err(Error::new(
             "lambda",
             format!("must be in [0, 1], got {lambda}"),
+        ));
+    }
+    if !(0.0..f64::INFINITY).contains(&knee) {
+        return Err(Error::new(
+            "knee",
+            format!("must be finite and at least 0, got {knee}"),
         ));
     }
     let images = Images {
@@ -133,6 +145,7 @@ pub fn photometric<T: Real, Y: Sample<T>>(
     let counted = channels * mask.map_or(height * width, |m| m.iter().filter(|&&m| m != 0).count());
     let plan = Plan {
         ssim: lambda > 0.0,
+        knee,
         l1_scale: (1.0 - lambda) / counted.max(1) as f64,
         ssim_scale: lambda / render.len() as f64,
     };
@@ -177,6 +190,7 @@ pub fn ssim<T: Real, Y: Sample<T>>(
     images.check("a", "b")?;
     let plan = Plan {
         ssim: true,
+        knee: 0.0,
         l1_scale: 0.0,
         ssim_scale: 0.0,
     };

@@ -96,12 +96,13 @@ fn photometric<'py>(
     target: &Bound<'py, PyAny>,
     mask: Option<&Bound<'py, PyAny>>,
     lambda_dssim: f64,
+    knee: f64,
     want_grad: bool,
 ) -> PyResult<Loss<'py>> {
     by_dtypes!(
         render,
         target,
-        photometric_as(render, target, mask, lambda_dssim, want_grad)
+        photometric_as(render, target, mask, lambda_dssim, knee, want_grad)
     )
 }
 
@@ -110,6 +111,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
     target: &Bound<'py, PyAny>,
     mask: Option<&Bound<'py, PyAny>>,
     lambda_dssim: f64,
+    knee: f64,
     want_grad: bool,
 ) -> PyResult<Loss<'py>> {
     let py = render.py();
@@ -122,7 +124,9 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
     let out = want_grad.then_some(&mut grad[..]);
     let value = py.detach(|| {
         T::with_scratch(|scratch| {
-            threads::install(|| loss::photometric(x, y, mask, h, w, c, lambda_dssim, out, scratch))
+            threads::install(|| {
+                loss::photometric(x, y, mask, h, w, c, lambda_dssim, knee, out, scratch)
+            })
         })
     })?;
     let grad = want_grad.then(|| grad.into_pyarray(py).into_any());

@@ -71,6 +71,24 @@ def test_value_and_gradient_agree_with_plain_torch(
         assert off < 10 * tolerance
 
 
+@pytest.mark.parametrize("lambda_dssim", [0.0, 0.2])
+def test_with_a_knee_it_is_hubers_function(lambda_dssim: float) -> None:
+    render, photo, mask = images(33, 17)
+    target = photo.double() / 255
+    render.requires_grad_()
+    huber = torch.nn.functional.huber_loss(render[mask], target[mask], delta=0.15) / 0.15
+    without = (1 - lambda_dssim) * (render - target).abs()[mask].mean()
+    expected = reference(render, target, mask, lambda_dssim) - without + (1 - lambda_dssim) * huber
+    (expected_grad,) = torch.autograd.grad(expected, render)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
+        x = render.detach().to(dtype).requires_grad_()
+        value = photometric_loss(x, photo, mask, lambda_dssim, knee=0.15)
+        value.backward()
+        assert abs(value.item() - expected.item()) < tolerance
+        assert x.grad is not None
+        assert (x.grad - expected_grad).norm() < 10 * tolerance * expected_grad.norm()
+
+
 def test_reference_uses_8_bit_photos_in_double() -> None:
     photo = torch.tensor([[[255, 128, 0]]], dtype=torch.uint8)
     value = photometric_loss(torch.zeros(1, 1, 3, dtype=torch.float64), photo, lambda_dssim=0.0)
@@ -149,9 +167,10 @@ def test_bad_input_is_named() -> None:
         "mask": lambda: photometric_loss(render, photo, mask.int()),
         "mask: expected shape": lambda: photometric_loss(render, photo, mask[:, :4]),
         "lambda_dssim": lambda: photometric_loss(render, photo, lambda_dssim=1.5),
+        "knee": lambda: photometric_loss(render, photo, knee=-0.1),
         "render: must be on the CPU": lambda: photometric_loss(render.to("meta"), photo),
     }.items():
         with pytest.raises(ValueError, match=name):
             call()
     with pytest.raises(ValueError, match="render: must be C-contiguous"):
-        _rust.photometric(render.numpy().transpose(1, 0, 2), photo.numpy(), None, 0.2, False)
+        _rust.photometric(render.numpy().transpose(1, 0, 2), photo.numpy(), None, 0.2, 0.0, False)

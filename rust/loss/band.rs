@@ -337,24 +337,38 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         }
     }
 
-    /// The sum of the absolute differences of a row. The gradient is that of L1 plus, if the filtered maps of
-    /// the row lie at `maps[..][i]`, that of SSIM.
+    /// The sum of the absolute differences of a row, rounded off within the knee. The gradient is that of L1
+    /// (or Huber's) plus, if the filtered maps of the row lie at `maps[..][i]`, that of SSIM.
     #[inline(always)]
     fn finish(&mut self, row: usize, grad: Option<&mut [T]>, i: Option<usize>) -> f64 {
         self.load(row);
         let Images { mask, channels, .. } = self.images.row(row);
+        let knee = self.plan.knee;
         let part = self.pad..self.pad + self.n;
         let (p, q) = (&self.buffers.p[part.clone()], &self.buffers.q[part.clone()]);
         if let Some(grad) = grad {
             let scale = T::from_f64(self.plan.l1_scale);
-            for (grad, &q) in grad.iter_mut().zip(q) {
-                *grad = if q > T::ZERO {
-                    scale
-                } else if q < T::ZERO {
-                    -scale
-                } else {
-                    T::ZERO
-                };
+            if knee > 0.0 {
+                let (knee, slope) = (T::from_f64(knee), T::from_f64(self.plan.l1_scale / knee));
+                for (grad, &q) in grad.iter_mut().zip(q) {
+                    *grad = if q > knee {
+                        scale
+                    } else if q < -knee {
+                        -scale
+                    } else {
+                        slope * q
+                    };
+                }
+            } else {
+                for (grad, &q) in grad.iter_mut().zip(q) {
+                    *grad = if q > T::ZERO {
+                        scale
+                    } else if q < T::ZERO {
+                        -scale
+                    } else {
+                        T::ZERO
+                    };
+                }
             }
             if let Some(i) = i {
                 let scale = T::from_f64(self.plan.ssim_scale);
@@ -374,7 +388,14 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
                 grad[pixel * channels..(pixel + 1) * channels].fill(T::ZERO);
             }
         }
-        sum(q, f64::abs)
+        if knee > 0.0 {
+            sum(q, |q| {
+                let within = q.abs().min(knee);
+                within * (q.abs() - within / 2.0) / knee
+            })
+        } else {
+            sum(q, f64::abs)
+        }
     }
 }
 

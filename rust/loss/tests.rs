@@ -71,8 +71,9 @@ fn loss<T: Real>(
 ) -> (Photometric, Vec<T>) {
     let mut grad = vec![T::from_f64(7.0); x.len()];
     let mut scratch = LossScratch::default();
-    let value = photometric(x, y, mask, h, w, c, lambda, Some(&mut grad), &mut scratch).unwrap();
-    let alone = photometric(x, y, mask, h, w, c, lambda, None, &mut scratch).unwrap();
+    let (out, s) = (Some(&mut grad[..]), &mut scratch);
+    let value = photometric(x, y, mask, h, w, c, lambda, 0.0, out, s).unwrap();
+    let alone = photometric(x, y, mask, h, w, c, lambda, 0.0, None, s).unwrap();
     assert!(
         value == alone || value.loss.is_nan(),
         "{value:?} with the gradient, {alone:?} without"
@@ -360,16 +361,51 @@ fn scratch_of_another_size_can_be_reused() {
     let mut scratch = LossScratch::default();
     for size @ [h, w, c] in SIZES.into_iter().rev() {
         let (x, y) = (noise(1, h * w * c), photo(2, h * w * c));
-        let got = photometric(&x, &y, None, h, w, c, 0.2, None, &mut scratch).unwrap();
+        let got = photometric(&x, &y, None, h, w, c, 0.2, 0.0, None, &mut scratch).unwrap();
         assert_eq!(got, loss(&x, &y, None, size, 0.2).0);
     }
+}
+
+#[test]
+fn with_a_knee_small_differences_count_by_their_square() {
+    let size @ [h, w, c] = [33, 17, 3];
+    let (x, y) = (noise(1, h * w * c), photo(2, h * w * c));
+    let mask: Vec<u8> = noise(3, h * w).iter().map(|&v| (v > 0.3).into()).collect();
+    let (counted, knee) = (mask.iter().filter(|&&m| m == 1).count() * c, 0.25);
+    let counts = |i: usize| f64::from(mask[i / c]) / counted as f64;
+    let difference: Vec<f64> = x.iter().zip(unit(&y)).map(|(x, y)| x - y).collect();
+    let huber = difference.iter().enumerate().map(|(i, d)| {
+        let d = d.abs();
+        counts(i)
+            * (if d < knee {
+                d * d / (2.0 * knee)
+            } else {
+                d - knee / 2.0
+            })
+    });
+    let mut scratch = LossScratch::default();
+    let mut grad = vec![0.0; x.len()];
+    let (y, m) = (&y[..], Some(&mask[..]));
+    let got = photometric(&x, y, m, h, w, c, 0.0, knee, Some(&mut grad), &mut scratch).unwrap();
+    assert!((got.loss - huber.sum::<f64>()).abs() < 1e-14);
+    for (i, (&g, &d)) in grad.iter().zip(&difference).enumerate() {
+        assert!(
+            (g - counts(i) * (d / knee).clamp(-1.0, 1.0)).abs() < 1e-15,
+            "{i}"
+        );
+    }
+    assert!(difference.iter().any(|d| d.abs() < knee) && difference.iter().any(|d| d.abs() > knee));
+    let both = photometric(&x, y, m, h, w, c, 0.4, knee, None, &mut scratch).unwrap();
+    let plain = loss(&x, y, m, size, 0.4).0;
+    assert_eq!(both.ssim, plain.ssim);
+    assert!((both.loss - plain.loss - 0.6 * (got.loss - plain.l1)).abs() < 1e-14);
 }
 
 #[test]
 fn wrong_input_is_named() {
     let mut scratch = LossScratch::default();
     let x = [0.0f32; 12];
-    let mut call = |y: &[u8], mask: Option<&[u8]>, lambda, shape: [usize; 3]| {
+    let mut call = |y: &[u8], mask: Option<&[u8]>, lambda, knee, shape: [usize; 3]| {
         photometric(
             &x,
             y,
@@ -378,15 +414,19 @@ fn wrong_input_is_named() {
             shape[1],
             shape[2],
             lambda,
+            knee,
             None,
             &mut scratch,
         )
         .unwrap_err()
         .name
     };
-    assert_eq!(call(&[0; 12], None, 0.2, [2, 2, 4]), "render");
-    assert_eq!(call(&[0; 12], None, 0.2, [0, 2, 3]), "render");
-    assert_eq!(call(&[0; 11], None, 0.2, [2, 2, 3]), "target");
-    assert_eq!(call(&[0; 12], Some(&[1; 3]), 0.2, [2, 2, 3]), "mask");
-    assert_eq!(call(&[0; 12], None, f64::NAN, [2, 2, 3]), "lambda");
+    assert_eq!(call(&[0; 12], None, 0.2, 0.0, [2, 2, 4]), "render");
+    assert_eq!(call(&[0; 12], None, 0.2, 0.0, [0, 2, 3]), "render");
+    assert_eq!(call(&[0; 11], None, 0.2, 0.0, [2, 2, 3]), "target");
+    assert_eq!(call(&[0; 12], Some(&[1; 3]), 0.2, 0.0, [2, 2, 3]), "mask");
+    assert_eq!(call(&[0; 12], None, f64::NAN, 0.0, [2, 2, 3]), "lambda");
+    for knee in [-0.1, f64::NAN, f64::INFINITY] {
+        assert_eq!(call(&[0; 12], None, 0.2, knee, [2, 2, 3]), "knee");
+    }
 }
