@@ -99,12 +99,17 @@ def test_low_resolution_compares_shrunk_renders() -> None:
     assert float(again) == pytest.approx(loss, rel=0.02)  # the enlarged photo still holds the small one
 
 
-def test_noise_leaves_dssim_out() -> None:
+def test_noise_counts_by_its_square_without_dssim() -> None:
     scene = tiny_scene()
     view = scene.train[0]
     render = render_like(view.image)
-    expected = np.abs(render.numpy() - view.image / 255).mean()
-    assert float(HQGS(scene, fixed("noise:25")).loss(render, view)) == pytest.approx(expected, rel=1e-6)
+    difference, knee = render - torch.from_numpy(view.image / 255).float(), 2 * 25 / 255
+    assert (difference.abs() < knee).any()
+    assert (difference.abs() > knee).any()
+    expected = 2 / knee * torch.nn.functional.huber_loss(difference, torch.zeros(()), delta=knee)
+    assert float(HQGS(scene, fixed("noise:25")).loss(render, view)) == pytest.approx(
+        float(expected), rel=1e-6
+    )
 
 
 def test_jpeg_forgives_what_the_file_leaves_open() -> None:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 LAMBDA_DSSIM = 0.2
+KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
+STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
@@ -72,7 +74,9 @@ class HQGS(Plain):
       there. The direction of a motion is each photo's own, as the diagnosis tells it.
     - JPEG: beside the pixels, the render is compared with the cells that the file leaves open (`JpegCells`).
     - Noise or JPEG: no D-SSIM. It is normalised by the local contrast, so that it asks for the noise in flat
-      parts; L1 averages the noise over the views.
+      parts.
+    - Noise: differences count by their square up to two standard deviations of the noise (Huber's function).
+      The mean of Gaussian noise over the views is nearer to the truth than their median, which L1 asks for.
     - None of them: the loss of 3DGS.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
@@ -169,6 +173,9 @@ class HQGS(Plain):
             self._smallest = None
         target = self._targets[view.name]
         image = render if target.operator is None else target.operator(render)
+        if target.centres is None and self.noise:
+            knee = KNEE * self.noise
+            return STEEPER * photometric_loss(image, target.photo, target.mask, self._dssim, knee)
         pixels = photometric_loss(image, target.photo, target.mask, self._dssim)
         if target.centres is None:
             return pixels
