@@ -324,6 +324,7 @@ fn the_machines_baseline_agrees_with_its_best_level() {
     };
     let plan = Plan {
         ssim: true,
+        knee: 0.0,
         l1_scale: 0.5,
         ssim_scale: 0.5,
     };
