@@ -89,6 +89,24 @@ def test_with_a_knee_it_is_hubers_function(lambda_dssim: float) -> None:
         assert (x.grad - expected_grad).norm() < 10 * tolerance * expected_grad.norm()
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_smallest_knee_is_none(dtype: torch.dtype) -> None:
+    render, photo, _ = images(20, 10)
+    render = render.to(dtype)
+    target = photo.to(dtype) / 255
+    render[:5] = target[:5]
+    for knee in (5e-324, 1e-300, 1e-44):
+        x, y = (render.clone().requires_grad_() for _ in range(2))
+        value = photometric_loss(x, target, lambda_dssim=0.0, knee=knee)
+        plain = photometric_loss(y, target, lambda_dssim=0.0)
+        assert value.item() == pytest.approx(plain.item(), rel=1e-6)
+        value.backward()
+        plain.backward()
+        assert x.grad is not None
+        assert x.grad.isfinite().all()
+        assert torch.equal(x.grad, y.grad), knee  # type: ignore[arg-type]
+
+
 def test_reference_uses_8_bit_photos_in_double() -> None:
     photo = torch.tensor([[[255, 128, 0]]], dtype=torch.uint8)
     value = photometric_loss(torch.zeros(1, 1, 3, dtype=torch.float64), photo, lambda_dssim=0.0)

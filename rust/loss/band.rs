@@ -348,15 +348,15 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         let (p, q) = (&self.buffers.p[part.clone()], &self.buffers.q[part.clone()]);
         if let Some(grad) = grad {
             let scale = T::from_f64(self.plan.l1_scale);
-            if knee > 0.0 {
-                let (knee, slope) = (T::from_f64(knee), T::from_f64(self.plan.l1_scale / knee));
+            let narrow = T::from_f64(knee); // 0 where T has nothing so small
+            if narrow > T::ZERO {
                 for (grad, &q) in grad.iter_mut().zip(q) {
-                    *grad = if q > knee {
+                    *grad = if q > narrow {
                         scale
-                    } else if q < -knee {
+                    } else if q < -narrow {
                         -scale
                     } else {
-                        slope * q
+                        scale * (q / narrow)
                     };
                 }
             } else {
@@ -391,7 +391,7 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         if knee > 0.0 {
             sum(q, |q| {
                 let within = q.abs().min(knee);
-                within * (q.abs() - within / 2.0) / knee
+                within / knee * (q.abs() - within / 2.0)
             })
         } else {
             sum(q, f64::abs)
