@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from hqgs.bench.output import markdown_table
 from hqgs.bench.quality_summary import COSTS, Group, Run, columns, density, mean_of
 
@@ -99,22 +97,29 @@ def training_times(numbers: Summary) -> str:
 
 def courses(groups: Sequence[Group], labels: Sequence[str]) -> str:
     """Held-out PSNR and seconds of training at the evaluations that all runs have, means over the runs."""
-    at = {
-        label: [{h["iteration"]: h for h in group.runs[label]["history"]} for group in groups]
+    runs = [group.runs[label] for group in groups for label in labels]
+    shared = sorted(set.intersection(*({h["iteration"] for h in run["history"]} for run in runs)))
+
+    def mean(label: str, iteration: int, name: str) -> float | None:
+        def value(run: Run) -> float | None:
+            return next(h[name] for h in run["history"] if h["iteration"] == iteration)
+
+        return mean_of(groups, label, value)
+
+    body = [
+        [
+            label,
+            *(
+                f"{_number(mean(label, k, 'psnr'), '.2f')}, {_number(mean(label, k, 'seconds'), '.0f')} s"
+                for k in shared
+            ),
+        ]
         for label in labels
-    }
-    shared = sorted(set.intersection(*(set(history) for part in at.values() for history in part)))
-
-    def entry(label: str, iteration: int) -> str:
-        found = [history[iteration] for history in at[label]]
-        values = [h["psnr"] for h in found]
-        psnr = None if None in values else float(np.mean(values))
-        return f"{_number(psnr, '.2f')}, {np.mean([h['seconds'] for h in found]):.0f} s"
-
+    ]
     return markdown_table(
         "PSNR (dB) and seconds of training on the way, means over all runs",
         ["iterations", *(f"{k:,}" for k in shared)],
-        [[label, *(entry(label, k) for k in shared)] for label in labels],
+        body,
     )
 
 

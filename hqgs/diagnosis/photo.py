@@ -96,7 +96,7 @@ def inspect_photo(
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     levels = _middle(levels)
     jpeg = find_jpeg(levels, path)
-    limit = _blur_limit(LEAST_BLUR, width, enlargement)
+    limit = _least_blur(LEAST_BLUR, enlargement) * width / enlargement.width
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
     if not found.hiding and (noise := estimate_noise(levels)) is not None:
         found = replace(found, noise=noise.level, noise_limit=noise.limit)
@@ -144,7 +144,7 @@ def _with_hidden(photo: PhotoDiagnosis, hidden: Hidden | None) -> PhotoDiagnosis
         noise=hidden.noise,
         noise_limit=hidden.noise_limit,
         blur=_enlarged(Blur("gaussian", sigma, sigma, 0.0), scale),
-        blur_limit=_blur_limit(hidden.sigma_limit, photo.width, photo.enlargement),
+        blur_limit=_least_blur(hidden.sigma_limit, photo.enlargement) * scale,
     )
 
 
@@ -158,9 +158,9 @@ def _with_blur(photo: PhotoDiagnosis, levels: Floats, hidden: Hidden | None) -> 
     )
 
 
-def _blur_limit(limit: float, width: int, enlargement: Enlargement) -> float:
-    """The least blur that is told of a photo, px, where it is `limit` in one that was not enlarged."""
-    return (limit - SHARPER if enlargement.factor > 1 else limit) * width / enlargement.width
+def _least_blur(limit: float, enlargement: Enlargement) -> float:
+    """The least blur that is told, px of the small photo; `limit`: of photos that were not enlarged."""
+    return limit - SHARPER if enlargement.factor > 1 else limit
 
 
 def _enlarged(blur: Blur, scale: float) -> Blur:

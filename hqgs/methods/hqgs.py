@@ -101,6 +101,7 @@ class HQGS(Plain):
         self.noise = float(kinds.get("noise") or 0.0) / 255
         self._factor = int(kinds.get("lowres") or 1)
         self._jpeg = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
+        self._knee = KNEE * self.noise if self._jpeg is None else 0.0
         self._dssim = 0.0 if "noise" in kinds or self._jpeg else LAMBDA_DSSIM
         self._directions = self._motion_directions(scene) if "motion" in kinds else {}
         self._operators: dict[tuple[int, int, float | None], Operator | None] = {}
@@ -126,13 +127,13 @@ class HQGS(Plain):
         hqgs = replace(config.hqgs, formation=str(self.degradation))
         kinds = {step.kind for step in self.degradation.steps}
         budget, threshold = config.densify.max_gaussians, config.densify.grad_threshold
-        told = sum(self._sharp_pixels(target) for target in self._targets.values())
-        if "jpeg" in kinds and "noise" not in kinds:
-            kept = sum(self._kept(target) for target in self._targets.values())
-            pixels = sum(target.photo[..., 0].numel() for target in self._targets.values())
-            threshold = min(threshold, DensifyConfig.grad_threshold * math.sqrt(min(kept / pixels, 1.0)))
-            told = min(told, kept)
         if self.degradation.steps:
+            told = sum(self._sharp_pixels(target) for target in self._targets.values())
+            if "jpeg" in kinds and "noise" not in kinds:
+                kept = sum(self._kept(target) for target in self._targets.values())
+                pixels = sum(target.photo[..., 0].numel() for target in self._targets.values())
+                threshold = min(threshold, DensifyConfig.grad_threshold * math.sqrt(min(kept / pixels, 1.0)))
+                told = min(told, kept)
             budget = min(budget, max(int(self.config.gaussians_per_pixel * told), self._least))
         method = config.method
         if method == AUTO:
@@ -173,12 +174,9 @@ class HQGS(Plain):
             self._smallest = None
         target = self._targets[view.name]
         image = render if target.operator is None else target.operator(render)
-        if target.centres is None and self.noise:
-            knee = KNEE * self.noise
-            return STEEPER * photometric_loss(image, target.photo, target.mask, self._dssim, knee)
-        pixels = photometric_loss(image, target.photo, target.mask, self._dssim)
+        pixels = photometric_loss(image, target.photo, target.mask, self._dssim, self._knee)
         if target.centres is None:
-            return pixels
+            return STEEPER * pixels if self._knee else pixels
         if target.mask is not None:
             image = torch.where(target.mask[..., None], image, floats(target.photo))
         cells = self._cells[target.photo.shape[0], target.photo.shape[1]]
