@@ -88,9 +88,9 @@ def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: dict[str, Any]) -> None
     rows = quick["results"]["formations"]
     assert [r["case"] for r in rows] == [
         "3dgs, 500", "hqgs, blur", "hqgs, lowres:2", "hqgs, jpeg:10", "hqgs, blur+lowres:2+jpeg:10",
-        "hqgs, paper",
+        "hqgs, paper's V6", "hqgs, paper's V7",
     ]  # fmt: skip
-    assert [r["method"] for r in rows] == ["3dgs"] + 5 * ["hqgs"]
+    assert [r["method"] for r in rows] == ["3dgs"] + 6 * ["hqgs"]
     assert rows[0]["over_first"] == 1
     assert all(0.5 < r["over_first"] / (r["seconds"] / rows[0]["seconds"]) < 2 for r in rows)
     assert {r["gaussians"] for r in rows} == {500}

@@ -22,6 +22,7 @@ from hqgs.bench.scene import make_trainer, warm_up
 from hqgs.bench.step import measure_steps, whole_step
 from hqgs.methods import METHODS, check_method
 from hqgs.methods.hqgs import PAPER, HQGSConfig
+from hqgs.methods.paper import VARIANTS
 from hqgs.train import Trainer
 
 
@@ -103,7 +104,9 @@ class Speed:
         trainers = {f"3dgs, {n:,}": self._trainer(n, "3dgs")}
         for formation in self.config.formations:
             trainers[f"hqgs, {formation}"] = self._trainer(n, "hqgs", HQGSConfig(formation=formation))
-        trainers["hqgs, paper"] = self._trainer(n, "hqgs", HQGSConfig(guidance=PAPER))
+        for variant in ("V6", "V7"):  # the paper's module beside the loss of 3dgs, and all of it
+            config = HQGSConfig(guidance=PAPER, paper=VARIANTS[variant])
+            trainers[f"hqgs, paper's {variant}"] = self._trainer(n, "hqgs", config)
         rows = measure_steps(trainers, self.config.repeats)
         self.report.results["formations"] = rows
         self.report.tables.append(tables.steps(rows))
