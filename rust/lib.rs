@@ -20,12 +20,6 @@ pub mod loss;
 pub mod project;
 #[cfg(feature = "python")]
 mod python;
-#[cfg(feature = "python")]
-mod python_loss;
-#[cfg(feature = "python")]
-mod python_pictures;
-#[cfg(feature = "python")]
-mod python_weights;
 pub mod real;
 pub mod render;
 pub mod scene;

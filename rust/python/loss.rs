@@ -1,10 +1,10 @@
-//! The Python binding of the loss and of the optimizer; the rasterizer's is `python.rs`.
+//! The binding of the loss and of the optimizer.
 
+use super::arrays::{Array, is_f32};
 use crate::{
     adam::{self, AdamArrays, AdamOptions, Selection},
     error::Error,
     loss::{self, LossScratch, Sample},
-    python::{Array, is_f32},
     real::Real,
     threads,
 };
@@ -13,7 +13,7 @@ use pyo3::{exceptions::PyValueError, prelude::*};
 use std::cell::RefCell;
 
 /// Add the functions of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(photometric, m)?)?;
     m.add_function(wrap_pyfunction!(ssim, m)?)?;
     m.add_function(wrap_pyfunction!(adam_step, m)?)

@@ -1,9 +1,9 @@
-//! The Python binding of the operators on pictures.
+//! The binding of the operators on pictures.
 
+use super::arrays::{Array, by_dtype};
 use crate::{
     cells,
     error::Error,
-    python::{Array, is_f32},
     real::Real,
     separable::{self, Dense},
     threads,
@@ -12,7 +12,7 @@ use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;
 
 /// Add the functions and classes of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Separable>()?;
     m.add_function(wrap_pyfunction!(cell_distance, m)?)
 }
@@ -89,11 +89,7 @@ impl Separable {
         image: &Bound<'py, PyAny>,
         transposed: bool,
     ) -> PyResult<Bound<'py, PyAny>> {
-        if is_f32(image) {
-            self.apply_as::<f32>(image, transposed)
-        } else {
-            self.apply_as::<f64>(image, transposed)
-        }
+        by_dtype!(image, apply_either(self, image, transposed))
     }
 
     /// `apply` of the operator whose weights are the absolute values, on float32.
@@ -102,15 +98,13 @@ impl Separable {
     }
 }
 
-impl Separable {
-    fn apply_as<'py, T: Typed>(
-        &self,
-        image: &Bound<'py, PyAny>,
-        transposed: bool,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        let (straight, turned) = T::of(self);
-        apply(if transposed { turned } else { straight }, image)
-    }
+fn apply_either<'py, T: Typed>(
+    operator: &Separable,
+    image: &Bound<'py, PyAny>,
+    transposed: bool,
+) -> PyResult<Bound<'py, PyAny>> {
+    let (straight, turned) = T::of(operator);
+    apply(if transposed { turned } else { straight }, image)
 }
 
 fn apply<'py, T: Real + Element>(
@@ -135,11 +129,7 @@ fn cell_distance<'py>(
     scale: f64,
     want_grad: bool,
 ) -> PyResult<Distance<'py>> {
-    if is_f32(x) {
-        cell_distance_as::<f32>(x, centres, widths, scale, want_grad)
-    } else {
-        cell_distance_as::<f64>(x, centres, widths, scale, want_grad)
-    }
+    by_dtype!(x, cell_distance_as(x, centres, widths, scale, want_grad))
 }
 
 fn cell_distance_as<'py, T: Real + Element>(

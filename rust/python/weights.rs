@@ -1,17 +1,12 @@
-//! The Python binding of the blending weights.
+//! The binding of the blending weights.
 
-use crate::{
-    composite::CompositeInput,
-    error::Error,
-    python::{Array, Frame},
-    real::Real,
-    threads, tiles, weights,
-};
+use super::{arrays::Array, project::Frame};
+use crate::{composite::CompositeInput, error::Error, real::Real, threads, tiles, weights};
 use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;
 
 /// Add the function of this file to the module.
-pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(blending_weights, m)?)
 }
 

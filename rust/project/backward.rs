@@ -1,0 +1,482 @@
+//! Vector-Jacobian product of the projection.
+
+use super::{Inputs, ProjectOptions, Projection, Shading, chunks, direction, narrow3};
+use crate::{
+    camera::{Camera, CameraGrad},
+    columns::{self, Column, GROUP, get3, wide3},
+    constants::PROJECT_CHUNK,
+    fresh::{Blank, Fresh},
+    geometry::{CameraGradLanes, CameraLanes, Cotangent, GeometryGrad},
+    lanes::{Wide, lanes, splat as splat_lanes, splat3},
+    real::{Lanes, Real},
+    scene::Gaussians,
+    sh,
+    work::Work,
+};
+use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, dispatch};
+use rayon::prelude::*;
+use std::slice::from_ref;
+
+/// Cotangents of the projection's outputs, all dense over N. `None` is 0.
+#[derive(Debug, Clone, Copy)]
+pub struct ProjectCotangents<'a, T> {
+    /// Of `means2d`, [N, 2].
+    pub means2d: Option<&'a [T]>,
+    /// Whitened gradient of the 2D covariance (E_uu, E_uv, E_vv), [N, 3]; see `geometry.rs`.
+    pub whitened: Option<&'a [T]>,
+    /// Of `opacities`, [N].
+    pub opacities: Option<&'a [T]>,
+    /// Of `depths`, [N].
+    pub depths: Option<&'a [T]>,
+    /// Of `conics`, [N, 3].
+    pub conics: Option<&'a [T]>,
+    /// Of `colors` from the harmonics, [N, 3].
+    pub colors: Option<&'a [T]>,
+}
+
+/// The cotangents of a group, a column per number.
+struct Cotangents<T> {
+    means2d: [Column<T>; 2],
+    whitened: [Column<T>; 3],
+    opacities: Column<T>,
+    depths: Column<T>,
+    conics: [Column<T>; 3],
+    colors: [Column<T>; 3],
+}
+
+impl<T: Real> Cotangents<T> {
+    const ZERO: Self = Self {
+        means2d: [Column::ZERO; 2],
+        whitened: [Column::ZERO; 3],
+        opacities: Column::ZERO,
+        depths: Column::ZERO,
+        conics: [Column::ZERO; 3],
+        colors: [Column::ZERO; 3],
+    };
+
+    #[inline(always)]
+    fn read<S: Simd>(&mut self, simd: S, v: &ProjectCotangents<T>, first: usize) {
+        if let Some(v) = v.means2d {
+            columns::read(simd, v, first, &mut self.means2d);
+        }
+        if let Some(v) = v.whitened {
+            columns::read(simd, v, first, &mut self.whitened);
+        }
+        if let Some(v) = v.opacities {
+            self.opacities.load(v, first);
+        }
+        if let Some(v) = v.depths {
+            self.depths.load(v, first);
+        }
+        if let Some(v) = v.conics {
+            columns::read(simd, v, first, &mut self.conics);
+        }
+        if let Some(v) = v.colors {
+            columns::read(simd, v, first, &mut self.colors);
+        }
+    }
+
+    /// Gaussians of the group with a cotangent that is not 0.
+    #[inline(always)]
+    fn nonzero(&self) -> u16 {
+        let mut any = [false; GROUP];
+        for columns in [
+            &self.means2d[..],
+            &self.whitened,
+            from_ref(&self.opacities),
+            from_ref(&self.depths),
+            &self.conics,
+            &self.colors,
+        ] {
+            for column in columns {
+                for (any, v) in any.iter_mut().zip(&column.0) {
+                    *any |= *v != T::ZERO;
+                }
+            }
+        }
+        let mut set = 0;
+        for (lane, any) in any.iter().enumerate() {
+            set |= u16::from(*any) << lane;
+        }
+        set
+    }
+}
+
+/// Which gradients [`backward()`] is to compute.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Wanted {
+    /// Of the means.
+    pub means: bool,
+    /// Of the quaternions.
+    pub quats: bool,
+    /// Of the scales.
+    pub scales: bool,
+    /// Of the opacities.
+    pub opacities: bool,
+    /// Of `Harmonics::coefficients`.
+    pub harmonics: bool,
+    /// Of `Harmonics::rest`.
+    pub harmonics_rest: bool,
+    /// Of the whole pose of the camera, not only of its centre.
+    pub camera: bool,
+}
+
+/// Gradients of the projection's inputs; empty where not wanted. Zeros for a Gaussian that is culled or without
+/// a cotangent, and for harmonics above the degree in use.
+#[derive(Debug)]
+pub struct GaussianGrads<T> {
+    /// [N, 3]
+    pub means: Vec<T>,
+    /// [N, 4]
+    pub quats: Vec<T>,
+    /// [N, 3]
+    pub scales: Vec<T>,
+    /// [N]
+    pub opacities: Vec<T>,
+    /// As `Harmonics::coefficients`.
+    pub harmonics: Vec<T>,
+    /// As `Harmonics::rest`.
+    pub harmonics_rest: Vec<T>,
+    /// Of the camera.
+    pub camera: CameraGrad,
+    /// Counts.
+    pub work: Work,
+}
+
+/// What one job fills of it: empty where not wanted.
+struct BackwardChunk<'a, T> {
+    /// Of the means, quaternions, scales, opacities, harmonics and their rest.
+    outs: [Blank<'a, T>; 6],
+    /// Numbers per Gaussian, in that order.
+    rows: [usize; 6],
+}
+
+impl<T: Real> BackwardChunk<'_, T> {
+    /// A buffer for the rows of one group for each output.
+    fn buffers(&self) -> [Vec<T>; 6] {
+        self.rows.map(|row| vec![T::ZERO; GROUP * row])
+    }
+
+    /// Give out the first `rows` rows of the buffers.
+    #[inline(always)]
+    fn put(&mut self, buffers: &[Vec<T>; 6], rows: usize) {
+        for ((out, buffer), row) in self.outs.iter_mut().zip(buffers).zip(self.rows) {
+            out.put(&buffer[..row * rows]);
+        }
+    }
+}
+
+/// Vector-Jacobian product of [`forward()`](super::forward()). Groups of 16 Gaussians without a cotangent are left out, and so is
+/// the geometry where the colours alone have cotangents.
+///
+/// `projection` and `shading` must be those that `forward` made from the same inputs.
+pub fn backward<T: Real>(
+    gaussians: &Gaussians<T>,
+    shading: Option<&Shading<T>>,
+    camera: &Camera,
+    options: &ProjectOptions,
+    projection: &Projection,
+    v: &ProjectCotangents<T>,
+    wanted: Wanted,
+) -> GaussianGrads<T> {
+    let n = gaussians.len();
+    let (row, rest_row) = shading.map_or((0, 0), |s| s.rows);
+    let rows = [
+        (wanted.means, 3),
+        (wanted.quats, 4),
+        (wanted.scales, 3),
+        (wanted.opacities, 1),
+        (wanted.harmonics, row),
+        (wanted.harmonics_rest, rest_row),
+    ]
+    .map(|(wanted, row)| if wanted { row } else { 0 });
+    let mut arrays = rows.map(|row| Fresh::<T>::new(row * n));
+    let [means, quats, scales, opacities, sh, rest] = &mut arrays;
+    let jobs: Vec<_> = chunks(means, n, rows[0])
+        .into_iter()
+        .zip(chunks(quats, n, rows[1]))
+        .zip(chunks(scales, n, rows[2]))
+        .zip(chunks(opacities, n, rows[3]))
+        .zip(chunks(sh, n, rows[4]))
+        .zip(chunks(rest, n, rows[5]))
+        .collect();
+    let level = Level::new();
+    let parts: Vec<_> = jobs
+        .into_par_iter()
+        .enumerate()
+        .map(|(chunk, (((((means, quats), scales), opacities), sh), rest))| {
+            let out = BackwardChunk {
+                outs: [means, quats, scales, opacities, sh, rest],
+                rows,
+            };
+            dispatch!(level, simd => backward_chunk(
+                simd, gaussians, shading, camera, options, projection, v, chunk * PROJECT_CHUNK, out, wanted.camera
+            ))
+        })
+        .collect();
+    let (mut camera_grad, mut work) = (CameraGrad::ZERO, Work::default());
+    for (part, more) in &parts {
+        camera_grad.add(part);
+        work = work.plus(*more);
+    }
+    let [means, quats, scales, opacities, sh, rest] = arrays.map(Fresh::finish);
+    GaussianGrads {
+        means,
+        quats,
+        scales,
+        opacities,
+        harmonics: sh,
+        harmonics_rest: rest,
+        camera: camera_grad,
+        work,
+    }
+}
+
+/// VJP of the Gaussians of one chunk.
+#[inline(always)]
+fn backward_chunk<S: Simd, T: Real>(
+    simd: S,
+    gaussians: &Gaussians<T>,
+    shading: Option<&Shading<T>>,
+    camera: &Camera,
+    options: &ProjectOptions,
+    projection: &Projection,
+    v: &ProjectCotangents<T>,
+    begin: usize,
+    mut chunk: BackwardChunk<T>,
+    camera_wanted: bool,
+) -> (CameraGrad, Work) {
+    let zero = splat_lanes(simd, 0.0);
+    let camera_lanes = CameraLanes::new(
+        simd,
+        camera,
+        options.near_plane,
+        options.far_plane,
+        options.eps2d,
+    );
+    let center = splat3(simd, camera.center);
+    let mut camera_grad = CameraGradLanes::zero(simd);
+    let mut inputs = Inputs::ZERO;
+    let mut cotangents = Cotangents::ZERO;
+    let geometry_wanted = v.means2d.is_some()
+        || v.whitened.is_some()
+        || v.opacities.is_some()
+        || v.depths.is_some()
+        || v.conics.is_some();
+    let mut work = Work::default();
+    let mut colors = ColorGroup::ZERO;
+    let mut out = GradColumns::<T>::ZERO;
+    let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
+    let [_, _, _, _, row, rest_row] = chunk.rows;
+    let end = gaussians.len().min(begin + PROJECT_CHUNK);
+    for first in (begin..end).step_by(GROUP) {
+        let rows = GROUP.min(end - first);
+        let mut visible = 0u16;
+        for (lane, depth) in projection.depths[first..first + rows].iter().enumerate() {
+            visible |= u16::from(*depth > 0.0) << lane;
+        }
+        if visible == 0 {
+            chunk.put(&zeros, rows);
+            continue;
+        }
+        cotangents.read(simd, v, first);
+        if visible & cotangents.nonzero() == 0 {
+            chunk.put(&zeros, rows);
+            continue;
+        }
+        inputs.read(simd, gaussians, first);
+        let mut v_colors = None;
+        if let (Some(shading), true) = (shading, v.colors.is_some()) {
+            work.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
+            let (means, directions) = (&inputs.means, &mut colors.directions);
+            for at in (0..GROUP).step_by(lanes::<S>()) {
+                let (d, inverse) = direction(simd, wide3(simd, means, at), center);
+                let valid = lanes_in(simd, visible, at);
+                let d = d.only(valid, zero);
+                directions[0].set(simd, at, d.x);
+                directions[1].set(simd, at, d.y);
+                directions[2].set(simd, at, d.z);
+                colors.inverses.set(simd, at, valid.select(inverse, zero));
+            }
+            colors.backward(simd, shading, first / GROUP, &cotangents.colors, visible);
+            v_colors = Some(shading);
+        }
+        work.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
+        for at in (0..GROUP).step_by(lanes::<S>()) {
+            // Not those that were culled, nor those beyond the end.
+            let valid = lanes_in(simd, visible, at);
+            let mut grad = GeometryGrad::zero(simd);
+            let mut v_input_opacity = zero;
+            if geometry_wanted {
+                let mut g = inputs.geometry(simd, at, &camera_lanes);
+                g.valid = valid;
+                let v_opacity = cotangents.opacities.wide(simd, at);
+                v_input_opacity = v_opacity;
+                let mut whitened = wide3(simd, &cotangents.whitened, at);
+                if v.conics.is_some() {
+                    whitened = whitened + g.whiten_conic(simd, wide3(simd, &cotangents.conics, at));
+                }
+                if options.antialiased {
+                    let v_compensation = v_opacity * inputs.opacities.wide(simd, at);
+                    whitened =
+                        whitened + g.whiten_compensation(simd, &camera_lanes, v_compensation);
+                    v_input_opacity = v_opacity * g.compensation();
+                }
+                let [x, y] = &cotangents.means2d;
+                let cotangent = Cotangent {
+                    mean2d: [x.wide(simd, at), y.wide(simd, at)],
+                    whitened,
+                    depth: cotangents.depths.wide(simd, at),
+                };
+                grad = g.vjp(
+                    simd,
+                    &cotangent,
+                    &camera_lanes,
+                    camera_wanted.then_some(&mut camera_grad),
+                );
+            }
+            if v_colors.is_some() {
+                // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
+                let d = wide3(simd, &colors.directions, at);
+                let v_d = wide3(simd, &colors.v_directions, at).only(valid, zero);
+                let v_mean = (v_d - d.by(d.dot(v_d))).by(colors.inverses.wide(simd, at));
+                grad.mean = grad.mean + v_mean;
+                camera_grad.center = camera_grad.center - v_mean;
+            }
+            out.set(simd, at, &grad, v_input_opacity, valid, zero);
+        }
+        let GradColumns {
+            means: [x, y, z],
+            quats: [q0, q1, q2, q3],
+            scales: [s0, s1, s2],
+            opacities,
+        } = &out;
+        let [means, quats, scales, alphas, first_rows, rest_rows] = &mut buffers;
+        columns::write([&x.0, &y.0, &z.0], means);
+        columns::write([&q0.0, &q1.0, &q2.0, &q3.0], quats);
+        columns::write([&s0.0, &s1.0, &s2.0], scales);
+        columns::write([&opacities.0], alphas);
+        if let Some(shading) = v_colors {
+            let used = 3 * sh::count(shading.degree);
+            let in_first = used.min(shading.rows.0);
+            let (v_first, v_rest) = colors.v_coefficients[..used].split_at(in_first);
+            if row > 0 {
+                columns::write_rows(simd, v_first, first_rows, row);
+            }
+            if rest_row > 0 {
+                columns::write_rows(simd, v_rest, rest_rows, rest_row);
+            }
+        }
+        chunk.put(&buffers, rows);
+    }
+    (camera_grad.sum(), work)
+}
+
+/// Gradients of a group in the type of the inputs.
+struct GradColumns<T> {
+    means: [Column<T>; 3],
+    quats: [Column<T>; 4],
+    scales: [Column<T>; 3],
+    opacities: Column<T>,
+}
+
+impl<T: Real> GradColumns<T> {
+    const ZERO: Self = Self {
+        means: [Column::ZERO; 3],
+        quats: [Column::ZERO; 4],
+        scales: [Column::ZERO; 3],
+        opacities: Column::ZERO,
+    };
+
+    /// Set the Gaussians `at..`; 0 where they are not valid.
+    #[inline(always)]
+    fn set<S: Simd>(
+        &mut self,
+        simd: S,
+        at: usize,
+        grad: &GeometryGrad<S>,
+        opacity: Wide<S>,
+        valid: <Wide<S> as SimdBase<S>>::Mask,
+        zero: Wide<S>,
+    ) {
+        let mean = grad.mean.only(valid, zero);
+        let scale = grad.scale.only(valid, zero);
+        self.means[0].saturate(simd, at, mean.x);
+        self.means[1].saturate(simd, at, mean.y);
+        self.means[2].saturate(simd, at, mean.z);
+        self.scales[0].saturate(simd, at, scale.x);
+        self.scales[1].saturate(simd, at, scale.y);
+        self.scales[2].saturate(simd, at, scale.z);
+        for k in 0..4 {
+            self.quats[k].saturate(simd, at, valid.select(grad.quat[k], zero));
+        }
+        self.opacities
+            .saturate(simd, at, valid.select(opacity, zero));
+    }
+}
+
+/// What the gradients of a group's colours need, a column per number.
+struct ColorGroup<T> {
+    v_coefficients: [Column<T>; 3 * sh::MAX_COUNT],
+    /// Unit vectors from the camera centre, and one over the distances.
+    directions: [Column<f64>; 3],
+    inverses: Column<f64>,
+    v_directions: [Column<T>; 3],
+}
+
+impl<T: Real> ColorGroup<T> {
+    const ZERO: Self = Self {
+        v_coefficients: [Column::ZERO; 3 * sh::MAX_COUNT],
+        directions: [Column::ZERO; 3],
+        inverses: Column::ZERO,
+        v_directions: [Column::ZERO; 3],
+    };
+
+    /// Gradients of the coefficients and of the directions, from that of the colours.
+    #[inline(always)]
+    fn backward<S: Simd>(
+        &mut self,
+        simd: S,
+        shading: &Shading<T>,
+        group: usize,
+        v_colors: &[Column<T>; 3],
+        visible: u16,
+    ) {
+        let d = narrow3::<T>(&self.directions);
+        let mut v_open = *v_colors;
+        for (column, clamped) in v_open.iter_mut().zip(shading.clamped[group]) {
+            let open = visible & !clamped;
+            for (lane, x) in column.0.iter_mut().enumerate() {
+                *x = if open >> lane & 1 == 1 { *x } else { T::ZERO };
+            }
+        }
+        for at in (0..GROUP).step_by(Lanes::<T, S>::LEN) {
+            let v = v_open.map(|v| v.get(simd, at));
+            let basis = sh::basis::<S, T>(simd, shading.degree, get3(simd, &d, at));
+            for (k, y) in basis.iter().enumerate().take(sh::count(shading.degree)) {
+                for (channel, v) in v.iter().enumerate() {
+                    self.v_coefficients[3 * k + channel].set(simd, at, *y * *v);
+                }
+            }
+            let Some(slopes) = shading.slopes.get(group) else {
+                continue; // degree 0: `v_directions` stay 0
+            };
+            for (axis, v_direction) in self.v_directions.iter_mut().enumerate() {
+                let along = v[0] * slopes[axis].get(simd, at);
+                let along = v[1].mul_add(slopes[3 + axis].get(simd, at), along);
+                let along = v[2].mul_add(slopes[6 + axis].get(simd, at), along);
+                v_direction.set(simd, at, along);
+            }
+        }
+    }
+}
+
+/// The lanes of a group in a bit set, as 1 or 0.
+#[inline(always)]
+fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> <Wide<S> as SimdBase<S>>::Mask {
+    let mut ones = [0.0; GROUP];
+    for (lane, one) in ones.iter_mut().enumerate() {
+        *one = f64::from(set >> lane & 1);
+    }
+    Wide::<S>::from_slice(simd, &ones[at..at + lanes::<S>()]).simd_gt(splat_lanes(simd, 0.0))
+}
