@@ -33,7 +33,7 @@ from hqgs.methods.hqgs import GUIDANCES, HQGSConfig
 from hqgs.report import RunResult
 from hqgs.restore import restore_scene
 from hqgs.run import CHECKPOINT, open_run, run
-from hqgs.sfm import sfm_scene
+from hqgs.sfm import KEPT, sfm_scene
 from hqgs.synthetic import embedded_scene
 from hqgs.train import TrainingError
 
@@ -152,11 +152,11 @@ def _train(args: argparse.Namespace) -> int:
                 )
             if args.threads is not None:
                 hqgs.set_num_threads(args.threads)
-            scene = _scene(args, args.out / "scene", args.sfm, skip_unreadable="photos" in config.leave_out)
+            scene = _scene(args, args.out, args.sfm, skip_unreadable="photos" in config.leave_out)
             if degradation.steps:
                 scene = degrade_scene(scene, degradation, config.seed)
             if args.sfm and (scene.source != "photos" or degradation.steps):
-                scene = sfm_scene(scene)
+                scene = sfm_scene(scene, args.out / KEPT)
                 print(scene.sfm)
             if args.restore is not None:
                 scene = restore_scene(scene, args.restore)
@@ -179,7 +179,7 @@ def _degrade(args: argparse.Namespace) -> int:
     try:
         degradation = parse_degradation(args.kind)
         check_new_folder(args.out)
-        scene = _scene(args, cache=None)
+        scene = _scene(args, out=None)
         write_degraded_scene(scene, args.out, degradation, args.seed)
     except BAD_INPUT as error:
         return fail(2, str(error))
@@ -191,7 +191,7 @@ def _degrade(args: argparse.Namespace) -> int:
 
 def _diagnose(args: argparse.Namespace) -> int:
     try:
-        diagnosis = diagnose_scene(_scene(args, cache=None))
+        diagnosis = diagnose_scene(_scene(args, out=None))
         if args.out is not None:
             write_json(args.out, asdict(diagnosis))
     except BAD_INPUT as error:
@@ -203,7 +203,7 @@ def _diagnose(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    return run_export(args, lambda: None if args.scene is None else _scene(args, cache=None))
+    return run_export(args, lambda: None if args.scene is None else _scene(args, out=None))
 
 
 def _config(args: argparse.Namespace) -> TrainConfig:
@@ -222,13 +222,18 @@ def _config(args: argparse.Namespace) -> TrainConfig:
 
 
 def _scene(
-    args: argparse.Namespace, cache: Path | None, sfm: bool = False, skip_unreadable: bool = False
+    args: argparse.Namespace, out: Path | None, sfm: bool = False, skip_unreadable: bool = False
 ) -> Scene:
+    """`out`: the folder of the run, which keeps what is made of a scene; None keeps nothing."""
     if args.scene != EMBEDDED:
-        return load_scene(args.scene, args.downscale, reconstruct=sfm, skip_unreadable=skip_unreadable)
+        keep = None if out is None else out / KEPT
+        return load_scene(
+            args.scene, args.downscale, reconstruct=sfm, skip_unreadable=skip_unreadable, keep_sfm=keep
+        )
     if not args.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {args.downscale}")
     width, height = (round(size / args.downscale) for size in EMBEDDED_SIZE)
+    cache = None if out is None else out / "scene"
     return embedded_scene(cache=cache, width=width, height=height)
 
 

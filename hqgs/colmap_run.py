@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.camera import Camera
+from hqgs.files import keep_folder
 from hqgs.rasterize import get_num_threads
 
 PROGRAM = Path(__file__).with_name("sfm_program.py")
@@ -20,13 +22,18 @@ LEAST_SHARE = 0.5  # of the photos must find their place in it
 
 
 def run_colmap(
-    directory: Path, photos: Path, names: Sequence[str], cameras: Sequence[Camera] | None
+    directory: Path,
+    photos: Path,
+    names: Sequence[str],
+    cameras: Sequence[Camera] | None,
+    keep: Path | None = None,
 ) -> pycolmap.Reconstruction:
     """COLMAP's largest model of the photos `names` in the folder `photos`; `directory` gets its files.
 
     `cameras`: pinhole intrinsics that stay as they are; None: COLMAP finds them. `directory / "masks"`, if it
-    is there, holds a mask for every photo. ValueError for fewer than 3 photos, where COLMAP fails, or where
-    the photos do not match.
+    is there, holds a mask for every photo. Models are kept in the folder `keep`: COLMAP does not run again
+    for the same photos, masks, cameras and version. ValueError for fewer than 3 photos, where COLMAP fails,
+    or where the photos do not match.
     """
     if len(names) < LEAST_PHOTOS:
         raise ValueError(f"structure from motion needs at least {LEAST_PHOTOS} photos, got {len(names)}")
@@ -34,6 +41,9 @@ def run_colmap(
     if cameras is not None:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
+    kept = None if keep is None else keep / _key(directory / "masks", given)
+    if kept is not None and kept.is_dir():
+        return pycolmap.Reconstruction(kept)
     np.savez(directory / "input.npz", **given)  # pyright: ignore[reportArgumentType]
     program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
     done = subprocess.run(program, capture_output=True, stdin=subprocess.DEVNULL, check=False)
@@ -45,7 +55,23 @@ def run_colmap(
             f"COLMAP could start from no two of the {len(names)} photos: they need texture and overlap, and "
             "places to be taken from that lie apart"
         )
+    if kept is not None:
+        keep_folder(directory / "model", kept)
     return pycolmap.Reconstruction(directory / "model")
+
+
+def _key(masks: Path, given: dict[str, NDArray[np.generic]]) -> str:
+    """A name for everything that the model depends on; where the photos lie is not part of it."""
+    digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode() + PROGRAM.read_bytes())
+    photos = Path(str(given["photos"]))
+    for name in given["names"].tolist():
+        for file in (photos / name, masks / f"{name}.png"):
+            content = file.read_bytes() if file.is_file() else b""
+            digest.update(f"{name} {len(content)} ".encode() + content)
+    for part in ("sizes", "Ks"):
+        if part in given:
+            digest.update(given[part].tobytes())
+    return digest.hexdigest()[:16]
 
 
 def registered(model: pycolmap.Reconstruction, photos: int) -> dict[str, NDArray[np.float64]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +33,22 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         tmp.replace(path)
     finally:
         tmp.unlink(missing_ok=True)
+
+
+def keep_folder(source: Path, target: Path) -> None:
+    """Copy a folder of files, flushed to disk, under a name that it gets when it is complete.
+
+    A `target` that is there by then stays.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as name:
+        copy = Path(name) / target.name
+        shutil.copytree(source, copy)
+        for file in copy.iterdir():
+            with file.open("rb+") as f:
+                os.fsync(f.fileno())
+        if not target.exists():
+            copy.rename(target)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -17,6 +17,8 @@ from hqgs.camera import Scene, Tracks, View, as_floats
 from hqgs.colmap_run import model_points, registered, run_colmap
 from hqgs.degradations import to_uint8
 
+KEPT = "sfm"  # in the folder of a run: its reconstructions
+
 
 @dataclass(frozen=True)
 class SfmReport:
@@ -60,7 +62,7 @@ class SfmReport:
         return text
 
 
-def sfm_scene(scene: Scene) -> Scene:
+def sfm_scene(scene: Scene, keep: Path | None = None) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
 
     COLMAP (SIFT, exhaustive matching, incremental mapping) sees the training photos alone, clipped and
@@ -68,7 +70,8 @@ def sfm_scene(scene: Scene) -> Scene:
     reconstruction is moved into the scene's frame by the training cameras (`align`, `refine`), so that the
     held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.
     `Scene.sfm` and `Scene.notes` compare the two. The same photos give the same bits, whatever the number of
-    threads.
+    threads. `keep` is a folder for the reconstruction, which the next call with the same photos takes from
+    there.
 
     ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
     """
@@ -76,7 +79,8 @@ def sfm_scene(scene: Scene) -> Scene:
     with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
         directory = Path(name)
         _write_photos(directory, views)
-        model = run_colmap(directory, directory / "photos", list(views), [v.camera for v in scene.train])
+        cameras = [view.camera for view in scene.train]
+        model = run_colmap(directory, directory / "photos", list(views), cameras, keep)
     poses = registered(model, len(views))
     kept = [views[file] for file in poses]
     viewmats, own = np.stack(list(poses.values())), np.stack([view.camera.viewmat for view in kept])

@@ -277,7 +277,8 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
     error = {"median": 0.125, "max": 0.5}
     seen = []
 
-    def sfm(scene: Scene) -> Scene:
+    def sfm(scene: Scene, keep: Path) -> Scene:
+        assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image)
         report = SfmReport(5, ["lost"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, 0.3)
         return replace(scene, sfm=report, points=scene.points + np.float32(0.01))

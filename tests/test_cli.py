@@ -83,11 +83,12 @@ def test_sfm_replaces_poses_and_points_once(
     report = SfmReport(5, ["lost.png"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, None)
     seen: list[Any] = []
 
-    def load(path: str, downscale: float, reconstruct: bool, skip_unreadable: bool) -> Scene:
+    def load(path: str, downscale: float, reconstruct: bool, **_: Any) -> Scene:
         seen.append(reconstruct)
         return replace(tiny_scene(), source=source)
 
-    def sfm(scene: Scene) -> Scene:
+    def sfm(scene: Scene, keep: Path) -> Scene:
+        assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image.dtype)
         return replace(scene, sfm=report)
 

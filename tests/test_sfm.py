@@ -123,6 +123,31 @@ def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene
         assert a.camera.viewmat.tobytes() == b.camera.viewmat.tobytes()
 
 
+def test_a_reconstruction_that_is_kept_is_not_made_again(
+    cards: Scene, found: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sfm_scene(cards, tmp_path / "run" / "sfm")
+    (kept,) = (tmp_path / "run" / "sfm").iterdir()
+    assert {file.name for file in kept.iterdir()} >= {"cameras.bin", "images.bin", "points3D.bin"}
+
+    def run(*args: object, **kwargs: object) -> None:
+        raise AssertionError("COLMAP runs")
+
+    monkeypatch.setattr(colmap_run.subprocess, "run", run)
+    again = sfm_scene(cards, tmp_path / "run" / "sfm")
+    assert again.points.tobytes() == found.points.tobytes()
+    assert again.sfm == found.sfm
+    for a, b in zip(again.train, found.train, strict=True):
+        assert a.camera.viewmat.tobytes() == b.camera.viewmat.tobytes()
+    darker = replace(cards.train[0], image=cards.train[0].image - (cards.train[0].image > 0))
+    half = np.zeros(darker.image.shape[:2], bool)
+    half[: HEIGHT // 2] = True
+    wider = replace(darker.camera, K=darker.camera.K * [[1.01], [1.01], [1]])
+    for first in (darker, replace(cards.train[0], mask=half), replace(cards.train[0], camera=wider)):
+        with pytest.raises(AssertionError, match="COLMAP runs"):
+            sfm_scene(replace(cards, train=[first, *cards.train[1:]]), tmp_path / "run" / "sfm")
+
+
 def test_degraded_photos_without_a_place_are_left_out(cards: Scene) -> None:
     rng = np.random.default_rng(0)
     foreign = replace(cards.train[2], image=rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8))

@@ -25,6 +25,7 @@ from hqgs.checkpoint import scene_fingerprint
 from hqgs.degradations import NONE
 from hqgs.files import write_text
 from hqgs.machine import machine_facts, version_facts
+from hqgs.sfm import KEPT
 from hqgs.train import TrainingError
 
 SMOKE = "smoke"
@@ -97,7 +98,8 @@ class Quality:
     def photos(self, cell: Cell) -> Scene:
         """What a cell trains on; its group, which comes in a row, shares it."""
         if self._photos is None or self._photos[0] != cell.group:
-            scene = trained(self.scenes[cell.scene], cell.degradation, cell.seed, self.store.sfm)
+            sfm = self.store.root / KEPT if self.store.sfm else None
+            scene = trained(self.scenes[cell.scene], cell.degradation, cell.seed, sfm)
             self._photos = (cell.group, scene)
         return self._photos[1]
 

@@ -71,10 +71,13 @@ def validation_split(scene: Scene) -> Scene:
     return replace(scene, train=train, test=held, notes=[*scene.notes, note])
 
 
-def trained(scene: Scene, degradation: str, seed: int, sfm: bool) -> Scene:
-    """The scene that a cell trains: `degraded`, with `sfm` with poses and points from its training photos."""
+def trained(scene: Scene, degradation: str, seed: int, sfm: Path | None) -> Scene:
+    """The scene that a cell trains: `degraded`, with `sfm` with poses and points from its training photos.
+
+    `sfm` is the folder that keeps the reconstructions.
+    """
     scene = degraded(scene, degradation, seed)
-    return sfm_scene(scene) if sfm else scene
+    return scene if sfm is None else sfm_scene(scene, sfm)
 
 
 def degraded(scene: Scene, degradation: str, seed: int) -> Scene:

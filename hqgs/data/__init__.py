@@ -27,6 +27,7 @@ def load_scene(
     test_every: int = 8,
     reconstruct: bool = False,
     skip_unreadable: bool = False,
+    keep_sfm: Path | None = None,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
@@ -43,6 +44,7 @@ def load_scene(
     at downscale 1, the only one at which they stand for `View.image`.
 
     With `reconstruct` a folder that holds photos alone gets its cameras and points from them (`read_photos`).
+    `keep_sfm` is a folder for that reconstruction, which the next call takes from there.
 
     With `skip_unreadable` training photos that cannot be decoded (or whose mask or small photo cannot) are
     left out, as long as at least half of the training photos remain; `Scene.notes` names them. The other
@@ -60,7 +62,7 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    capture = _read(root, downscale, reconstruct)
+    capture = _read(root, downscale, reconstruct, keep_sfm)
     degraded = read_degraded_folder(root)
     if degraded is not None:
         notes = [*degraded.notes, *capture.notes]
@@ -89,7 +91,7 @@ def load_scene(
     return Scene(root.name, train, test, points, colors, capture.source, notes, _tracks(capture, views))
 
 
-def _read(root: Path, downscale: float, reconstruct: bool) -> Capture:
+def _read(root: Path, downscale: float, reconstruct: bool, keep_sfm: Path | None) -> Capture:
     has_model, has_photos = bool(find_models(root)), photo_folder(root, downscale) is not None
     others = [name for name in (SINGLE, TRAIN, POSES) if (root / name).is_file()]
     if has_model and (has_photos or not others):
@@ -106,7 +108,7 @@ def _read(root: Path, downscale: float, reconstruct: bool) -> Capture:
         return read_llff(root, downscale)
     bare = bare_photos(root, downscale) is not None
     if bare and reconstruct:
-        return read_photos(root, downscale)
+        return read_photos(root, downscale, keep_sfm)
     entries = sorted(p.name for p in root.iterdir())
     found = ", ".join(entries[:12]) + (" ..." if len(entries) > 12 else "") if entries else "nothing"
     raise ValueError(

@@ -23,19 +23,20 @@ def bare_photos(root: Path, downscale: float) -> tuple[Path, float, list[str], l
     return (folder, left, notes, names) if names else None
 
 
-def read_photos(root: Path, downscale: float) -> Capture:
+def read_photos(root: Path, downscale: float, keep: Path | None = None) -> Capture:
     """Cameras and points of a folder of photos, from all of them, by COLMAP.
 
     Photos of one size share a camera (SIMPLE_RADIAL), which is found as well. Held-out views are among the
     photos: without them they would have no pose. The notes say so, and name the photos that have no place.
-    ValueError where there is no photo, or COLMAP cannot make a model of half of them.
+    `keep`: a folder for the reconstruction, see `run_colmap`. ValueError where there is no photo, or COLMAP
+    cannot make a model of half of them.
     """
     found = bare_photos(root, downscale)
     if found is None:
         raise ValueError(f"{root} holds no photos")
     folder, left, notes, names = found
     with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as directory:
-        model = run_colmap(Path(directory), folder, names, None)
+        model = run_colmap(Path(directory), folder, names, None, keep)
     poses = registered(model, len(names))
     cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     photos = [
