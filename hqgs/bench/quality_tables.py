@@ -81,9 +81,10 @@ def costs(groups: Sequence[Group], labels: Sequence[str], facts: str) -> str:
         [label, *(_number(mean_of(groups, label, COSTS[name]), form) for name, (_, form) in heads.items())]
         for label in labels
     ]
-    return markdown_table(
-        f"Cost, means over all runs; {facts}", ["", *(head for head, _ in heads.values())], body
-    )
+    runs = [group.runs[label] for group in groups for label in labels]
+    hours = sum(run["wall_seconds"] for run in runs) / 3600
+    title = f"Cost, means over all {len(runs)} runs, which took {hours:.1f} h; {facts}"
+    return markdown_table(title, ["", *(head for head, _ in heads.values())], body)
 
 
 def training_times(numbers: Summary) -> str:
