@@ -1,0 +1,292 @@
+//! Images by the definition, what the knobs cost, and what must hold exactly.
+
+use super::*;
+use crate::{
+    constants::ALPHA_MIN,
+    synthetic::Synthetic,
+    tuning::{Spans, Tuning},
+};
+use rayon::ThreadPoolBuilder;
+
+fn harmonics<T: Real>(s: &Synthetic<T>) -> Harmonics<'_, T> {
+    Harmonics {
+        coefficients: &s.harmonics,
+        rest: None,
+        stored: 16,
+        degree: 3,
+    }
+}
+
+fn render<T: Real>(s: &Synthetic<T>) -> Rendered<T> {
+    forward(
+        &s.gaussians(),
+        &harmonics(s),
+        &s.camera,
+        &ProjectOptions::default(),
+    )
+    .unwrap()
+}
+
+fn cotangent<T: Real>(s: &Synthetic<T>) -> Vec<T> {
+    let n = 3 * s.camera.width * s.camera.height;
+    (0..n)
+        .map(|i| T::from_f64((i as f64 * 0.37).sin()))
+        .collect()
+}
+
+fn gradients<T: Real>(s: &Synthetic<T>, r: &Rendered<T>) -> Gradients<T> {
+    let options = ProjectOptions::default();
+    backward(&s.gaussians(), &s.camera, &options, r, &cotangent(s)).unwrap()
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bits() {
+    let s = Synthetic::<f32>::new(5000, 150, 97, 1).unwrap();
+    let run = |threads| {
+        ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap()
+            .install(|| {
+                let r = render(&s);
+                let g = gradients(&s, &r);
+                (r.image, r.alphas, g)
+            })
+    };
+    let one = run(1);
+    for threads in [2, 3, 7] {
+        assert!(run(threads) == one, "{threads} threads");
+    }
+}
+
+/// The image by the definition: every Gaussian at every pixel, in depth order.
+fn brute_force(s: &Synthetic<f64>, r: &Rendered<f64>) -> Vec<f64> {
+    let n = s.opacities.len();
+    let mut order: Vec<usize> = (0..n)
+        .filter(|&i| r.projection.splats[i].visible())
+        .collect();
+    order.sort_by(|&a, &b| r.projection.depths[a].total_cmp(&r.projection.depths[b]));
+    // The colours are tested elsewhere: take them from the records.
+    let mut colors = vec![[0.0; 3]; n];
+    for list in &r.tiles.lists {
+        for (record, color) in list.records.iter().zip(list.colors.chunks_exact(3)) {
+            colors[record.gaussian as usize].copy_from_slice(color);
+        }
+    }
+    let mut image = Vec::new();
+    for y in 0..s.camera.height {
+        for x in 0..s.camera.width {
+            let (mut t, mut rgb) = (1.0, [0.0; 3]);
+            for &i in &order {
+                let alpha = r.projection.splats[i].alpha(x as f64 + 0.5, y as f64 + 0.5);
+                if alpha < ALPHA_MIN {
+                    continue;
+                }
+                if t * (1.0 - alpha) <= 0.999e-4 {
+                    break;
+                }
+                for (c, k) in rgb.iter_mut().zip(colors[i]) {
+                    *c += t * alpha * k;
+                }
+                t *= 1.0 - alpha;
+            }
+            image.extend(rgb);
+        }
+    }
+    image
+}
+
+#[test]
+fn tiles_and_blocks_leave_no_pixel_out() {
+    for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
+        let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
+        let r = render(&s);
+        let expected = brute_force(&s, &r);
+        for (i, (a, b)) in r.image.iter().zip(&expected).enumerate() {
+            assert!(
+                (a - b).abs() < 1e-12,
+                "seed {seed}, value {i}: {a} instead of {b}"
+            );
+        }
+    }
+}
+
+fn tuned(s: &Synthetic<f32>, tuning: Tuning) -> (Rendered<f32>, Gradients<f32>) {
+    let options = ProjectOptions {
+        tuning,
+        ..ProjectOptions::default()
+    };
+    let (g, h) = (s.gaussians(), harmonics(s));
+    let r = forward(&g, &h, &s.camera, &options).unwrap();
+    let v = backward(&g, &s.camera, &options, &r, &cotangent(s)).unwrap();
+    (r, v)
+}
+
+#[test]
+fn what_is_skipped_changes_no_bit() {
+    let s = Synthetic::<f32>::new(2000, 150, 97, 5).unwrap();
+    let (r, g) = tuned(&s, Tuning::default());
+    for (spans, skip_blocks) in [
+        (Spans::Ellipse, false),
+        (Spans::Box, true),
+        (Spans::Box, false),
+    ] {
+        let tuning = Tuning {
+            spans,
+            skip_blocks,
+            ..Tuning::default()
+        };
+        let (other, v) = tuned(&s, tuning);
+        assert!(r.image == other.image && g == v, "{tuning:?}");
+        let pairs = other.tiles.pairs();
+        assert_eq!(pairs > r.tiles.pairs(), spans == Spans::Box, "{tuning:?}");
+    }
+}
+
+#[test]
+fn looser_knobs_have_larger_errors() {
+    let s = Synthetic::<f32>::new(2000, 150, 97, 6).unwrap();
+    let exact = Tuning {
+        alpha_min: 1e-9,
+        transmittance_min: 0.0,
+        ..Tuning::default()
+    };
+    let (r, _) = tuned(&s, exact);
+    let error = |tuning| -> f64 {
+        let (other, _) = tuned(&s, tuning);
+        let pairs = r.image.iter().zip(&other.image);
+        pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum()
+    };
+    let floor = |alpha_min| error(Tuning { alpha_min, ..exact });
+    let stop = |transmittance_min| {
+        error(Tuning {
+            transmittance_min,
+            ..exact
+        })
+    };
+    let degree = |exp2_degree| {
+        error(Tuning {
+            exp2_degree,
+            ..exact
+        })
+    };
+    assert!(0.0 < floor(1e-4) && floor(1e-4) < floor(4e-3) && floor(4e-3) < floor(0.03));
+    assert!(0.0 < stop(1e-4) && stop(1e-4) < stop(1e-3) && stop(1e-3) < stop(1e-2));
+    assert!(0.0 < degree(5) && degree(5) < degree(4) && degree(4) < degree(3));
+}
+
+#[test]
+fn knobs_out_of_range_are_named() {
+    let d = Tuning::default();
+    assert!(d.check().is_ok());
+    for (name, tuning) in [
+        (
+            "alpha_min",
+            Tuning {
+                alpha_min: 0.0,
+                ..d
+            },
+        ),
+        (
+            "alpha_min",
+            Tuning {
+                alpha_min: f64::NAN,
+                ..d
+            },
+        ),
+        (
+            "transmittance_min",
+            Tuning {
+                transmittance_min: 1.0,
+                ..d
+            },
+        ),
+        (
+            "exp2_degree",
+            Tuning {
+                exp2_degree: 7,
+                ..d
+            },
+        ),
+    ] {
+        assert_eq!(tuning.check().unwrap_err().name, name);
+    }
+}
+
+#[test]
+fn single_precision_stays_close() {
+    let s = Synthetic::<f64>::new(1000, 80, 60, 8).unwrap();
+    let single = |v: &[f64]| v.iter().map(|x| *x as f32).collect::<Vec<f32>>();
+    let s32 = Synthetic {
+        means: single(&s.means),
+        quats: single(&s.quats),
+        scales: single(&s.scales),
+        opacities: single(&s.opacities),
+        harmonics: single(&s.harmonics),
+        camera: s.camera,
+    };
+    // The same numbers in both precisions.
+    let double = |v: &[f32]| v.iter().map(|x| f64::from(*x)).collect::<Vec<f64>>();
+    let s64 = Synthetic {
+        means: double(&s32.means),
+        quats: double(&s32.quats),
+        scales: double(&s32.scales),
+        opacities: double(&s32.opacities),
+        harmonics: double(&s32.harmonics),
+        camera: s.camera,
+    };
+    let (r32, r64) = (render(&s32), render(&s64));
+    // No alpha of this scene rounds to the other side of its floor, which would be a jump.
+    let far = r32
+        .image
+        .iter()
+        .zip(&r64.image)
+        .filter(|(a, b)| (f64::from(**a) - **b).abs() > 2e-6);
+    assert_eq!(far.count(), 0);
+    let (g32, g64) = (gradients(&s32, &r32), gradients(&s64, &r64));
+    let error = |a: &[f32], b: &[f64]| {
+        let d: f64 = a
+            .iter()
+            .zip(b)
+            .map(|(x, y)| (f64::from(*x) - y).powi(2))
+            .sum();
+        (d / b.iter().map(|y| y * y).sum::<f64>()).sqrt()
+    };
+    for (name, e) in [
+        ("means", error(&g32.means, &g64.means)),
+        ("quats", error(&g32.quats, &g64.quats)),
+        ("scales", error(&g32.scales, &g64.scales)),
+        ("opacities", error(&g32.opacities, &g64.opacities)),
+        ("harmonics", error(&g32.harmonics, &g64.harmonics)),
+    ] {
+        assert!(e < 1e-5, "{name}: relative error {e}");
+    }
+}
+
+#[test]
+fn no_gaussians_and_none_visible_give_an_empty_image() {
+    let empty = Synthetic::<f32>::new(0, 20, 20, 1).unwrap();
+    assert!(render(&empty).image.iter().all(|x| *x == 0.0));
+    let mut behind = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
+    behind
+        .means
+        .iter_mut()
+        .skip(2)
+        .step_by(3)
+        .for_each(|z| *z = -*z - 1.0);
+    let r = render(&behind);
+    assert!(r.image.iter().chain(&r.alphas).all(|x| *x == 0.0));
+    assert!(r.radii.iter().all(|x| *x == 0));
+    assert!(gradients(&behind, &r).means.iter().all(|x| *x == 0.0));
+}
+
+#[test]
+fn the_wrong_length_is_named() {
+    let s = Synthetic::<f32>::new(10, 20, 20, 1).unwrap();
+    let g = Gaussians {
+        scales: &s.scales[..29],
+        ..s.gaussians()
+    };
+    let error = forward(&g, &harmonics(&s), &s.camera, &ProjectOptions::default()).unwrap_err();
+    assert_eq!(error.name, "scales");
+}
