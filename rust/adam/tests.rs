@@ -1,6 +1,7 @@
 //! The fused step against the formulas of torch, and what must hold exactly.
 
 use super::*;
+use crate::synthetic;
 
 /// torch's formulas, one element at a time.
 macro_rules! reference {
@@ -26,15 +27,10 @@ const OPTIONS: AdamOptions = AdamOptions {
     eps: 1e-15,
 };
 
+/// In [-1, 1).
 fn noise(seed: u64, n: usize) -> Vec<f64> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
-    let next = |_| {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
-        (state >> 40) as f64 / (1u64 << 23) as f64 - 1.0
-    };
-    (0..n).map(next).collect()
+    let values = synthetic::noise(seed, n).into_iter();
+    values.map(|v| 2.0 * v - 1.0).collect()
 }
 
 /// param, exp_avg, exp_avg_sq after `steps` steps.

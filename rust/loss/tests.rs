@@ -4,6 +4,7 @@ use super::{
     band::{C1, C2, SIGMA},
     *,
 };
+use crate::synthetic::noise;
 
 /// The textbook formula with direct 11 x 11 sums: (L1, SSIM).
 fn reference(x: &[f64], y: &[f64], mask: Option<&[u8]>, [h, w, c]: [usize; 3]) -> (f64, f64) {
@@ -34,17 +35,6 @@ fn reference(x: &[f64], y: &[f64], mask: Option<&[u8]>, [h, w, c]: [usize; 3]) -
     let counted = (0..h * w).filter(|&p| counts(p)).count() * c;
     let l1 = x.iter().zip(y).map(|(x, y)| (x - y).abs()).sum::<f64>() / counted.max(1) as f64;
     (l1, ssim / (h * w * c) as f64)
-}
-
-fn noise(seed: u64, n: usize) -> Vec<f64> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
-    let next = |_| {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
-        (state >> 40) as f64 / (1u64 << 24) as f64
-    };
-    (0..n).map(next).collect()
 }
 
 fn photo(seed: u64, n: usize) -> Vec<u8> {
