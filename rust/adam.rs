@@ -44,7 +44,7 @@ pub struct AdamArrays<'a, T> {
 /// What a step updates; everything else is left as it is, moments included.
 #[derive(Debug, Clone, Copy)]
 pub struct Selection<'a> {
-    /// Rows whose number here is 0 are left out, [N] for arrays of N rows (the selective Adam of Taming 3DGS,
+    /// Rows whose number here is 0 are left out, `[N]` for arrays of N rows (the selective Adam of Taming 3DGS,
     /// Mallick et al. 2024). None: none.
     pub visible: Option<&'a [u8]>,
     /// Numbers of a row.

@@ -25,7 +25,7 @@ pub struct CompositeInput<'a, T> {
     pub tiles: &'a Tiles<T>,
     /// Image size.
     pub camera: &'a Camera,
-    /// Colour behind everything, [channels].
+    /// Colour behind everything, `[channels]`.
     pub background: Option<&'a [T]>,
 }
 

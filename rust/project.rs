@@ -88,7 +88,7 @@ impl Splat {
 pub struct Projection {
     /// All N Gaussians, culled ones included.
     pub splats: Vec<Splat>,
-    /// View-space depth, [N]; 0 where culled.
+    /// View-space depth, `[N]`; 0 where culled.
     pub depths: Vec<f64>,
     /// That of the options.
     pub tuning: Tuning,

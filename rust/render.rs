@@ -34,7 +34,7 @@ pub struct Gradients<T> {
     pub quats: Vec<T>,
     /// [N, 3]
     pub scales: Vec<T>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<T>,
     /// [N, K, 3]
     pub harmonics: Vec<T>,

@@ -15,7 +15,7 @@ pub struct Gaussians<'a, T> {
     pub quats: &'a [T],
     /// Standard deviations, [N, 3], world.
     pub scales: &'a [T],
-    /// Opacities, [N].
+    /// Opacities, `[N]`.
     pub opacities: &'a [T],
 }
 

@@ -13,7 +13,7 @@ pub struct Synthetic<T> {
     pub quats: Vec<T>,
     /// [N, 3]
     pub scales: Vec<T>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<T>,
     /// [N, 16, 3]
     pub harmonics: Vec<T>,

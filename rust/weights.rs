@@ -14,7 +14,7 @@ use fearless_simd::{Level, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// The largest weight of each Gaussian over the pixels of an image, [N]; 0 for one that no pixel blends.
+/// The largest weight of each Gaussian over the pixels of an image, `[N]`; 0 for one that no pixel blends.
 ///
 /// `mask` [H, W] says which pixels count; None: all of them. The tile lists need no channels, and the
 /// background plays no part. The power of 2 is always that of the default tuning. A maximum is the same in any

@@ -56,13 +56,13 @@ pub struct CompositeGrads<T> {
     pub means2d: Vec<T>,
     /// Whitened gradient of the 2D covariance, [N, 3]; see `geometry.rs`.
     pub whitened: Vec<T>,
-    /// Of `opacities`, [N].
+    /// Of `opacities`, `[N]`.
     pub opacities: Vec<T>,
     /// Sum over the pixels of the absolute gradient of `means2d`, [N, 2].
     pub absolute: Vec<T>,
     /// Of `colors`, [N, channels].
     pub colors: Vec<T>,
-    /// Of `background`, [channels].
+    /// Of `background`, `[channels]`.
     pub background: Vec<T>,
     /// Counts.
     pub work: Work,

@@ -24,9 +24,9 @@ pub struct ProjectCotangents<'a, T> {
     pub means2d: Option<&'a [T]>,
     /// Whitened gradient of the 2D covariance (E_uu, E_uv, E_vv), [N, 3]; see `geometry.rs`.
     pub whitened: Option<&'a [T]>,
-    /// Of `opacities`, [N].
+    /// Of `opacities`, `[N]`.
     pub opacities: Option<&'a [T]>,
-    /// Of `depths`, [N].
+    /// Of `depths`, `[N]`.
     pub depths: Option<&'a [T]>,
     /// Of `conics`, [N, 3].
     pub conics: Option<&'a [T]>,
@@ -131,7 +131,7 @@ pub struct GaussianGrads<T> {
     pub quats: Vec<T>,
     /// [N, 3]
     pub scales: Vec<T>,
-    /// [N]
+    /// `[N]`
     pub opacities: Vec<T>,
     /// As `Harmonics::coefficients`.
     pub harmonics: Vec<T>,

@@ -26,13 +26,13 @@ pub struct Projected<T> {
     pub projection: Projection,
     /// Centres in pixels, [N, 2].
     pub means2d: Vec<T>,
-    /// View-space depth, [N].
+    /// View-space depth, `[N]`.
     pub depths: Vec<T>,
     /// Inverse covariance (xx, xy, yy), [N, 3].
     pub conics: Vec<T>,
     /// Radii of the support in pixels, rounded up, [N, 2].
     pub radii: Vec<i32>,
-    /// Opacities, compensated if antialiased, [N].
+    /// Opacities, compensated if antialiased, `[N]`.
     pub opacities: Vec<T>,
     /// Colours from the spherical harmonics, [N, 3]; empty without them.
     pub colors: Vec<T>,
