@@ -152,6 +152,20 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
     assert least.config.densify.max_gaussians == len(scene.points)
 
 
+def test_degraded_photos_are_trained_without_resets() -> None:
+    scene, config = tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:6"))
+    trainer = Trainer(scene, config)
+    resets = ("resets of the opacities", "a budget of Gaussians bears none")
+    assert trainer.method.left_out() == [resets]
+    while trainer.iteration < config.densify.stop + 1:
+        trainer.step()
+    assert trainer.gaussians.activated_opacities().median() > 2 * config.densify.reset_opacity
+    assert Trainer(scene, trainer.config).config == trainer.config
+    for method in (fixed("none"), HQGSConfig(guidance="paper")):
+        kept = Trainer(scene, tiny_config(method="hqgs", hqgs=method)).config.densify
+        assert kept == config.densify
+
+
 def kept_by_the_codec(scene: Scene) -> tuple[int, int]:
     """Luma coefficients of the training photos that are not zero, and pixels."""
     kept = pixels = 0

@@ -82,6 +82,8 @@ class HQGS(Plain):
     - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
       Blur and noise make a pixel count less, and a photo tells no more than the coefficients that its codec
       kept. More Gaussians paint the noise and the ringing of deblurring.
+    - No resets of the opacities: with growth at its budget, what a reset takes away seldom comes back where
+      it was.
     - JPEG without noise: growth asks for less gradient, since within the cells there is none. A share k of
       coefficients outside their cells, of any sign, adds up to sqrt(k) of the gradient of all; the share that
       the codec kept stands for it.
@@ -126,7 +128,8 @@ class HQGS(Plain):
         """The formation that was found, and a budget of Gaussians that the photos can determine."""
         hqgs = replace(config.hqgs, formation=str(self.degradation))
         kinds = {step.kind for step in self.degradation.steps}
-        budget, threshold = config.densify.max_gaussians, config.densify.grad_threshold
+        densify = config.densify
+        budget, threshold = densify.max_gaussians, densify.grad_threshold
         if self.degradation.steps:
             told = sum(self._sharp_pixels(target) for target in self._targets.values())
             if "jpeg" in kinds and "noise" not in kinds:
@@ -135,10 +138,17 @@ class HQGS(Plain):
                 threshold = min(threshold, DensifyConfig.grad_threshold * math.sqrt(min(kept / pixels, 1.0)))
                 told = min(told, kept)
             budget = min(budget, max(int(self.config.gaussians_per_pixel * told), self._least))
+            if densify.reset_every < densify.stop:
+                self._left_out.append(("resets of the opacities", "a budget of Gaussians bears none"))
+            densify = replace(
+                densify,
+                max_gaussians=budget,
+                grad_threshold=threshold,
+                reset_every=max(densify.reset_every, densify.stop),
+            )
         method = config.method
         if method == AUTO:
             method = "hqgs" if self.degradation.steps else "3dgs"
-        densify = replace(config.densify, max_gaussians=budget, grad_threshold=threshold)
         return replace(config, method=method, hqgs=hqgs, densify=densify)
 
     def left_out(self) -> list[tuple[str, str]]:
