@@ -67,6 +67,7 @@ class Scene:
     source: str  # the format it was read from: "colmap", "llff", "transforms", "embedded"
     notes: list[str] = field(default_factory=list)  # what a reader of the report should know
     tracks: Tracks | None = None  # of the points, px of the views; None: its files do not tell
+    seen: dict[str, NDArray[np.intp]] | None = None  # rows of the points that each photo shows; None as above
     sfm: SfmReport | None = None  # how poses and points differ from its files'; None: they are those
 
     @property

@@ -74,6 +74,18 @@ def _key(masks: Path, given: dict[str, NDArray[np.generic]]) -> str:
     return digest.hexdigest()[:16]
 
 
+def seen_points(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.intp]]:
+    """By photo, the rows of `model_points` that it shows, ascending; photos without a place show none."""
+    row = {point: k for k, point in enumerate(sorted(model.points3D))}
+    return {
+        image.name: np.array(
+            sorted({row[p.point3D_id] for p in image.points2D if p.has_point3D()}), dtype=np.intp
+        )
+        for image in model.images.values()
+        if image.has_pose
+    }
+
+
 def registered(model: pycolmap.Reconstruction, photos: int) -> dict[str, NDArray[np.float64]]:
     """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few of the `photos` have one."""
     poses = {}

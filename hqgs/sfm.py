@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from hqgs.align import Observations, align, camera_centers, refine, rotation_angles
 from hqgs.camera import Scene, Tracks, View, as_floats
-from hqgs.colmap_run import model_points, registered, run_colmap
+from hqgs.colmap_run import model_points, registered, run_colmap, seen_points
 from hqgs.degradations import to_uint8
 
 KEPT = "sfm"  # in the folder of a run: its reconstructions
@@ -120,6 +120,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None) -> Scene:
         point_colors=colors,
         notes=[*scene.notes, str(report)],
         tracks=tracks,
+        seen={views[file].name: rows for file, rows in seen_points(model).items()},
         sfm=report,
     )
 

@@ -14,7 +14,7 @@ from PIL import Image
 from tiny_scene import tiny_scene
 
 import hqgs.degrade
-from hqgs.camera import Scene
+from hqgs.camera import Scene, Tracks
 from hqgs.data import load_scene
 from hqgs.degradations import degrade_image, encode_jpeg, parse_degradation, to_uint8
 from hqgs.degrade import degrade_scene, write_degraded_scene
@@ -118,6 +118,26 @@ def test_errors_name_the_photo_and_the_seed() -> None:
 # --- as a folder
 
 
+def test_a_written_scene_tells_which_photos_show_which_points(tmp_path: Path) -> None:
+    scene = colmap_scene(tmp_path)
+    views = [*scene.train, *scene.test]
+    rng = np.random.default_rng(0)
+    seen = {view.name: np.flatnonzero(rng.random(len(scene.points)) < 0.5) for view in views}
+    seen[views[0].name] = np.zeros(0, np.intp)
+    length = sum(map(len, seen.values())) / len(np.unique(np.concatenate(list(seen.values()))))
+    scene = replace(scene, seen=seen, tracks=Tracks(length, 0.75))
+    back = load_scene(write(scene, tmp_path / "out", "jpeg:9"))
+    assert back.tracks is not None
+    assert (back.tracks.length, back.tracks.error) == pytest.approx((length, 0.75))
+    assert back.seen is not None
+    assert set(back.seen) == {
+        f"{stem}.{'png' if stem in ('view_00', 'view_08') else 'jpg'}"
+        for stem in stems([v.name for v in views])
+    }
+    for name, rows in back.seen.items():
+        np.testing.assert_array_equal(rows, seen[f"{stems([name])[0]}.{views[0].name.rsplit('.', 1)[1]}"])
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_written_scene_reads_back(tmp_path: Path, kind: str) -> None:
     scene = colmap_scene(tmp_path)
@@ -133,6 +153,7 @@ def test_a_written_scene_reads_back(tmp_path: Path, kind: str) -> None:
         assert new.mask is None
     np.testing.assert_array_equal(back.points, scene.points)
     np.testing.assert_array_equal(back.point_colors, scene.point_colors)
+    assert (scene.seen, scene.tracks, back.seen, back.tracks) == (None,) * 4
 
     for old, new in zip(scene.test, back.test, strict=True):
         np.testing.assert_array_equal(new.image, old.image)

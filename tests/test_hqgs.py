@@ -156,7 +156,7 @@ def test_degraded_photos_are_trained_without_resets() -> None:
     scene, config = tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:6"))
     trainer = Trainer(scene, config)
     resets = ("resets of the opacities", "a budget of Gaussians bears none")
-    assert trainer.method.left_out() == [resets]
+    assert resets in trainer.method.left_out()
     while trainer.iteration < config.densify.stop + 1:
         trainer.step()
     assert trainer.gaussians.activated_opacities().median() > 2 * config.densify.reset_opacity

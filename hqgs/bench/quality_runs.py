@@ -25,6 +25,7 @@ from hqgs.files import atomic_path, write_json
 from hqgs.machine import peak_rss_mb, reset_peak_rss
 from hqgs.methods import METHODS
 from hqgs.methods.base import AUTO
+from hqgs.methods.hqgs import PAPER
 from hqgs.metrics import METRICS, evaluate_view, mean_metrics
 from hqgs.render import render_view
 from hqgs.report import RenderedView
@@ -54,6 +55,8 @@ class RunStore:
         config = {k: v for k, v in asdict(cell.config).items() if k not in METHODS or k == cell.row.method}
         if not config["leave_out"]:
             del config["leave_out"]  # runs from before there was such a choice are the same
+        if cell.row.method == "hqgs" and cell.row.hqgs.guidance == PAPER:
+            del config["hqgs"]["first_points"]  # so are the paper's, which has no use for it
         facts = {
             "format": FORMAT,
             "version": hqgs.__version__,

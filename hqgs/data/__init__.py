@@ -88,7 +88,8 @@ def load_scene(
     if len(points) == 0:
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)
-    return Scene(root.name, train, test, points, colors, capture.source, notes, _tracks(capture, views))
+    tracks = _tracks(capture, views)
+    return Scene(root.name, train, test, points, colors, capture.source, notes, tracks, capture.seen)
 
 
 def _read(root: Path, downscale: float, reconstruct: bool, keep_sfm: Path | None) -> Capture:

@@ -43,6 +43,7 @@ class Capture:
     near_far: dict[str, tuple[float, float]] = field(default_factory=dict)  # depth range by photo name
     notes: list[str] = field(default_factory=list)
     tracks: Tracks | None = None  # px of the cameras' own size
+    seen: dict[str, NDArray[np.intp]] | None = None  # by photo, rows of the points that it shows
 
 
 def no_points() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -9,7 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.camera import Tracks
-from hqgs.colmap_run import model_points
+from hqgs.colmap_run import model_points, seen_points
 from hqgs.data.capture import (
     Capture,
     Photo,
@@ -78,7 +78,12 @@ def read_colmap(root: Path, downscale: float) -> Capture:
         notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
     points, colors = keep_finite(*model_points(model), notes)
     tracks = _tracks(model, path)
-    return Capture("colmap", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks)
+    seen = None
+    if tracks is not None and len(points) == model.num_points3D():  # else the rows would not be those
+        seen = seen_points(model)
+    return Capture(
+        "colmap", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks, seen=seen
+    )
 
 
 def _tracks(model: pycolmap.Reconstruction, path: Path) -> Tracks | None:

@@ -13,12 +13,20 @@ from hqgs.data.colmap_files import cameras_file_size, check_binary_model
 
 
 def write_colmap(
-    folder: Path, cameras: dict[str, Camera], points: NDArray[np.float32], colors: NDArray[np.uint8]
+    folder: Path,
+    cameras: dict[str, Camera],
+    points: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+    seen: dict[str, NDArray[np.intp]] | None = None,
+    reprojection_error: float = 0.0,
 ) -> None:
     """Write a binary model into `folder`: the camera of each photo name, points [P, 3] and colours [P, 3].
 
-    Photos with equal intrinsics share a PINHOLE camera. The points have no tracks: a `Scene` holds none.
-    The names are COLMAP's, relative to the folder of photos. Raises OSError if the files are not whole.
+    Photos with equal intrinsics share a PINHOLE camera. The names are COLMAP's, relative to the folder of
+    photos. `seen` has for each of them the rows of the points that it shows; where it shows them is not
+    known, so they are written where the camera sees them. Every point gets `reprojection_error`, px, as its
+    mean distance from the photos. Without `seen` the points have no tracks. Raises OSError if the files are
+    not whole.
     """
     model = pycolmap.Reconstruction()
     ids: dict[tuple[float, ...], int] = {}
@@ -34,8 +42,12 @@ def write_colmap(
         image = pycolmap.Image(name=name, camera_id=ids[key], image_id=image_id)
         rotation = pycolmap.Rotation3d(camera.viewmat[:3, :3])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, camera.viewmat[:3, 3]))
-    for point, color in zip(points, colors, strict=True):
+    ids_of_points = [
         model.add_point3D(point.astype(np.float64), pycolmap.Track(), color)
+        for point, color in zip(points, colors, strict=True)
+    ]
+    if seen is not None:
+        _add_tracks(model, cameras, points.astype(np.float64), ids_of_points, seen, reprojection_error)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
     # COLMAP takes no notice of a full disk.
@@ -46,3 +58,22 @@ def write_colmap(
             raise ValueError(f"{cameras_file} is damaged")
     except ValueError as error:
         raise OSError(f"cannot write the COLMAP model (is the disk full?): {error}") from error
+
+
+def _add_tracks(
+    model: pycolmap.Reconstruction,
+    cameras: dict[str, Camera],
+    points: NDArray[np.float64],
+    ids: list[int],
+    seen: dict[str, NDArray[np.intp]],
+    reprojection_error: float,
+) -> None:
+    for image in model.images.values():
+        camera, rows = cameras[image.name], seen.get(image.name, np.zeros(0, np.intp))
+        inside = points[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        pixels = (inside @ camera.K.T)[:, :2] / inside[:, 2:]
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
+        for k, row in enumerate(rows.tolist()):
+            model.add_observation(ids[row], pycolmap.TrackElement(image.image_id, k))
+    for point in model.points3D.values():
+        point.error = reprojection_error

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hqgs.camera import Tracks
-from hqgs.colmap_run import model_points, registered, run_colmap
+from hqgs.colmap_run import model_points, registered, run_colmap, seen_points
 from hqgs.data.capture import PHOTO_SUFFIXES, Capture, Photo, find_mask, keep_finite, photo_folder, some
 
 
@@ -54,4 +54,7 @@ def read_photos(root: Path, downscale: float, keep: Path | None = None) -> Captu
             f"{len(missing)} photos were left out, as COLMAP found no place for them: {some(missing)}"
         )
     points, colors = keep_finite(*model_points(model), notes)
-    return Capture("photos", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks)
+    seen = seen_points(model) if len(points) == model.num_points3D() else None
+    return Capture(
+        "photos", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks, seen=seen
+    )

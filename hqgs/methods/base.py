@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.camera import View
+from hqgs.camera import Scene, View
+from hqgs.first_points import Colors, Points
 from hqgs.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -39,6 +40,10 @@ class Method(Protocol):
 
     def adapt(self, config: TrainConfig) -> TrainConfig:
         """The configuration to train with: the given one, with what the method decides for this scene."""
+        ...
+
+    def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
+        """The points [N, 3] and colours [N, 3] to start from; `config` is what `adapt` gave."""
         ...
 
     def left_out(self) -> list[tuple[str, str]]:
@@ -86,6 +91,9 @@ class Plain:
 
     def adapt(self, config: TrainConfig) -> TrainConfig:
         return replace(config, method=self.name) if config.method == AUTO else config
+
+    def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
+        return scene.points, scene.point_colors
 
     def left_out(self) -> list[tuple[str, str]]:
         return []

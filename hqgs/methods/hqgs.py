@@ -17,6 +17,7 @@ from hqgs.degradations import Degradation, parse_degradation, small_side
 from hqgs.densify import DensifyConfig
 from hqgs.diagnosis import diagnose_scene
 from hqgs.diagnosis.resolution import undo_enlargement
+from hqgs.first_points import Colors, Points, points_along_edges
 from hqgs.formation import Operator, formation
 from hqgs.gaussians import Gaussians
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
@@ -46,6 +47,7 @@ class HQGSConfig:
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
     smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
     gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
+    first_points: float = 1.0  # share of that number to start from, filled up along edges; 0: no filling up
 
     def __post_init__(self) -> None:
         if self.guidance not in GUIDANCES:
@@ -55,6 +57,8 @@ class HQGSConfig:
         for name in ("jpeg_pixels", "smallest", "gaussians_per_pixel"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        if not 0 <= self.first_points <= 1:
+            raise ValueError(f"first_points is {self.first_points}, wanted 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,8 @@ class HQGS(Plain):
     - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
       Blur and noise make a pixel count less, and a photo tells no more than the coefficients that its codec
       kept. More Gaussians paint the noise and the ringing of deblurring.
+    - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
+      more: pixels along the photos' edges, at the depth of the points around them (`points_along_edges`).
     - No resets of the opacities: with growth at its budget, what a reset takes away seldom comes back where
       it was.
     - JPEG without noise: growth asks for less gradient, since within the cells there is none. A share k of
@@ -150,6 +156,21 @@ class HQGS(Plain):
         if method == AUTO:
             method = "hqgs" if self.degradation.steps else "3dgs"
         return replace(config, method=method, hqgs=hqgs, densify=densify)
+
+    def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
+        what, points, colors = "first points along edges", scene.points, scene.point_colors
+        wanted = int(self.config.first_points * config.densify.max_gaussians)
+        if self.as_photographed or not wanted:
+            return points, colors
+        if scene.seen is None:
+            self._left_out.append((what, "the scene does not tell which photos see which of its points"))
+        elif len(points) >= wanted:
+            self._left_out.append((what, f"it has {len(points)} points for {wanted} that are called for"))
+        else:
+            count = wanted - len(points)
+            more = points_along_edges(scene.train, points, scene.seen, count, config.seed)
+            points, colors = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
+        return points, colors
 
     def left_out(self) -> list[tuple[str, str]]:
         return self._left_out
