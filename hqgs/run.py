@@ -131,6 +131,12 @@ def _progress_line(trainer: Trainer) -> str:
     return f"{where}, held-out views {', '.join(values)}"
 
 
+def _first_points(trainer: Trainer) -> list[str]:
+    own = len(trainer.scene.points)
+    more = trainer.first_points - own
+    return [f"started from the scene's {own} points and {more} more along the photos' edges"] if more else []
+
+
 def _write_results(trainer: Trainer, out: Path) -> RunResult:
     scene, config = trainer.scene, trainer.config
     left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
@@ -157,7 +163,7 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
     result = RunResult(
         scene=scene.name,
         source=scene.source,
-        notes=scene.notes,
+        notes=[*scene.notes, *_first_points(trainer)],
         method=config.method,
         seed=config.seed,
         iterations=trainer.iteration,

@@ -5,7 +5,8 @@ once. DIRECTORY holds `input.npz`: photos (the folder), names [V], and of known 
 and height and Ks [V, 3, 3], of known poses viewmats [V, 4, 4]. If DIRECTORY has a folder `masks`, each photo
 has a mask `NAME.png` there. The files of COLMAP and the answer go into DIRECTORY:
 
-`triangulate`: points for known cameras and poses, `points.npz` (points [P, 3] float32, colors [P, 3] uint8).
+`triangulate`: points for known cameras and poses, `points.npz` (points [P, 3] float32, colors [P, 3] uint8,
+and of each sighting the numbers of the photo and of the point: photos [O], rows [O]).
 
 `reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is
 no model. Known cameras stay as they are. Unknown ones are SIMPLE_RADIAL, one for all photos if they have one
@@ -49,6 +50,8 @@ def triangulate(directory: Path) -> None:
         directory / "points.npz",
         points=np.array([p.xyz for p in points], np.float32).reshape(-1, 3),
         colors=np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+        photos=np.array([e.image_id - 1 for p in points for e in p.track.elements], np.intp),
+        rows=np.array([k for k, p in enumerate(points) for _ in p.track.elements], np.intp),
     )
 
 

@@ -60,7 +60,9 @@ class Trainer:
         self.method = make_method(scene, config)
         self.config = config = self.method.adapt(config)
         self.frugality = Frugality(config, scene.train, self.method)
-        self.gaussians = Gaussians.from_points(*self.method.first_points(scene, config), config.sh_degree)
+        points = self.method.first_points(scene, config)
+        self.first_points = len(points[0])
+        self.gaussians = Gaussians.from_points(*points, config.sh_degree)
         self.optimizer = self._make_optimizer()
         self.densifier = Densifier(config.densify, self.extent, scene.reach, config.seed, len(self.gaussians))
         self.iteration = 0  # steps done

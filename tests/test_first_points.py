@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.camera import Camera, Scene, View
 from hqgs.first_points import points_along_edges
 from hqgs.methods.hqgs import HQGSConfig
+from hqgs.run import run
 from hqgs.train import Trainer
 
 NORMAL, OFFSET = np.array([0.3, -0.2, 1.0]), 5.0  # the plane NORMAL . x = OFFSET
@@ -103,7 +106,12 @@ def with_tracks(scene: Scene) -> Scene:
     return replace(scene, seen={view.name: np.arange(len(scene.points)) for view in scene.train})
 
 
-def test_hqgs_starts_from_them_where_points_are_few() -> None:
+def run_report(trainer: Trainer, out: Path) -> str:
+    run(trainer, out, progress=False)
+    return (out / "report.json").read_text()
+
+
+def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
     scene = with_tracks(tiny_scene())
     few, known = len(scene.points), {name: rows[:20] for name, rows in (scene.seen or {}).items()}
     sparse = replace(scene, points=scene.points[:20], point_colors=scene.point_colors[:20], seen=known)
@@ -117,6 +125,11 @@ def test_hqgs_starts_from_them_where_points_are_few() -> None:
     assert len(started.gaussians) == int(0.2 * pixels) > 3 * 20
     np.testing.assert_array_equal(started.gaussians.means[:20].detach().numpy(), sparse.points)
     assert "first points along edges" not in dict(started.method.left_out())
+    (note,) = json.loads(run_report(started, tmp_path))["notes"]
+    assert (
+        note
+        == f"started from the scene's 20 points and {started.first_points - 20} more along the photos' edges"
+    )
     assert len(trainer(sparse, first_points=0.0).gaussians) == 20
     assert len(trainer(sparse, formation="none").gaussians) == 20
     enough = trainer(scene, first_points=0.01)

@@ -88,6 +88,26 @@ def test_poses_and_points_are_those_of_the_scene(cards: Scene, found: Scene) -> 
     assert found.point_colors.shape == found.points.shape
 
 
+def test_it_tells_which_photos_show_which_points(found: Scene) -> None:
+    assert found.seen is not None
+    assert found.sfm is not None
+    assert set(found.seen) == {view.name for view in found.train}
+    sightings = sum(map(len, found.seen.values()))
+    assert sightings == pytest.approx(found.sfm.track_length * len(found.points), rel=0.01)
+    shown, colors = [], []
+    for view in found.train:
+        rows, camera = found.seen[view.name], view.camera
+        inside = found.points[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        x, y = ((inside @ camera.K.T)[:, :2] / inside[:, 2:]).T.astype(int)
+        assert ((x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)).all()
+        shown.append(view.image[y, x].ravel())
+        colors.append(found.point_colors[rows].ravel())
+    # Features lie where the photo changes, and the colours are means over the photos.
+    likeness = np.corrcoef(np.concatenate(shown), np.concatenate(colors))[0, 1]
+    others = np.corrcoef(np.concatenate(shown), np.roll(np.concatenate(colors), 30))[0, 1]
+    assert likeness > 0.7 > 0.3 > others
+
+
 def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> None:
     report = found.sfm
     assert report is not None
@@ -208,6 +228,8 @@ def test_a_folder_of_photos_alone_becomes_a_scene(cards: Scene, tmp_path: Path) 
     assert "from all photos (9 of 9 registered), the held-out views among them" in scene.notes[0]
     assert scene.tracks is not None
     assert scene.tracks.error < 1
+    assert scene.seen is not None
+    assert set(scene.seen) == {f"photo {k}.png" for k in range(9)}
     own = [*cards.test[:1], *cards.train, *cards.test[1:]]
     new = sorted([*scene.train, *scene.test], key=lambda view: view.name)
     a, b = (np.array([v.camera.center for v in views]) for views in (own, new))

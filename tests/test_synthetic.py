@@ -13,7 +13,7 @@ from PIL import Image
 
 from hqgs.camera import Camera, Scene, View
 from hqgs.synthetic import embedded_cameras, embedded_scene, render_depth, render_view, scene, shading
-from hqgs.synthetic.points import sfm_points, surface_points
+from hqgs.synthetic.points import SparsePoints, sfm_points, surface_points
 from hqgs.synthetic.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
 from hqgs.synthetic.scene import look_at
 from hqgs.synthetic.studio import studio
@@ -236,7 +236,7 @@ def depth_error(views: list[View], points: NDArray[np.float32]) -> NDArray[np.fl
 
 def test_points_by_colmap() -> None:
     views = views_of(252, 189, 5)
-    points, colors, note = sfm_points(views)
+    points, colors, photos, rows, note = sfm_points(views)
     assert note == f"{len(points)} points by COLMAP with the known cameras"
     assert points.dtype == np.float32
     assert colors.shape == points.shape
@@ -244,28 +244,34 @@ def test_points_by_colmap() -> None:
     assert np.median(depth_error(views, points)) < 0.01
     assert sorted(points.tolist()) == points.tolist()
     again = sfm_points(views)
-    assert again[0].tobytes() == points.tobytes()
-    assert again[1].tobytes() == colors.tobytes()
+    assert [a.tobytes() for a in again[:4]] == [a.tobytes() for a in (points, colors, photos, rows)]
+    assert set(rows) == set(range(len(points)))
+    assert len(rows) >= 3 * len(points)
+    off = [depth_error([views[photo]], points[rows[photos == photo]]) for photo in range(5)]
+    assert np.median(np.concatenate(off)) < 0.01
 
 
 def test_points_when_colmap_is_late_or_fails() -> None:
     views = views_of(63, 47, 3)
-    points, _, note = sfm_points(views, time_limit=0)
+    points, _, _, _, note = sfm_points(views, time_limit=0)
     assert note == "4000 points cast onto the surfaces, as COLMAP gave none: it took more than 0 s"
     assert np.quantile(depth_error(views, points[::8]), 0.9) < 0.02
-    assert points.tobytes() == surface_points(views)[0].tobytes()
-    assert points.tobytes() != surface_points(views, seed=1)[0].tobytes()
-    exact, paint = surface_points(views[:1], 50, noise=0)
-    for point, color in zip(exact.astype(np.float64), paint, strict=True):
-        x, y, z = project(views[0].camera, point)
+    assert points.tobytes() == surface_points(views).points.tobytes()
+    assert points.tobytes() != surface_points(views, seed=1).points.tobytes()
+    exact, paint, photos, rows, _ = surface_points(views[:2], 50, noise=0)
+    assert (np.bincount(photos) == 25).all()
+    for view, point, color in zip(
+        [views[k] for k in photos], exact[rows].astype(np.float64), paint[rows], strict=True
+    ):
+        x, y, z = project(view.camera, point)
         assert (x % 1, y % 1) == (pytest.approx(0.5, abs=1e-3), pytest.approx(0.5, abs=1e-3))
-        assert (views[0].image[int(y), int(x)] == color).all()
-        assert render_depth(views[0].camera)[int(y), int(x)] == pytest.approx(z, rel=1e-6)
+        assert (view.image[int(y), int(x)] == color).all()
+        assert render_depth(view.camera)[int(y), int(x)] == pytest.approx(z, rel=1e-6)
 
     flat = [replace(v, image=np.full_like(v.image, 128)) for v in views]
-    assert "as COLMAP gave none: it found only 0 points" in sfm_points(flat)[2]
+    assert "as COLMAP gave none: it found only 0 points" in sfm_points(flat).note
     clash = [replace(v, name="same.png") for v in views]
-    assert "as COLMAP gave none: it ended with status 1" in sfm_points(clash)[2]
+    assert "as COLMAP gave none: it ended with status 1" in sfm_points(clash).note
 
 
 def same_scene(a: Scene, b: Scene) -> bool:
@@ -274,6 +280,9 @@ def same_scene(a: Scene, b: Scene) -> bool:
         all(v.name == w.name and v.image.tobytes() == w.image.tobytes() for v, w in views)
         and a.points.tobytes() == b.points.tobytes()
         and a.point_colors.tobytes() == b.point_colors.tobytes()
+        and {name: rows.tolist() for name, rows in (a.seen or {}).items()}
+        == {name: rows.tolist() for name, rows in (b.seen or {}).items()}
+        and a.seen is not None
         and a.notes == b.notes
     )
 
@@ -281,8 +290,8 @@ def same_scene(a: Scene, b: Scene) -> bool:
 def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rendered: list[Camera] = []
 
-    def cast(views: list[View], _: float) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
-        return *surface_points(views, 60), "cast"
+    def cast(views: list[View], _: float) -> SparsePoints:
+        return surface_points(views, 60)._replace(note="cast")
 
     def counting(camera: Camera, threads: int | None, gloss: float | None) -> NDArray[np.uint8]:
         rendered.append(camera)
@@ -330,9 +339,9 @@ def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_scene_without_cache_takes_points_from_training_photos(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def fake(views: list[View], time_limit: float) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
+    def fake(views: list[View], time_limit: float) -> SparsePoints:
         asked.extend(v.name for v in views)
-        return np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), f"limit {time_limit:g}"
+        return surface_points(views, 30)._replace(note=f"limit {time_limit:g}")
 
     monkeypatch.setattr(scene, "sfm_points", fake)
     made = embedded_scene(width=16, height=12, num_views=17)

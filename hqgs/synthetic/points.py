@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,19 @@ from hqgs.synthetic.shading import render_depth
 
 MIN_POINTS = 200  # fewer are no basis for a reconstruction
 
-Points = tuple[NDArray[np.float32], NDArray[np.uint8], str]
+
+class SparsePoints(NamedTuple):
+    """Points to start from."""
+
+    points: NDArray[np.float32]  # [P, 3], world, ascending by x, y, z
+    colors: NDArray[np.uint8]  # [P, 3]
+    photos: NDArray[np.intp]  # [O], of each sighting the number of the view
+    rows: NDArray[np.intp]  # [O], and that of the point
+    note: str  # for the report
 
 
-def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -> Points:
-    """Points [P, 3] (world), colours [P, 3] and a note for the report.
+def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -> SparsePoints:
+    """Points of the views by COLMAP.
 
     COLMAP (SIFT, exhaustive matching, triangulation with the known cameras) runs in its own process and is
     killed after `time_limit` seconds. Where it fails, is late or finds fewer than 200 points, they come from
@@ -53,28 +62,31 @@ def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -
         else:
             if done.returncode == 0:
                 with np.load(directory / "points.npz", allow_pickle=False) as data:
-                    points, colors = data["points"], data["colors"]
+                    points, colors, photos, rows = (data[k] for k in ("points", "colors", "photos", "rows"))
                 if len(points) >= MIN_POINTS:
                     note = f"{len(points)} points by COLMAP with the known cameras"
-                    return *_sorted(points, colors), note
+                    return _sorted(points, colors, photos, rows, note)
                 trouble = f"it found only {len(points)} points"
             else:
                 last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
                 trouble = f"it ended with status {done.returncode} {' '.join(last)}".strip()
-    points, colors = surface_points(views, seed=seed)
-    return points, colors, f"{len(points)} points cast onto the surfaces, as COLMAP gave none: {trouble}"
+    cast = surface_points(views, seed=seed)
+    why = f"{len(cast.points)} points cast onto the surfaces, as COLMAP gave none: {trouble}"
+    return cast._replace(note=why)
 
 
 def surface_points(
     views: Sequence[View], count: int = 4000, noise: float = 0.005, seed: int = 0
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points [count, 3] under random pixels of photos of the embedded scene, and their colours [count, 3].
+) -> SparsePoints:
+    """`count` points under random pixels of photos of the embedded scene, each seen by its own photo.
 
     The depth is off by a normal error of standard deviation `noise` times the depth.
     """
     rng = np.random.default_rng(seed)
-    points, colors = [], []
-    for view, share in zip(views, np.array_split(np.arange(count), len(views)), strict=True):
+    points, colors, photos = [], [], []
+    for number, (view, share) in enumerate(
+        zip(views, np.array_split(np.arange(count), len(views)), strict=True)
+    ):
         camera = view.camera
         depth = render_depth(camera)
         rows, cols = np.nonzero(np.isfinite(depth))
@@ -85,12 +97,21 @@ def surface_points(
         y = (i + 0.5 - camera.K[1, 2]) / camera.K[1, 1] * z
         points.append((np.stack([x, y, z], -1) - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
         colors.append(view.image[i, j])
-    return _sorted(np.concatenate(points).astype(np.float32), np.concatenate(colors))
+        photos.append(np.full(len(pick), number, np.intp))
+    xyz = np.concatenate(points).astype(np.float32)
+    note = f"{count} points cast onto the surfaces"
+    return _sorted(xyz, np.concatenate(colors), np.concatenate(photos), np.arange(count), note)
 
 
 def _sorted(
-    points: NDArray[np.float32], colors: NDArray[np.uint8]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    points: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+    photos: NDArray[np.intp],
+    rows: NDArray[np.intp],
+    note: str,
+) -> SparsePoints:
     """In ascending order of x, then y, then z."""
     order = np.lexsort(points.T[::-1])
-    return points[order], colors[order]
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return SparsePoints(points[order], colors[order], photos, place[rows], note)

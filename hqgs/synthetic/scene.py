@@ -16,7 +16,7 @@ from PIL import Image
 from hqgs.camera import Camera, Scene, View
 from hqgs.colmap_run import PROGRAM
 from hqgs.files import atomic_path, write_json
-from hqgs.synthetic.points import Points, sfm_points
+from hqgs.synthetic.points import SparsePoints, sfm_points
 from hqgs.synthetic.shading import render_view
 
 FOCAL, WIDTH, HEIGHT = 410.0, 504, 378  # pixels; other sizes scale the intrinsics
@@ -64,14 +64,16 @@ def embedded_scene(
     else:
         photos, points = made
         views = [View(*parts) for parts in zip(names, cameras, photos, strict=True)]
+    train = [v for k, v in enumerate(views) if k % 8]
     return Scene(
         name="embedded",
-        train=[v for k, v in enumerate(views) if k % 8],
+        train=train,
         test=views[::8],
-        points=points[0],
-        point_colors=points[1],
+        points=points.points,
+        point_colors=points.colors,
         source="embedded",
-        notes=[points[2]],
+        notes=[points.note],
+        seen={v.name: np.unique(points.rows[points.photos == k]) for k, v in enumerate(train)},
     )
 
 
@@ -124,22 +126,22 @@ def _key(cameras: list[Camera], names: list[str], gloss: float | None) -> dict[s
     }
 
 
-def _write_cache(cache: Path, views: list[View], points: Points, gloss: float | None) -> None:
+def _write_cache(cache: Path, views: list[View], points: SparsePoints, gloss: float | None) -> None:
     """Photos and points first, the key with their checksums last, so that a key vouches for whole files."""
     for view in views:
         with atomic_path(cache / view.name) as tmp:
             Image.fromarray(view.image).save(tmp)
     with atomic_path(cache / "points.npz") as tmp:
-        np.savez(tmp, points=points[0], colors=points[1])
+        np.savez(tmp, points=points.points, colors=points.colors, photos=points.photos, rows=points.rows)
     names = [view.name for view in views]
     files = {name: _checksum(cache / name) for name in [*names, "points.npz"]}
-    key = {"made": _key([view.camera for view in views], names, gloss), "files": files, "note": points[2]}
+    key = {"made": _key([view.camera for view in views], names, gloss), "files": files, "note": points.note}
     write_json(cache / "key.json", key)
 
 
 def _read_cache(
     cache: Path, cameras: list[Camera], names: list[str], gloss: float | None
-) -> tuple[list[NDArray[np.uint8]], Points] | None:
+) -> tuple[list[NDArray[np.uint8]], SparsePoints] | None:
     """Photos and points, or None if anything is missing, damaged or made by another version."""
     try:
         key = json.loads((cache / "key.json").read_text(encoding="utf-8"))
@@ -152,7 +154,8 @@ def _read_cache(
             with Image.open(cache / name) as image:
                 photos.append(np.asarray(image))
         with np.load(cache / "points.npz", allow_pickle=False) as data:
-            return photos, (data["points"], data["colors"], str(key["note"]))
+            arrays = (data[name] for name in ("points", "colors", "photos", "rows"))
+            return photos, SparsePoints(*arrays, note=str(key["note"]))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None
 
