@@ -75,11 +75,14 @@ def _key(masks: Path, given: dict[str, NDArray[np.generic]]) -> str:
 
 
 def seen_points(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.intp]]:
-    """By photo, the rows of `model_points` that it shows, ascending; photos without a place show none."""
+    """By photo, the rows of `model_points` that it shows, ascending; photos without a place show none.
+
+    Points that the model lacks do not count: tools remove some and leave the photos as they are.
+    """
     row = {point: k for k, point in enumerate(sorted(model.points3D))}
     return {
         image.name: np.array(
-            sorted({row[p.point3D_id] for p in image.points2D if p.has_point3D()}), dtype=np.intp
+            sorted({row[p.point3D_id] for p in image.points2D if p.point3D_id in row}), dtype=np.intp
         )
         for image in model.images.values()
         if image.has_pose
