@@ -71,8 +71,7 @@ def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -
                 last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
                 trouble = f"it ended with status {done.returncode} {' '.join(last)}".strip()
     cast = surface_points(views, seed=seed)
-    why = f"{len(cast.points)} points cast onto the surfaces, as COLMAP gave none: {trouble}"
-    return cast._replace(note=why)
+    return cast._replace(note=f"{cast.note}, as COLMAP gave none: {trouble}")
 
 
 def surface_points(
