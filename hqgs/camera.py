@@ -42,6 +42,15 @@ class View:
     low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
 
 
+def unproject(
+    camera: Camera, pixels: NDArray[np.float64], depths: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points [M, 3], world, at view-space `depths` [M] behind `pixels` [M, 2], x and y."""
+    in_camera = np.linalg.solve(camera.K, np.stack([*pixels.T, np.ones(len(pixels))])) * depths
+    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    return (in_camera - t[:, None]).T @ R
+
+
 def as_floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
     """A copy of a photo with white at 1."""
     return np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32)

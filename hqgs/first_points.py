@@ -11,7 +11,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import QhullError
 
-from hqgs.camera import View, as_floats
+from hqgs.camera import View, as_floats, unproject
 from hqgs.degradations import to_uint8
 from hqgs.edges import edge_magnitude
 
@@ -51,9 +51,7 @@ def points_along_edges(
         depths = _depths(view, points[rows].astype(np.float64), pixels)
         if depths is None:
             continue
-        K, viewmat = view.camera.K, view.camera.viewmat
-        rays = np.linalg.solve(K, np.vstack([pixels.T, np.ones(len(pixels))])).T
-        found.append(((rays * depths[:, None] - viewmat[:3, 3]) @ viewmat[:3, :3]).astype(np.float32))
+        found.append(unproject(view.camera, pixels, depths).astype(np.float32))
         columns, lines = pixels.astype(np.intp).T
         colors.append(to_uint8(as_floats(view.image)[lines, columns]))
     return np.concatenate(found), np.concatenate(colors)

@@ -8,7 +8,7 @@ import numpy as np
 import plyfile
 from numpy.typing import NDArray
 
-from hqgs.camera import View
+from hqgs.camera import View, unproject
 
 COUNT = 20_000
 SEED = 0
@@ -37,10 +37,7 @@ def random_points(
         rows, columns = np.divmod(rng.choice(cells, count), view.camera.width)
         near, far = near_far.get(view.name) or guessed[view.name]
         depth = np.exp(rng.uniform(np.log(near), np.log(far), count))
-        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(count)])
-        in_camera = np.linalg.solve(view.camera.K, pixels) * depth
-        R, t = view.camera.viewmat[:3, :3], view.camera.viewmat[:3, 3]
-        points.append((in_camera - t[:, None]).T @ R)
+        points.append(unproject(view.camera, np.stack([columns + 0.5, rows + 0.5], 1), depth))
         colors.append(view.image[rows, columns])
     if not points:
         raise ValueError("the masks hide every pixel of every training view")
