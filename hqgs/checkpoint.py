@@ -102,7 +102,10 @@ def remove_leftovers(path: str | Path) -> None:
 
 
 def scene_fingerprint(scene: Scene) -> dict[str, str]:
-    """Digests of what a run reads of a scene, each under the name of what it covers."""
+    """Digests of what a run reads of a scene, each under the name of what it covers.
+
+    The same on every machine: cameras count to 1e-9 and to float32, since linear algebra rounds by CPU.
+    """
 
     def digest(arrays: Iterable[NDArray[Any]]) -> str:
         sha = hashlib.sha256()
@@ -115,7 +118,11 @@ def scene_fingerprint(scene: Scene) -> dict[str, str]:
     names = "\n".join([*(v.name for v in scene.train), "", *(v.name for v in scene.test)])
     return {
         "views": hashlib.sha256(names.encode()).hexdigest()[:16],
-        "cameras": digest(array for v in views for array in (v.camera.K, v.camera.viewmat)),
+        "cameras": digest(
+            np.round(array, 9).astype(np.float32) + 0.0  # -0 becomes 0
+            for v in views
+            for array in (v.camera.K, v.camera.viewmat)
+        ),
         "photos": digest(v.image for v in views),
         "low": digest(v.low for v in views if v.low is not None),
         "masks": digest(v.mask for v in views if v.mask is not None),

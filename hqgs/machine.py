@@ -9,13 +9,19 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
+from hqgs._rust import simd_level
+
 PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
 def machine_facts() -> dict[str, str | int | float | None]:
-    """CPU model, cores this process may use, memory in GiB (None where unknown), system and architecture."""
+    """CPU model, vector instructions in use, cores this process may use, memory in GiB, system, architecture.
+
+    Memory is None where unknown.
+    """
     return {
         "cpu": _cpu_model(),
+        "simd": simd_level(),  # a virtual machine's model may name none: "AMD EPYC" has them all
         "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
         "memory_gib": _memory_gib(),
         "system": platform.system(),

@@ -10,6 +10,7 @@ mod weights;
 
 use crate::threads;
 use arrays::{Array, by_dtype};
+use fearless_simd::Level;
 use numpy::Element;
 use pyo3::prelude::*;
 use std::ffi::{c_int, c_long};
@@ -46,6 +47,24 @@ fn get_num_threads() -> usize {
     threads::get()
 }
 
+/// The vector instructions that the crate uses on this CPU; results may differ by rounding between them.
+#[pyfunction]
+fn simd_level() -> &'static str {
+    match Level::new() {
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        Level::Avx512(_) => "AVX-512",
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        Level::Avx2(_) => "AVX2",
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        Level::Sse4_2(_) => "SSE4.2",
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        Level::Sse2(_) => "SSE2",
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon(_) => "NEON",
+        _ => "none",
+    }
+}
+
 /// Address of the first element of an array as the crate sees it, to test that nothing is copied.
 #[pyfunction]
 fn data_pointer(array: &Bound<'_, PyAny>) -> PyResult<usize> {
@@ -62,6 +81,7 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     keep_freed_memory();
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(simd_level, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
     project::register(m)?;
     composite::register(m)?;

@@ -297,7 +297,7 @@ def test_read_report_refuses_other_files(tmp_path: Path, text: str, message: str
 
 def test_machine_facts_name_no_host_user_or_path() -> None:
     facts = machine.machine_facts()
-    assert facts.keys() == {"cpu", "cores", "memory_gib", "system", "architecture"}
+    assert facts.keys() == {"cpu", "simd", "cores", "memory_gib", "system", "architecture"}
     assert facts["cpu"]
     for value in (*facts.values(), *machine.version_facts().values()):
         assert value != socket.gethostname()

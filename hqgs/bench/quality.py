@@ -209,7 +209,7 @@ class Quality:
     def circumstances(self, runs: Sequence[Run]) -> str:
         """Machine, threads and commit; a warning where the runs differ in them."""
         seen = {
-            "CPU": [run["machine"]["cpu"] for run in runs],
+            "CPU": [" ".join(filter(None, map(run["machine"].get, ("cpu", "simd")))) for run in runs],
             "threads": [run["threads"] for run in runs],
             "commit": [run["versions"]["git_commit"] for run in runs],
         }
