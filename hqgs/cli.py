@@ -1,12 +1,14 @@
 """The command line: `hqgs train SCENE --out DIR` and `hqgs degrade SCENE --kind KIND --out DIR`.
 
-Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C.
-Then a training run has written everything, unless Ctrl-C was pressed twice, and degrading nothing.
+Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C or
+SIGTERM. Then a training run has written everything, unless Ctrl-C was pressed twice, and degrading nothing.
 """
 
 from __future__ import annotations
 
 import argparse
+import signal
+import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -46,8 +48,10 @@ KINDS_HELP = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code."""
+    """Run the command line and return the exit code. SIGTERM counts as Ctrl-C."""
     args = _parser().parse_args(argv)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # instead of pycolmap's, with a stack trace
     try:
         return args.run(args)
     except KeyboardInterrupt:

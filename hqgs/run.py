@@ -23,6 +23,7 @@ from hqgs.ply import write_ply
 from hqgs.report import RunResult, write_report
 from hqgs.train import Step, Trainer
 
+ENDINGS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and what batch systems send
 CHECKPOINT, PLY = "checkpoint.safetensors", "scene.ply"
 BAR_EVERY = 10  # steps between updates of the numbers in the progress bar
 
@@ -91,7 +92,10 @@ def run(trainer: Trainer, out: str | Path, progress: bool = True) -> RunResult:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[threading.Event]:
-    """Within this, the first Ctrl-C sets the event that it yields, the second raises KeyboardInterrupt."""
+    """Within this, the first Ctrl-C sets the event that it yields, the second raises KeyboardInterrupt.
+
+    So does SIGTERM.
+    """
     requested = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield requested  # signals only reach the main thread
@@ -99,13 +103,16 @@ def deferred_interrupt() -> Iterator[threading.Event]:
 
     def on_interrupt(number: int, frame: object) -> None:
         requested.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for ending in ENDINGS:
+            signal.signal(ending, signal.default_int_handler)
 
-    before = signal.signal(signal.SIGINT, on_interrupt)
+    before = {ending: signal.signal(ending, on_interrupt) for ending in ENDINGS}
     try:
         yield requested
     finally:
-        signal.signal(signal.SIGINT, before)
+        for ending, handler in before.items():
+            # None: it was not set from Python. pycolmap's prints a stack trace, which nobody asked for.
+            signal.signal(ending, signal.SIG_DFL if handler is None else handler)
 
 
 class _BarNumbers:

@@ -185,8 +185,9 @@ def test_what_a_killed_writer_leaves_is_removed(tmp_path: Path) -> None:
     assert hidden(tmp_path) == []
 
 
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_real_ctrl_c_is_exit_code_130_with_checkpoint_and_report(
-    processes: ForkServerContext, folder: Path, tmp_path: Path
+    processes: ForkServerContext, folder: Path, tmp_path: Path, ending: signal.Signals
 ) -> None:
     out = tmp_path / "out"
     command = ["train", str(folder), "--out", str(out), "--iterations", "50000", "--eval-every", "50000"]
@@ -194,7 +195,7 @@ def test_a_real_ctrl_c_is_exit_code_130_with_checkpoint_and_report(
     child.start()
     wait_for(out / CHECKPOINT, child)
     assert child.pid is not None
-    os.kill(child.pid, signal.SIGINT)
+    os.kill(child.pid, ending)
     child.join(60)
     assert child.exitcode == 130
     done = json.loads((out / "report.json").read_text())["iterations"]

@@ -22,7 +22,7 @@ from hqgs.densify import DensifyConfig
 from hqgs.gaussians import Gaussians
 from hqgs.methods import METHODS, ThreeDGS, check_method
 from hqgs.ply import read_ply
-from hqgs.run import CHECKPOINT, PLY, open_run, run, train
+from hqgs.run import CHECKPOINT, ENDINGS, PLY, open_run, run, train
 from hqgs.synthetic import embedded_scene
 from hqgs.train import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
 
@@ -282,16 +282,19 @@ def test_a_method_trains_and_keeps_tensors_of_its_own(probe: Probe, tmp_path: Pa
         assert torch.equal(again.optimizer.state[probe.offset]["exp_avg"], moments)
 
 
-def test_ctrl_c_ends_the_run_with_everything_written(probe: Probe, tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_the_run_with_everything_written(
+    probe: Probe, tmp_path: Path, ending: signal.Signals
+) -> None:
     def interrupt(loss: Tensor) -> Tensor:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(ending)
         return loss
 
-    handler = signal.getsignal(signal.SIGINT)
+    handlers = [signal.getsignal(number) or signal.SIG_DFL for number in ENDINGS]  # None: pycolmap's
     probe.at[17] = interrupt
     config = tiny_config(method="probe")
     result = train(tiny_scene(), config, tmp_path, progress=False)
-    assert signal.getsignal(signal.SIGINT) is handler
+    assert [signal.getsignal(number) for number in ENDINGS] == handlers
     assert result.iterations == 17
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["left_out"] == [{"what": "iterations 18 to 30", "why": "the run was stopped"}]
