@@ -133,6 +133,7 @@ def _paper(label: str, config: PaperConfig) -> Row:
 
 
 BASELINE, SRGS, HQGS = Row("3dgs", "3dgs"), Row("srgs", "srgs"), Row("hqgs", "hqgs")
+OWN_POINTS = Row("scene's points", "hqgs", hqgs=HQGSConfig(first_points=0.0))
 METHODS = (BASELINE, SRGS, HQGS)
 KINDS = ("none", "jpeg:10", "noise:25", "lowres:4", "blur", "mixed")
 GRID = (
@@ -170,6 +171,10 @@ PROTOCOLS = {
     "grid": Protocol("how each method bears stronger degradation", METHODS, GRID, one_scene=True),
     "guidance": Protocol(
         "hqgs, the paper's guidance and 3dgs", (BASELINE, _paper("paper", PaperConfig()), HQGS), KINDS
+    ),
+    "points": Protocol(
+        "hqgs from the scene's points alone and with those along edges",
+        (OWN_POINTS, HQGS), tuple(kind for kind in KINDS if kind != "none"), baseline=OWN_POINTS.label,
     ),
     "smoke": Protocol(
         "a tiny scene, seconds: only a test", METHODS, ("none", "noise:25", "lowres:2"),
