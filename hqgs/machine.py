@@ -9,8 +9,6 @@ import sys
 from importlib import metadata
 from pathlib import Path
 
-from hqgs._rust import simd_level
-
 PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
@@ -19,6 +17,8 @@ def machine_facts() -> dict[str, str | int | float | None]:
 
     Memory is None where unknown.
     """
+    from hqgs._rust import simd_level  # here, since the rest of this file loads nothing
+
     return {
         "cpu": _cpu_model(),
         "simd": simd_level(),  # a virtual machine's model may name none: "AMD EPYC" has them all
