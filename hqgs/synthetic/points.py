@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.camera import View
+from hqgs.camera import View, unproject
 from hqgs.colmap_run import PROGRAM
 from hqgs.synthetic.shading import render_depth
 
@@ -92,9 +92,7 @@ def surface_points(
         pick = rng.integers(0, len(rows), len(share))
         i, j = rows[pick], cols[pick]
         z = depth[i, j] * (1 + noise * rng.standard_normal(len(pick)))
-        x = (j + 0.5 - camera.K[0, 2]) / camera.K[0, 0] * z
-        y = (i + 0.5 - camera.K[1, 2]) / camera.K[1, 1] * z
-        points.append((np.stack([x, y, z], -1) - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3])
+        points.append(unproject(camera, np.stack([j, i], 1).astype(np.float64) + 0.5, z))
         colors.append(view.image[i, j])
         photos.append(np.full(len(pick), number, np.intp))
     xyz = np.concatenate(points).astype(np.float32)
