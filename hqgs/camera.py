@@ -51,6 +51,17 @@ def unproject(
     return (in_camera - t[:, None]).T @ R
 
 
+def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels [M, 2], x and y, and view-space depths [M] of `points` [M, 3], world.
+
+    Nothing is left out: pixels of points behind the camera mean nothing, and are not finite at depth 0.
+    """
+    inside = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    depths = inside[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (inside @ camera.K.T)[:, :2] * (1 / depths)[:, None], depths
+
+
 def as_floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
     """A copy of a photo with white at 1."""
     return np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32)

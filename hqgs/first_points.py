@@ -11,7 +11,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import QhullError
 
-from hqgs.camera import View, as_floats, unproject
+from hqgs.camera import View, as_floats, project, unproject
 from hqgs.degradations import to_uint8
 from hqgs.edges import edge_magnitude
 
@@ -78,13 +78,11 @@ def _depths(
     view: View, points: NDArray[np.float64], pixels: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
     """Depths [M] at `pixels` [M, 2] of the surface through points [P, 3]; None where there are too few."""
-    camera = view.camera
-    inside = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    inside = inside[inside[:, 2] > 0]
-    if len(inside) < LEAST:
+    where, depths = project(view.camera, points)
+    front = depths > 0
+    if np.count_nonzero(front) < LEAST:
         return None
-    nearness = 1 / inside[:, 2]
-    where = (inside @ camera.K.T)[:, :2] * nearness[:, None]
+    where, nearness = where[front], 1 / depths[front]
     nearest = NearestNDInterpolator(where, nearness)(pixels)
     try:
         surface = LinearNDInterpolator(where, nearness)(pixels)

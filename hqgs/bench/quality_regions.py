@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs.bench.quality_scenes import degraded_views
-from hqgs.camera import Scene, View
+from hqgs.camera import Scene, View, project
 from hqgs.edges import edge_magnitude
 from hqgs.methods.base import photo_tensors
 from hqgs.metrics import psnr
@@ -29,12 +29,10 @@ def count_regions(means: NDArray[np.float32], views: Sequence[View]) -> dict[str
     over channels; ties at the limit are flat. `density` is Gaussians per 1,000 pixels.
     """
     regions = {name: {"gaussians": 0, "pixels": 0} for name in ("edge", "flat")}
-    homogeneous = means.astype(np.float64)
     for view in views:
         camera = view.camera
-        at = homogeneous @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        at = at[at[:, 2] > NEAR]
-        pixels = np.floor(at @ camera.K.T[:, :2] / at[:, 2:])  # column, row: pixel j spans j to j + 1
+        pixels, depths = project(camera, means.astype(np.float64))
+        pixels = np.floor(pixels[depths > NEAR])  # column, row: pixel j spans j to j + 1
         inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         columns, rows = pixels[inside].astype(np.int64).T
         hits = np.zeros((camera.height, camera.width), np.int64)

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.camera import Camera
+from hqgs.camera import Camera, project
 from hqgs.data.colmap_files import cameras_file_size, check_binary_model
 
 
@@ -70,8 +70,7 @@ def _add_tracks(
 ) -> None:
     for image in model.images.values():
         camera, rows = cameras[image.name], seen.get(image.name, np.zeros(0, np.intp))
-        inside = points[rows] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        pixels = (inside @ camera.K.T)[:, :2] / inside[:, 2:]
+        pixels, _ = project(camera, points[rows])
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
         for k, row in enumerate(rows.tolist()):
             model.add_observation(ids[row], pycolmap.TrackElement(image.image_id, k))
