@@ -510,9 +510,14 @@ def test_estimates_learn_from_finished_runs(monkeypatch: pytest.MonkeyPatch) -> 
     estimate.probe(replace(first, iterations=2), scene)
     assert estimate.knows(first)
     assert not estimate.knows(second)
-    monkeypatch.setattr(estimate, "_first", {("a", "3dgs"): 0.1, ("a", "srgs"): 0.2})
+    monkeypatch.setattr(estimate, "_first", {("a", "3dgs"): (0.1, 99.0), ("a", "srgs"): (0.2, 99.0)})
     assert estimate.seconds([first, first]) == pytest.approx(2 * 100 * 0.1 * GROWTH)
-    estimate.add(third, {"wall_seconds": 60.0, "iterations": 100, "first_step_seconds": 0.15})  # grew 4 times
+    run = {"iterations": 100, "first_step_seconds": 0.15, "config": {"densify": {"max_gaussians": 2000}}}
+    estimate.add(third, {**run, "initial_points": 1900, "wall_seconds": 15.0})  # no room: tells no growth
+    assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * GROWTH)
+    estimate.add(third, {**run, "initial_points": 100, "wall_seconds": 60.0})  # four times slower
     assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * 4)
-    assert estimate.seconds([third]) == pytest.approx(60)
+    assert estimate.seconds([third]) == pytest.approx((15 + 60) / 2)
+    monkeypatch.setattr(estimate, "_first", {("a", "srgs"): (0.2, 1.5)})
+    assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * 1.5)
     assert [duration(s) for s in (59.6, 125, 11_100)] == ["60 s", "2 min", "3 h 05 min"]
