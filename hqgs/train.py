@@ -227,13 +227,16 @@ class Trainer:
         return min(self.gaussians.sh_degree, self.frugality.degree(self.iteration))
 
     def _set_rates(self) -> None:
-        """Exponential decay of the means' rate over the run; the others are constant. Harmonics above the
-        degree in use, which never had a gradient, are left out of Adam."""
+        """Exponential decay over the run. Harmonics above the degree in use, which never had a gradient, are
+        left out of Adam."""
         config = self.config
         part = self.frugality.part(self.iteration)
-        rate = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
         groups = {group["name"]: group for group in self.optimizer.param_groups}
-        groups["means"]["lr"] = rate
+        hold = config.lr_hold
+        falling = max(part - hold, 0.0) / (1 - hold) if hold < 1 else 0.0
+        for name in self.gaussians.named():
+            groups[name]["lr"] = getattr(config, f"lr_{name}") * config.lr_end**falling
+        groups["means"]["lr"] = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
         groups["shN"]["used"] = (self._active_degree() + 1) ** 2 - 1
 
     def _render(self, camera: Camera) -> tuple[Tensor, dict[str, Any]]:

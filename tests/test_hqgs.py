@@ -14,6 +14,7 @@ from test_srgs import fine_scene
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.camera import Scene, as_floats
+from hqgs.config import TrainConfig
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import degrade_scene
 from hqgs.densify import DensifyConfig, select_rows
@@ -150,6 +151,34 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
         assert trainer.config.densify.max_gaussians == int(0.2 * pixels / share), formation
     least = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed("lowres:4", gaussians_per_pixel=0.1)))
     assert least.config.densify.max_gaussians == len(scene.points)
+
+
+def test_under_noise_the_rates_of_long_runs_fall() -> None:
+    """Where nothing grows: without tracks the scene starts with fewer than its budget."""
+    scene = tiny_scene()
+    full = replace(scene, seen={view.name: np.arange(len(scene.points)) for view in scene.train})
+
+    def adapted(formation: str, iterations: int, photos: Scene = full, **changes: float) -> TrainConfig:
+        changes = {"gaussians_per_pixel": 20.0} | changes
+        config = tiny_config(iterations, method="hqgs", hqgs=fixed(formation, **changes))
+        return HQGS(photos, config.hqgs).adapt(config)
+
+    def falls(*given: object, **changes: float) -> bool:
+        config = adapted(*given, **changes)  # type: ignore[arg-type]
+        assert (config.lr_end < 1) == (config.lr_hold < 1)
+        return config.lr_end < 1
+
+    config = adapted("noise:20", 3_000 + 2 * 1_200)
+    assert config.lr_hold == pytest.approx(3_000 / config.iterations)
+    assert config.lr_end == pytest.approx(np.exp(-2))
+    assert adapted("noise:20", 10_000_000).lr_end > 0
+    assert falls("blur:1+noise:20", 10_000)
+    assert not falls("noise:20", 3_000)
+    assert not falls("blur:2", 10_000)
+    assert not falls("noise:20+jpeg:50", 10_000)
+    assert not falls("noise:20", 10_000, first_points=0.5)
+    assert not falls("noise:20", 10_000, scene)
+    assert falls("noise:20", 10_000, scene, gaussians_per_pixel=0.0)  # its points are its budget
 
 
 def test_degraded_photos_are_trained_without_resets() -> None:

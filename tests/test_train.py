@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -324,6 +325,20 @@ def test_scenes_that_cannot_be_trained_are_refused() -> None:
     view = View("odd.png", s.train[0].camera, s.train[0].image[:-1])
     with pytest.raises(ValueError, match=r"view 'odd.png': the image is uint8 \[15, 24, 3\].*\[16, 24, 3\]"):
         Trainer(Scene(s.name, [view], [], s.points, s.point_colors, s.source), tiny_config())
+
+
+def test_rates_fall_exponentially_to_their_ends() -> None:
+    config = replace(tiny_config(10), lr_hold=0.5, lr_end=0.01)
+    trainer = Trainer(tiny_scene(), config)
+    for k in range(1, 11):
+        trainer.step()
+        rates = {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
+        means = config.lr_means * (config.lr_means_final / config.lr_means) ** (k / 10)
+        assert rates.pop("means") == pytest.approx(trainer.extent * means)
+        assert set(rates) == {"quats", "scales", "opacities", "sh0", "shN"}
+        for name, rate in rates.items():
+            share = 0.01 ** (max(k - 5, 0) / 5)
+            assert rate == pytest.approx(getattr(config, f"lr_{name}") * share), name
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,8 @@ LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
+BORNE = 3_000  # iterations at full learning rates; with more, a whole budget of Gaussians learns the noise
+FALL = 1_200  # iterations in which the rates fall by e from then on
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -88,6 +90,8 @@ class HQGS(Plain):
       kept. More Gaussians paint the noise and the ringing of deblurring.
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at the depth of the points around them (`points_along_edges`).
+    - Noise, and a run that starts with its whole budget: the learning rates fall from iteration 3,000 on. At
+      constant rates the Gaussians learn the noise then.
     - No resets of the opacities: with growth at its budget, what a reset takes away seldom comes back where
       it was.
     - JPEG without noise: growth asks for less gradient, since within the cells there is none. A share k of
@@ -104,7 +108,7 @@ class HQGS(Plain):
         self.degradation = (
             self._diagnose(scene) if config.formation == AUTO else parse_degradation(config.formation)
         )
-        self._least = len(scene.points)
+        self._least, self._has_tracks = len(scene.points), scene.seen is not None
         kinds = {step.kind: step.value for step in self.degradation.steps}
         self.noise = float(kinds.get("noise") or 0.0) / 255
         self._factor = int(kinds.get("lowres") or 1)
@@ -152,10 +156,16 @@ class HQGS(Plain):
                 grad_threshold=threshold,
                 reset_every=max(densify.reset_every, densify.stop),
             )
+            if self._knee and self._starts_full(budget):
+                config = _falling_rates(config)
         method = config.method
         if method == AUTO:
             method = "hqgs" if self.degradation.steps else "3dgs"
         return replace(config, method=method, hqgs=hqgs, densify=densify)
+
+    def _starts_full(self, budget: int) -> bool:
+        """Whether the first points are as many as may ever be: nothing has to learn after growth."""
+        return self._least >= budget or (self._has_tracks and self.config.first_points == 1)
 
     def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
         what, points, colors = "first points along edges", scene.points, scene.point_colors
@@ -281,6 +291,14 @@ class HQGS(Plain):
                 self._cells[height, width] = JpegCells(tables_of_quality(self._jpeg), height, width)
             centres = self._cells[height, width].centres(torch.from_numpy(as_floats(array)))
         return Target(operator, photo, None if mask is None else torch.from_numpy(mask), centres)
+
+
+def _falling_rates(config: TrainConfig) -> TrainConfig:
+    """Full learning rates for `BORNE` iterations, then a fall by e in each `FALL`."""
+    rest = config.iterations - BORNE
+    if rest <= 0:
+        return config
+    return replace(config, lr_hold=BORNE / config.iterations, lr_end=max(math.exp(-rest / FALL), 1e-300))
 
 
 def _photo(view: View, factor: int) -> NDArray[np.uint8] | NDArray[np.float32]:
