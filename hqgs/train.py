@@ -214,13 +214,12 @@ class Trainer:
         self.guard = Guard(**meta["guard"])
 
     def _make_optimizer(self) -> Adam:
-        config = self.config
         groups: list[dict[str, Any]] = [
-            {"name": name, "params": [tensor.requires_grad_()], "lr": getattr(config, f"lr_{name}")}
+            {"name": name, "params": [tensor.requires_grad_()]}  # `_set_rates` has their rates
             for name, tensor in self.gaussians.named().items()
         ]
         own = [group | {"every_row": True} for group in self.method.param_groups()]
-        return Adam(groups + own, lr=0.0, eps=config.adam_eps)
+        return Adam(groups + own, lr=0.0, eps=self.config.adam_eps)
 
     def _active_degree(self) -> int:
         """Of the harmonics: it rises with the iterations."""
