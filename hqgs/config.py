@@ -32,8 +32,6 @@ class TrainConfig:
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
-    lr_hold: float = 1.0  # part of the run at these rates (but the means'); then they fall exponentially to
-    lr_end: float = 1.0  # this share of them at its end
     adam_eps: float = 1e-15
     selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
     leave_out: tuple[str, ...] = ()  # of `hqgs.left_out.ITEMS`: what the run may do without, where it pays

@@ -226,16 +226,15 @@ class Trainer:
         return min(self.gaussians.sh_degree, self.frugality.degree(self.iteration))
 
     def _set_rates(self) -> None:
-        """Exponential decay over the run. Harmonics above the degree in use, which never had a gradient, are
-        left out of Adam."""
-        config = self.config
+        """As far as the method leaves them; the means' decay exponentially over the run. Harmonics above the
+        degree in use, which never had a gradient, are left out of Adam."""
+        config, left = self.config, self.method.rate_left
         part = self.frugality.part(self.iteration)
         groups = {group["name"]: group for group in self.optimizer.param_groups}
-        hold = config.lr_hold
-        falling = max(part - hold, 0.0) / (1 - hold) if hold < 1 else 0.0
         for name in self.gaussians.named():
-            groups[name]["lr"] = getattr(config, f"lr_{name}") * config.lr_end**falling
-        groups["means"]["lr"] = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
+            groups[name]["lr"] = left * getattr(config, f"lr_{name}")
+        means = self.extent * config.lr_means ** (1 - part) * config.lr_means_final**part
+        groups["means"]["lr"] = left * means
         groups["shN"]["used"] = (self._active_degree() + 1) ** 2 - 1
 
     def _render(self, camera: Camera) -> tuple[Tensor, dict[str, Any]]:

@@ -55,8 +55,6 @@ class RunStore:
         config = {k: v for k, v in asdict(cell.config).items() if k not in METHODS or k == cell.row.method}
         if not config["leave_out"]:
             del config["leave_out"]  # runs from before there was such a choice are the same
-        if config["lr_end"] == 1.0:
-            del config["lr_hold"], config["lr_end"]  # so are those with rates that do not fall
         if cell.row.method == "hqgs" and cell.row.hqgs.guidance == PAPER:
             del config["hqgs"]["first_points"]  # so are the paper's, which has no use for it
         facts = {

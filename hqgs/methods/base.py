@@ -34,6 +34,11 @@ class Method(Protocol):
         """Standard deviation of the photos' noise as far as it is known, where 1 is white."""
         ...
 
+    @property
+    def rate_left(self) -> float:
+        """Share of the Gaussians' learning rates that the next step is to take, 0..1."""
+        ...
+
     def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
         """What of a render [H, W, 3] is compared with what of the photo (float), and the mask of the two."""
         ...
@@ -84,6 +89,10 @@ class Plain:
     name: str
     as_photographed = False
     noise = 0.0
+
+    @property
+    def rate_left(self) -> float:
+        return 1.0
 
     def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
         photo, mask = photo_tensors(view)

@@ -20,6 +20,7 @@ from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.first_points import Colors, Points, points_along_edges
 from hqgs.formation import Operator, formation
 from hqgs.gaussians import Gaussians
+from hqgs.held_pixels import HeldPixels
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
 from hqgs.methods.base import AUTO, Method, Plain, floats, photo_tensors
@@ -34,8 +35,7 @@ LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
-BORNE = 3_000  # iterations at full learning rates; with more, a whole budget of Gaussians learns the noise
-FALL = 1_200  # iterations in which the rates fall by e from then on
+DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -86,12 +86,15 @@ class HQGS(Plain):
     - None of them: the loss of 3DGS.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - The less the photos tell, the fewer Gaussians they determine: growth ends at a share of the pixels.
-      Blur and noise make a pixel count less, and a photo tells no more than the coefficients that its codec
-      kept. More Gaussians paint the noise and the ringing of deblurring.
+      Blur makes a pixel count less, and a photo tells no more than the coefficients that its codec kept. More
+      Gaussians paint the ringing of deblurring.
+    - Noise: growth ends at a multiple of E^(1/3), where E counts a pixel less for its noise. With M
+      anisotropic atoms the error of a picture with edges falls as M^-2 (Candes and Donoho 2004), and that by
+      the noise grows as M / E: their sum is least at an M that goes with E^(1/3).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at the depth of the points around them (`points_along_edges`).
-    - Noise, and a run that starts with its whole budget: the learning rates fall from iteration 3,000 on. At
-      constant rates the Gaussians learn the noise then.
+    - Noise: the learning rates are halved as often as a fiftieth of the pixels, which the loss leaves out,
+      finds that nothing is gained any more (`HeldPixels`). At constant rates the Gaussians learn the noise.
     - No resets of the opacities: with growth at its budget, what a reset takes away seldom comes back where
       it was.
     - JPEG without noise: growth asks for less gradient, since within the cells there is none. A share k of
@@ -108,7 +111,7 @@ class HQGS(Plain):
         self.degradation = (
             self._diagnose(scene) if config.formation == AUTO else parse_degradation(config.formation)
         )
-        self._least, self._has_tracks = len(scene.points), scene.seen is not None
+        self._least = len(scene.points)
         kinds = {step.kind: step.value for step in self.degradation.steps}
         self.noise = float(kinds.get("noise") or 0.0) / 255
         self._factor = int(kinds.get("lowres") or 1)
@@ -122,10 +125,19 @@ class HQGS(Plain):
         self._smallest: Tensor | None = None  # [N] world units; None: to be computed
         self._age = 0  # steps since it was
         self._targets = {view.name: self._target(view) for view in scene.train}
+        self._held: HeldPixels | None = None
+        if self._knee:
+            self._held = HeldPixels({name: (t.photo, t.mask) for name, t in self._targets.items()})
+            masks = self._held.masks
+            self._targets = {name: replace(t, mask=masks[name]) for name, t in self._targets.items()}
 
     @property
     def as_photographed(self) -> bool:
         return not self.degradation.steps
+
+    @property
+    def rate_left(self) -> float:
+        return 1.0 if self._held is None else self._held.rate_left
 
     def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
         if self.as_photographed:
@@ -141,13 +153,18 @@ class HQGS(Plain):
         densify = config.densify
         budget, threshold = densify.max_gaussians, densify.grad_threshold
         if self.degradation.steps:
-            told = sum(self._sharp_pixels(target) for target in self._targets.values())
+            targets = self._targets.values()
+            told = sum(self._sharp_pixels(target) for target in targets)
             if "jpeg" in kinds and "noise" not in kinds:
-                kept = sum(self._kept(target) for target in self._targets.values())
-                pixels = sum(target.photo[..., 0].numel() for target in self._targets.values())
+                kept = sum(self._kept(target) for target in targets)
+                pixels = sum(target.photo[..., 0].numel() for target in targets)
                 threshold = min(threshold, DensifyConfig.grad_threshold * math.sqrt(min(kept / pixels, 1.0)))
                 told = min(told, kept)
-            budget = min(budget, max(int(self.config.gaussians_per_pixel * told), self._least))
+            most = self.config.gaussians_per_pixel * told
+            if self.noise:
+                told = sum(self._sharp_pixels(target, self.noise) for target in targets)
+                most = min(most, DETERMINED * told ** (1 / 3))
+            budget = min(budget, max(int(most), self._least))
             if densify.reset_every < densify.stop:
                 self._left_out.append(("resets of the opacities", "a budget of Gaussians bears none"))
             densify = replace(
@@ -156,16 +173,10 @@ class HQGS(Plain):
                 grad_threshold=threshold,
                 reset_every=max(densify.reset_every, densify.stop),
             )
-            if self._knee and self._starts_full(budget):
-                config = _falling_rates(config)
         method = config.method
         if method == AUTO:
             method = "hqgs" if self.degradation.steps else "3dgs"
         return replace(config, method=method, hqgs=hqgs, densify=densify)
-
-    def _starts_full(self, budget: int) -> bool:
-        """Whether the first points are as many as may ever be: nothing has to learn after growth."""
-        return self._least >= budget or (self._has_tracks and self.config.first_points == 1)
 
     def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
         what, points, colors = "first points along edges", scene.points, scene.point_colors
@@ -198,13 +209,19 @@ class HQGS(Plain):
         self._smallest = None
 
     def state_dict(self) -> dict[str, Tensor]:
-        if self._smallest is None:
-            return {}
-        return {"smallest": self._smallest, "age": torch.tensor(self._age)}
+        state = {}
+        if self._held is not None:
+            state = {f"held.{name}": tensor for name, tensor in self._held.state_dict().items()}
+        if self._smallest is not None:
+            state |= {"smallest": self._smallest, "age": torch.tensor(self._age)}
+        return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self._smallest = state.get("smallest")
         self._age = int(state.get("age", 0))
+        if self._held is not None:
+            parts = {name: tensor for name, tensor in state.items() if name.startswith("held.")}
+            self._held.load_state_dict({name.removeprefix("held."): t for name, t in parts.items()})
 
     def loss(self, render: Tensor, view: View) -> Tensor:
         if self.as_photographed:
@@ -215,6 +232,8 @@ class HQGS(Plain):
             self._smallest = None
         target = self._targets[view.name]
         image = render if target.operator is None else target.operator(render)
+        if self._held is not None:
+            self._held.see(view.name, image)
         pixels = photometric_loss(image, target.photo, target.mask, self._dssim, self._knee)
         if target.centres is None:
             return STEEPER * pixels if self._knee else pixels
@@ -223,14 +242,15 @@ class HQGS(Plain):
         cells = self._cells[target.photo.shape[0], target.photo.shape[1]]
         return cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
 
-    def _sharp_pixels(self, target: Target) -> float:
+    def _sharp_pixels(self, target: Target, noise: float = 0.0) -> float:
         """How many sharp pixels without noise would tell as much as this photo does, roughly.
 
-        A blur of sigma px spreads a point over 4 pi sigma^2 pixels, a disc or a line over its own. Noise of
-        s levels asks for the mean of (s / HALVING)^2 more pixels until it is below what one pixel may be off.
+        A blur of sigma px spreads a point over 4 pi sigma^2 pixels, a disc or a line over its own. Noise (its
+        standard deviation, where 1 is white) of s levels asks for the mean of (s / HALVING)^2 more pixels
+        until it is below what one pixel may be off.
         """
         height, width = target.photo.shape[:2]
-        share = 1.0
+        share = 1.0 + (255 * noise / HALVING) ** 2
         for step in self.degradation.for_width(width * self._factor).steps:
             value = step.value or 0.0
             value_in_photo = value / self._factor
@@ -240,8 +260,6 @@ class HQGS(Plain):
                 share += math.pi * value_in_photo**2
             elif step.kind == "motion":
                 share += value_in_photo
-            elif step.kind == "noise":
-                share += (value / HALVING) ** 2
         return height * width / share
 
     @staticmethod
@@ -291,14 +309,6 @@ class HQGS(Plain):
                 self._cells[height, width] = JpegCells(tables_of_quality(self._jpeg), height, width)
             centres = self._cells[height, width].centres(torch.from_numpy(as_floats(array)))
         return Target(operator, photo, None if mask is None else torch.from_numpy(mask), centres)
-
-
-def _falling_rates(config: TrainConfig) -> TrainConfig:
-    """Full learning rates for `BORNE` iterations, then a fall by e in each `FALL`."""
-    rest = config.iterations - BORNE
-    if rest <= 0:
-        return config
-    return replace(config, lr_hold=BORNE / config.iterations, lr_end=max(math.exp(-rest / FALL), 1e-300))
 
 
 def _photo(view: View, factor: int) -> NDArray[np.uint8] | NDArray[np.float32]:

@@ -1,0 +1,156 @@
+"""The pixels that the loss leaves out, and the learning rates that follow them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+import torch
+from test_hqgs import fixed
+from tiny_scene import tiny_config, tiny_scene
+from torch import Tensor
+
+from hqgs.camera import View
+from hqgs.degradations import parse_degradation
+from hqgs.degrade import degrade_scene
+from hqgs.held_pixels import FACTOR, SHARE, STEPS, HeldPixels
+from hqgs.methods.hqgs import HQGS
+from hqgs.train import Trainer
+
+SIZE = (20, 30)
+
+
+def photos(count: int = 3) -> dict[str, tuple[Tensor, Tensor | None]]:
+    rng = np.random.default_rng(5)
+    return {f"{k}.png": (torch.from_numpy(rng.random((*SIZE, 3), np.float32)), None) for k in range(count)}
+
+
+def look(held: HeldPixels, given: dict[str, tuple[Tensor, Tensor | None]], offset: float) -> None:
+    """As many steps as lie between two looks, with renders that are `offset` off."""
+    names = list(given)
+    for k in range(len(names) * -(-STEPS // len(names))):
+        name = names[k % len(names)]
+        held.see(name, given[name][0] + offset)
+
+
+def test_a_fiftieth_of_the_pixels_that_count_is_held_back() -> None:
+    mask = torch.zeros(SIZE, dtype=torch.bool)
+    mask[:, :10] = True
+    given = photos(2) | {"mask.png": (photos()["0.png"][0], mask)}
+    masks = HeldPixels(given).masks
+    assert {name: int((~m).sum()) for name, m in masks.items() if name != "mask.png"} == {
+        "0.png": SHARE * 600,
+        "1.png": SHARE * 600,
+    }
+    assert int(masks["mask.png"].sum()) == 200 - SHARE * 200
+    assert not masks["mask.png"][~mask].any()
+    assert int(mask.sum()) == 200  # the given one is as it was
+    assert not torch.equal(masks["0.png"], masks["1.png"])
+    again = HeldPixels(given).masks
+    assert all(torch.equal(masks[name], again[name]) for name in masks)
+
+
+def test_only_held_pixels_are_looked_at() -> None:
+    given = photos()
+    held = HeldPixels(given)
+    look(held, given, 0.3)
+    for name, (photo, _) in given.items():
+        worse = torch.where(held.masks[name][..., None], photo + 9.0, photo + 0.2)
+        given[name] = (worse, None)
+    look(held, given, 0.0)
+    assert held.rate_left == 1.0
+
+
+def test_rates_are_halved_at_each_look_without_a_gain() -> None:
+    given = photos()
+    held = HeldPixels(given)
+    rates = []
+    for offset in (0.5, 0.4, 0.4, 0.41, 0.39, 0.395, 0.3):
+        look(held, given, offset)
+        rates.append(held.rate_left)
+    assert rates == [1, 1, FACTOR, FACTOR**2, FACTOR**2, FACTOR**3, FACTOR**3]
+
+
+def test_photos_are_compared_with_themselves() -> None:
+    """A photo that comes in later, or is left out for a while, is no gain and no loss."""
+    given = photos()
+    first = {name: given[name] for name in ("0.png", "1.png")}
+    held = HeldPixels(given)
+    for offset in (0.5, 0.4):
+        for k in range(201):
+            held.see(f"{k % 2}.png", first[f"{k % 2}.png"][0] + offset)
+    for k in range(201):
+        name = f"{k % 3}.png"
+        held.see(name, given[name][0] + (5.0 if k % 3 == 2 else 0.39))
+    assert held.rate_left == 1.0
+    for _ in range(201):
+        held.see("2.png", given["2.png"][0] + 4.0)
+    assert held.rate_left == 1.0
+
+
+def test_what_is_not_finite_is_passed_over() -> None:
+    given = photos() | {"masked.png": (photos()["0.png"][0], torch.zeros(SIZE, dtype=torch.bool))}
+    held = HeldPixels(given)
+    look(held, given, 0.5)
+    held.see("0.png", torch.full((*SIZE, 3), torch.nan))
+    look(held, given, 0.4)
+    look(held, given, 0.4)
+    assert held.rate_left == FACTOR
+    look(held, given, torch.nan)
+    assert held.rate_left == FACTOR
+
+
+def test_its_state_goes_on_where_it_was() -> None:
+    given = photos()
+    one, other = HeldPixels(given), HeldPixels(given)
+    for offset in (0.5, 0.6):
+        look(one, given, offset)
+    for k in range(100):
+        one.see(f"{k % 3}.png", given[f"{k % 3}.png"][0] + 0.7)
+    other.load_state_dict(one.state_dict())
+    for held in (one, other):
+        for k in range(100, 201):
+            held.see(f"{k % 3}.png", given[f"{k % 3}.png"][0] + 0.4)
+    assert one.rate_left == other.rate_left == FACTOR**2
+    ends = one.state_dict(), other.state_dict()
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+    with pytest.raises(ValueError, match=r"sums is \[3\], wanted \[2\]"):
+        HeldPixels(photos(2)).load_state_dict(one.state_dict())
+    with pytest.raises(KeyError, match="counts"):
+        other.load_state_dict({k: v for k, v in one.state_dict().items() if k != "counts"})
+
+
+def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
+    """Grey photos have nothing else to learn. The scene stays nearer to the grey for it, and a checkpoint
+    changes no bit."""
+    clean = tiny_scene()
+    grey = [replace(view, image=np.full_like(view.image, 128)) for view in clean.train]
+    scene = degrade_scene(replace(clean, train=grey), parse_degradation("noise:50"), 0)
+    fast = {"lr_sh0": 0.02, "lr_shN": 0.01, "lr_scales": 0.03, "lr_quats": 0.01, "lr_opacities": 0.2}
+    config = tiny_config(1_000, method="hqgs", hqgs=fixed("noise:50"), **fast)
+    trainer, constant = Trainer(scene, config), Trainer(scene, config)
+    with patch.object(HQGS, "rate_left", 1.0):
+        while constant.iteration < config.iterations:
+            constant.step()
+    while trainer.iteration < config.iterations:
+        trainer.step()
+        if trainer.iteration == 700:
+            trainer.save(tmp_path / "c")
+    assert trainer.method.rate_left <= FACTOR**2
+    errors = [error_of_grey(t, scene.train) for t in (trainer, constant)]
+    assert errors[0] < 0.97 * errors[1]
+    resumed = Trainer(scene, config)
+    resumed.restore(tmp_path / "c")
+    while resumed.iteration < config.iterations:
+        resumed.step()
+    assert torch.equal(resumed.gaussians.means, trainer.gaussians.means)
+    assert resumed.method.rate_left == trainer.method.rate_left
+
+
+def error_of_grey(trainer: Trainer, views: list[View]) -> float:
+    with torch.no_grad():
+        renders = [trainer._render(view.camera)[0] for view in views]
+    return float(torch.stack(renders).sub(128 / 255).square().mean())
