@@ -118,7 +118,7 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
     pixels = sum(view.image[..., 0].size for view in scene.train)
 
     def trainer(scene: Scene, formation: str = "noise:6", **changes: float) -> Trainer:
-        hqgs = HQGSConfig(formation=formation, gaussians_per_pixel=0.4, **changes)  # type: ignore[arg-type]
+        hqgs = HQGSConfig(formation=formation, gaussians_per_pixel=0.2, **changes)  # type: ignore[arg-type]
         return Trainer(scene, tiny_config(method="hqgs", hqgs=hqgs))
 
     started = trainer(sparse)
