@@ -144,6 +144,12 @@ def _first_points(trainer: Trainer) -> list[str]:
     return [f"started from the scene's {own} points and {more} more along the photos' edges"] if more else []
 
 
+def _rates(trainer: Trainer) -> list[str]:
+    left = trainer.method.rate_left
+    why = "pixels held back from the noisy photos showed no gain any more"
+    return [f"the learning rates fell to 1/{1 / left:.0f}: {why}"] if left < 1 else []
+
+
 def _write_results(trainer: Trainer, out: Path) -> RunResult:
     scene, config = trainer.scene, trainer.config
     left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
@@ -170,7 +176,7 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
     result = RunResult(
         scene=scene.name,
         source=scene.source,
-        notes=[*scene.notes, *_first_points(trainer)],
+        notes=[*scene.notes, *_first_points(trainer), *_rates(trainer)],
         method=config.method,
         seed=config.seed,
         iterations=trainer.iteration,

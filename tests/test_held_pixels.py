@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -18,6 +19,7 @@ from hqgs.degradations import parse_degradation
 from hqgs.degrade import degrade_scene
 from hqgs.held_pixels import FACTOR, SHARE, STEPS, HeldPixels
 from hqgs.methods.hqgs import HQGS
+from hqgs.run import run
 from hqgs.train import Trainer
 
 SIZE = (20, 30)
@@ -142,6 +144,10 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
     assert trainer.method.rate_left <= FACTOR**2
     errors = [error_of_grey(t, scene.train) for t in (trainer, constant)]
     assert errors[0] < 0.97 * errors[1]
+    run(trainer, tmp_path / "out", progress=False)  # which only writes
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert any(note.startswith("the learning rates fell to 1/") for note in report["notes"])
+    assert any(entry["what"] == "1/50 of each photo's pixels in the loss" for entry in report["left_out"])
     resumed = Trainer(scene, config)
     resumed.restore(tmp_path / "c")
     while resumed.iteration < config.iterations:

@@ -20,7 +20,7 @@ from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.first_points import Colors, Points, points_along_edges
 from hqgs.formation import Operator, formation
 from hqgs.gaussians import Gaussians
-from hqgs.held_pixels import HeldPixels
+from hqgs.held_pixels import SHARE, HeldPixels
 from hqgs.jpeg_cells import Coefficients, JpegCells, tables_of_quality
 from hqgs.losses import photometric_loss
 from hqgs.methods.base import AUTO, Method, Plain, floats, photo_tensors
@@ -128,6 +128,8 @@ class HQGS(Plain):
         self._held: HeldPixels | None = None
         if self._knee:
             self._held = HeldPixels({name: (t.photo, t.mask) for name, t in self._targets.items()})
+            what = f"1/{1 / SHARE:.0f} of each photo's pixels in the loss"
+            self._left_out.append((what, "they tell when the scene would start to learn the noise"))
             masks = self._held.masks
             self._targets = {name: replace(t, mask=masks[name]) for name, t in self._targets.items()}
 
