@@ -12,6 +12,7 @@ from torch import Tensor
 SHARE = 1 / 50  # of the pixels of each photo
 STEPS = 200  # at least, from one look to the next
 FACTOR = 0.5  # what is left of the learning rates after a look without a gain
+LEAST = FACTOR**20  # share of the rates below which nothing moves any more
 
 
 class HeldPixels:
@@ -74,7 +75,7 @@ class HeldPixels:
         gains = self._best - now
         known = torch.isfinite(gains)
         if known.any() and gains[known].mean() <= 0:
-            self.rate_left *= FACTOR
+            self.rate_left = max(self.rate_left * FACTOR, LEAST)
         else:
             self._best = torch.where(torch.isfinite(now), now, self._best)
         self._sums.zero_()

@@ -17,7 +17,7 @@ from torch import Tensor
 from hqgs.camera import View
 from hqgs.degradations import parse_degradation
 from hqgs.degrade import degrade_scene
-from hqgs.held_pixels import FACTOR, SHARE, STEPS, HeldPixels
+from hqgs.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels
 from hqgs.methods.hqgs import HQGS
 from hqgs.run import run
 from hqgs.train import Trainer
@@ -74,6 +74,9 @@ def test_rates_are_halved_at_each_look_without_a_gain() -> None:
         look(held, given, offset)
         rates.append(held.rate_left)
     assert rates == [1, 1, FACTOR, FACTOR**2, FACTOR**2, FACTOR**3, FACTOR**3]
+    for _ in range(25):
+        look(held, given, 0.6)
+    assert held.rate_left == LEAST > 0
 
 
 def test_photos_are_compared_with_themselves() -> None:
