@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hqgs.camera import as_floats
+
 SHARE = 1 / 50  # of the pixels of each photo
 STEPS = 200  # at least, from one look to the next
 FACTOR = 0.5  # what is left of the learning rates after a look without a gain
@@ -37,9 +39,8 @@ class HeldPixels:
             drawn = np.random.default_rng(k).choice(places, math.ceil(SHARE * len(places)), replace=False)
             held = torch.from_numpy(drawn)
             counts.view(-1)[held] = False
-            colors = photo.reshape(-1, 3)[held]
             self.masks[name] = counts
-            self._held.append((held, colors if photo.is_floating_point() else colors / 255))
+            self._held.append((held, torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))))
         self._interval = len(photos) * math.ceil(STEPS / len(photos))
         self._steps = 0
         self._sums, self._counts = torch.zeros(2, len(photos), dtype=torch.float64)

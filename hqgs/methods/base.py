@@ -89,10 +89,7 @@ class Plain:
     name: str
     as_photographed = False
     noise = 0.0
-
-    @property
-    def rate_left(self) -> float:
-        return 1.0
+    rate_left = 1.0
 
     def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
         photo, mask = photo_tensors(view)

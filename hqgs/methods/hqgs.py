@@ -222,8 +222,8 @@ class HQGS(Plain):
         self._smallest = state.get("smallest")
         self._age = int(state.get("age", 0))
         if self._held is not None:
-            parts = {name: tensor for name, tensor in state.items() if name.startswith("held.")}
-            self._held.load_state_dict({name.removeprefix("held."): t for name, t in parts.items()})
+            own = {n.removeprefix("held."): t for n, t in state.items() if n.startswith("held.")}
+            self._held.load_state_dict(own)
 
     def loss(self, render: Tensor, view: View) -> Tensor:
         if self.as_photographed:
