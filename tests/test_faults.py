@@ -32,19 +32,17 @@ from PIL import Image
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
-import hqgs.run
-from hqgs import cli
-from hqgs.bench.cli import BENCHMARKS
-from hqgs.bench.output import Benchmark, Report
-from hqgs.checkpoint import FolderBusyError, load_checkpoint, save_checkpoint
-from hqgs.config import TrainConfig
-from hqgs.data import load_scene
-from hqgs.data.colmap_write import write_colmap as write_model
-from hqgs.densify import DensifyConfig
-from hqgs.files import write_json
-from hqgs.ply import read_ply, write_ply
-from hqgs.run import CHECKPOINT, PLY, train
-from hqgs.train import Trainer
+from benchmarks.cli import BENCHMARKS
+from benchmarks.output import Benchmark, Report
+from hqgs.base.files import CHECKPOINT, PLY, FolderBusyError, write_json
+from hqgs.cli import main as cli
+from hqgs.export.ply import read_ply, write_ply
+from hqgs.pipeline import train
+from hqgs.scene.formats.colmap import write_colmap as write_model
+from hqgs.scene.load import load_scene
+from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
+from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.trainer import Trainer
 
 KILLS = 50 if os.environ.get("HQGS_LONG") else 6
 NOBODY = 65534  # the user id without rights
@@ -92,7 +90,7 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
 def processes() -> ForkServerContext:
     """Children that start from a process in which everything is imported already."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hqgs.cli", "tiny_scene", "piq"])
+    context.set_forkserver_preload(["hqgs.cli.main", "tiny_scene", "piq"])
     return context
 
 
@@ -447,7 +445,7 @@ def test_a_clock_that_goes_backwards_gives_no_negative_time(
 
     monkeypatch.setattr(time, "time", backwards)
     monkeypatch.setattr(time, "time_ns", lambda: int(backwards() * 1e9))
-    hqgs.run.train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    train(tiny_scene(), tiny_config(), tmp_path, progress=False)
     report = json.loads((tmp_path / "report.json").read_text())
     seconds = [0.0, *(entry["seconds"] for entry in report["history"]), report["seconds"]]
     assert seconds == sorted(seconds)
