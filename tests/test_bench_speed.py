@@ -1,5 +1,5 @@
-"""The benchmark `speed` at tiny sizes: the fields of its JSON, numbers that agree with each other and with those
-of another computation, and what it says when something is missing."""
+"""`speed` at tiny sizes: the fields of its JSON, numbers that agree with each other and with those of another
+computation, and what it says when something is missing."""
 
 from __future__ import annotations
 

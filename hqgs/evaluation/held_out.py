@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.render import render_view
+from hqgs.model.render import BACKGROUND, render_view
 from hqgs.scene.scene import Scene
-from hqgs.training.config import TrainConfig
 
 
 def held_out_renders(scene: Scene, gaussians: Gaussians) -> list[NDArray[np.float32]]:
     """The held-out views [H, W, 3] as training renders them, not clamped."""
-    background = TrainConfig().background
     with one_torch_thread(), torch.no_grad():
         return [
-            render_view(gaussians, view.camera, gaussians.sh_degree, background)[0].numpy()
+            render_view(gaussians, view.camera, gaussians.sh_degree, BACKGROUND)[0].numpy()
             for view in scene.test
         ]
 

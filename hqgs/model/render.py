@@ -15,6 +15,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
 from hqgs.scene.scene import Camera, View
 
+BACKGROUND = (0.0, 0.0, 0.0)  # RGB
 OPTIONS = (
     0.01,
     1e10,

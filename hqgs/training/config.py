@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from hqgs.model.gaussians import MAX_SH_DEGREE
+from hqgs.model.render import BACKGROUND
 from hqgs.photos.formula import parse_degradation
 
 AUTO, NONE = "auto", "none"
@@ -214,7 +215,7 @@ class TrainConfig:
     adam_eps: float = 1e-15
     selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
     leave_out: tuple[str, ...] = ()  # of `hqgs.left_out.ITEMS`: what the run may do without, where it pays
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # RGB
+    background: tuple[float, float, float] = BACKGROUND  # RGB
     eval_every: int = 3_000  # iterations between evaluations on the held-out views
     checkpoint_every: int = 1_000  # iterations; does not change the result
     densify: DensifyConfig = field(default_factory=DensifyConfig)
