@@ -1,4 +1,4 @@
-"""Running COLMAP in a process of its own (`sfm_program.py`), and reading what it found."""
+"""Running COLMAP in a process of its own (`program.py`), and reading what it found."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hqgs.base.files import keep_folder
 from hqgs.scene.formats.colmap import LEAST_PHOTOS
 from hqgs.scene.scene import Camera
 
-PROGRAM = Path(__file__).with_name("sfm_program.py")
+PROGRAM = Path(__file__).with_name("program.py")
 
 
 def run_colmap(
