@@ -23,6 +23,7 @@ PAGES = [*ROOT.glob("*.md"), *sorted(ROOT.glob("docs/**/*.md"))]
 FOLDERS = ("benchmarks", "docs", "examples", "hqgs", "rust", "tests", ".ci")  # whose paths are checked
 SOURCES = (".py", ".rs", ".toml", ".md")  # a name with such an end is a path from the repository's top
 CLASSES = ("hqgs", "hqgs.model.gaussians", "hqgs.scene.scene", "hqgs.training.config")  # of `Scene.extent`
+TOOLS = ("pip", "pytest", "ruff", "sphinx-build")  # of others, whose flags are not checked
 PARSERS = {"hqgs": hqgs_parser, "benchmarks": benchmarks_parser}
 FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", flags=re.DOTALL | re.MULTILINE)
 
@@ -74,7 +75,7 @@ def _wrong_mention(words: list[str]) -> list[str]:
         return _wrong_flags(words, known, "any command")
     parser, arguments = _parser_of(words)
     if parser is None:
-        return []
+        return [f"command {words[0]}"] if _flags(words) and words[0] not in TOOLS else []
     commands = _commands_of(parser)
     if not arguments or arguments[0] == "--help":
         return []

@@ -37,7 +37,7 @@ def test_the_command_of_a_report_can_still_be_given(report: Path) -> None:
     [
         "see `hqgs/scene/load.py`, `rust/`, `docs/results/*.json` and [the README](README.md)",
         "`train --sfm`, `--leave-out none`, `python -m hqgs export`, `uv run pytest tests/test_docs.py`",
-        "`hqgs.rasterization`, `hqgs.scene.load.load_scene` and `Scene.seen`, but not `report.json`, `sparse/0` or `mixed`",
+        "`hqgs.rasterization`, `hqgs.scene.load.load_scene`, `Scene.seen`; not `report.json` or `sparse/0`",
         "```sh\nuv run python -m hqgs train FOLDER --out DIR  # a comment\n```",
         "```python\nimport hqgs\nhqgs.set_num_threads(2)\n```",
     ],
@@ -58,6 +58,7 @@ def test_what_exists_is_not_found_wrong(page: str) -> None:
         ("`--guidance papr`", "--guidance papr"),
         ("`uv run python -m hqgs trian FOLDER`", "command trian"),
         ("`python -m benchmarks qualty --sfm`", "command qualty"),
+        ("`bench quality --sfm`", "command bench"),
         ("`examples/train_llff.py --epochs 3`", "examples/train_llff.py --epochs"),
         ("`cargo bench --bench nothing`", "cargo --bench nothing"),
         ("`hqgs.rasterise`", "name hqgs.rasterise"),
