@@ -66,7 +66,7 @@ def rasterization(
         backgrounds: colour behind everything, [C, D]; None is 0.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), "RGB+D" or "RGB+ED"; depth is
             the last channel.
-        absgrad: also leave the sum over pixels of |d loss / d means2d| in `meta["means2d"].absgrad`.
+        absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
 
@@ -74,7 +74,7 @@ def rasterization(
         render_colors [C, height, width, X], render_alphas [C, height, width, 1], and a dict with means2d
         [C, N, 2] (call `.retain_grad()` on it to get its gradient), radii [C, N, 2] int32 (0 where
         culled), depths [C, N], conics [C, N, 3], opacities [C, N], width, height, n_cameras, tile_size
-        and work (pairs, blocks evaluated, blocks with a change; `hqgs.work.work_counts` counts more).
+        and work (pairs, blocks evaluated, blocks with a change; `hqgs.model.work_counts` counts more).
 
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.

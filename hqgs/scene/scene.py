@@ -63,7 +63,7 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """Radius of the camera positions: 1.1 max |c - mean(c)|, or 1 for a single camera."""
+        """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera."""
         centers = np.stack([v.camera.center for v in self.train])
         radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
         return 1.1 * radius if radius > 0 else 1.0

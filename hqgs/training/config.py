@@ -148,15 +148,17 @@ class PaperConfig:
     The paper gives one row of figures, V1 (3DGS) to V7 (everything), for five parts. Read so that each
     variant is a method and that V4 may be worse than V3, as it is there:
 
-    | variant | SAF | EAF | concat | CA | loss | F' |
-    |---|---|---|---|---|---|---|
-    | V1 | | | | | L1 + D-SSIM | none: 3DGS |
-    | V2 | x | | | | L1 + D-SSIM | SAF |
-    | V3 | | x | | | L1 + D-SSIM | EAF |
-    | V4 | x | x | | | L1 + D-SSIM | SAF + EAF |
-    | V5 | x | x | x | | L1 + D-SSIM | [SAF; EAF] |
-    | V6 | x | x | x | x | L1 + D-SSIM | [CA; EAF] |
-    | V7 | x | x | x | x | L1 + 5 SCS | [CA; EAF] |
+    =======  ===  ===  ======  ==  ===========  ==========
+    variant  SAF  EAF  concat  CA  loss         F'
+    =======  ===  ===  ======  ==  ===========  ==========
+    V1                             L1 + D-SSIM  none: 3DGS
+    V2       x                     L1 + D-SSIM  SAF
+    V3            x                L1 + D-SSIM  EAF
+    V4       x    x                L1 + D-SSIM  SAF + EAF
+    V5       x    x    x           L1 + D-SSIM  [SAF; EAF]
+    V6       x    x    x       x   L1 + D-SSIM  [CA; EAF]
+    V7       x    x    x       x   L1 + 5 SCS   [CA; EAF]
+    =======  ===  ===  ======  ==  ===========  ==========
 
     L1 + D-SSIM is 3DGS's, with the weights 0.8 and 0.2. The ablation of losses is V7 with each `loss`.
     """

@@ -1,4 +1,4 @@
-"""COLMAP in a process of its own: the program `python sfm_program.py COMMAND DIRECTORY`.
+"""COLMAP in a process of its own: the program `python program.py COMMAND DIRECTORY`.
 
 So a crash or a hang of COLMAP cannot take its caller along. It imports nothing of hqgs, so that it starts at
 once. DIRECTORY holds `input.npz`: photos (the folder), names [V], and of known cameras sizes [V, 2] as width
