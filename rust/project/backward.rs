@@ -1,17 +1,21 @@
 //! Vector-Jacobian product of the projection.
 
-use super::{Inputs, ProjectOptions, Projection, Shading, chunks, direction, narrow3};
-use crate::{
-    camera::{Camera, CameraGrad},
-    columns::{self, Column, GROUP, get3, wide3},
-    constants::PROJECT_CHUNK,
-    fresh::{Blank, Fresh},
+use super::{
+    Inputs, ProjectOptions, Projection, Shading, chunks, direction,
     geometry::{CameraGradLanes, CameraLanes, Cotangent, GeometryGrad},
-    lanes::{Wide, lanes, splat as splat_lanes, splat3},
-    real::{Lanes, Real},
-    scene::Gaussians,
-    sh,
-    work::Work,
+    narrow3, sh,
+};
+use crate::{
+    constants::PROJECT_CHUNK,
+    counts::Counts,
+    scene::{Camera, CameraGrad, Gaussians},
+    simd::{
+        Lanes, Real, Wide,
+        groups::{self, Column, GROUP, get3, wide3},
+        lanes, splat as splat_lanes,
+        vec3::splat3,
+    },
+    uninit::{UninitPiece, UninitVec},
 };
 use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, dispatch};
 use rayon::prelude::*;
@@ -57,10 +61,10 @@ impl<T: Real> Cotangents<T> {
     #[inline(always)]
     fn read<S: Simd>(&mut self, simd: S, v: &ProjectCotangents<T>, first: usize) {
         if let Some(v) = v.means2d {
-            columns::read(simd, v, first, &mut self.means2d);
+            groups::read(simd, v, first, &mut self.means2d);
         }
         if let Some(v) = v.whitened {
-            columns::read(simd, v, first, &mut self.whitened);
+            groups::read(simd, v, first, &mut self.whitened);
         }
         if let Some(v) = v.opacities {
             self.opacities.load(v, first);
@@ -69,10 +73,10 @@ impl<T: Real> Cotangents<T> {
             self.depths.load(v, first);
         }
         if let Some(v) = v.conics {
-            columns::read(simd, v, first, &mut self.conics);
+            groups::read(simd, v, first, &mut self.conics);
         }
         if let Some(v) = v.colors {
-            columns::read(simd, v, first, &mut self.colors);
+            groups::read(simd, v, first, &mut self.colors);
         }
     }
 
@@ -140,13 +144,13 @@ pub struct GaussianGrads<T> {
     /// Of the camera.
     pub camera: CameraGrad,
     /// Counts.
-    pub work: Work,
+    pub counts: Counts,
 }
 
 /// What one job fills of it: empty where not wanted.
 struct BackwardChunk<'a, T> {
     /// Of the means, quaternions, scales, opacities, harmonics and their rest.
-    outs: [Blank<'a, T>; 6],
+    outs: [UninitPiece<'a, T>; 6],
     /// Numbers per Gaussian, in that order.
     rows: [usize; 6],
 }
@@ -190,7 +194,7 @@ pub fn backward<T: Real>(
         (wanted.harmonics_rest, rest_row),
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
-    let mut arrays = rows.map(|row| Fresh::<T>::new(row * n));
+    let mut arrays = rows.map(|row| UninitVec::<T>::new(row * n));
     let [means, quats, scales, opacities, sh, rest] = &mut arrays;
     let jobs: Vec<_> = chunks(means, n, rows[0])
         .into_iter()
@@ -214,12 +218,12 @@ pub fn backward<T: Real>(
             ))
         })
         .collect();
-    let (mut camera_grad, mut work) = (CameraGrad::ZERO, Work::default());
+    let (mut camera_grad, mut counts) = (CameraGrad::ZERO, Counts::default());
     for (part, more) in &parts {
         camera_grad.add(part);
-        work = work.plus(*more);
+        counts = counts.plus(*more);
     }
-    let [means, quats, scales, opacities, sh, rest] = arrays.map(Fresh::finish);
+    let [means, quats, scales, opacities, sh, rest] = arrays.map(UninitVec::finish);
     GaussianGrads {
         means,
         quats,
@@ -228,7 +232,7 @@ pub fn backward<T: Real>(
         harmonics: sh,
         harmonics_rest: rest,
         camera: camera_grad,
-        work,
+        counts,
     }
 }
 
@@ -245,7 +249,7 @@ fn backward_chunk<S: Simd, T: Real>(
     begin: usize,
     mut chunk: BackwardChunk<T>,
     camera_wanted: bool,
-) -> (CameraGrad, Work) {
+) -> (CameraGrad, Counts) {
     let zero = splat_lanes(simd, 0.0);
     let camera_lanes = CameraLanes::new(
         simd,
@@ -263,7 +267,7 @@ fn backward_chunk<S: Simd, T: Real>(
         || v.opacities.is_some()
         || v.depths.is_some()
         || v.conics.is_some();
-    let mut work = Work::default();
+    let mut counts = Counts::default();
     let mut colors = ColorGroup::ZERO;
     let mut out = GradColumns::<T>::ZERO;
     let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
@@ -287,7 +291,7 @@ fn backward_chunk<S: Simd, T: Real>(
         inputs.read(simd, gaussians, first);
         let mut v_colors = None;
         if let (Some(shading), true) = (shading, v.colors.is_some()) {
-            work.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
+            counts.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
             let (means, directions) = (&inputs.means, &mut colors.directions);
             for at in (0..GROUP).step_by(lanes::<S>()) {
                 let (d, inverse) = direction(simd, wide3(simd, means, at), center);
@@ -301,7 +305,7 @@ fn backward_chunk<S: Simd, T: Real>(
             colors.backward(simd, shading, first / GROUP, &cotangents.colors, visible);
             v_colors = Some(shading);
         }
-        work.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
+        counts.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
         for at in (0..GROUP).step_by(lanes::<S>()) {
             // Not those that were culled, nor those beyond the end.
             let valid = lanes_in(simd, visible, at);
@@ -352,24 +356,24 @@ fn backward_chunk<S: Simd, T: Real>(
             opacities,
         } = &out;
         let [means, quats, scales, alphas, first_rows, rest_rows] = &mut buffers;
-        columns::write([&x.0, &y.0, &z.0], means);
-        columns::write([&q0.0, &q1.0, &q2.0, &q3.0], quats);
-        columns::write([&s0.0, &s1.0, &s2.0], scales);
-        columns::write([&opacities.0], alphas);
+        groups::write([&x.0, &y.0, &z.0], means);
+        groups::write([&q0.0, &q1.0, &q2.0, &q3.0], quats);
+        groups::write([&s0.0, &s1.0, &s2.0], scales);
+        groups::write([&opacities.0], alphas);
         if let Some(shading) = v_colors {
             let used = 3 * sh::count(shading.degree);
             let in_first = used.min(shading.rows.0);
             let (v_first, v_rest) = colors.v_coefficients[..used].split_at(in_first);
             if row > 0 {
-                columns::write_rows(simd, v_first, first_rows, row);
+                groups::write_rows(simd, v_first, first_rows, row);
             }
             if rest_row > 0 {
-                columns::write_rows(simd, v_rest, rest_rows, rest_row);
+                groups::write_rows(simd, v_rest, rest_rows, rest_row);
             }
         }
         chunk.put(&buffers, rows);
     }
-    (camera_grad.sum(), work)
+    (camera_grad.sum(), counts)
 }
 
 /// Gradients of a group in the type of the inputs.

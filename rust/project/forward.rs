@@ -1,20 +1,24 @@
 //! Projection, forward.
 
 use super::{
-    Inputs, ProjectOptions, Projection, Shading, Slopes, Splat, chunks, direction, narrow3,
+    Inputs, ProjectOptions, Projection, Shading, Slopes, Splat, chunks, direction,
+    geometry::{CameraLanes, Geometry},
+    narrow3, sh,
 };
 use crate::{
-    camera::Camera,
-    columns::{self, Column, GROUP, MAX_COLUMNS, Rows, get3},
+    accuracy_knobs::Spans,
     constants::{FACTOR_MAX, PROJECT_CHUNK, SUPPORT_SLACK, TILE},
-    fresh::{Blank, Fresh},
-    geometry::{CameraLanes, Geometry},
-    lanes::{V3, Wide, lanes, ln, splat as splat_lanes, splat3},
-    real::{Lanes, Real},
-    scene::{Colors, Gaussians, Harmonics},
-    sh,
-    tuning::Spans,
-    work::Work,
+    counts::Counts,
+    scene::{Camera, Colors, Gaussians, Harmonics},
+    simd::{
+        Lanes, Real, Wide,
+        groups::{self, Column, GROUP, MAX_COLUMNS, Rows, get3},
+        lanes,
+        math::ln,
+        splat as splat_lanes,
+        vec3::{V3, splat3},
+    },
+    uninit::{UninitPiece, UninitVec},
 };
 use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, SimdMask, dispatch};
 use rayon::prelude::*;
@@ -39,7 +43,7 @@ pub struct Projected<T> {
     /// How they change, if asked for.
     pub shading: Option<Shading<T>>,
     /// Counts.
-    pub work: Work,
+    pub counts: Counts,
 }
 
 /// What one job fills of it; zeros before.
@@ -59,7 +63,11 @@ struct ForwardChunk<'a, T> {
 }
 
 /// The same for an array with `row` entries for each group of them, of which a chunk holds a whole number.
-fn group_chunks<T: Copy>(array: &mut Fresh<T>, n: usize, row: usize) -> Vec<Blank<'_, T>> {
+fn group_chunks<T: Copy>(
+    array: &mut UninitVec<T>,
+    n: usize,
+    row: usize,
+) -> Vec<UninitPiece<'_, T>> {
     const GROUPS: usize = PROJECT_CHUNK / GROUP;
     let (groups, count) = (n.div_ceil(GROUP), n.div_ceil(PROJECT_CHUNK));
     array.cut((0..count).map(|c| GROUPS.min(groups - c * GROUPS) * row))
@@ -84,7 +92,7 @@ impl<T: Real> Coefficients<T> {
         let (row, rest_row) = h.rows();
         if let Some(rest) = h.rest {
             let (low, high) = self.columns.split_first_chunk_mut::<3>().expect("3 of 64");
-            columns::read(simd, h.coefficients, first, low);
+            groups::read(simd, h.coefficients, first, low);
             self.rows.read(simd, rest, rest_row, first, used - 3, high);
         } else {
             self.rows
@@ -178,7 +186,7 @@ impl Group {
         let mean = g.mean2d(camera_lanes);
         let sigma = g.sigma();
         let conic = g.conic();
-        let floor = o.tuning.alpha_min;
+        let floor = o.knobs.alpha_min;
         let opaque = opacity.simd_ge(splat_lanes(simd, floor)) & opacity.simd_lt(infinity);
         let radius = (ln(simd, opacity * (1.0 / floor)).max(zero) * 2.0).sqrt();
         let [s, m, t] = g.factors;
@@ -194,7 +202,7 @@ impl Group {
                 & (mean[k] - radii).simd_lt(splat_lanes(simd, size[k]));
             largest = largest.max(radii);
             // Tiles whose pixel centres lie within `mean +- extent`, clipped to the image.
-            let extent = match o.tuning.spans {
+            let extent = match o.knobs.spans {
                 Spans::Square => g.largest_sigma() * 3.0,
                 Spans::Ellipse | Spans::Box => reach * sigma[k],
             };
@@ -265,11 +273,14 @@ pub fn forward<T: Real>(
     let clamped = usize::from(shaded.is_some());
     let sloped = usize::from(shaded.is_some_and(|h| h.degree > 0));
     let groups = n.div_ceil(GROUP);
-    let (mut splats, mut keys) = (Fresh::new(n), Fresh::new(n));
-    let (mut means2d, mut depths) = (Fresh::new(2 * n), Fresh::new(n));
-    let (mut conics, mut radii) = (Fresh::new(3 * n), Fresh::new(2 * n));
-    let (mut opacities, mut rgb) = (Fresh::new(n), Fresh::new(channels * n));
-    let (mut slopes, mut clamps) = (Fresh::new(sloped * groups), Fresh::new(clamped * groups));
+    let (mut splats, mut keys) = (UninitVec::new(n), UninitVec::new(n));
+    let (mut means2d, mut depths) = (UninitVec::new(2 * n), UninitVec::new(n));
+    let (mut conics, mut radii) = (UninitVec::new(3 * n), UninitVec::new(2 * n));
+    let (mut opacities, mut rgb) = (UninitVec::new(n), UninitVec::new(channels * n));
+    let (mut slopes, mut clamps) = (
+        UninitVec::new(sloped * groups),
+        UninitVec::new(clamped * groups),
+    );
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))
@@ -283,7 +294,7 @@ pub fn forward<T: Real>(
         .zip(group_chunks(&mut clamps, n, clamped))
         .collect();
     let level = Level::new();
-    let work = jobs
+    let counts = jobs
         .into_par_iter()
         .enumerate()
         .map(
@@ -314,12 +325,12 @@ pub fn forward<T: Real>(
                 ))
             },
         )
-        .reduce(Work::default, Work::plus);
+        .reduce(Counts::default, Counts::plus);
     Projected {
         projection: Projection {
             splats: splats.finish(),
             depths: keys.finish(),
-            tuning: options.tuning,
+            knobs: options.knobs,
         },
         means2d: means2d.finish(),
         depths: depths.finish(),
@@ -333,7 +344,7 @@ pub fn forward<T: Real>(
             slopes: slopes.finish(),
             clamped: clamps.finish(),
         }),
-        work,
+        counts,
     }
 }
 
@@ -347,11 +358,11 @@ fn forward_chunk<S: Simd, T: Real>(
     options: &ProjectOptions,
     begin: usize,
     out: ForwardChunk<T>,
-) -> Work {
+) -> Counts {
     let count = out.splats.len();
-    let mut work = Work {
+    let mut counts = Counts {
         gaussians: count as u64,
-        ..Work::default()
+        ..Counts::default()
     };
     let camera_lanes = CameraLanes::new(
         simd,
@@ -389,8 +400,8 @@ fn forward_chunk<S: Simd, T: Real>(
         }
         match colors {
             Colors::Harmonics(h) if keep != 0 => {
-                work.harmonics += (rows * sh::count(h.degree)) as u64;
-                work.slopes += if out.slopes.is_empty() {
+                counts.harmonics += (rows * sh::count(h.degree)) as u64;
+                counts.slopes += if out.slopes.is_empty() {
                     0
                 } else {
                     rows as u64
@@ -427,7 +438,7 @@ fn forward_chunk<S: Simd, T: Real>(
                     }
                 }
                 let [r, g, b] = &rgb;
-                columns::write([&r.0, &g.0, &b.0], rows_of(out.colors, 3, start, rows));
+                groups::write([&r.0, &g.0, &b.0], rows_of(out.colors, 3, start, rows));
             }
             Colors::Harmonics(_) => {}
             Colors::Channels(data, channels) => {
@@ -439,7 +450,7 @@ fn forward_chunk<S: Simd, T: Real>(
                 }
             }
         }
-        work.projected += u64::from(keep.count_ones());
+        counts.projected += u64::from(keep.count_ones());
         if keep == 0 {
             continue;
         }
@@ -452,21 +463,21 @@ fn forward_chunk<S: Simd, T: Real>(
         let depth = kept::<f64>(&group.depth, keep);
         out.keys[start..start + rows].copy_from_slice(&depth[..rows]);
         let depth = kept(&group.depth, keep);
-        columns::write([&depth], rows_of(out.depths, 1, start, rows));
+        groups::write([&depth], rows_of(out.depths, 1, start, rows));
         let opacity = kept(&group.opacity, keep);
-        columns::write([&opacity], rows_of(out.opacities, 1, start, rows));
+        groups::write([&opacity], rows_of(out.opacities, 1, start, rows));
         let (x, y) = (kept(&group.mean[0], keep), kept(&group.mean[1], keep));
-        columns::write([&x, &y], rows_of(out.means2d, 2, start, rows));
+        groups::write([&x, &y], rows_of(out.means2d, 2, start, rows));
         let (x, y) = (kept(&group.radii[0], keep), kept(&group.radii[1], keep));
-        columns::write(
+        groups::write(
             [&integers(&x), &integers(&y)],
             rows_of(out.radii, 2, start, rows),
         );
         let [a, b, c] = &group.conic;
         let conic = [&kept(a, keep), &kept(b, keep), &kept(c, keep)];
-        columns::write(conic, rows_of(out.conics, 3, start, rows));
+        groups::write(conic, rows_of(out.conics, 3, start, rows));
     }
-    work
+    counts
 }
 
 /// The values of the Gaussians in a set, 0 elsewhere.

@@ -1,21 +1,23 @@
 //! The binding of the projection.
 
-use super::arrays::{AnyType, Array, Counts, Optional, Scalar, by_dtype, join, of_type, optional};
-use crate::{
-    camera::Camera,
-    error::Error,
+use crate::arrays::{
+    AnyType, Array, CountsByName, Optional, Scalar, by_dtype, join, of_type, optional,
+};
+use crate::error::BindingResult;
+use hqgs::{
+    Error,
+    accuracy_knobs::{AccuracyKnobs, Spans},
+    counts::Counts,
     project::{self, GaussianGrads, ProjectCotangents, ProjectOptions, Projection, Shading},
-    real::Real,
-    scene::{Colors, Gaussians, Harmonics},
+    scene::{Camera, Colors, Gaussians, Harmonics},
+    simd::Real,
     threads,
-    tuning::{Spans, Tuning},
-    work::Work,
 };
 use numpy::{Element, IntoPyArray};
 use pyo3::{IntoPyObjectExt, prelude::*};
 
 /// Add the functions and classes of this file to the module.
-pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Frame>()?;
     m.add_function(wrap_pyfunction!(project_forward, m)?)?;
     m.add_function(wrap_pyfunction!(project_backward, m)?)
@@ -30,14 +32,14 @@ fn accumulate<T: Real>(sum: &mut [T], part: &[T]) {
 
 /// The projection of N Gaussians into C cameras.
 #[pyclass(frozen, module = "hqgs._rust")]
-pub(super) struct Frame {
-    pub(super) cameras: Vec<Camera>,
-    pub(super) projections: Vec<Projection>,
+pub(crate) struct Frame {
+    pub(crate) cameras: Vec<Camera>,
+    pub(crate) projections: Vec<Projection>,
     options: ProjectOptions,
-    pub(super) n: usize,
+    pub(crate) n: usize,
     /// Of each camera; a `Vec<Option<Shading<T>>>`.
     shadings: AnyType,
-    work: Work,
+    counts: Counts,
 }
 
 #[pymethods]
@@ -56,8 +58,8 @@ impl Frame {
 
     /// Counts of the projection.
     #[getter]
-    fn counts(&self) -> Counts {
-        self.work.entries().collect()
+    fn counts(&self) -> CountsByName {
+        self.counts.entries().collect()
     }
 }
 
@@ -83,9 +85,9 @@ fn cameras(
 /// alpha_min, transmittance_min, spans, skip_blocks, exp2_degree
 type Knobs<'a> = (f64, f64, &'a str, bool, usize);
 
-fn tuning(knobs: Option<Knobs>) -> Result<Tuning, Error> {
+fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
     let Some((alpha_min, transmittance_min, spans, skip_blocks, exp2_degree)) = knobs else {
-        return Ok(Tuning::default());
+        return Ok(AccuracyKnobs::default());
     };
     let spans = match spans {
         "ellipse" => Spans::Ellipse,
@@ -96,15 +98,15 @@ fn tuning(knobs: Option<Knobs>) -> Result<Tuning, Error> {
             return Err(Error::new("spans", message));
         }
     };
-    let tuning = Tuning {
+    let knobs = AccuracyKnobs {
         alpha_min,
         transmittance_min,
         spans,
         skip_blocks,
         exp2_degree,
     };
-    tuning.check()?;
-    Ok(tuning)
+    knobs.check()?;
+    Ok(knobs)
 }
 
 /// Project Gaussians; see `hqgs/rasterize.py` for the shapes. `colors` are harmonics if there is a degree.
@@ -125,7 +127,7 @@ fn project_forward<'py>(
     options: (f64, f64, f64, f64, bool, bool),
     sh_degree: Option<usize>,
     knobs: Option<Knobs>,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
     let options = ProjectOptions {
         near_plane,
@@ -134,7 +136,7 @@ fn project_forward<'py>(
         eps2d,
         antialiased,
         differentiable,
-        tuning: tuning(knobs)?,
+        knobs: accuracy_knobs(knobs)?,
     };
     by_dtype!(
         means,
@@ -158,7 +160,7 @@ fn project_as<'py, T: Scalar>(
     height: usize,
     options: ProjectOptions,
     sh_degree: Option<usize>,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let py = means.py();
     let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
     let colors = Array::<T>::new("colors", colors)?;
@@ -197,9 +199,9 @@ fn project_as<'py, T: Scalar>(
     let colors = join(&mut outs, |out| &mut out.colors);
     let frame = Frame {
         cameras,
-        work: outs
+        counts: outs
             .iter()
-            .fold(Work::default(), |sum, out| sum.plus(out.work)),
+            .fold(Counts::default(), |sum, out| sum.plus(out.counts)),
         shadings: Box::new(
             outs.iter_mut()
                 .map(|out| out.shading.take())
@@ -218,7 +220,7 @@ fn project_as<'py, T: Scalar>(
         opacities.into_pyarray(py),
         colors.into_pyarray(py),
     );
-    out.into_bound_py_any(py)
+    Ok(out.into_bound_py_any(py)?)
 }
 
 /// The borrowed arrays of the Gaussians.
@@ -235,7 +237,7 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         quats: &Bound<'py, PyAny>,
         scales: &Bound<'py, PyAny>,
         opacities: &Bound<'py, PyAny>,
-    ) -> PyResult<Self> {
+    ) -> BindingResult<Self> {
         Ok(Self {
             means: Array::new("means", means)?,
             quats: Array::new("quats", quats)?,
@@ -244,7 +246,7 @@ impl<'py, T: Scalar> Arrays<'py, T> {
         })
     }
 
-    fn gaussians(&self) -> PyResult<Gaussians<'_, T>> {
+    fn gaussians(&self) -> BindingResult<Gaussians<'_, T>> {
         let gaussians = Gaussians {
             means: self.means.slice()?,
             quats: self.quats.slice()?,
@@ -261,7 +263,7 @@ fn channels_of<'a, T: Scalar>(
     colors: &'a Array<'_, T>,
     n: usize,
     cameras: usize,
-) -> PyResult<(&'a [T], usize)> {
+) -> BindingResult<(&'a [T], usize)> {
     let (data, channels) = (colors.slice()?, colors.shape().last().copied().unwrap_or(0));
     check_colors(data, n, cameras, channels)?;
     Ok((data, channels))
@@ -272,7 +274,7 @@ fn harmonics<'a, T: Scalar>(
     rest: Option<&'a Array<'_, T>>,
     n: usize,
     degree: usize,
-) -> PyResult<Harmonics<'a, T>> {
+) -> BindingResult<Harmonics<'a, T>> {
     let count = |array: &Array<'_, T>| match array.shape() {
         &[_, k, 3] => Ok(k),
         other => Err(Error::shape("colors", "[N, K, 3]", format!("{other:?}"))),
@@ -294,7 +296,7 @@ fn project_backward<'py>(
     inputs: Inputs<'py>,
     cotangents: Cotangents<'py>,
     wanted: [bool; 7],
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     by_dtype!(
         &inputs.0,
         project_backward_as(frame, &inputs, cotangents, wanted)
@@ -324,7 +326,7 @@ fn project_backward_as<'py, T: Scalar>(
     inputs: &Inputs<'py>,
     v: Cotangents<'py>,
     wanted: [bool; 7],
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let py = frame.py();
     let frame = frame.get();
     let arrays = Arrays::<T>::new(&inputs.0, &inputs.1, &inputs.2, &inputs.3)?;
@@ -337,7 +339,7 @@ fn project_backward_as<'py, T: Scalar>(
     let v_conics = optional::<T>("v_conics", v.4.as_ref())?;
     let v_colors = optional::<T>("v_colors", v.5.as_ref())?;
     let (n, c) = (frame.n, frame.cameras.len());
-    let part = |a: &Option<Array<'py, T>>| -> PyResult<Option<usize>> {
+    let part = |a: &Option<Array<'py, T>>| -> BindingResult<Option<usize>> {
         Ok(a.as_ref().map(|a| a.shape().iter().product()))
     };
     for (name, rows, got) in [
@@ -418,7 +420,7 @@ fn project_backward_as<'py, T: Scalar>(
                         accumulate(&mut sums.opacities, &grads.opacities);
                         accumulate(&mut sums.harmonics, &grads.harmonics);
                         accumulate(&mut sums.harmonics_rest, &grads.harmonics_rest);
-                        sums.work = sums.work.plus(grads.work);
+                        sums.counts = sums.counts.plus(grads.counts);
                     }
                 }
             }
@@ -436,13 +438,13 @@ fn project_backward_as<'py, T: Scalar>(
             .harmonics_rest
             .then(|| grads.harmonics_rest.into_pyarray(py)),
         wanted.camera.then(|| viewmats.into_pyarray(py)),
-        grads.work.entries().collect::<Counts>(),
+        grads.counts.entries().collect::<CountsByName>(),
     );
-    out.into_bound_py_any(py)
+    Ok(out.into_bound_py_any(py)?)
 }
 
 /// Check that there is one set of colours for all cameras, or one each.
-pub(super) fn check_colors<T>(
+pub(crate) fn check_colors<T>(
     data: &[T],
     n: usize,
     cameras: usize,
@@ -460,7 +462,7 @@ pub(super) fn check_colors<T>(
 }
 
 /// Colours of camera `i`: one set for all cameras, or one each.
-pub(super) fn of_camera<T>(data: &[T], i: usize, len: usize) -> &[T] {
+pub(crate) fn of_camera<T>(data: &[T], i: usize, len: usize) -> &[T] {
     if data.len() == len {
         data
     } else {
