@@ -163,8 +163,8 @@ mod tests {
     #[test]
     fn pieces_become_one_vector() {
         for lengths in [vec![], vec![0], vec![3, 0, 4], vec![1; 1000]] {
-            let mut fresh = UninitVec::new(lengths.iter().sum());
-            let pieces = fresh.cut(lengths.iter().copied());
+            let mut vector = UninitVec::new(lengths.iter().sum());
+            let pieces = vector.cut(lengths.iter().copied());
             assert_eq!(pieces.len(), lengths.len());
             pieces.into_par_iter().enumerate().for_each(|(k, piece)| {
                 let mut piece = piece;
@@ -179,7 +179,7 @@ mod tests {
                 .enumerate()
                 .flat_map(|(k, n)| vec![k as f64; *n])
                 .collect();
-            assert_eq!(fresh.finish(), expected);
+            assert_eq!(vector.finish(), expected);
         }
     }
 
@@ -188,9 +188,9 @@ mod tests {
         // The second is streamed; its pieces begin at addresses that are aligned to 16 bytes, and not.
         for len in [1000, STREAMED / 4 + 7] {
             let expected: Vec<f32> = (0..len).map(|i| i as f32).collect();
-            let mut fresh = UninitVec::new(len);
+            let mut vector = UninitVec::new(len);
             let parts: Vec<_> = expected.chunks(len / 5 + 1).collect();
-            let pieces = fresh.cut(parts.iter().map(|part| part.len()));
+            let pieces = vector.cut(parts.iter().map(|part| part.len()));
             pieces
                 .into_par_iter()
                 .zip(parts)
@@ -203,44 +203,44 @@ mod tests {
                         }
                     }
                 });
-            assert!(fresh.finish() == expected, "{len} elements");
+            assert!(vector.finish() == expected, "{len} elements");
         }
     }
 
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_put_in_part_is_found() {
-        let mut fresh = UninitVec::new(4);
-        fresh.cut([4].into_iter()).pop().unwrap().put(&[1.0f32; 3]);
-        fresh.finish();
+        let mut vector = UninitVec::new(4);
+        vector.cut([4].into_iter()).pop().unwrap().put(&[1.0f32; 3]);
+        vector.finish();
     }
 
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_not_set_is_found() {
-        let mut fresh = UninitVec::new(5);
-        fresh.cut([2, 3].into_iter()).pop().unwrap().fill(1u8);
-        fresh.finish();
+        let mut vector = UninitVec::new(5);
+        vector.cut([2, 3].into_iter()).pop().unwrap().fill(1u8);
+        vector.finish();
     }
 
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_set_in_part_is_found() {
-        let mut fresh = UninitVec::new(5);
-        for mut piece in fresh.cut([2, 3].into_iter()) {
+        let mut vector = UninitVec::new(5);
+        for mut piece in vector.cut([2, 3].into_iter()) {
             piece.next(2, 1u8);
         }
-        fresh.finish();
+        vector.finish();
     }
 
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn setting_one_piece_in_two_cuts_is_not_enough() {
-        let mut fresh = UninitVec::new(4);
+        let mut vector = UninitVec::new(4);
         for _ in 0..2 {
-            fresh.cut([2, 2].into_iter()).pop().unwrap().fill(1u8);
+            vector.cut([2, 2].into_iter()).pop().unwrap().fill(1u8);
         }
-        fresh.finish();
+        vector.finish();
     }
 
     #[test]

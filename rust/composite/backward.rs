@@ -56,7 +56,8 @@ pub struct CompositeGrads<T> {
     pub counts: Counts,
 }
 
-/// VJP of [`forward()`](super::forward()). Tiles and blocks whose pixels have no cotangent that is not 0 are left out.
+/// VJP of [`forward()`](super::forward()). Tiles and blocks whose pixels have no cotangent that is not 0 are left
+/// out.
 ///
 /// # Errors
 /// When the length of an array does not fit.

@@ -106,7 +106,7 @@ fn weigh<S: Simd, T: Real, const V: usize>(
     transmittance: &[T],
     largest: &mut [T],
 ) {
-    let (x, y) = grid.block::<S, V>(simd, block);
+    let [x, y] = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
     let zero = Lanes::<T, S>::splat(simd, T::ZERO);
     let mut open = load::<S, T, V>(simd, transmittance);

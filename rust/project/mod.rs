@@ -1,11 +1,15 @@
 //! Projection of all Gaussians into one camera, forward and VJP: geometry, culling, spherical harmonics.
 
 mod backward;
+mod camera_lanes;
+mod colors;
 mod forward;
 mod geometry;
 pub mod sh;
+mod splats;
 
 pub use backward::{GaussianGrads, ProjectCotangents, Wanted, backward};
+pub use colors::Shading;
 pub use forward::{Projected, forward};
 
 use crate::{
@@ -14,14 +18,14 @@ use crate::{
     scene::Gaussians,
     simd::{
         Real, Wide,
-        groups::{self, Column, wide3},
-        splat as splat_lanes,
-        vec3::V3,
+        groups::{self, Column, GROUP, wide3},
+        lanes, splat,
     },
     uninit::{UninitPiece, UninitVec},
 };
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
-use geometry::{CameraLanes, Geometry};
+use camera_lanes::CameraLanes;
+use fearless_simd::{Simd, SimdBase};
+use geometry::Geometry;
 
 /// Options of the projection; the defaults are gsplat's.
 #[derive(Debug, Clone, Copy)]
@@ -99,29 +103,14 @@ pub struct Projection {
     pub knobs: AccuracyKnobs,
 }
 
-/// How the colours from harmonics change, for [`backward()`]: with it the coefficients, which are most of a
-/// scene's memory, are read by the forward pass alone.
-#[derive(Debug)]
-pub struct Shading<T> {
-    /// As `Harmonics::rows`.
-    rows: (usize, usize),
-    /// As `Harmonics::degree`.
-    degree: usize,
-    /// For each group of Gaussians the derivatives of its colours; none at degree 0.
-    slopes: Vec<Slopes<T>>,
-    /// For each group and channel the Gaussians whose colour is clamped at 0.
-    clamped: Vec<[u16; 3]>,
-}
-
-/// Derivatives of channel c along axis a of the unit vector from the camera centre, at 3 c + a, as if its three
-/// numbers were free.
-type Slopes<T> = [Column<T>; 9];
-
 /// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.
 fn chunks<T: Copy>(array: &mut UninitVec<T>, n: usize, row: usize) -> Vec<UninitPiece<'_, T>> {
     let rows = |c| PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
     array.cut((0..n.div_ceil(PROJECT_CHUNK)).map(|c| rows(c) * row))
 }
+
+/// The lanes of a mask of f64.
+type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
 
 /// The geometry of a group of Gaussians, one column per number.
 struct Inputs<T> {
@@ -166,25 +155,12 @@ impl<T: Real> Inputs<T> {
     }
 }
 
-/// Unit vectors from the camera centre, and one over the distances. A Gaussian on the centre has no direction:
-/// both are 0.
+/// The lanes of a group in a bit set, as 1 or 0.
 #[inline(always)]
-fn direction<S: Simd>(simd: S, mean: V3<Wide<S>>, center: V3<Wide<S>>) -> (V3<Wide<S>>, Wide<S>) {
-    let (zero, one) = (splat_lanes(simd, 0.0), splat_lanes(simd, 1.0));
-    let d = mean - center;
-    let length = d.dot(d).sqrt();
-    let inverse = length.simd_gt(zero).select(one / length, zero);
-    (d.by(inverse), inverse)
-}
-
-/// Three columns in the type of the inputs.
-#[inline(always)]
-fn narrow3<T: Real>(columns: &[Column<f64>; 3]) -> [Column<T>; 3] {
-    let mut out = [Column::ZERO; 3];
-    for (out, column) in out.iter_mut().zip(columns) {
-        for (o, x) in out.0.iter_mut().zip(column.0) {
-            *o = T::from_f64(x);
-        }
+fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> Mask<S> {
+    let mut ones = [0.0; GROUP];
+    for (lane, one) in ones.iter_mut().enumerate() {
+        *one = f64::from(set >> lane & 1);
     }
-    out
+    Wide::<S>::from_slice(simd, &ones[at..at + lanes::<S>()]).simd_gt(splat(simd, 0.0))
 }

@@ -9,7 +9,7 @@ use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
 
 /// Counts of one block.
 #[derive(Default)]
-pub(in crate::composite) struct Blended {
+pub struct Blended {
     /// Layers evaluated.
     pub layers: usize,
     /// Layers that changed a pixel.
@@ -21,13 +21,7 @@ pub(in crate::composite) struct Blended {
 /// Blend the layers over one block (V vectors). `transmittance` is 1 inside the image and 0 outside before,
 /// and what the last layer leaves after. The colours go to `colors[channel]`, block by block.
 #[inline(always)]
-pub(in crate::composite) fn blend<
-    S: Simd,
-    T: Real,
-    const D: usize,
-    const E: usize,
-    const V: usize,
->(
+pub fn blend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -38,7 +32,7 @@ pub(in crate::composite) fn blend<
     let splat = |x: T| Lanes::<T, S>::splat(simd, x);
     let channels = if D > 0 { D } else { layers.channels };
     let at = block * BLOCK_PIXELS;
-    let (x, y) = grid.block::<S, V>(simd, block);
+    let [x, y] = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
     let zero = splat(T::ZERO);
     // What the last layer leaves, and the same with 0 where the pixel is finished.

@@ -54,13 +54,9 @@ impl<T: Real> Grid<T> {
 
     /// The pixel centres of a block, as V vectors each.
     #[inline(always)]
-    pub fn block<S: Simd, const V: usize>(
-        &self,
-        simd: S,
-        block: usize,
-    ) -> ([Lanes<T, S>; V], [Lanes<T, S>; V]) {
+    pub fn block<S: Simd, const V: usize>(&self, simd: S, block: usize) -> [[Lanes<T, S>; V]; 2] {
         let at = block * BLOCK_PIXELS;
-        (load(simd, &self.x[at..]), load(simd, &self.y[at..]))
+        [load(simd, &self.x[at..]), load(simd, &self.y[at..])]
     }
 }
 

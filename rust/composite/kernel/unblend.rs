@@ -10,16 +10,16 @@ use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
 /// Sums over the pixels of a tile for one Gaussian; the order of the fields is the order in memory.
 /// With w the gradient of the loss with respect to sigma: w, w u, w v, w u^2, w u v, w v^2.
-pub(in crate::composite) const MOMENTS: usize = 6;
+pub const MOMENTS: usize = 6;
 
 /// |d loss / d mean2d| summed pixel by pixel, x and y, where asked for.
-pub(in crate::composite) const ABSOLUTE: usize = 2;
+pub const ABSOLUTE: usize = 2;
 
 /// Numbers that `unblend` stores per layer of a block.
-pub(in crate::composite) const LAYER: usize = 2 * BLOCK_PIXELS;
+pub const LAYER: usize = 2 * BLOCK_PIXELS;
 
 /// One tile in the backward pass.
-pub(in crate::composite) struct Adjoint<T> {
+pub struct Adjoint<T> {
     /// 1 inside the image, 0 outside.
     pub transmittance: Pixels<T>,
     /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance.
@@ -53,13 +53,7 @@ impl<T: Real> Adjoint<T> {
 /// a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however deep
 /// the layer.
 #[inline(always)]
-pub(in crate::composite) fn unblend<
-    S: Simd,
-    T: Real,
-    const D: usize,
-    const E: usize,
-    const V: usize,
->(
+pub fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -70,7 +64,7 @@ pub(in crate::composite) fn unblend<
     let splat = |x: T| Lanes::<T, S>::splat(simd, x);
     let channels = if D > 0 { D } else { layers.channels };
     let at = block * BLOCK_PIXELS;
-    let (x, y) = grid.block::<S, V>(simd, block);
+    let [x, y] = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
     let (cap, zero) = (splat(T::from_f64(ALPHA_MAX)), splat(T::ZERO));
     let mut open = load::<S, T, V>(simd, &adjoint.transmittance[at..]);
@@ -122,7 +116,7 @@ pub(in crate::composite) fn unblend<
 }
 
 /// Running sums of one Gaussian over its blocks.
-pub(in crate::composite) struct Sums<S: Simd, T: Real> {
+pub struct Sums<S: Simd, T: Real> {
     record: RecordLanes<S, T>,
     /// The moments, the colours (at most 4 channels), the absolute gradients.
     lanes: [Lanes<T, S>; MOMENTS + 4 + ABSOLUTE],
