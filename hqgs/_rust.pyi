@@ -1,4 +1,4 @@
-"""The extension module; rust/python.rs and its folder are its source."""
+"""The extension module; rust/python/ is its source."""
 
 from typing import Any
 

@@ -1,35 +1,30 @@
 //! A fast, deterministic CPU rasterizer for 3D Gaussian Splatting, with exact gradients.
 //!
-//! Modules in pipeline order: [`scene`] and [`camera`] describe the input, [`project`] turns Gaussians into
-//! splats ([`sh`] gives their colours), [`tiles`] orders them and bins them, [`composite`] blends them.
-//! Each stage has its forward function and its vector-Jacobian product side by side, works on borrowed
-//! slices in f32 or f64, and gives the same bits for any number of threads.
+//! The modules in the order of the pipeline:
+//!
+//! 1. [`scene`]: Gaussians and cameras, what comes in;
+//! 2. [`project`]: Gaussians become splats, their harmonics colours;
+//! 3. [`tiles`]: splats are sorted into the tiles that they reach, front to back;
+//! 4. [`composite`]: the splats of each tile are blended into pixels;
+//! 5. [`training`]: the loss of the picture, and the step of the optimizer.
+//!
+//! [`render`] is the whole way of one image, there and back. Each stage has its forward function and its
+//! vector-Jacobian product side by side, works on borrowed slices in f32 or f64, and gives the same bits for any
+//! number of threads.
 
-pub mod adam;
-pub mod camera;
-pub mod cells;
-mod columns;
 pub mod composite;
-pub mod constants;
-pub mod error;
-mod fresh;
-mod geometry;
-mod kernel;
-mod lanes;
-pub mod loss;
 pub mod project;
-#[cfg(feature = "python")]
-mod python;
-pub mod real;
 pub mod render;
 pub mod scene;
-pub mod separable;
-pub mod sh;
-pub mod synthetic;
-pub mod threads;
 pub mod tiles;
-pub mod tuning;
-pub mod weights;
-pub mod work;
+pub mod training;
+
+pub mod accuracy_knobs;
+pub mod constants;
+pub mod counts;
+pub mod error;
+pub mod simd;
+pub mod threads;
+mod uninit;
 
 pub use error::Error;

@@ -3,12 +3,11 @@
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::{
-    adam::{self, AdamArrays, AdamOptions, Selection},
     composite::{self, CompositeCotangents, CompositeInput},
     project::{self, ProjectCotangents, ProjectOptions, Projected},
-    scene::{Colors, Harmonics},
-    synthetic::Synthetic,
+    scene::{Colors, Harmonics, synthetic::Synthetic},
     tiles,
+    training::adam::{self, AdamArrays, AdamOptions, Selection},
 };
 
 const SIZES: [usize; 3] = [10_000, 100_000, 500_000];
@@ -73,7 +72,7 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         b.iter(|| composite::forward(&input).expect("right lengths"));
     });
     let view = composite::forward(&input).expect("right lengths");
-    println!("{name}, {n} Gaussians: {:?}", view.work);
+    println!("{name}, {n} Gaussians: {:?}", view.counts);
     let v_image: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
     let v = CompositeCotangents {
         image: &v_image,

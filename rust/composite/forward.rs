@@ -1,16 +1,18 @@
 //! Compositing, forward.
 
-use super::{CompositeInput, Composited, for_alpha, for_vectors};
-use crate::{
-    constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
-    error::Error,
-    fresh::Fresh,
+use super::{
+    CompositeInput, Composited, for_alpha, for_vectors,
     kernel::{self, Grid, Pixels},
-    real::{Lanes, Real},
-    tuning::EXP2_DEGREE,
-    work::Work,
 };
-use fearless_simd::{Level, Simd, SimdBase, dispatch};
+use crate::{
+    accuracy_knobs::EXP2_DEGREE,
+    constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
+    counts::Counts,
+    error::Error,
+    simd::Real,
+    uninit::UninitVec,
+};
+use fearless_simd::{Level, Simd, dispatch};
 use rayon::prelude::*;
 use std::iter::repeat_n;
 
@@ -24,7 +26,7 @@ pub struct Image<T> {
     /// For the backward pass.
     pub composited: Composited<T>,
     /// Counts.
-    pub work: Work,
+    pub counts: Counts,
 }
 
 /// Composite all tiles.
@@ -34,14 +36,14 @@ pub struct Image<T> {
 pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
     input.check()?;
     let (tiles, channels) = (input.tiles, input.channels());
-    let count = tiles.columns * tiles.rows;
+    let count = tiles.tiles_x * tiles.tiles_y;
     let mut depths = vec![[0; TILE_BLOCKS]; count];
-    let mut transmittance = Fresh::new(count * TILE_PIXELS);
-    let mut colors = Fresh::new(count * channels);
+    let mut transmittance = UninitVec::new(count * TILE_PIXELS);
+    let mut colors = UninitVec::new(count * channels);
     let grid = Grid::new();
     let level = Level::new();
-    let degree = input.projection.tuning.exp2_degree;
-    let work = depths
+    let degree = input.projection.knobs.exp2_degree;
+    let counts = depths
         .par_iter_mut()
         .zip(transmittance.cut(repeat_n(TILE_PIXELS, count)))
         .zip(colors.cut(repeat_n(channels, count)))
@@ -53,14 +55,36 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
                 channels, degree, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
             ))
         })
-        .reduce(Work::default, Work::plus);
+        .reduce(Counts::default, Counts::plus);
     let (transmittance, colors) = (transmittance.finish(), colors.finish());
+    let (image, alphas) = image_from_tiles(input, &transmittance, &colors);
+    Ok(Image {
+        image,
+        alphas,
+        composited: Composited {
+            depths,
+            transmittance,
+        },
+        counts: Counts {
+            channels: channels as u64,
+            ..counts
+        },
+    })
+}
+
+/// The image and its alphas from the tiles' transmittances and colours, which lie in block order.
+fn image_from_tiles<T: Real>(
+    input: &CompositeInput<T>,
+    transmittance: &[T],
+    colors: &[Pixels<T>],
+) -> (Vec<T>, Vec<T>) {
+    let (tiles, channels) = (input.tiles, input.channels());
     let (width, height) = (input.camera.width, input.camera.height);
     let (mut image, mut alphas) = (
-        Fresh::new(width * height * channels),
-        Fresh::new(width * height),
+        UninitVec::new(width * height * channels),
+        UninitVec::new(width * height),
     );
-    let pixels = (0..tiles.rows).map(|row| TILE.min(height - row * TILE) * width);
+    let pixels = (0..tiles.tiles_y).map(|row| TILE.min(height - row * TILE) * width);
     image
         .cut(pixels.clone().map(|n| n * channels))
         .into_par_iter()
@@ -69,7 +93,7 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
         .for_each(|(row, (image, alphas))| {
             let (image, alphas) = (image.fill(T::ZERO), alphas.fill(T::ZERO));
             let base = row * TILE * width;
-            for tile in row * tiles.columns..(row + 1) * tiles.columns {
+            for tile in row * tiles.tiles_x..(row + 1) * tiles.tiles_x {
                 let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
                 let colors = &colors[tile * channels..(tile + 1) * channels];
                 for (p, pixel, n) in input.runs(tile) {
@@ -86,20 +110,10 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
                 }
             }
         });
-    Ok(Image {
-        image: image.finish(),
-        alphas: alphas.finish(),
-        composited: Composited {
-            depths,
-            transmittance,
-        },
-        work: Work {
-            channels: channels as u64,
-            ..work
-        },
-    })
+    (image.finish(), alphas.finish())
 }
 
+/// Composite one tile.
 #[inline(always)]
 fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     simd: S,
@@ -109,13 +123,13 @@ fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     depths: &mut [u32; TILE_BLOCKS],
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
-) -> Work {
+) -> Counts {
     let list = &input.tiles.lists[tile];
     list.fetch();
-    let mut work = Work {
+    let mut counts = Counts {
         tiles: u64::from(!list.records.is_empty()),
         pairs: list.records.len() as u64,
-        ..Work::default()
+        ..Counts::default()
     };
     for (p, _, n) in input.runs(tile) {
         transmittance[p..p + n].fill(T::ONE);
@@ -123,11 +137,11 @@ fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
         let layers = input.layers(tile, block);
-        let blended = for_vectors!(simd: S, T, D, E, blend(grid, block, layers, pixels, colors));
+        let blended = for_vectors!(S, T, V => kernel::blend::<S, T, D, E, V>(simd, grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
-        work.blocks += blended.layers as u64;
-        work.changed_blocks += blended.changed;
-        work.blended += blended.pixels;
+        counts.blocks += blended.layers as u64;
+        counts.changed_blocks += blended.changed;
+        counts.blended += blended.pixels;
     }
-    work
+    counts
 }

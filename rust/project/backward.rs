@@ -1,19 +1,26 @@
 //! Vector-Jacobian product of the projection.
 
-use super::{Inputs, ProjectOptions, Projection, Shading, chunks, direction, narrow3};
-use crate::{
-    camera::{Camera, CameraGrad},
-    columns::{self, Column, GROUP, get3, wide3},
-    constants::PROJECT_CHUNK,
-    fresh::{Blank, Fresh},
-    geometry::{CameraGradLanes, CameraLanes, Cotangent, GeometryGrad},
-    lanes::{Wide, lanes, splat as splat_lanes, splat3},
-    real::{Lanes, Real},
-    scene::Gaussians,
-    sh,
-    work::Work,
+use super::{
+    Inputs, Mask, ProjectOptions, Projection, Shading,
+    camera_lanes::{CameraGradLanes, CameraLanes},
+    chunks,
+    colors::ColorGroup,
+    geometry::{Cotangent, Geometry, GeometryGrad},
+    lanes_in, sh,
 };
-use fearless_simd::{Level, Select, Simd, SimdBase, SimdFloat, dispatch};
+use crate::{
+    constants::PROJECT_CHUNK,
+    counts::Counts,
+    scene::{Camera, CameraGrad, Gaussians},
+    simd::{
+        Real, Wide,
+        groups::{self, Column, GROUP, wide3},
+        lanes, splat as splat_lanes,
+        vec3::splat3,
+    },
+    uninit::{UninitPiece, UninitVec},
+};
+use fearless_simd::{Level, Select, Simd, dispatch};
 use rayon::prelude::*;
 use std::slice::from_ref;
 
@@ -41,6 +48,8 @@ struct Cotangents<T> {
     opacities: Column<T>,
     depths: Column<T>,
     conics: [Column<T>; 3],
+    /// Whether there are any for the conics.
+    has_conics: bool,
     colors: [Column<T>; 3],
 }
 
@@ -51,16 +60,17 @@ impl<T: Real> Cotangents<T> {
         opacities: Column::ZERO,
         depths: Column::ZERO,
         conics: [Column::ZERO; 3],
+        has_conics: false,
         colors: [Column::ZERO; 3],
     };
 
     #[inline(always)]
     fn read<S: Simd>(&mut self, simd: S, v: &ProjectCotangents<T>, first: usize) {
         if let Some(v) = v.means2d {
-            columns::read(simd, v, first, &mut self.means2d);
+            groups::read(simd, v, first, &mut self.means2d);
         }
         if let Some(v) = v.whitened {
-            columns::read(simd, v, first, &mut self.whitened);
+            groups::read(simd, v, first, &mut self.whitened);
         }
         if let Some(v) = v.opacities {
             self.opacities.load(v, first);
@@ -68,12 +78,45 @@ impl<T: Real> Cotangents<T> {
         if let Some(v) = v.depths {
             self.depths.load(v, first);
         }
+        self.has_conics = v.conics.is_some();
         if let Some(v) = v.conics {
-            columns::read(simd, v, first, &mut self.conics);
+            groups::read(simd, v, first, &mut self.conics);
         }
         if let Some(v) = v.colors {
-            columns::read(simd, v, first, &mut self.colors);
+            groups::read(simd, v, first, &mut self.colors);
         }
+    }
+
+    /// Gradients of the geometry `g` of the Gaussians `at..`, and of their opacities; `opacity`: these, if they
+    /// are compensated.
+    #[inline(always)]
+    fn pull<S: Simd>(
+        &self,
+        simd: S,
+        at: usize,
+        g: &Geometry<S>,
+        opacity: Option<Wide<S>>,
+        camera: &CameraLanes<S>,
+        camera_grad: Option<&mut CameraGradLanes<S>>,
+    ) -> (GeometryGrad<S>, Wide<S>) {
+        let v_splat_opacity = self.opacities.wide(simd, at);
+        let mut v_opacity = v_splat_opacity;
+        let mut whitened = wide3(simd, &self.whitened, at);
+        if self.has_conics {
+            whitened = whitened + g.whiten_conic(simd, wide3(simd, &self.conics, at));
+        }
+        if let Some(opacity) = opacity {
+            let v_compensation = v_splat_opacity * opacity;
+            whitened = whitened + g.whiten_compensation(simd, camera, v_compensation);
+            v_opacity = v_splat_opacity * g.compensation();
+        }
+        let [x, y] = &self.means2d;
+        let cotangent = Cotangent {
+            mean2d: [x.wide(simd, at), y.wide(simd, at)],
+            whitened,
+            depth: self.depths.wide(simd, at),
+        };
+        (g.vjp(simd, &cotangent, camera, camera_grad), v_opacity)
     }
 
     /// Gaussians of the group with a cotangent that is not 0.
@@ -140,13 +183,13 @@ pub struct GaussianGrads<T> {
     /// Of the camera.
     pub camera: CameraGrad,
     /// Counts.
-    pub work: Work,
+    pub counts: Counts,
 }
 
 /// What one job fills of it: empty where not wanted.
 struct BackwardChunk<'a, T> {
     /// Of the means, quaternions, scales, opacities, harmonics and their rest.
-    outs: [Blank<'a, T>; 6],
+    outs: [UninitPiece<'a, T>; 6],
     /// Numbers per Gaussian, in that order.
     rows: [usize; 6],
 }
@@ -166,8 +209,8 @@ impl<T: Real> BackwardChunk<'_, T> {
     }
 }
 
-/// Vector-Jacobian product of [`forward()`](super::forward()). Groups of 16 Gaussians without a cotangent are left out, and so is
-/// the geometry where the colours alone have cotangents.
+/// Vector-Jacobian product of [`forward()`](super::forward()). Groups of 16 Gaussians without a cotangent are left
+/// out, and so is the geometry where the colours alone have cotangents.
 ///
 /// `projection` and `shading` must be those that `forward` made from the same inputs.
 pub fn backward<T: Real>(
@@ -190,7 +233,7 @@ pub fn backward<T: Real>(
         (wanted.harmonics_rest, rest_row),
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
-    let mut arrays = rows.map(|row| Fresh::<T>::new(row * n));
+    let mut arrays = rows.map(|row| UninitVec::<T>::new(row * n));
     let [means, quats, scales, opacities, sh, rest] = &mut arrays;
     let jobs: Vec<_> = chunks(means, n, rows[0])
         .into_iter()
@@ -214,12 +257,12 @@ pub fn backward<T: Real>(
             ))
         })
         .collect();
-    let (mut camera_grad, mut work) = (CameraGrad::ZERO, Work::default());
+    let (mut camera_grad, mut counts) = (CameraGrad::ZERO, Counts::default());
     for (part, more) in &parts {
         camera_grad.add(part);
-        work = work.plus(*more);
+        counts = counts.plus(*more);
     }
-    let [means, quats, scales, opacities, sh, rest] = arrays.map(Fresh::finish);
+    let [means, quats, scales, opacities, sh, rest] = arrays.map(UninitVec::finish);
     GaussianGrads {
         means,
         quats,
@@ -228,7 +271,7 @@ pub fn backward<T: Real>(
         harmonics: sh,
         harmonics_rest: rest,
         camera: camera_grad,
-        work,
+        counts,
     }
 }
 
@@ -245,7 +288,7 @@ fn backward_chunk<S: Simd, T: Real>(
     begin: usize,
     mut chunk: BackwardChunk<T>,
     camera_wanted: bool,
-) -> (CameraGrad, Work) {
+) -> (CameraGrad, Counts) {
     let zero = splat_lanes(simd, 0.0);
     let camera_lanes = CameraLanes::new(
         simd,
@@ -263,7 +306,8 @@ fn backward_chunk<S: Simd, T: Real>(
         || v.opacities.is_some()
         || v.depths.is_some()
         || v.conics.is_some();
-    let mut work = Work::default();
+    let shading = shading.filter(|_| v.colors.is_some());
+    let mut counts = Counts::default();
     let mut colors = ColorGroup::ZERO;
     let mut out = GradColumns::<T>::ZERO;
     let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
@@ -285,91 +329,44 @@ fn backward_chunk<S: Simd, T: Real>(
             continue;
         }
         inputs.read(simd, gaussians, first);
-        let mut v_colors = None;
-        if let (Some(shading), true) = (shading, v.colors.is_some()) {
-            work.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
-            let (means, directions) = (&inputs.means, &mut colors.directions);
-            for at in (0..GROUP).step_by(lanes::<S>()) {
-                let (d, inverse) = direction(simd, wide3(simd, means, at), center);
-                let valid = lanes_in(simd, visible, at);
-                let d = d.only(valid, zero);
-                directions[0].set(simd, at, d.x);
-                directions[1].set(simd, at, d.y);
-                directions[2].set(simd, at, d.z);
-                colors.inverses.set(simd, at, valid.select(inverse, zero));
-            }
-            colors.backward(simd, shading, first / GROUP, &cotangents.colors, visible);
-            v_colors = Some(shading);
+        if let Some(shading) = shading {
+            counts.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
+            let (means, v_colors) = (&inputs.means, &cotangents.colors);
+            let group = first / GROUP;
+            colors.backward(simd, shading, group, means, center, v_colors, visible);
         }
-        work.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
+        counts.backward_gaussians += if geometry_wanted { rows as u64 } else { 0 };
         for at in (0..GROUP).step_by(lanes::<S>()) {
             // Not those that were culled, nor those beyond the end.
             let valid = lanes_in(simd, visible, at);
-            let mut grad = GeometryGrad::zero(simd);
-            let mut v_input_opacity = zero;
+            let (mut grad, mut v_opacity) = (GeometryGrad::zero(simd), zero);
             if geometry_wanted {
                 let mut g = inputs.geometry(simd, at, &camera_lanes);
                 g.valid = valid;
-                let v_opacity = cotangents.opacities.wide(simd, at);
-                v_input_opacity = v_opacity;
-                let mut whitened = wide3(simd, &cotangents.whitened, at);
-                if v.conics.is_some() {
-                    whitened = whitened + g.whiten_conic(simd, wide3(simd, &cotangents.conics, at));
-                }
-                if options.antialiased {
-                    let v_compensation = v_opacity * inputs.opacities.wide(simd, at);
-                    whitened =
-                        whitened + g.whiten_compensation(simd, &camera_lanes, v_compensation);
-                    v_input_opacity = v_opacity * g.compensation();
-                }
-                let [x, y] = &cotangents.means2d;
-                let cotangent = Cotangent {
-                    mean2d: [x.wide(simd, at), y.wide(simd, at)],
-                    whitened,
-                    depth: cotangents.depths.wide(simd, at),
+                let opacity = if options.antialiased {
+                    Some(inputs.opacities.wide(simd, at))
+                } else {
+                    None
                 };
-                grad = g.vjp(
-                    simd,
-                    &cotangent,
-                    &camera_lanes,
-                    camera_wanted.then_some(&mut camera_grad),
-                );
+                let camera_grad = camera_wanted.then_some(&mut camera_grad);
+                (grad, v_opacity) =
+                    cotangents.pull(simd, at, &g, opacity, &camera_lanes, camera_grad);
             }
-            if v_colors.is_some() {
-                // Through the normalisation; a Gaussian on the camera centre gets no gradient from its colour.
-                let d = wide3(simd, &colors.directions, at);
-                let v_d = wide3(simd, &colors.v_directions, at).only(valid, zero);
-                let v_mean = (v_d - d.by(d.dot(v_d))).by(colors.inverses.wide(simd, at));
+            if shading.is_some() {
+                let v_mean = colors.mean_vjp(simd, at, valid);
                 grad.mean = grad.mean + v_mean;
                 camera_grad.center = camera_grad.center - v_mean;
             }
-            out.set(simd, at, &grad, v_input_opacity, valid, zero);
+            out.set(simd, at, &grad, v_opacity, valid, zero);
         }
-        let GradColumns {
-            means: [x, y, z],
-            quats: [q0, q1, q2, q3],
-            scales: [s0, s1, s2],
-            opacities,
-        } = &out;
-        let [means, quats, scales, alphas, first_rows, rest_rows] = &mut buffers;
-        columns::write([&x.0, &y.0, &z.0], means);
-        columns::write([&q0.0, &q1.0, &q2.0, &q3.0], quats);
-        columns::write([&s0.0, &s1.0, &s2.0], scales);
-        columns::write([&opacities.0], alphas);
-        if let Some(shading) = v_colors {
-            let used = 3 * sh::count(shading.degree);
-            let in_first = used.min(shading.rows.0);
-            let (v_first, v_rest) = colors.v_coefficients[..used].split_at(in_first);
-            if row > 0 {
-                columns::write_rows(simd, v_first, first_rows, row);
-            }
-            if rest_row > 0 {
-                columns::write_rows(simd, v_rest, rest_rows, rest_row);
-            }
+        let [means, quats, scales, alphas, coefficients, rest] = &mut buffers;
+        out.write([means, quats, scales, alphas]);
+        if let Some(shading) = shading {
+            colors.write(simd, shading, [coefficients, rest], [row, rest_row]);
         }
         chunk.put(&buffers, rows);
     }
-    (camera_grad.sum(), work)
+    (camera_grad.sum(), counts)
 }
 
 /// Gradients of a group in the type of the inputs.
@@ -396,7 +393,7 @@ impl<T: Real> GradColumns<T> {
         at: usize,
         grad: &GeometryGrad<S>,
         opacity: Wide<S>,
-        valid: <Wide<S> as SimdBase<S>>::Mask,
+        valid: Mask<S>,
         zero: Wide<S>,
     ) {
         let mean = grad.mean.only(valid, zero);
@@ -413,70 +410,16 @@ impl<T: Real> GradColumns<T> {
         self.opacities
             .saturate(simd, at, valid.select(opacity, zero));
     }
-}
 
-/// What the gradients of a group's colours need, a column per number.
-struct ColorGroup<T> {
-    v_coefficients: [Column<T>; 3 * sh::MAX_COUNT],
-    /// Unit vectors from the camera centre, and one over the distances.
-    directions: [Column<f64>; 3],
-    inverses: Column<f64>,
-    v_directions: [Column<T>; 3],
-}
-
-impl<T: Real> ColorGroup<T> {
-    const ZERO: Self = Self {
-        v_coefficients: [Column::ZERO; 3 * sh::MAX_COUNT],
-        directions: [Column::ZERO; 3],
-        inverses: Column::ZERO,
-        v_directions: [Column::ZERO; 3],
-    };
-
-    /// Gradients of the coefficients and of the directions, from that of the colours.
+    /// Write them as rows.
     #[inline(always)]
-    fn backward<S: Simd>(
-        &mut self,
-        simd: S,
-        shading: &Shading<T>,
-        group: usize,
-        v_colors: &[Column<T>; 3],
-        visible: u16,
-    ) {
-        let d = narrow3::<T>(&self.directions);
-        let mut v_open = *v_colors;
-        for (column, clamped) in v_open.iter_mut().zip(shading.clamped[group]) {
-            let open = visible & !clamped;
-            for (lane, x) in column.0.iter_mut().enumerate() {
-                *x = if open >> lane & 1 == 1 { *x } else { T::ZERO };
-            }
-        }
-        for at in (0..GROUP).step_by(Lanes::<T, S>::LEN) {
-            let v = v_open.map(|v| v.get(simd, at));
-            let basis = sh::basis::<S, T>(simd, shading.degree, get3(simd, &d, at));
-            for (k, y) in basis.iter().enumerate().take(sh::count(shading.degree)) {
-                for (channel, v) in v.iter().enumerate() {
-                    self.v_coefficients[3 * k + channel].set(simd, at, *y * *v);
-                }
-            }
-            let Some(slopes) = shading.slopes.get(group) else {
-                continue; // degree 0: `v_directions` stay 0
-            };
-            for (axis, v_direction) in self.v_directions.iter_mut().enumerate() {
-                let along = v[0] * slopes[axis].get(simd, at);
-                let along = v[1].mul_add(slopes[3 + axis].get(simd, at), along);
-                let along = v[2].mul_add(slopes[6 + axis].get(simd, at), along);
-                v_direction.set(simd, at, along);
-            }
-        }
+    fn write(&self, [means, quats, scales, opacities]: [&mut [T]; 4]) {
+        let [x, y, z] = &self.means;
+        groups::write([&x.0, &y.0, &z.0], means);
+        let [w, x, y, z] = &self.quats;
+        groups::write([&w.0, &x.0, &y.0, &z.0], quats);
+        let [x, y, z] = &self.scales;
+        groups::write([&x.0, &y.0, &z.0], scales);
+        groups::write([&self.opacities.0], opacities);
     }
-}
-
-/// The lanes of a group in a bit set, as 1 or 0.
-#[inline(always)]
-fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> <Wide<S> as SimdBase<S>>::Mask {
-    let mut ones = [0.0; GROUP];
-    for (lane, one) in ones.iter_mut().enumerate() {
-        *one = f64::from(set >> lane & 1);
-    }
-    Wide::<S>::from_slice(simd, &ones[at..at + lanes::<S>()]).simd_gt(splat_lanes(simd, 0.0))
 }

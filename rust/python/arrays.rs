@@ -1,23 +1,18 @@
 //! Arrays in and out.
 
-use crate::{error::Error, real::Real};
+use crate::error::BindingResult;
+use hqgs::{Error, simd::Real};
 use numpy::{Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::{exceptions::PyValueError, prelude::*};
 use std::{any::Any, collections::HashMap};
 
-impl From<Error> for PyErr {
-    fn from(error: Error) -> Self {
-        PyValueError::new_err(error.to_string())
-    }
-}
-
 /// A borrowed C-contiguous array of known type.
-pub(super) struct Array<'py, T: Element>(PyReadonlyArrayDyn<'py, T>);
+pub(crate) struct Array<'py, T: Element>(PyReadonlyArrayDyn<'py, T>);
 
 impl<'py, T: Element> Array<'py, T> {
     /// Borrow `value`. rust-numpy's own `as_slice` accepts Fortran order, which would read a transposed
     /// array silently wrong, so the layout is checked here.
-    pub(super) fn new(name: &str, value: &Bound<'py, PyAny>) -> PyResult<Self> {
+    pub(crate) fn new(name: &str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
         let array = value.cast::<PyArrayDyn<T>>().map_err(|_| {
             let dtype = value
                 .getattr("dtype")
@@ -32,38 +27,39 @@ impl<'py, T: Element> Array<'py, T> {
                 "{name}: must be C-contiguous, got shape {:?} with strides {:?}",
                 array.shape(),
                 array.strides()
-            )));
+            ))
+            .into());
         }
         Ok(Self(array.try_readonly().map_err(|e| {
             PyValueError::new_err(format!("{name}: {e}"))
         })?))
     }
 
-    pub(super) fn slice(&self) -> PyResult<&[T]> {
+    pub(crate) fn slice(&self) -> BindingResult<&[T]> {
         Ok(self.0.as_slice()?)
     }
 
-    pub(super) fn shape(&self) -> &[usize] {
+    pub(crate) fn shape(&self) -> &[usize] {
         self.0.shape()
     }
 }
 
-pub(super) type Optional<'a, 'py> = Option<&'a Bound<'py, PyAny>>;
+pub(crate) type Optional<'a, 'py> = Option<&'a Bound<'py, PyAny>>;
 
-pub(super) fn optional<'py, T: Element>(
+pub(crate) fn optional<'py, T: Element>(
     name: &str,
     value: Optional<'_, 'py>,
-) -> PyResult<Option<Array<'py, T>>> {
+) -> BindingResult<Option<Array<'py, T>>> {
     value.map(|v| Array::new(name, v)).transpose()
 }
 
 /// Whether `value` is an array of f32 (otherwise it must be of f64).
-pub(super) fn is_f32(value: &Bound<'_, PyAny>) -> bool {
+pub(crate) fn is_f32(value: &Bound<'_, PyAny>) -> bool {
     value.cast::<PyArrayDyn<f32>>().is_ok()
 }
 
 /// One array of every camera's outputs, one after the other, [C, ...].
-pub(super) fn join<O, T: Copy>(outs: &mut [O], array: impl Fn(&mut O) -> &mut Vec<T>) -> Vec<T> {
+pub(crate) fn join<O, T: Copy>(outs: &mut [O], array: impl Fn(&mut O) -> &mut Vec<T>) -> Vec<T> {
     let mut parts: Vec<_> = outs
         .iter_mut()
         .map(|out| std::mem::take(array(out)))
@@ -75,27 +71,27 @@ pub(super) fn join<O, T: Copy>(outs: &mut [O], array: impl Fn(&mut O) -> &mut Ve
 }
 
 /// Something for one of the scalar types.
-pub(super) type AnyType = Box<dyn Any + Send + Sync>;
+pub(crate) type AnyType = Box<dyn Any + Send + Sync>;
 
 /// What was stored for type T.
-pub(super) fn of_type<'a, V: 'static>(stored: &'a AnyType, name: &str) -> PyResult<&'a V> {
+pub(crate) fn of_type<'a, V: 'static>(stored: &'a AnyType, name: &str) -> BindingResult<&'a V> {
     stored
         .downcast_ref()
         .ok_or_else(|| Error::new(name, "dtype differs from the forward pass").into())
 }
 
-/// The counts of [`Work`] by name.
-pub(super) type Counts = HashMap<&'static str, u64>;
+/// The counts of [`Counts`] by name.
+pub(crate) type CountsByName = HashMap<&'static str, u64>;
 
 /// A scalar type that the binding offers.
-pub(super) trait Scalar: Real + Element {}
+pub(crate) trait Scalar: Real + Element {}
 impl Scalar for f32 {}
 impl Scalar for f64 {}
 
 /// Call the generic function for the dtype of an array.
 macro_rules! by_dtype {
     ($array:expr, $function:ident($($argument:expr),* $(,)?)) => {
-        if $crate::python::arrays::is_f32($array) {
+        if $crate::arrays::is_f32($array) {
             $function::<f32>($($argument),*)
         } else {
             $function::<f64>($($argument),*)
@@ -103,4 +99,4 @@ macro_rules! by_dtype {
     };
 }
 
-pub(super) use by_dtype;
+pub(crate) use by_dtype;

@@ -1,22 +1,23 @@
 //! The binding of the tile lists and of compositing.
 
-use super::{
-    arrays::{AnyType, Array, Counts, Optional, Scalar, by_dtype, join, of_type, optional},
+use crate::{
+    arrays::{AnyType, Array, CountsByName, Optional, Scalar, by_dtype, join, of_type, optional},
+    error::BindingResult,
     project::{Frame, check_colors, of_camera},
 };
-use crate::{
+use hqgs::{
+    Error,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
-    error::Error,
+    counts::Counts,
     threads,
     tiles::{self, Tiles},
-    work::Work,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
 use std::time::Instant;
 
 /// Add the functions and classes of this file to the module.
-pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Composite>()?;
     m.add_function(wrap_pyfunction!(composite_forward, m)?)?;
     m.add_function(wrap_pyfunction!(composite_backward, m)?)
@@ -27,7 +28,7 @@ pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
 struct Composite {
     /// Of each camera; a `Vec<View<T>>`.
     views: AnyType,
-    work: Work,
+    counts: Counts,
     bin_seconds: f64,
 }
 
@@ -42,7 +43,11 @@ impl Composite {
     /// (pairs, blocks evaluated, blocks with a change): the work of the forward pass.
     #[getter]
     fn work(&self) -> (u64, u64, u64) {
-        (self.work.pairs, self.work.blocks, self.work.changed_blocks)
+        (
+            self.counts.pairs,
+            self.counts.blocks,
+            self.counts.changed_blocks,
+        )
     }
 
     /// Wall-clock seconds that the tile lists took.
@@ -54,13 +59,13 @@ impl Composite {
     /// (Gaussian, pixel) pairs that were blended.
     #[getter]
     fn blended(&self) -> u64 {
-        self.work.blended
+        self.counts.blended
     }
 
     /// Counts of the forward pass.
     #[getter]
-    fn counts(&self) -> Counts {
-        self.work.entries().collect()
+    fn counts(&self) -> CountsByName {
+        self.counts.entries().collect()
     }
 }
 
@@ -92,7 +97,7 @@ fn composite_forward<'py>(
     colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
     channels: usize,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     by_dtype!(colors, composite_as(frame, colors, backgrounds, channels))
 }
 
@@ -101,7 +106,7 @@ fn composite_as<'py, T: Scalar>(
     colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
     channels: usize,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let py = colors.py();
     let frame = frame.get();
     let colors = Array::<T>::new("colors", colors)?;
@@ -112,7 +117,7 @@ fn composite_as<'py, T: Scalar>(
     let (state, image, alphas) = py.detach(|| {
         threads::install(|| -> Result<_, Error> {
             let (mut images, mut alphas) = (Vec::new(), Vec::new());
-            let (mut views, mut total, mut bin_seconds) = (Vec::new(), Work::default(), 0.0);
+            let (mut views, mut total, mut bin_seconds) = (Vec::new(), Counts::default(), 0.0);
             for (i, (camera, projection)) in
                 frame.cameras.iter().zip(&frame.projections).enumerate()
             {
@@ -131,7 +136,7 @@ fn composite_as<'py, T: Scalar>(
                     background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 };
                 let view = composite::forward(&input)?;
-                total = total.plus(view.work);
+                total = total.plus(view.counts);
                 images.push(view.image);
                 alphas.push(view.alphas);
                 let composited = view.composited;
@@ -140,7 +145,7 @@ fn composite_as<'py, T: Scalar>(
             Ok((
                 Composite {
                     views: Box::new(views),
-                    work: total,
+                    counts: total,
                     bin_seconds,
                 },
                 join(&mut images, |image| image),
@@ -149,7 +154,7 @@ fn composite_as<'py, T: Scalar>(
         })
     })?;
     let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));
-    out.into_bound_py_any(py)
+    Ok(out.into_bound_py_any(py)?)
 }
 
 /// VJP of `composite_forward`. `wanted`: geometry, absolute, colors, backgrounds.
@@ -164,7 +169,7 @@ fn composite_backward<'py>(
     v_alphas: Optional<'_, 'py>,
     channels: usize,
     wanted: [bool; 4],
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     by_dtype!(
         colors,
         composite_backward_as(
@@ -189,7 +194,7 @@ fn composite_backward_as<'py, T: Scalar>(
     v_alphas: Optional<'_, 'py>,
     channels: usize,
     wanted: [bool; 4],
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let py = colors.py();
     let (frame, composite) = (frame.get(), composite.get());
     let views = of_type::<Vec<View<T>>>(&composite.views, "colors")?;
@@ -247,9 +252,9 @@ fn composite_backward_as<'py, T: Scalar>(
             cameras.map(backward).collect::<Result<_, Error>>()
         })
     })?;
-    let work = outs
+    let counts = outs
         .iter()
-        .fold(Work::default(), |sum, out| sum.plus(out.work));
+        .fold(Counts::default(), |sum, out| sum.plus(out.counts));
     let means2d = join(&mut outs, |out| &mut out.means2d);
     let whitened = join(&mut outs, |out| &mut out.whitened);
     let opacities = join(&mut outs, |out| &mut out.opacities);
@@ -263,7 +268,7 @@ fn composite_backward_as<'py, T: Scalar>(
         (geometry && absolute).then(|| absolutes.into_pyarray(py)),
         want_colors.then(|| v_colors.into_pyarray(py)),
         background.then(|| v_background.into_pyarray(py)),
-        work.entries().collect::<Counts>(),
+        counts.entries().collect::<CountsByName>(),
     );
-    out.into_bound_py_any(py)
+    Ok(out.into_bound_py_any(py)?)
 }

@@ -1,18 +1,21 @@
 //! The binding of the operators on pictures.
 
-use super::arrays::{Array, by_dtype};
-use crate::{
-    cells,
-    error::Error,
-    real::Real,
-    separable::{self, Dense},
+use crate::arrays::{Array, by_dtype};
+use crate::error::BindingResult;
+use hqgs::{
+    Error,
+    simd::Real,
     threads,
+    training::{
+        jpeg_cells,
+        separable::{self, Dense},
+    },
 };
 use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;
 
 /// Add the functions and classes of this file to the module.
-pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Separable>()?;
     m.add_function(wrap_pyfunction!(cell_distance, m)?)
 }
@@ -42,7 +45,7 @@ impl Typed for f64 {
 }
 
 /// A borrowed matrix.
-fn dense<'a>(name: &str, matrix: &'a Array<f64>) -> PyResult<Dense<'a>> {
+fn dense<'a>(name: &str, matrix: &'a Array<f64>) -> BindingResult<Dense<'a>> {
     let &[height, width] = matrix.shape() else {
         let got = format!("{:?}", matrix.shape());
         return Err(Error::shape(name, "[height, width]", got).into());
@@ -62,7 +65,7 @@ impl Separable {
         rows: &Bound<'_, PyAny>,
         columns: &Bound<'_, PyAny>,
         channels: Option<&Bound<'_, PyAny>>,
-    ) -> PyResult<Self> {
+    ) -> BindingResult<Self> {
         let (rows, columns) = (Array::new("rows", rows)?, Array::new("columns", columns)?);
         let channels = channels.map(|m| Array::new("channels", m)).transpose()?;
         let (rows, columns) = (dense("rows", &rows)?, dense("columns", &columns)?);
@@ -88,12 +91,12 @@ impl Separable {
         &self,
         image: &Bound<'py, PyAny>,
         transposed: bool,
-    ) -> PyResult<Bound<'py, PyAny>> {
+    ) -> BindingResult<Bound<'py, PyAny>> {
         by_dtype!(image, apply_either(self, image, transposed))
     }
 
     /// `apply` of the operator whose weights are the absolute values, on float32.
-    fn apply_absolute<'py>(&self, image: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    fn apply_absolute<'py>(&self, image: &Bound<'py, PyAny>) -> BindingResult<Bound<'py, PyAny>> {
         apply(&self.single.0.absolute(), image)
     }
 }
@@ -102,7 +105,7 @@ fn apply_either<'py, T: Typed>(
     operator: &Separable,
     image: &Bound<'py, PyAny>,
     transposed: bool,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let (straight, turned) = T::of(operator);
     apply(if transposed { turned } else { straight }, image)
 }
@@ -110,7 +113,7 @@ fn apply_either<'py, T: Typed>(
 fn apply<'py, T: Real + Element>(
     operator: &separable::Separable<T>,
     image: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> BindingResult<Bound<'py, PyAny>> {
     let py = image.py();
     let image = Array::<T>::new("image", image)?;
     let (data, shape) = (image.slice()?, image.shape());
@@ -120,7 +123,7 @@ fn apply<'py, T: Real + Element>(
 
 type Distance<'py> = (f64, Option<Bound<'py, PyAny>>);
 
-/// `cells::distance`: the value and, if wanted, the flat gradient.
+/// `jpeg_cells::distance`: the value and, if wanted, the flat gradient.
 #[pyfunction]
 fn cell_distance<'py>(
     x: &Bound<'py, PyAny>,
@@ -128,7 +131,7 @@ fn cell_distance<'py>(
     widths: &Bound<'py, PyAny>,
     scale: f64,
     want_grad: bool,
-) -> PyResult<Distance<'py>> {
+) -> BindingResult<Distance<'py>> {
     by_dtype!(x, cell_distance_as(x, centres, widths, scale, want_grad))
 }
 
@@ -138,7 +141,7 @@ fn cell_distance_as<'py, T: Real + Element>(
     widths: &Bound<'py, PyAny>,
     scale: f64,
     want_grad: bool,
-) -> PyResult<Distance<'py>> {
+) -> BindingResult<Distance<'py>> {
     let py = x.py();
     let x = Array::<T>::new("x", x)?;
     let centres = Array::<T>::new("centres", centres)?;
@@ -153,6 +156,6 @@ fn cell_distance_as<'py, T: Real + Element>(
     let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
     let out = want_grad.then_some(&mut grad[..]);
     let value =
-        py.detach(|| threads::install(|| cells::distance(x, centres, widths, scale, out)))?;
+        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))?;
     Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
 }

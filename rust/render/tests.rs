@@ -2,9 +2,9 @@
 
 use super::*;
 use crate::{
+    accuracy_knobs::{AccuracyKnobs, Spans},
     constants::ALPHA_MIN,
-    synthetic::Synthetic,
-    tuning::{Spans, Tuning},
+    scene::synthetic::Synthetic,
 };
 use rayon::ThreadPoolBuilder;
 
@@ -111,9 +111,9 @@ fn tiles_and_blocks_leave_no_pixel_out() {
     }
 }
 
-fn tuned(s: &Synthetic<f32>, tuning: Tuning) -> (Rendered<f32>, Gradients<f32>) {
+fn tuned(s: &Synthetic<f32>, knobs: AccuracyKnobs) -> (Rendered<f32>, Gradients<f32>) {
     let options = ProjectOptions {
-        tuning,
+        knobs,
         ..ProjectOptions::default()
     };
     let (g, h) = (s.gaussians(), harmonics(s));
@@ -125,47 +125,47 @@ fn tuned(s: &Synthetic<f32>, tuning: Tuning) -> (Rendered<f32>, Gradients<f32>) 
 #[test]
 fn what_is_skipped_changes_no_bit() {
     let s = Synthetic::<f32>::new(2000, 150, 97, 5).unwrap();
-    let (r, g) = tuned(&s, Tuning::default());
+    let (r, g) = tuned(&s, AccuracyKnobs::default());
     for (spans, skip_blocks) in [
         (Spans::Ellipse, false),
         (Spans::Box, true),
         (Spans::Box, false),
     ] {
-        let tuning = Tuning {
+        let knobs = AccuracyKnobs {
             spans,
             skip_blocks,
-            ..Tuning::default()
+            ..AccuracyKnobs::default()
         };
-        let (other, v) = tuned(&s, tuning);
-        assert!(r.image == other.image && g == v, "{tuning:?}");
+        let (other, v) = tuned(&s, knobs);
+        assert!(r.image == other.image && g == v, "{knobs:?}");
         let pairs = other.tiles.pairs();
-        assert_eq!(pairs > r.tiles.pairs(), spans == Spans::Box, "{tuning:?}");
+        assert_eq!(pairs > r.tiles.pairs(), spans == Spans::Box, "{knobs:?}");
     }
 }
 
 #[test]
 fn looser_knobs_have_larger_errors() {
     let s = Synthetic::<f32>::new(2000, 150, 97, 6).unwrap();
-    let exact = Tuning {
+    let exact = AccuracyKnobs {
         alpha_min: 1e-9,
         transmittance_min: 0.0,
-        ..Tuning::default()
+        ..AccuracyKnobs::default()
     };
     let (r, _) = tuned(&s, exact);
-    let error = |tuning| -> f64 {
-        let (other, _) = tuned(&s, tuning);
+    let error = |knobs| -> f64 {
+        let (other, _) = tuned(&s, knobs);
         let pairs = r.image.iter().zip(&other.image);
         pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum()
     };
-    let floor = |alpha_min| error(Tuning { alpha_min, ..exact });
+    let floor = |alpha_min| error(AccuracyKnobs { alpha_min, ..exact });
     let stop = |transmittance_min| {
-        error(Tuning {
+        error(AccuracyKnobs {
             transmittance_min,
             ..exact
         })
     };
     let degree = |exp2_degree| {
-        error(Tuning {
+        error(AccuracyKnobs {
             exp2_degree,
             ..exact
         })
@@ -177,39 +177,39 @@ fn looser_knobs_have_larger_errors() {
 
 #[test]
 fn knobs_out_of_range_are_named() {
-    let d = Tuning::default();
+    let d = AccuracyKnobs::default();
     assert!(d.check().is_ok());
-    for (name, tuning) in [
+    for (name, knobs) in [
         (
             "alpha_min",
-            Tuning {
+            AccuracyKnobs {
                 alpha_min: 0.0,
                 ..d
             },
         ),
         (
             "alpha_min",
-            Tuning {
+            AccuracyKnobs {
                 alpha_min: f64::NAN,
                 ..d
             },
         ),
         (
             "transmittance_min",
-            Tuning {
+            AccuracyKnobs {
                 transmittance_min: 1.0,
                 ..d
             },
         ),
         (
             "exp2_degree",
-            Tuning {
+            AccuracyKnobs {
                 exp2_degree: 7,
                 ..d
             },
         ),
     ] {
-        assert_eq!(tuning.check().unwrap_err().name, name);
+        assert_eq!(knobs.check().unwrap_err().name, name);
     }
 }
 

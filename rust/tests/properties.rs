@@ -3,13 +3,12 @@
 //! `PROPTEST_CASES` and `PROPTEST_RNG_SEED` ask for more scenes or others than those of the fixed seed.
 
 use hqgs::{
-    camera::Camera,
+    accuracy_knobs::{AccuracyKnobs, Spans},
     composite::{self, CompositeCotangents, CompositeInput},
     project::{self, ProjectCotangents, ProjectOptions},
-    real::Real,
-    scene::{Colors, Gaussians, Harmonics},
+    scene::{Camera, Colors, Gaussians, Harmonics},
+    simd::Real,
     tiles,
-    tuning::{Spans, Tuning},
 };
 use proptest::{collection::vec, prelude::*, sample::select, test_runner::RngSeed};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -544,12 +543,12 @@ fn work_in_parts_changes_no_bit<T: Real>(
     }
     for (spans, skip_blocks) in [(Spans::Ellipse, false), (Spans::Box, true)] {
         let mut other = s.clone();
-        other.options.tuning = Tuning {
+        other.options.knobs = AccuracyKnobs {
             spans,
             skip_blocks,
-            ..Tuning::default()
+            ..AccuracyKnobs::default()
         };
-        prop_assert!(other.render::<T>() == out, "{:?}", other.options.tuning);
+        prop_assert!(other.render::<T>() == out, "{:?}", other.options.knobs);
     }
     Ok(())
 }

@@ -1,0 +1,214 @@
+//! The gradients of each Gaussian from those of its pairs.
+
+use super::{
+    CompositeGrads, CompositeInput, Wanted,
+    kernel::{ABSOLUTE, MOMENTS},
+};
+use crate::{
+    project::Splat,
+    simd::Real,
+    tiles::{Chunk, UNIT},
+    uninit::UninitVec,
+};
+use fearless_simd::{Level, Simd, dispatch};
+use rayon::prelude::*;
+use std::hint::black_box;
+
+/// Call a function for the number of channels: the common ones are compiled for it.
+macro_rules! for_channels {
+    ($channels:expr, $function:ident, $simd:expr, $types:ty, ($($argument:expr),*)) => {
+        match $channels {
+            3 => $function::<_, $types, 3>($simd, $($argument),*),
+            4 => $function::<_, $types, 4>($simd, $($argument),*),
+            _ => $function::<_, $types, 0>($simd, $($argument),*),
+        }
+    };
+}
+
+/// Layout of one pair's gradients: moments, colours, absolute gradients.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PairLayout {
+    pub absolute: bool,
+    pub channels: usize,
+}
+
+impl PairLayout {
+    /// Numbers of a pair.
+    pub const fn row(self) -> usize {
+        MOMENTS + self.channels + if self.absolute { ABSOLUTE } else { 0 }
+    }
+}
+
+/// Sum each Gaussian's pairs in tile order, and turn the moments into gradients.
+pub(super) fn gather<T: Real>(
+    input: &CompositeInput<T>,
+    pair_grads: &[Vec<T>],
+    layout: PairLayout,
+    wanted: Wanted,
+) -> CompositeGrads<T> {
+    let chunks = &input.tiles.chunks;
+    let channels = layout.channels;
+    let rows = [
+        (wanted.geometry, 2),
+        (wanted.geometry, 3),
+        (wanted.geometry, 1),
+        (layout.absolute, ABSOLUTE),
+        (wanted.colors, channels),
+    ]
+    .map(|(wanted, row)| if wanted { row } else { 0 });
+    let n = input.projection.splats.len();
+    let mut arrays = rows.map(|row| UninitVec::new(row * n));
+    let cut = |array, row| UninitVec::cut(array, chunks.iter().map(|c| (c.end - c.begin) * row));
+    let [means2d, whitened, opacities, absolute, colors] = &mut arrays;
+    let jobs: Vec<_> = chunks
+        .iter()
+        .zip(cut(means2d, rows[0]))
+        .zip(cut(whitened, rows[1]))
+        .zip(cut(opacities, rows[2]))
+        .zip(cut(absolute, rows[3]))
+        .zip(cut(colors, rows[4]))
+        .collect();
+    let level = Level::new();
+    jobs.into_par_iter().for_each(
+        |(((((chunk, means2d), whitened), opacities), absolute), colors)| {
+            let out = Gather {
+                chunk,
+                means2d: means2d.fill(T::ZERO),
+                whitened: whitened.fill(T::ZERO),
+                opacities: opacities.fill(T::ZERO),
+                absolute: absolute.fill(T::ZERO),
+                colors: colors.fill(T::ZERO),
+            };
+            dispatch!(level, simd => for_channels!(
+                channels, gather_chunk, simd, T, (input, pair_grads, layout, out)
+            ));
+        },
+    );
+    let [means2d, whitened, opacities, absolute, colors] = arrays.map(UninitVec::finish);
+    CompositeGrads {
+        means2d,
+        whitened,
+        opacities,
+        absolute,
+        colors,
+        ..CompositeGrads::default()
+    }
+}
+
+/// The outputs of one chunk: empty where not wanted, zeros before.
+struct Gather<'a, T> {
+    chunk: &'a Chunk,
+    means2d: &'a mut [T],
+    whitened: &'a mut [T],
+    opacities: &'a mut [T],
+    absolute: &'a mut [T],
+    colors: &'a mut [T],
+}
+
+impl<T: Real> Gather<'_, T> {
+    /// Write the gradients of Gaussian `i` from the sums over its pairs.
+    #[inline(always)]
+    fn write(
+        &mut self,
+        i: usize,
+        splat: &Splat,
+        moments: &[f64],
+        colors: &[f64],
+        absolute: &[f64],
+    ) {
+        let i = i - self.chunk.begin;
+        write(self.colors, i, colors);
+        let [s, m, t] = splat.factors;
+        // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
+        let (wu, wv) = (moments[1] / UNIT, moments[2] / UNIT);
+        write(self.means2d, i, &[-s * wu, s * m * wu - t * wv]);
+        // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
+        let k = -0.5 / (UNIT * UNIT);
+        let whitened = [k * moments[3], k * moments[4], k * moments[5]];
+        write(self.whitened, i, &whitened);
+        // sigma enters as opacity exp(-sigma)
+        write(self.opacities, i, &[-moments[0] / splat.opacity]);
+        let absolute = [s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)];
+        write(self.absolute, i, &absolute);
+    }
+}
+
+/// Row `i` of an output, if it is wanted.
+#[inline(always)]
+fn write<T: Real>(out: &mut [T], i: usize, values: &[f64]) {
+    if !out.is_empty() {
+        for (o, v) in out[i * values.len()..].iter_mut().zip(values) {
+            *o = T::from_f64(*v);
+        }
+    }
+}
+
+/// Spans whose rows are looked up together.
+const FETCH: usize = 64;
+
+/// `gather` for one chunk of Gaussians.
+#[inline(always)]
+fn gather_chunk<S: Simd, T: Real, const D: usize>(
+    _: S,
+    input: &CompositeInput<T>,
+    pair_grads: &[Vec<T>],
+    layout: PairLayout,
+    mut out: Gather<T>,
+) {
+    let channels = if D > 0 { D } else { layout.channels };
+    let row = PairLayout { channels, ..layout }.row();
+    let mut next = out.chunk.starts.clone();
+    let zeros = vec![T::ZERO; row];
+    let mut moments = [0.0; MOMENTS];
+    let mut absolute = [0.0; ABSOLUTE];
+    let mut colors = vec![0.0; channels];
+    let mut current = None;
+    let mut rows: Vec<&[T]> = Vec::new();
+    for spans in out.chunk.spans.chunks(FETCH) {
+        // A short loop that only looks the rows up: its many misses overlap.
+        rows.clear();
+        for span in spans {
+            for tile in span.tiles(input.tiles.tiles_x) {
+                let place = next[tile] as usize;
+                next[tile] += 1;
+                let grads = pair_grads[tile]
+                    .get(place * row..(place + 1) * row)
+                    .unwrap_or(&zeros);
+                black_box(grads[0]);
+                black_box(grads[row - 1]);
+                rows.push(grads);
+            }
+        }
+        let mut rows = rows.iter();
+        for span in spans {
+            let i = span.gaussian as usize;
+            if let Some(last) = current.filter(|&last| last != i) {
+                let splat = &input.projection.splats[last];
+                out.write(last, splat, &moments, &colors, &absolute);
+                moments.fill(0.0);
+                colors.fill(0.0);
+                absolute.fill(0.0);
+            }
+            current = Some(i);
+            for grads in rows.by_ref().take(span.tiles(input.tiles.tiles_x).len()) {
+                add(&mut moments, grads);
+                add(&mut colors[..channels], &grads[MOMENTS..]);
+                if layout.absolute {
+                    add(&mut absolute, &grads[MOMENTS + channels..]);
+                }
+            }
+        }
+    }
+    if let Some(last) = current {
+        let splat = &input.projection.splats[last];
+        out.write(last, splat, &moments, &colors, &absolute);
+    }
+}
+
+#[inline(always)]
+fn add<T: Real>(sums: &mut [f64], grads: &[T]) {
+    let grads = &grads[..sums.len()];
+    for (sum, grad) in sums.iter_mut().zip(grads) {
+        *sum += grad.to_f64();
+    }
+}

@@ -1,0 +1,201 @@
+//! The inner loops of compositing: one Gaussian against the 4 x 4 pixel blocks of one tile.
+//!
+//! A tile keeps its pixels block by block (`block * 16 + row in block * 4 + column in block`), so that a
+//! block is one or a few SIMD vectors. A block goes through its own list of Gaussians with its pixels in
+//! registers. A finished pixel has transmittance 0.
+
+mod blend;
+mod unblend;
+
+pub(super) use blend::blend;
+pub(super) use unblend::{ABSOLUTE, Adjoint, LAYER, MOMENTS, Sums, unblend};
+
+use crate::{
+    constants::{ALPHA_MAX, BLOCK, BLOCK_PIXELS, BLOCKS_PER_SIDE, TILE, TILE_PIXELS},
+    simd::{Lanes, Real},
+    tiles::Record,
+};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
+
+/// One value for each pixel of a tile, block by block.
+pub(super) type Pixels<T> = [T; TILE_PIXELS];
+
+/// Lanes of a vector of `T`.
+#[inline(always)]
+pub(super) const fn width<S: Simd, T: Real>() -> usize {
+    <Lanes<T, S> as SimdBase<S>>::LEN
+}
+
+/// (row, column) in the tile of pixel `p` in block order.
+pub(super) const fn position(p: usize) -> (usize, usize) {
+    let (block, inner) = (p / BLOCK_PIXELS, p % BLOCK_PIXELS);
+    (
+        block / BLOCKS_PER_SIDE * BLOCK + inner / BLOCK,
+        block % BLOCKS_PER_SIDE * BLOCK + inner % BLOCK,
+    )
+}
+
+/// Coordinates that do not depend on the Gaussian, relative to the tile's centre.
+pub(super) struct Grid<T> {
+    /// Pixel centres.
+    x: Pixels<T>,
+    y: Pixels<T>,
+}
+
+impl<T: Real> Grid<T> {
+    pub fn new() -> Self {
+        let half = (TILE / 2) as f64;
+        let pixel = |k: usize| T::from_f64(k as f64 + 0.5 - half);
+        Self {
+            x: std::array::from_fn(|p| pixel(position(p).1)),
+            y: std::array::from_fn(|p| pixel(position(p).0)),
+        }
+    }
+
+    /// The pixel centres of a block, as V vectors each.
+    #[inline(always)]
+    pub fn block<S: Simd, const V: usize>(&self, simd: S, block: usize) -> [[Lanes<T, S>; V]; 2] {
+        let at = block * BLOCK_PIXELS;
+        [load(simd, &self.x[at..]), load(simd, &self.y[at..])]
+    }
+}
+
+/// A [`Record`] in vectors.
+pub(super) struct RecordLanes<S: Simd, T: Real> {
+    u0: Lanes<T, S>,
+    v0: Lanes<T, S>,
+    s: Lanes<T, S>,
+    n: Lanes<T, S>,
+    t: Lanes<T, S>,
+    opacity: Lanes<T, S>,
+}
+
+impl<S: Simd, T: Real> RecordLanes<S, T> {
+    #[inline(always)]
+    pub fn new(simd: S, g: &Record<T>) -> Self {
+        let splat = |x: T| Lanes::<T, S>::splat(simd, x);
+        Self {
+            u0: splat(g.u0),
+            v0: splat(g.v0),
+            s: splat(g.s),
+            n: splat(g.n),
+            t: splat(g.t),
+            opacity: splat(g.opacity),
+        }
+    }
+
+    /// (u, v) at the pixels (x, y).
+    #[inline(always)]
+    fn position(&self, x: Lanes<T, S>, y: Lanes<T, S>) -> (Lanes<T, S>, Lanes<T, S>) {
+        (
+            self.s.mul_add(x, self.n.mul_add(y, self.u0)),
+            self.t.mul_add(y, self.v0),
+        )
+    }
+
+    /// alpha at the pixels (x, y): the one function that both passes use. E: degree of the power of 2.
+    #[inline(always)]
+    pub fn alpha<const E: usize>(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
+        let (u, v) = self.position(x, y);
+        let power = u.mul_add(u, v * v);
+        let alpha =
+            self.opacity * T::exp2::<S, E>(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
+        alpha.min(Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX)))
+    }
+}
+
+/// A block's pixels of `data`, as V vectors.
+#[inline(always)]
+pub(super) fn load<S: Simd, T: Real, const V: usize>(simd: S, data: &[T]) -> [Lanes<T, S>; V] {
+    let mut out = [Lanes::<T, S>::splat(simd, T::ZERO); V];
+    for (j, out) in out.iter_mut().enumerate() {
+        *out = Lanes::<T, S>::from_slice(simd, &data[j * width::<S, T>()..][..width::<S, T>()]);
+    }
+    out
+}
+
+/// The other way round.
+#[inline(always)]
+pub(super) fn store<S: Simd, T: Real, const V: usize>(data: &mut [T], vectors: [Lanes<T, S>; V]) {
+    for (j, vector) in vectors.into_iter().enumerate() {
+        vector.store_slice(&mut data[j * width::<S, T>()..][..width::<S, T>()]);
+    }
+}
+
+/// The Gaussians of one block, front to back.
+#[derive(Clone, Copy)]
+pub(super) struct Layers<'a, T> {
+    /// Indices into `records`.
+    pub list: &'a [u32],
+    /// Of the whole tile.
+    pub records: &'a [Record<T>],
+    /// Colours of the records, [records, channels].
+    pub colors: &'a [T],
+    /// Colour behind the last layer.
+    pub background: Option<&'a [T]>,
+    pub channels: usize,
+    /// Smallest alpha that is blended.
+    pub floor: T,
+    /// Transmittance at which a pixel is finished.
+    pub least: T,
+}
+
+/// Layers between two tests whether all pixels are finished.
+pub(super) const STRIDE: usize = 4;
+
+/// What decides whether a pixel blends a layer, in vectors.
+pub(super) struct Decision<S: Simd, T: Real> {
+    /// Smallest alpha that is blended.
+    floor: Lanes<T, S>,
+    /// Transmittance at which a pixel is finished.
+    least: Lanes<T, S>,
+    one: Lanes<T, S>,
+    zero: Lanes<T, S>,
+}
+
+/// What becomes of pixels that meet a layer.
+pub(super) struct Met<S: Simd, T: Real> {
+    /// The pixels that blend it.
+    pub blended: <Lanes<T, S> as SimdBase<S>>::Mask,
+    /// Transmittance behind the layer, where it is blended.
+    pub behind: Lanes<T, S>,
+    /// What the next layer meets: the transmittance, 0 where the pixel is finished.
+    pub open: Lanes<T, S>,
+}
+
+impl<S: Simd, T: Real> Decision<S, T> {
+    #[inline(always)]
+    pub fn new(simd: S, layers: &Layers<T>) -> Self {
+        Self {
+            floor: Lanes::<T, S>::splat(simd, layers.floor),
+            least: Lanes::<T, S>::splat(simd, layers.least),
+            one: Lanes::<T, S>::splat(simd, T::ONE),
+            zero: Lanes::<T, S>::splat(simd, T::ZERO),
+        }
+    }
+
+    /// Pixels of transmittance `open` meet a layer. Both passes and the largest weights decide here, so that
+    /// they cannot disagree.
+    #[inline(always)]
+    pub fn meet(&self, alpha: Lanes<T, S>, open: Lanes<T, S>) -> Met<S, T> {
+        let opaque = alpha.simd_ge(self.floor);
+        let behind = open * (self.one - alpha);
+        let blended = opaque & behind.simd_gt(self.least);
+        Met {
+            blended,
+            behind,
+            // An opaque lane that does not blend is finished.
+            open: opaque.select(blended.select(behind, self.zero), open),
+        }
+    }
+
+    /// Whether no pixel is open any more.
+    #[inline(always)]
+    pub fn finished<const V: usize>(&self, open: &[Lanes<T, S>; V]) -> bool {
+        let mut unfinished = 0;
+        for open in open {
+            unfinished |= open.simd_gt(self.zero).to_bitmask();
+        }
+        unfinished == 0
+    }
+}

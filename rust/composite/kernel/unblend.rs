@@ -1,0 +1,214 @@
+//! A block in the backward pass, and the sums over the blocks of a tile.
+
+use super::{Decision, Grid, Layers, Pixels, RecordLanes, load, store, width};
+use crate::{
+    constants::{ALPHA_MAX, BLOCK_PIXELS, TILE_PIXELS},
+    simd::{Lanes, Real},
+    tiles::Record,
+};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+
+/// Sums over the pixels of a tile for one Gaussian; the order of the fields is the order in memory.
+/// With w the gradient of the loss with respect to sigma: w, w u, w v, w u^2, w u v, w v^2.
+pub const MOMENTS: usize = 6;
+
+/// |d loss / d mean2d| summed pixel by pixel, x and y, where asked for.
+pub const ABSOLUTE: usize = 2;
+
+/// Numbers that `unblend` stores per layer of a block.
+pub const LAYER: usize = 2 * BLOCK_PIXELS;
+
+/// One tile in the backward pass.
+pub struct Adjoint<T> {
+    /// 1 inside the image, 0 outside.
+    pub transmittance: Pixels<T>,
+    /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance.
+    pub behind: Pixels<T>,
+    /// Cotangent of each channel.
+    pub v_colors: Vec<Pixels<T>>,
+}
+
+impl<T: Real> Adjoint<T> {
+    pub fn new(channels: usize) -> Self {
+        Self {
+            transmittance: [T::ZERO; TILE_PIXELS],
+            behind: [T::ZERO; TILE_PIXELS],
+            v_colors: vec![[T::ZERO; TILE_PIXELS]; channels],
+        }
+    }
+
+    /// Set everything to 0.
+    #[inline(always)]
+    pub fn clear(&mut self) {
+        self.transmittance.fill(T::ZERO);
+        self.behind.fill(T::ZERO);
+        self.v_colors.as_flattened_mut().fill(T::ZERO);
+    }
+}
+
+/// Gradients of the layers of one block (V vectors). For each layer `out` receives w, the gradient with
+/// respect to sigma, and the weight of its colour.
+///
+/// Front to back once more for transmittance and alpha of each layer, then back to front. There `behind` is
+/// a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however deep
+/// the layer.
+#[inline(always)]
+pub fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
+    simd: S,
+    grid: &Grid<T>,
+    block: usize,
+    layers: Layers<T>,
+    adjoint: &Adjoint<T>,
+    out: &mut [T],
+) {
+    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
+    let channels = if D > 0 { D } else { layers.channels };
+    let at = block * BLOCK_PIXELS;
+    let [x, y] = grid.block::<S, V>(simd, block);
+    let decision = Decision::new(simd, &layers);
+    let (cap, zero) = (splat(T::from_f64(ALPHA_MAX)), splat(T::ZERO));
+    let mut open = load::<S, T, V>(simd, &adjoint.transmittance[at..]);
+    for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)) {
+        let record = RecordLanes::<S, T>::new(simd, &layers.records[k as usize]);
+        let (mut before, mut alphas) = (open, [zero; V]);
+        for j in 0..V {
+            let alpha = record.alpha::<E>(simd, x[j], y[j]);
+            let met = decision.meet(alpha, open[j]);
+            before[j] = open[j];
+            alphas[j] = met.blended.select(alpha, zero);
+            open[j] = met.open;
+        }
+        store::<S, T, V>(out, before);
+        store::<S, T, V>(&mut out[BLOCK_PIXELS..], alphas);
+    }
+    let mut behind = load::<S, T, V>(simd, &adjoint.behind[at..]);
+    let mut v_colors = [[zero; V]; D];
+    for (v, color) in v_colors.iter_mut().zip(&adjoint.v_colors) {
+        *v = load::<S, T, V>(simd, &color[at..]);
+    }
+    for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)).rev() {
+        let k = k as usize;
+        let rgb = &layers.colors[k * channels..(k + 1) * channels];
+        let before = load::<S, T, V>(simd, out);
+        let alpha = load::<S, T, V>(simd, &out[BLOCK_PIXELS..]);
+        let (mut ws, mut weights) = ([zero; V], [zero; V]);
+        for j in 0..V {
+            let weight = before[j] * alpha[j];
+            let mut q = zero;
+            for (c, color) in rgb.iter().enumerate() {
+                let v = if D > 0 {
+                    v_colors[c][j]
+                } else {
+                    let v = &adjoint.v_colors[c][at + j * width::<S, T>()..];
+                    Lanes::<T, S>::from_slice(simd, &v[..width::<S, T>()])
+                };
+                q = v.mul_add(splat(*color), q);
+            }
+            let difference = q - behind[j];
+            // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
+            ws[j] = alpha[j].simd_lt(cap).select(weight * (behind[j] - q), zero);
+            behind[j] = alpha[j].mul_add(difference, behind[j]);
+            weights[j] = weight;
+        }
+        store::<S, T, V>(out, ws);
+        store::<S, T, V>(&mut out[BLOCK_PIXELS..], weights);
+    }
+}
+
+/// Running sums of one Gaussian over its blocks.
+pub struct Sums<S: Simd, T: Real> {
+    record: RecordLanes<S, T>,
+    /// The moments, the colours (at most 4 channels), the absolute gradients.
+    lanes: [Lanes<T, S>; MOMENTS + 4 + ABSOLUTE],
+}
+
+impl<S: Simd, T: Real> Sums<S, T> {
+    #[inline(always)]
+    pub fn new(simd: S, g: &Record<T>) -> Self {
+        Self {
+            record: RecordLanes::new(simd, g),
+            lanes: [Lanes::<T, S>::splat(simd, T::ZERO); MOMENTS + 4 + ABSOLUTE],
+        }
+    }
+
+    /// Add one block of what `unblend` stored. With D = 0 the gradient of the colour goes straight to `out`.
+    #[inline(always)]
+    pub fn add<const D: usize>(
+        &mut self,
+        simd: S,
+        grid: &Grid<T>,
+        block: usize,
+        layer: &[T],
+        v_colors: &[Pixels<T>],
+        absolute: bool,
+        out: &mut [T],
+    ) {
+        let (ws, weights) = layer.split_at(BLOCK_PIXELS);
+        for i in (0..BLOCK_PIXELS).step_by(width::<S, T>()) {
+            let at = block * BLOCK_PIXELS + i..block * BLOCK_PIXELS + i + width::<S, T>();
+            let w = Lanes::<T, S>::from_slice(simd, &ws[i..i + width::<S, T>()]);
+            let weight = Lanes::<T, S>::from_slice(simd, &weights[i..i + width::<S, T>()]);
+            let x = Lanes::<T, S>::from_slice(simd, &grid.x[at.clone()]);
+            let y = Lanes::<T, S>::from_slice(simd, &grid.y[at.clone()]);
+            let (u, v) = self.record.position(x, y);
+            let (wu, wv) = (w * u, w * v);
+            let lanes = &mut self.lanes;
+            lanes[0] += w;
+            lanes[1] += wu;
+            lanes[2] += wv;
+            lanes[3] = wu.mul_add(u, lanes[3]);
+            lanes[4] = wu.mul_add(v, lanes[4]);
+            lanes[5] = wv.mul_add(v, lanes[5]);
+            if D > 0 {
+                for (c, v) in v_colors[..D].iter().enumerate() {
+                    let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
+                    lanes[MOMENTS + c] = weight.mul_add(v, lanes[MOMENTS + c]);
+                }
+            } else {
+                for (c, v) in v_colors.iter().enumerate() {
+                    let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
+                    out[MOMENTS + c] += (weight * v).reduce_sum();
+                }
+            }
+            if absolute {
+                lanes[MOMENTS + D] += wu.abs();
+                lanes[MOMENTS + D + 1] += self.record.n.mul_add(wu, self.record.t * wv).abs();
+            }
+        }
+    }
+
+    /// Write the sums: moments, colours, absolute gradients.
+    #[inline(always)]
+    pub fn finish<const D: usize>(mut self, absolute: bool, out: &mut [T]) {
+        if absolute {
+            self.reduce::<D>(MOMENTS + D + ABSOLUTE, out);
+        } else {
+            self.reduce::<D>(MOMENTS + D, out);
+        }
+    }
+
+    /// Sum the lanes of the first `count` vectors, all together: each step adds neighbours and halves the
+    /// number of vectors.
+    #[inline(always)]
+    fn reduce<const D: usize>(&mut self, count: usize, out: &mut [T]) {
+        let (mut lanes, mut vectors) = (width::<S, T>(), count);
+        while lanes > 1 {
+            for k in 0..vectors.div_ceil(2) {
+                let (a, b) = (self.lanes[2 * k], self.lanes[(2 * k + 1).min(vectors - 1)]);
+                self.lanes[k] = a.unzip_low(b) + a.unzip_high(b);
+            }
+            vectors = vectors.div_ceil(2);
+            lanes /= 2;
+        }
+        for k in 0..count {
+            let sum = self.lanes[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
+            // Without compiled channels the colours lie between the moments and the absolute gradients.
+            let place = if D == 0 && k >= MOMENTS {
+                out.len() - count + k
+            } else {
+                k
+            };
+            out[place] = sum;
+        }
+    }
+}

@@ -1,0 +1,228 @@
+//! The largest blending weight of each Gaussian: how much it matters to the pixel that it matters to most.
+//!
+//! The weight of a Gaussian in a pixel is its alpha times the transmittance in front of it, the factor of its
+//! colour in the image. The kernel decides as the compositor does, and evaluates no colour.
+
+use super::{
+    CompositeInput, for_vectors,
+    kernel::{Decision, Grid, Layers, RecordLanes, STRIDE, load, width},
+};
+use crate::{
+    accuracy_knobs::EXP2_DEGREE,
+    constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
+    error::{Error, check_len},
+    simd::{Lanes, Real},
+};
+use fearless_simd::{Level, Select, Simd, SimdBase, dispatch};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// The largest weight of each Gaussian over the pixels of an image, `[N]`; 0 for one that no pixel blends.
+///
+/// `mask` [H, W] says which pixels count; None: all of them. The tile lists need no channels, and the
+/// background plays no part. The power of 2 is always that of the default knobs. A maximum is the same in any
+/// order, so that the bits depend on no number of threads.
+///
+/// # Errors
+/// When the length of the mask does not fit.
+pub fn max_weights<T: Real>(
+    input: &CompositeInput<T>,
+    mask: Option<&[bool]>,
+) -> Result<Vec<T>, Error> {
+    if let Some(mask) = mask {
+        check_len("mask", mask, input.pixels())?;
+    }
+    let n = input.projection.splats.len();
+    // The bits of a number that is not negative are ordered as the number is.
+    let most: Vec<AtomicU64> = (0..n).into_par_iter().map(|_| AtomicU64::new(0)).collect();
+    let grid = Grid::new();
+    let level = Level::new();
+    (0..input.tiles.lists.len())
+        .into_par_iter()
+        .for_each_init(Vec::new, |lanes, tile| {
+            dispatch!(level, simd => weigh_tile(simd, input, &grid, mask, tile, lanes, &most));
+        });
+    Ok(most
+        .into_par_iter()
+        .map(|bits| T::from_f64(f64::from_bits(bits.into_inner())))
+        .collect())
+}
+
+/// Raise `most` to the weights of one tile. `lanes` is a buffer.
+#[inline(always)]
+fn weigh_tile<S: Simd, T: Real>(
+    simd: S,
+    input: &CompositeInput<T>,
+    grid: &Grid<T>,
+    mask: Option<&[bool]>,
+    tile: usize,
+    lanes: &mut Vec<T>,
+    most: &[AtomicU64],
+) {
+    let list = &input.tiles.lists[tile];
+    if list.records.is_empty() {
+        return;
+    }
+    // A pixel that does not count is finished before it begins, as one outside the image.
+    let mut open = [T::ZERO; TILE_PIXELS];
+    for (p, pixel, n) in input.runs(tile) {
+        for k in 0..n {
+            if mask.is_none_or(|mask| mask[pixel + k]) {
+                open[p + k] = T::ONE;
+            }
+        }
+    }
+    lanes.clear();
+    lanes.resize(list.records.len() * width::<S, T>(), T::ZERO);
+    for block in 0..TILE_BLOCKS {
+        let open = &open[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
+        if open.iter().all(|x| *x == T::ZERO) {
+            continue;
+        }
+        let layers = input.layers(tile, block);
+        for_vectors!(S, T, V => weigh::<S, T, V>(simd, grid, block, layers, open, lanes));
+    }
+    for (record, lanes) in list.records.iter().zip(lanes.chunks_exact(width::<S, T>())) {
+        let mut weight = 0.0f64;
+        for lane in lanes {
+            weight = weight.max(lane.to_f64());
+        }
+        let most = &most[record.gaussian as usize];
+        if weight.to_bits() > most.load(Ordering::Relaxed) {
+            most.fetch_max(weight.to_bits(), Ordering::Relaxed);
+        }
+    }
+}
+
+/// Raise `largest` to the weights of the layers in one block (V vectors): for each record of the tile as many
+/// numbers as a vector has lanes, whose maximum is the record's. `transmittance` is 1 in the pixels that count,
+/// 0 in the others.
+#[inline(always)]
+fn weigh<S: Simd, T: Real, const V: usize>(
+    simd: S,
+    grid: &Grid<T>,
+    block: usize,
+    layers: Layers<T>,
+    transmittance: &[T],
+    largest: &mut [T],
+) {
+    let [x, y] = grid.block::<S, V>(simd, block);
+    let decision = Decision::new(simd, &layers);
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+    let mut open = load::<S, T, V>(simd, transmittance);
+    for part in layers.list.chunks(STRIDE) {
+        for &k in part {
+            let k = k as usize;
+            let record = RecordLanes::<S, T>::new(simd, &layers.records[k]);
+            let out = &mut largest[k * width::<S, T>()..(k + 1) * width::<S, T>()];
+            let mut most = Lanes::<T, S>::from_slice(simd, out);
+            for j in 0..V {
+                let alpha = record.alpha::<EXP2_DEGREE>(simd, x[j], y[j]);
+                let met = decision.meet(alpha, open[j]);
+                most = most.max(met.blended.select(open[j] * alpha, zero));
+                open[j] = met.open;
+            }
+            most.store_slice(out);
+        }
+        if decision.finished(&open) {
+            break;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        project::{self, ProjectOptions, Projection},
+        scene::{Colors, synthetic::Synthetic},
+        tiles::{self, Tiles},
+    };
+    use rayon::ThreadPoolBuilder;
+
+    fn binned<T: Real>(s: &Synthetic<T>) -> (Projection, Tiles<T>) {
+        let none = Colors::Channels(&[], 0);
+        let options = ProjectOptions::default();
+        let projection = project::forward(&s.gaussians(), none, &s.camera, &options).projection;
+        let tiles = tiles::bin(&projection, &[], 0, &s.camera).unwrap();
+        (projection, tiles)
+    }
+
+    fn weights<T: Real>(s: &Synthetic<T>, mask: Option<&[bool]>) -> Result<Vec<T>, Error> {
+        let (projection, tiles) = binned(s);
+        let input = CompositeInput {
+            projection: &projection,
+            tiles: &tiles,
+            camera: &s.camera,
+            background: None,
+        };
+        max_weights(&input, mask)
+    }
+
+    /// By the definition: every Gaussian at every pixel, in depth order.
+    fn brute_force(s: &Synthetic<f64>, mask: Option<&[bool]>) -> Vec<f64> {
+        let (projection, _) = binned(s);
+        let mut order: Vec<usize> = (0..s.opacities.len())
+            .filter(|&i| projection.splats[i].visible())
+            .collect();
+        order.sort_by(|&a, &b| projection.depths[a].total_cmp(&projection.depths[b]));
+        let mut most = vec![0.0f64; s.opacities.len()];
+        for pixel in 0..s.camera.width * s.camera.height {
+            if mask.is_some_and(|mask| !mask[pixel]) {
+                continue;
+            }
+            let (x, y) = (pixel % s.camera.width, pixel / s.camera.width);
+            let mut t = 1.0;
+            for &i in &order {
+                let alpha = projection.splats[i].alpha(x as f64 + 0.5, y as f64 + 0.5);
+                if alpha < 1.0 / 255.0 {
+                    continue;
+                }
+                if t * (1.0 - alpha) <= 0.999e-4 {
+                    break;
+                }
+                most[i] = most[i].max(t * alpha);
+                t *= 1.0 - alpha;
+            }
+        }
+        most
+    }
+
+    #[test]
+    fn weights_follow_the_definition() {
+        for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
+            let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
+            let some: Vec<bool> = (0..width * height).map(|i| i * 7 % 11 < 4).collect();
+            for mask in [None, Some(&some[..])] {
+                let expected = brute_force(&s, mask);
+                assert!(expected.iter().any(|w| *w > 0.1));
+                for (i, (a, b)) in weights(&s, mask).unwrap().iter().zip(&expected).enumerate() {
+                    assert!((a - b).abs() < 1e-13, "seed {seed}, {i}: {a}, not {b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let s = Synthetic::<f32>::new(5000, 150, 97, 1).unwrap();
+        let run = |threads| {
+            let pool = ThreadPoolBuilder::new().num_threads(threads);
+            pool.build().unwrap().install(|| weights(&s, None).unwrap())
+        };
+        let one = run(1);
+        for threads in [2, 3, 7] {
+            assert!(run(threads) == one, "{threads} threads");
+        }
+    }
+
+    #[test]
+    fn no_gaussians_and_no_pixels_that_count() {
+        let empty = Synthetic::<f32>::new(0, 20, 20, 1).unwrap();
+        assert!(weights(&empty, None).unwrap().is_empty());
+        let s = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
+        let none = weights(&s, Some(&[false; 400])).unwrap();
+        assert!(none.len() == 50 && none.iter().all(|w| *w == 0.0));
+        assert_eq!(weights(&s, Some(&[true; 399])).unwrap_err().name, "mask");
+    }
+}

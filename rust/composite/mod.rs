@@ -1,0 +1,126 @@
+//! Front-to-back compositing of binned splats, forward and VJP, tile by tile in parallel.
+
+mod backward;
+mod forward;
+mod gather;
+mod kernel;
+mod max_weights;
+
+pub use backward::{CompositeCotangents, CompositeGrads, Wanted, backward};
+pub use forward::{Image, forward};
+pub use max_weights::max_weights;
+
+use crate::{
+    constants::{BLOCK, TILE, TILE_BLOCKS, TILE_PIXELS},
+    error::{Error, check_len},
+    project::Projection,
+    scene::Camera,
+    simd::Real,
+    tiles::Tiles,
+};
+use kernel::Layers;
+
+/// Everything that both passes read.
+#[derive(Debug, Clone, Copy)]
+pub struct CompositeInput<'a, T> {
+    /// Projected Gaussians.
+    pub projection: &'a Projection,
+    /// Their tile lists.
+    pub tiles: &'a Tiles<T>,
+    /// Image size.
+    pub camera: &'a Camera,
+    /// Colour behind everything, `[channels]`.
+    pub background: Option<&'a [T]>,
+}
+
+impl<T: Real> CompositeInput<'_, T> {
+    /// Check the lengths of the arrays.
+    ///
+    /// # Errors
+    /// Names `backgrounds`.
+    fn check(&self) -> Result<(), Error> {
+        self.background
+            .map_or(Ok(()), |b| check_len("backgrounds", b, self.channels()))
+    }
+
+    fn channels(&self) -> usize {
+        self.tiles.channels
+    }
+
+    fn pixels(&self) -> usize {
+        self.camera.width * self.camera.height
+    }
+
+    /// What reaches one block.
+    fn layers(&self, tile: usize, block: usize) -> Layers<'_, T> {
+        let list = &self.tiles.lists[tile];
+        Layers {
+            list: &list.blocks[list.begins[block] as usize..list.begins[block + 1] as usize],
+            records: &list.records,
+            colors: &list.colors,
+            background: self.background,
+            channels: self.channels(),
+            floor: T::from_f64(self.projection.knobs.alpha_min),
+            least: T::from_f64(self.projection.knobs.transmittance_min),
+        }
+    }
+
+    /// The image's pixels in tile `tile`, up to four neighbours at a time: (index in block order, index in
+    /// the image, number).
+    #[inline(always)]
+    fn runs(&self, tile: usize) -> impl Iterator<Item = (usize, usize, usize)> + use<T> {
+        let (top, left) = (
+            tile / self.tiles.tiles_x * TILE,
+            tile % self.tiles.tiles_x * TILE,
+        );
+        let (width, height) = (self.camera.width, self.camera.height);
+        (0..TILE_PIXELS).step_by(BLOCK).filter_map(move |p| {
+            let (row, column) = kernel::position(p);
+            let (y, x) = (top + row, left + column);
+            (y < height && x < width).then(|| (p, y * width + x, BLOCK.min(width - x)))
+        })
+    }
+}
+
+/// What the backward pass replays.
+#[derive(Debug, Default)]
+pub struct Composited<T> {
+    /// For each block of each tile how many of its layers were evaluated before it was finished.
+    depths: Vec<[u32; TILE_BLOCKS]>,
+    /// Transmittance after the last layer, tile by tile in block order.
+    transmittance: Vec<T>,
+}
+
+/// Call a function for the number of channels, of which the common ones are compiled, and with three channels in
+/// f32 also for the degree of 2^x.
+macro_rules! for_alpha {
+    ($channels:expr, $degree:expr, $function:ident, $simd:expr, $T:ty, ($($argument:expr),*)) => {
+        match ($channels, if <$T>::SINGLE { $degree } else { EXP2_DEGREE }) {
+            (3, 3) => $function::<_, $T, 3, 3>($simd, $($argument),*),
+            (3, 4) => $function::<_, $T, 3, 4>($simd, $($argument),*),
+            (3, 5) => $function::<_, $T, 3, 5>($simd, $($argument),*),
+            (3, _) => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
+            (4, _) => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
+            _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
+        }
+    };
+}
+
+/// Call a kernel with the constant V: the number of vectors that a block has on this machine.
+macro_rules! for_vectors {
+    ($S:ty, $T:ty, $V:ident => $call:expr) => {
+        match BLOCK_PIXELS / crate::composite::kernel::width::<$S, $T>() {
+            1 => for_vectors!(@ $V = 1, $call),
+            2 => for_vectors!(@ $V = 2, $call),
+            4 => for_vectors!(@ $V = 4, $call),
+            8 => for_vectors!(@ $V = 8, $call),
+            _ => unreachable!("vectors have 2 to 16 lanes"),
+        }
+    };
+    (@ $V:ident = $vectors:literal, $call:expr) => {{
+        const $V: usize = $vectors;
+        $call
+    }};
+}
+
+use {for_alpha, for_vectors};

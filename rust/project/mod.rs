@@ -1,0 +1,166 @@
+//! Projection of all Gaussians into one camera, forward and VJP: geometry, culling, spherical harmonics.
+
+mod backward;
+mod camera_lanes;
+mod colors;
+mod forward;
+mod geometry;
+pub mod sh;
+mod splats;
+
+pub use backward::{GaussianGrads, ProjectCotangents, Wanted, backward};
+pub use colors::Shading;
+pub use forward::{Projected, forward};
+
+use crate::{
+    accuracy_knobs::AccuracyKnobs,
+    constants::{EPS2D, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK},
+    scene::Gaussians,
+    simd::{
+        Real, Wide,
+        groups::{self, Column, GROUP, wide3},
+        lanes, splat,
+    },
+    uninit::{UninitPiece, UninitVec},
+};
+use camera_lanes::CameraLanes;
+use fearless_simd::{Simd, SimdBase};
+use geometry::Geometry;
+
+/// Options of the projection; the defaults are gsplat's.
+#[derive(Debug, Clone, Copy)]
+pub struct ProjectOptions {
+    /// Gaussians nearer than this are culled.
+    pub near_plane: f64,
+    /// Gaussians farther than this are culled.
+    pub far_plane: f64,
+    /// Gaussians whose two radii are at most this many pixels are culled.
+    pub radius_clip: f64,
+    /// Low-pass filter, px^2.
+    pub eps2d: f64,
+    /// Scale the opacity so that the low-pass does not brighten small Gaussians.
+    pub antialiased: bool,
+    /// Keep what [`backward()`] needs of the harmonics.
+    pub differentiable: bool,
+    /// What trades accuracy for time, in this and the later stages.
+    pub knobs: AccuracyKnobs,
+}
+
+impl Default for ProjectOptions {
+    fn default() -> Self {
+        Self {
+            near_plane: NEAR_PLANE,
+            far_plane: FAR_PLANE,
+            radius_clip: 0.0,
+            eps2d: EPS2D,
+            antialiased: false,
+            differentiable: true,
+            knobs: AccuracyKnobs::default(),
+        }
+    }
+}
+
+/// One projected Gaussian as the compositor reads it: 64 bytes, one cache line.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(64))]
+pub struct Splat {
+    /// Centre, pixels. f64, because f32 would shift small Gaussians visibly: half an ulp at 500 px is 1.5e-5 px.
+    pub mean: [f64; 2],
+    /// Factors (s, m, t) of the conic; see `geometry.rs`.
+    pub factors: [f64; 3],
+    /// Opacity, compensated if antialiased; 0 for a culled Gaussian.
+    pub opacity: f64,
+    /// Radius of the support in standard deviations, with the slack.
+    pub reach: f32,
+    /// Tiles that its bounding box touches: x begin, x end, y begin, y end.
+    pub tiles: [u16; 4],
+}
+
+impl Splat {
+    /// Whether it was kept by the projection.
+    pub fn visible(&self) -> bool {
+        self.opacity > 0.0
+    }
+
+    /// Alpha at (x, y) by the definition, for the tests.
+    #[cfg(test)]
+    pub fn alpha(&self, x: f64, y: f64) -> f64 {
+        let [s, m, t] = self.factors;
+        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
+        let (u, v) = (s * (dx - m * dy), t * dy);
+        (self.opacity * (-0.5 * (u * u + v * v)).exp()).min(0.99)
+    }
+}
+
+/// What the later stages need of the projection of N Gaussians.
+#[derive(Debug, Default)]
+pub struct Projection {
+    /// All N Gaussians, culled ones included.
+    pub splats: Vec<Splat>,
+    /// View-space depth, `[N]`; 0 where culled.
+    pub depths: Vec<f64>,
+    /// That of the options.
+    pub knobs: AccuracyKnobs,
+}
+
+/// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.
+fn chunks<T: Copy>(array: &mut UninitVec<T>, n: usize, row: usize) -> Vec<UninitPiece<'_, T>> {
+    let rows = |c| PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
+    array.cut((0..n.div_ceil(PROJECT_CHUNK)).map(|c| rows(c) * row))
+}
+
+/// The lanes of a mask of f64.
+type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
+
+/// The geometry of a group of Gaussians, one column per number.
+struct Inputs<T> {
+    means: [Column<T>; 3],
+    quats: [Column<T>; 4],
+    scales: [Column<T>; 3],
+    opacities: Column<T>,
+}
+
+impl<T: Real> Inputs<T> {
+    const ZERO: Self = Self {
+        means: [Column::ZERO; 3],
+        quats: [Column::ZERO; 4],
+        scales: [Column::ZERO; 3],
+        opacities: Column::ZERO,
+    };
+
+    #[inline(always)]
+    fn read<S: Simd>(&mut self, simd: S, g: &Gaussians<T>, first: usize) {
+        groups::read(simd, g.means, first, &mut self.means);
+        groups::read(simd, g.quats, first, &mut self.quats);
+        groups::read(simd, g.scales, first, &mut self.scales);
+        self.opacities.load(g.opacities, first);
+    }
+
+    /// The geometry of the Gaussians `at..` of the group.
+    #[inline(always)]
+    fn geometry<S: Simd>(&self, simd: S, at: usize, camera: &CameraLanes<S>) -> Geometry<S> {
+        let quat = [
+            self.quats[0].wide(simd, at),
+            self.quats[1].wide(simd, at),
+            self.quats[2].wide(simd, at),
+            self.quats[3].wide(simd, at),
+        ];
+        Geometry::new::<T>(
+            simd,
+            wide3(simd, &self.means, at),
+            quat,
+            wide3(simd, &self.scales, at),
+            camera,
+        )
+    }
+}
+
+/// The lanes of a group in a bit set, as 1 or 0.
+#[inline(always)]
+fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> Mask<S> {
+    let mut ones = [0.0; GROUP];
+    for (lane, one) in ones.iter_mut().enumerate() {
+        *one = f64::from(set >> lane & 1);
+    }
+    Wide::<S>::from_slice(simd, &ones[at..at + lanes::<S>()]).simd_gt(splat(simd, 0.0))
+}

@@ -1,0 +1,41 @@
+//! What a function of the binding fails with.
+
+use hqgs::Error;
+use numpy::AsSliceError;
+use pyo3::{CastError, PyErr, exceptions::PyValueError};
+
+/// An error of the crate, or one of Python's own.
+#[derive(Debug)]
+pub(crate) struct BindingError(PyErr);
+
+pub(crate) type BindingResult<T> = Result<T, BindingError>;
+
+impl From<Error> for BindingError {
+    fn from(error: Error) -> Self {
+        Self(PyValueError::new_err(error.to_string()))
+    }
+}
+
+impl From<PyErr> for BindingError {
+    fn from(error: PyErr) -> Self {
+        Self(error)
+    }
+}
+
+impl From<CastError<'_, '_>> for BindingError {
+    fn from(error: CastError<'_, '_>) -> Self {
+        Self(error.into())
+    }
+}
+
+impl From<AsSliceError> for BindingError {
+    fn from(error: AsSliceError) -> Self {
+        Self(error.into())
+    }
+}
+
+impl From<BindingError> for PyErr {
+    fn from(error: BindingError) -> Self {
+        error.0
+    }
+}

@@ -1,0 +1,80 @@
+//! The Python extension `hqgs._rust`: all that knows Python. numpy arrays are borrowed, never copied; the GIL is
+//! released while the crate works; each [`hqgs::Error`] becomes a `ValueError`.
+
+mod arrays;
+mod composite;
+mod error;
+mod max_weights;
+mod pictures;
+mod project;
+mod training;
+
+use arrays::{Array, by_dtype};
+use error::BindingResult;
+use hqgs::{simd, threads};
+use numpy::Element;
+use pyo3::prelude::*;
+use std::ffi::{c_int, c_long};
+
+/// The buffers of an iteration are as large as those of the last one: an allocator that keeps them saves the
+/// page faults, which cost more than the arithmetic of the gradients.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// Let the allocator keep freed memory for this long: it would give it back after a second, in each second of
+/// the training again.
+const KEEP_FREED_MS: c_long = 10_000;
+
+#[allow(unsafe_code)]
+fn keep_freed_memory() {
+    /// `mi_option_purge_delay` of mimalloc.h.
+    const PURGE_DELAY: c_int = 15;
+    unsafe extern "C" {
+        // SAFETY: any thread may call it with any option, and the crate is linked with mimalloc.
+        safe fn mi_option_set_default(option: c_int, value: c_long);
+    }
+    mi_option_set_default(PURGE_DELAY, KEEP_FREED_MS);
+}
+
+/// Use this many threads from now on; results do not depend on it.
+#[pyfunction]
+fn set_num_threads(threads: usize) -> BindingResult<()> {
+    Ok(threads::set(threads)?)
+}
+
+/// Number of threads in use.
+#[pyfunction]
+fn get_num_threads() -> usize {
+    threads::get()
+}
+
+/// The vector instructions that the crate uses on this CPU; results may differ by rounding between them.
+#[pyfunction]
+fn simd_level() -> &'static str {
+    simd::level_name()
+}
+
+/// Address of the first element of an array as the crate sees it, to test that nothing is copied.
+#[pyfunction]
+fn data_pointer(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
+    by_dtype!(array, pointer_to(array))
+}
+
+fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
+    Ok(Array::<T>::new("array", array)?.slice()?.as_ptr() as usize)
+}
+
+/// The extension module `hqgs._rust`.
+#[pymodule]
+fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    keep_freed_memory();
+    m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
+    m.add_function(wrap_pyfunction!(simd_level, m)?)?;
+    m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
+    project::register(m)?;
+    composite::register(m)?;
+    training::register(m)?;
+    pictures::register(m)?;
+    max_weights::register(m)
+}

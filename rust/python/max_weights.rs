@@ -1,0 +1,72 @@
+//! The binding of the blending weights.
+
+use crate::{arrays::Array, error::BindingResult, project::Frame};
+use hqgs::{
+    Error,
+    composite::{self, CompositeInput},
+    simd::Real,
+    threads, tiles,
+};
+use numpy::{Element, IntoPyArray};
+use pyo3::prelude::*;
+
+/// Add the function of this file to the module.
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(blending_weights, m)?)
+}
+
+/// `composite::max_weights` of each camera of a frame, flat [C, N], computed in float64 or in float32. `mask`: bool
+/// [C, H, W].
+#[pyfunction]
+fn blending_weights<'py>(
+    frame: &Bound<'py, Frame>,
+    mask: Option<&Bound<'py, PyAny>>,
+    double: bool,
+) -> BindingResult<Bound<'py, PyAny>> {
+    if double {
+        blending_weights_as::<f64>(frame, mask)
+    } else {
+        blending_weights_as::<f32>(frame, mask)
+    }
+}
+
+fn blending_weights_as<'py, T: Real + Element>(
+    frame: &Bound<'py, Frame>,
+    mask: Option<&Bound<'py, PyAny>>,
+) -> BindingResult<Bound<'py, PyAny>> {
+    let py = frame.py();
+    let Frame {
+        cameras,
+        projections,
+        ..
+    } = frame.get();
+    let mask = mask.map(|m| Array::<bool>::new("mask", m)).transpose()?;
+    let size = cameras.first().map_or([0; 2], |c| [c.height, c.width]);
+    let expected = [cameras.len(), size[0], size[1]];
+    if let Some(got) = mask
+        .as_ref()
+        .map(Array::shape)
+        .filter(|got| *got != expected)
+    {
+        return Err(Error::shape("mask", format!("{expected:?}"), format!("{got:?}")).into());
+    }
+    let mask = mask.as_ref().map(Array::slice).transpose()?;
+    let pixels = size[0] * size[1];
+    let out = py.detach(|| {
+        threads::install(|| -> Result<_, Error> {
+            let mut out = Vec::new();
+            for (i, (camera, projection)) in cameras.iter().zip(projections).enumerate() {
+                let input = CompositeInput::<T> {
+                    projection,
+                    tiles: &tiles::bin(projection, &[], 0, camera)?,
+                    camera,
+                    background: None,
+                };
+                let mask = mask.map(|m| &m[i * pixels..(i + 1) * pixels]);
+                out.extend(composite::max_weights(&input, mask)?);
+            }
+            Ok(out)
+        })
+    })?;
+    Ok(out.into_pyarray(py).into_any())
+}

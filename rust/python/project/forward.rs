@@ -1,0 +1,208 @@
+//! The binding of the projection, forward.
+
+use super::{Arrays, Frame, check_colors, of_camera};
+use crate::{
+    arrays::{Array, Optional, Scalar, by_dtype, join, optional},
+    error::BindingResult,
+};
+use hqgs::{
+    Error,
+    accuracy_knobs::{AccuracyKnobs, Spans},
+    counts::Counts,
+    project::{self, ProjectOptions},
+    scene::{Camera, Colors, Harmonics},
+    threads,
+};
+use numpy::IntoPyArray;
+use pyo3::{IntoPyObjectExt, prelude::*};
+
+fn cameras(
+    viewmats: &[f64],
+    ks: &[f64],
+    width: usize,
+    height: usize,
+) -> Result<Vec<Camera>, Error> {
+    let (views, left_over) = viewmats.as_chunks::<16>();
+    if !left_over.is_empty() || views.len() * 9 != ks.len() {
+        let got = format!("{} and {} elements", viewmats.len(), ks.len());
+        return Err(Error::shape("viewmats, Ks", "[C, 4, 4] and [C, 3, 3]", got));
+    }
+    let (ks, _) = ks.as_chunks::<9>();
+    views
+        .iter()
+        .zip(ks)
+        .map(|(v, k)| Camera::new(v, k, width, height))
+        .collect()
+}
+
+/// alpha_min, transmittance_min, spans, skip_blocks, exp2_degree
+type Knobs<'a> = (f64, f64, &'a str, bool, usize);
+
+fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
+    let Some((alpha_min, transmittance_min, spans, skip_blocks, exp2_degree)) = knobs else {
+        return Ok(AccuracyKnobs::default());
+    };
+    let spans = match spans {
+        "ellipse" => Spans::Ellipse,
+        "box" => Spans::Box,
+        "square" => Spans::Square,
+        _ => {
+            let message = format!("must be ellipse, box or square, got {spans}");
+            return Err(Error::new("spans", message));
+        }
+    };
+    let knobs = AccuracyKnobs {
+        alpha_min,
+        transmittance_min,
+        spans,
+        skip_blocks,
+        exp2_degree,
+    };
+    knobs.check()?;
+    Ok(knobs)
+}
+
+/// Project Gaussians; see `hqgs/rasterize.py` for the shapes. `colors` are harmonics if there is a degree.
+/// `knobs`, which also hold for the later stages, are for the benchmark of error against run time alone.
+#[pyfunction]
+#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, knobs=None))]
+pub(super) fn project_forward<'py>(
+    means: &Bound<'py, PyAny>,
+    quats: &Bound<'py, PyAny>,
+    scales: &Bound<'py, PyAny>,
+    opacities: &Bound<'py, PyAny>,
+    colors: &Bound<'py, PyAny>,
+    rest: Optional<'_, 'py>,
+    viewmats: &Bound<'py, PyAny>,
+    ks: &Bound<'py, PyAny>,
+    width: usize,
+    height: usize,
+    options: (f64, f64, f64, f64, bool, bool),
+    sh_degree: Option<usize>,
+    knobs: Option<Knobs>,
+) -> BindingResult<Bound<'py, PyAny>> {
+    let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
+    let options = ProjectOptions {
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        antialiased,
+        differentiable,
+        knobs: accuracy_knobs(knobs)?,
+    };
+    by_dtype!(
+        means,
+        project_as(
+            means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options,
+            sh_degree
+        )
+    )
+}
+
+fn project_as<'py, T: Scalar>(
+    means: &Bound<'py, PyAny>,
+    quats: &Bound<'py, PyAny>,
+    scales: &Bound<'py, PyAny>,
+    opacities: &Bound<'py, PyAny>,
+    colors: &Bound<'py, PyAny>,
+    rest: Optional<'_, 'py>,
+    viewmats: &Bound<'py, PyAny>,
+    ks: &Bound<'py, PyAny>,
+    width: usize,
+    height: usize,
+    options: ProjectOptions,
+    sh_degree: Option<usize>,
+) -> BindingResult<Bound<'py, PyAny>> {
+    let py = means.py();
+    let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
+    let colors = Array::<T>::new("colors", colors)?;
+    let rest = optional::<T>("colors", rest)?;
+    let (viewmats, ks) = (
+        Array::<f64>::new("viewmats", viewmats)?,
+        Array::<f64>::new("Ks", ks)?,
+    );
+    let cameras = cameras(viewmats.slice()?, ks.slice()?, width, height)?;
+    let gaussians = arrays.gaussians()?;
+    let n = gaussians.len();
+    let harmonics = sh_degree
+        .map(|degree| harmonics(&colors, rest.as_ref(), n, degree))
+        .transpose()?;
+    let (channel_data, channels) = match harmonics {
+        Some(_) => (&[][..], 0),
+        None => channels_of(&colors, n, cameras.len())?,
+    };
+    let mut outs: Vec<_> = py.detach(|| {
+        threads::install(|| {
+            let project = |(i, camera)| {
+                let colors = harmonics.as_ref().map_or_else(
+                    || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
+                    Colors::Harmonics,
+                );
+                project::forward(&gaussians, colors, camera, &options)
+            };
+            cameras.iter().enumerate().map(project).collect()
+        })
+    });
+    let means2d = join(&mut outs, |out| &mut out.means2d);
+    let depths = join(&mut outs, |out| &mut out.depths);
+    let conics = join(&mut outs, |out| &mut out.conics);
+    let radii = join(&mut outs, |out| &mut out.radii);
+    let opacities = join(&mut outs, |out| &mut out.opacities);
+    let colors = join(&mut outs, |out| &mut out.colors);
+    let frame = Frame {
+        cameras,
+        counts: outs
+            .iter()
+            .fold(Counts::default(), |sum, out| sum.plus(out.counts)),
+        shadings: Box::new(
+            outs.iter_mut()
+                .map(|out| out.shading.take())
+                .collect::<Vec<_>>(),
+        ),
+        projections: outs.into_iter().map(|out| out.projection).collect(),
+        options,
+        n,
+    };
+    let out = (
+        frame,
+        means2d.into_pyarray(py),
+        depths.into_pyarray(py),
+        conics.into_pyarray(py),
+        radii.into_pyarray(py),
+        opacities.into_pyarray(py),
+        colors.into_pyarray(py),
+    );
+    Ok(out.into_bound_py_any(py)?)
+}
+
+/// Colours as channels: the data and their number.
+fn channels_of<'a, T: Scalar>(
+    colors: &'a Array<'_, T>,
+    n: usize,
+    cameras: usize,
+) -> BindingResult<(&'a [T], usize)> {
+    let (data, channels) = (colors.slice()?, colors.shape().last().copied().unwrap_or(0));
+    check_colors(data, n, cameras, channels)?;
+    Ok((data, channels))
+}
+
+fn harmonics<'a, T: Scalar>(
+    colors: &'a Array<'_, T>,
+    rest: Option<&'a Array<'_, T>>,
+    n: usize,
+    degree: usize,
+) -> BindingResult<Harmonics<'a, T>> {
+    let count = |array: &Array<'_, T>| match array.shape() {
+        &[_, k, 3] => Ok(k),
+        other => Err(Error::shape("colors", "[N, K, 3]", format!("{other:?}"))),
+    };
+    let harmonics = Harmonics {
+        coefficients: colors.slice()?,
+        rest: rest.map(Array::slice).transpose()?,
+        stored: count(colors)? + rest.map_or(Ok(0), count)?,
+        degree,
+    };
+    harmonics.check(n)?;
+    Ok(harmonics)
+}

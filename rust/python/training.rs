@@ -1,0 +1,264 @@
+//! The binding of the loss and of the optimizer.
+
+use crate::arrays::{Array, is_f32};
+use crate::error::BindingResult;
+use hqgs::{
+    Error,
+    simd::Real,
+    threads,
+    training::{
+        adam::{self, AdamArrays, AdamOptions, Selection},
+        loss::{self, LossScratch, Sample},
+    },
+};
+use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn};
+use pyo3::{exceptions::PyValueError, prelude::*};
+use std::cell::RefCell;
+
+/// Add the functions of this file to the module.
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(photometric, m)?)?;
+    m.add_function(wrap_pyfunction!(ssim, m)?)?;
+    m.add_function(wrap_pyfunction!(adam_step, m)?)
+}
+
+/// A scalar type with buffers that last as long as the calling thread, so that a step allocates none.
+trait Buffered: Real + Element {
+    fn with_scratch<R>(f: impl FnOnce(&mut LossScratch<Self>) -> R) -> R;
+}
+
+macro_rules! buffered {
+    ($type:ty) => {
+        impl Buffered for $type {
+            fn with_scratch<R>(f: impl FnOnce(&mut LossScratch<Self>) -> R) -> R {
+                thread_local!(static SCRATCH: RefCell<LossScratch<$type>> = RefCell::default());
+                SCRATCH.with_borrow_mut(f)
+            }
+        }
+    };
+}
+buffered!(f32);
+buffered!(f64);
+
+/// Call `$function::<T, Y>` for the dtypes of a render (f32 or f64) and of its target (u8 or the render's).
+macro_rules! by_dtypes {
+    ($render:expr, $target:expr, $function:ident($($argument:expr),*)) => {
+        match (is_f32($render), $target.cast::<PyArrayDyn<u8>>().is_ok()) {
+            (true, true) => $function::<f32, u8>($($argument),*),
+            (true, false) => $function::<f32, f32>($($argument),*),
+            (false, true) => $function::<f64, u8>($($argument),*),
+            (false, false) => $function::<f64, f64>($($argument),*),
+        }
+    };
+}
+
+/// Two images [H, W, C] and a mask [H, W].
+struct Images<'py, T: Element, Y: Element> {
+    x: Array<'py, T>,
+    y: Array<'py, Y>,
+    mask: Option<Array<'py, u8>>,
+}
+
+impl<'py, T: Element, Y: Element> Images<'py, T, Y> {
+    fn new(
+        [x_name, y_name]: [&str; 2],
+        x: &Bound<'py, PyAny>,
+        y: &Bound<'py, PyAny>,
+        mask: Option<&Bound<'py, PyAny>>,
+    ) -> BindingResult<Self> {
+        let (x, y) = (Array::new(x_name, x)?, Array::new(y_name, y)?);
+        let mask = mask.map(|m| Array::new("mask", m)).transpose()?;
+        let images = Self { x, y, mask };
+        let shape = images.x.shape();
+        if shape.len() != 3 {
+            return Err(Error::shape(x_name, "[H, W, C]", format!("{shape:?}")).into());
+        }
+        for (name, expected, got) in [
+            (y_name, shape, Some(images.y.shape())),
+            ("mask", &shape[..2], images.mask.as_ref().map(Array::shape)),
+        ] {
+            if let Some(got) = got.filter(|got| *got != expected) {
+                let (expected, got) = (format!("{expected:?}"), format!("{got:?}"));
+                return Err(Error::shape(name, expected, got).into());
+            }
+        }
+        Ok(images)
+    }
+
+    fn mask(&self) -> BindingResult<Option<&[u8]>> {
+        self.mask.as_ref().map(Array::slice).transpose()
+    }
+}
+
+type Loss<'py> = (f64, f64, Option<f64>, Option<Bound<'py, PyAny>>);
+
+/// `loss::photometric`: (loss, L1, SSIM or None if `lambda_dssim` is 0, flat gradient or None).
+#[pyfunction]
+fn photometric<'py>(
+    render: &Bound<'py, PyAny>,
+    target: &Bound<'py, PyAny>,
+    mask: Option<&Bound<'py, PyAny>>,
+    lambda_dssim: f64,
+    knee: f64,
+    want_grad: bool,
+) -> BindingResult<Loss<'py>> {
+    by_dtypes!(
+        render,
+        target,
+        photometric_as(render, target, mask, lambda_dssim, knee, want_grad)
+    )
+}
+
+fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
+    render: &Bound<'py, PyAny>,
+    target: &Bound<'py, PyAny>,
+    mask: Option<&Bound<'py, PyAny>>,
+    lambda_dssim: f64,
+    knee: f64,
+    want_grad: bool,
+) -> BindingResult<Loss<'py>> {
+    let py = render.py();
+    let images = Images::<T, Y>::new(["render", "target"], render, target, mask)?;
+    let &[h, w, c] = images.x.shape() else {
+        unreachable!("checked above")
+    };
+    let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
+    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let out = want_grad.then_some(&mut grad[..]);
+    let value = py.detach(|| {
+        T::with_scratch(|scratch| {
+            threads::install(|| {
+                loss::photometric(x, y, mask, h, w, c, lambda_dssim, knee, out, scratch)
+            })
+        })
+    })?;
+    let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
+    Ok((value.loss, value.l1, value.ssim, grad))
+}
+
+/// `loss::ssim`.
+#[pyfunction]
+#[pyo3(signature = (a, b, mask = None))]
+fn ssim(
+    a: &Bound<'_, PyAny>,
+    b: &Bound<'_, PyAny>,
+    mask: Option<&Bound<'_, PyAny>>,
+) -> BindingResult<f64> {
+    by_dtypes!(a, b, ssim_as(a, b, mask))
+}
+
+fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
+    a: &Bound<'py, PyAny>,
+    b: &Bound<'py, PyAny>,
+    mask: Option<&Bound<'py, PyAny>>,
+) -> BindingResult<f64> {
+    let images = Images::<T, Y>::new(["a", "b"], a, b, mask)?;
+    let &[h, w, c] = images.x.shape() else {
+        unreachable!("checked above")
+    };
+    let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
+    let value = a.py().detach(|| {
+        T::with_scratch(|scratch| threads::install(|| loss::ssim(x, y, mask, h, w, c, scratch)))
+    });
+    Ok(value?)
+}
+
+/// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
+/// many of the K alone are updated.
+#[pyfunction]
+fn adam_step(
+    param: &Bound<'_, PyAny>,
+    grad: &Bound<'_, PyAny>,
+    exp_avg: &Bound<'_, PyAny>,
+    exp_avg_sq: &Bound<'_, PyAny>,
+    step: u64,
+    options: (f64, f64, f64, f64),
+    visible: Option<&Bound<'_, PyAny>>,
+    used: Option<usize>,
+) -> BindingResult<()> {
+    let (lr, beta1, beta2, eps) = options;
+    let options = AdamOptions {
+        lr,
+        beta1,
+        beta2,
+        eps,
+    };
+    let update = if is_f32(param) {
+        adam_step_as::<f32>
+    } else {
+        adam_step_as::<f64>
+    };
+    let in_place = [param, exp_avg, exp_avg_sq];
+    update(in_place, grad, step, &options, visible, used)
+}
+
+fn adam_step_as<T: Real + Element>(
+    in_place: [&Bound<'_, PyAny>; 3],
+    grad: &Bound<'_, PyAny>,
+    step: u64,
+    options: &AdamOptions,
+    visible: Option<&Bound<'_, PyAny>>,
+    used: Option<usize>,
+) -> BindingResult<()> {
+    let py = grad.py();
+    let shape = Array::<T>::new("param", in_place[0])?.shape().to_vec();
+    let [mut param, mut exp_avg, mut exp_avg_sq] = [
+        writable::<T>("param", &shape, in_place[0])?,
+        writable::<T>("exp_avg", &shape, in_place[1])?,
+        writable::<T>("exp_avg_sq", &shape, in_place[2])?,
+    ];
+    let grad = Array::<T>::new("grad", grad)?;
+    if grad.shape() != shape {
+        return Err(
+            Error::shape("grad", format!("{shape:?}"), format!("{:?}", grad.shape())).into(),
+        );
+    }
+    let visible = visible
+        .map(|v| Array::<u8>::new("visible", v))
+        .transpose()?;
+    if let Some(got) = visible
+        .as_ref()
+        .map(Array::shape)
+        .filter(|got| *got != &shape[..shape.len().min(1)])
+    {
+        return Err(Error::shape(
+            "visible",
+            format!("{:?}", &shape[..shape.len().min(1)]),
+            format!("{got:?}"),
+        )
+        .into());
+    }
+    if let Some(used) = used.filter(|used| shape.len() < 2 || *used > shape[1]) {
+        let message = format!("cannot update {used} columns of {shape:?}");
+        return Err(Error::new("used", message).into());
+    }
+    let width: usize = shape.iter().skip(1).product();
+    let selection = Selection {
+        visible: visible.as_ref().map(Array::slice).transpose()?,
+        width,
+        used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
+    };
+    let arrays = AdamArrays {
+        param: param.as_slice_mut()?,
+        grad: grad.slice()?,
+        exp_avg: exp_avg.as_slice_mut()?,
+        exp_avg_sq: exp_avg_sq.as_slice_mut()?,
+    };
+    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))?)
+}
+
+/// Borrow a C-contiguous array of `shape` to write to it.
+fn writable<'py, T: Element>(
+    name: &str,
+    shape: &[usize],
+    value: &Bound<'py, PyAny>,
+) -> BindingResult<PyReadwriteArrayDyn<'py, T>> {
+    let got = Array::<T>::new(name, value)?.shape().to_vec();
+    if got != shape {
+        return Err(Error::shape(name, format!("{shape:?}"), format!("{got:?}")).into());
+    }
+    let array = value.cast::<PyArrayDyn<T>>()?;
+    Ok(array
+        .try_readwrite()
+        .map_err(|e| PyValueError::new_err(format!("{name}: {e}")))?)
+}

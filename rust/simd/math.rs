@@ -1,0 +1,172 @@
+//! Functions that the standard library has for numbers, lane by lane.
+
+use super::{Lanes, Wide, splat};
+use fearless_simd::{Simd, SimdBase, SimdFloat};
+
+/// Coefficients of `2^f` on [-0.5, 0.5], constant term first: minimax in the relative error (1.9e-9).
+const EXP2_F32: [f32; 7] = [
+    1.0,
+    std::f32::consts::LN_2, // to the last bit
+    0.240_226_47,
+    0.055_503_29,
+    0.009_618_489,
+    0.001_339_993_1,
+    0.000_153_458_12,
+];
+
+/// The same with fewer terms, to measure what they are worth: 7.5e-8, 2.6e-6 and 7.5e-5.
+const EXP2_F32_5: [f32; 6] = [
+    1.000_000_1,
+    0.693_146_94,
+    0.240_221_2,
+    0.055_507_13,
+    0.009_675_541,
+    0.001_327_647_2,
+];
+const EXP2_F32_4: [f32; 5] = [
+    0.999_999_3,
+    0.693_121_8,
+    0.240_247_44,
+    0.055_917_86,
+    0.009_570_102,
+];
+const EXP2_F32_3: [f32; 4] = [0.999_928_06, 0.693_260_97, 0.242_611_13, 0.055_171_67];
+
+/// Coefficients of `2^f` on [-0.5, 0.5]: Taylor series, `ln(2)^k / k!`, truncation error below 1e-17.
+const EXP2_F64: [f64; 14] = {
+    let mut c = [1.0; 14];
+    let mut k = 1;
+    while k < 14 {
+        c[k] = c[k - 1] * std::f64::consts::LN_2 / k as f64;
+        k += 1;
+    }
+    c
+};
+
+/// `2^x`: round to the nearest integer by adding `magic` (1.5 x 2^mantissa bits), whose low bits then hold
+/// that integer; evaluate the polynomial at the rest; add the integer to the exponent.
+macro_rules! exp2 {
+    ($T:ty, $simd:ident, $x:ident, $min:expr, $magic:expr, $bits:expr, $coefficients:expr) => {{
+        let x = $x.max(Lanes::<$T, S>::splat($simd, $min));
+        let magic = Lanes::<$T, S>::splat($simd, $magic);
+        let shifted = x + magic;
+        let f = x - (shifted - magic);
+        let mut p = Lanes::<$T, S>::splat($simd, $coefficients[$coefficients.len() - 1]);
+        let mut k = $coefficients.len() - 1;
+        while k > 0 {
+            k -= 1;
+            p = p.mul_add(f, Lanes::<$T, S>::splat($simd, $coefficients[k]));
+        }
+        Lanes::<$T, S>::from_bits(p.to_bits() + (shifted.to_bits() << $bits))
+    }};
+}
+
+/// [`Real::exp2`](super::Real::exp2) in f32.
+#[inline(always)]
+pub(super) fn exp2_f32<S: Simd, const DEGREE: usize>(simd: S, x: Lanes<f32, S>) -> Lanes<f32, S> {
+    match DEGREE {
+        3 => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32_3),
+        4 => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32_4),
+        5 => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32_5),
+        _ => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32),
+    }
+}
+
+/// [`Real::exp2`](super::Real::exp2) in f64.
+#[inline(always)]
+pub(super) fn exp2_f64<S: Simd>(simd: S, x: Lanes<f64, S>) -> Lanes<f64, S> {
+    exp2!(
+        f64,
+        simd,
+        x,
+        -1022.0,
+        6_755_399_441_055_744.0,
+        52u32,
+        EXP2_F64
+    )
+}
+
+/// Coefficients of `2 atanh(r) / r` in powers of `r^2`.
+const ATANH: [f64; 11] = {
+    let mut c = [2.0; 11];
+    let mut k = 0;
+    while k < 11 {
+        c[k] /= (2 * k + 1) as f64;
+        k += 1;
+    }
+    c
+};
+
+/// Natural logarithm of numbers in [1, inf), relative error below 1e-15; other lanes get anything.
+#[inline(always)]
+pub(crate) fn ln<S: Simd>(simd: S, x: Wide<S>) -> Wide<S> {
+    const SQRT_HALF: u64 = 0x3fe6_a09e_667f_3bcd;
+    const TWO_52: u64 = 0x4330_0000_0000_0000; // the bits of 2^52
+    // x = 2^e m with m in [sqrt(1/2), sqrt(2)); ln m = 2 atanh((m - 1) / (m + 1)), truncated after r^21 (1e-18).
+    let bits = x.to_bits();
+    let e = (bits - SQRT_HALF) >> 52u32;
+    let m = Wide::<S>::from_bits(bits - (e << 52u32));
+    let e = Wide::<S>::from_bits(e + TWO_52) - f64::from_bits(TWO_52);
+    let r = (m - 1.0) / (m + 1.0);
+    let r2 = r * r;
+    let mut p = splat(simd, ATANH[10]);
+    for c in ATANH[..10].iter().rev() {
+        p = p.mul_add(r2, splat(simd, *c));
+    }
+    e.mul_add(splat(simd, std::f64::consts::LN_2), p * r)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::Real;
+    use fearless_simd::{Level, dispatch};
+
+    fn worst_error<T: Real, const DEGREE: usize>() -> f64 {
+        fn run<S: Simd, T: Real, const DEGREE: usize>(simd: S) -> f64 {
+            (0..20_000)
+                .map(|i| {
+                    let x = T::from_f64(-f64::from(i) * 0.0037);
+                    let y = T::exp2::<S, DEGREE>(simd, Lanes::<T, S>::splat(simd, x))[0].to_f64();
+                    (y / x.to_f64().exp2() - 1.0).abs()
+                })
+                .fold(0.0, f64::max)
+        }
+        dispatch!(Level::new(), simd => run::<_, T, DEGREE>(simd))
+    }
+
+    #[test]
+    fn exp2_is_as_accurate_as_stated() {
+        let errors = [worst_error::<f32, 6>(), worst_error::<f64, 6>()];
+        assert!(errors[0] < 1.2e-7 && errors[1] < 3e-16, "{errors:?}");
+    }
+
+    #[test]
+    fn fewer_terms_have_the_error_of_their_polynomial() {
+        // The relative errors of the polynomials, with the roundings for the first.
+        for (error, expected) in [
+            (worst_error::<f32, 5>(), 2.1e-7),
+            (worst_error::<f32, 4>(), 2.7e-6),
+            (worst_error::<f32, 3>(), 7.5e-5),
+        ] {
+            assert!(
+                (error / expected - 1.0).abs() < 0.1,
+                "{error:e}, not {expected:e}"
+            );
+        }
+    }
+
+    #[inline(always)]
+    fn logarithm<S: Simd>(simd: S, x: f64) -> f64 {
+        ln(simd, splat(simd, x))[0]
+    }
+
+    #[test]
+    fn logarithm_is_as_accurate_as_stated() {
+        for i in 0..200_000 {
+            let x = 1.0 + (f64::from(i) * 1e-4).powi(3) / 30.0;
+            let y = dispatch!(Level::new(), simd => logarithm(simd, x));
+            assert!((y - x.ln()).abs() <= 1e-15 * x.ln(), "ln {x} = {y}");
+        }
+    }
+}

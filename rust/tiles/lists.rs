@@ -1,0 +1,152 @@
+//! The list of one tile: its pairs, front to back.
+
+use super::{
+    block_masks::{Shapes, all_blocks, reached_blocks},
+    pairs::{Pairs, Record, copy_color},
+};
+use crate::{constants::TILE_BLOCKS, project::Projection, simd::Real};
+use fearless_simd::Simd;
+use std::hint::black_box;
+
+/// The Gaussians whose support reaches a pixel centre of one tile.
+#[derive(Debug, Default)]
+pub(crate) struct List<T> {
+    /// What the kernels need of each pair, by (depth, index), so that they read a stream.
+    pub records: Vec<Record<T>>,
+    /// Colours of the records, [pairs, channels].
+    pub colors: Vec<T>,
+    /// For each record its place by index among the tile's records.
+    pub places: Vec<u32>,
+    /// For each record the blocks that it reaches: bit b for block b.
+    pub masks: Vec<u16>,
+    /// For each block, one after the other, the records that reach it, front to back.
+    pub blocks: Vec<u32>,
+    /// Begin of each block in `blocks`, and the end.
+    pub begins: [u32; TILE_BLOCKS + 1],
+}
+
+impl<T: Copy> List<T> {
+    /// Bring the records and colours into cache, before the blocks ask for them one by one.
+    #[inline(always)]
+    pub fn fetch(&self) {
+        fetch(&self.records);
+        fetch(&self.colors);
+    }
+}
+
+/// Read one element of each cache line: in so short a loop many misses overlap.
+#[inline(always)]
+fn fetch<T: Copy>(data: &[T]) {
+    for element in data.iter().step_by((64 / size_of::<T>()).max(1)) {
+        black_box(*element);
+    }
+}
+
+/// Buffers of one thread, reused from tile to tile.
+pub(super) struct Scratch<T> {
+    /// (bits of the depth as f32, place by index).
+    keys: Vec<u64>,
+    /// Records and colours by index.
+    records: Vec<Record<T>>,
+    colors: Vec<T>,
+    shapes: Shapes,
+    reached: [Vec<u32>; TILE_BLOCKS],
+}
+
+impl<T> Default for Scratch<T> {
+    fn default() -> Self {
+        Self {
+            keys: Vec::new(),
+            records: Vec::new(),
+            colors: Vec::new(),
+            shapes: Shapes::default(),
+            reached: Default::default(),
+        }
+    }
+}
+
+/// Collect a tile's pairs and order them.
+#[inline(always)]
+pub(super) fn list<S: Simd, T: Real>(
+    simd: S,
+    projection: &Projection,
+    chunks: &[Pairs<T>],
+    channels: usize,
+    tile: usize,
+    scratch: &mut Scratch<T>,
+) -> List<T> {
+    let Scratch {
+        keys,
+        records,
+        colors,
+        shapes,
+        reached,
+    } = scratch;
+    keys.clear();
+    records.clear();
+    colors.clear();
+    // The pieces are short, and the first line of each is a miss.
+    for pairs in chunks {
+        let range = pairs.tile(tile);
+        fetch(&pairs.depths[range.clone()]);
+        fetch(&pairs.records[range.clone()]);
+        fetch(&pairs.colors[range.start * channels..range.end * channels]);
+    }
+    for pairs in chunks {
+        let range = pairs.tile(tile);
+        for depth in &pairs.depths[range.clone()] {
+            keys.push(u64::from(*depth) << 32 | keys.len() as u64);
+        }
+        colors.extend_from_slice(&pairs.colors[range.start * channels..range.end * channels]);
+        records.extend_from_slice(&pairs.records[range]);
+    }
+    let n = keys.len();
+    let mut list = List {
+        records: Vec::with_capacity(n),
+        colors: vec![T::ZERO; n * channels],
+        places: Vec::with_capacity(n),
+        ..List::default()
+    };
+    if n == 0 {
+        return list;
+    }
+    keys.sort_unstable();
+    for key in keys.iter() {
+        list.places.push(*key as u32);
+    }
+    order_ties(projection, keys, records, &mut list.places);
+    shapes.resize(n);
+    for (k, place) in list.places.iter().enumerate() {
+        let place = *place as usize;
+        copy_color(
+            &mut list.colors[k * channels..(k + 1) * channels],
+            &colors[place * channels..(place + 1) * channels],
+        );
+        shapes.set(k, &records[place]);
+        list.records.push(records[place]);
+    }
+    if projection.knobs.skip_blocks {
+        reached_blocks(simd, shapes, n, &mut list.masks, reached);
+    } else {
+        all_blocks(n, &mut list.masks, reached);
+    }
+    list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
+    for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
+        list.blocks.extend_from_slice(records);
+        *begin = list.blocks.len() as u32;
+    }
+    list
+}
+
+/// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
+/// equal ones stay in the order of their indices.
+fn order_ties<T>(projection: &Projection, keys: &[u64], records: &[Record<T>], order: &mut [u32]) {
+    let depth = |o: &u32| projection.depths[records[*o as usize].gaussian as usize];
+    let mut begin = 0;
+    for run in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
+        if run.len() > 1 {
+            order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
+        }
+        begin += run.len();
+    }
+}

@@ -1,0 +1,239 @@
+//! The fused step against the formulas of torch, and what must hold exactly.
+
+use super::*;
+use crate::scene::synthetic;
+
+/// torch's formulas, one element at a time.
+macro_rules! reference {
+    ($type:ty, $name:ident) => {
+        fn $name(state: &mut [[$type; 3]], grad: &[$type], step: i32, o: &AdamOptions) {
+            for ([p, m, v], &g) in state.iter_mut().zip(grad) {
+                *m += (g - *m) * (1.0 - o.beta1) as $type;
+                *v = *v * o.beta2 as $type + (1.0 - o.beta2) as $type * g * g;
+                let step_size = o.lr / (1.0 - o.beta1.powf(f64::from(step)));
+                let bias2_sqrt = (1.0 - o.beta2.powf(f64::from(step))).sqrt();
+                *p += -step_size as $type * *m / (v.sqrt() / bias2_sqrt as $type + o.eps as $type);
+            }
+        }
+    };
+}
+reference!(f32, reference_f32);
+reference!(f64, reference_f64);
+
+const OPTIONS: AdamOptions = AdamOptions {
+    lr: 0.01,
+    beta1: 0.9,
+    beta2: 0.999,
+    eps: 1e-15,
+};
+
+/// In [-1, 1).
+fn noise(seed: u64, n: usize) -> Vec<f64> {
+    let values = synthetic::noise(seed, n).into_iter();
+    values.map(|v| 2.0 * v - 1.0).collect()
+}
+
+/// param, exp_avg, exp_avg_sq after `steps` steps.
+fn run<T: Real>(n: usize, steps: u64, selection: &Selection) -> [Vec<T>; 3] {
+    let param = noise(1, n).into_iter().map(T::from_f64).collect();
+    let mut arrays = [param, vec![T::ZERO; n], vec![T::ZERO; n]];
+    for at in 1..=steps {
+        let [param, exp_avg, exp_avg_sq] = &mut arrays;
+        let arrays = AdamArrays {
+            param,
+            grad: &grad(at, n),
+            exp_avg,
+            exp_avg_sq,
+        };
+        step(arrays, at, &OPTIONS, selection).unwrap();
+    }
+    arrays
+}
+
+fn grad<T: Real>(at: u64, n: usize) -> Vec<T> {
+    let scale = 10f64.powi(at as i32 % 5 - 3);
+    noise(at + 2, n)
+        .into_iter()
+        .map(|v| T::from_f64(v * scale))
+        .collect()
+}
+
+macro_rules! check {
+    ($type:ty, $reference:ident, $n:expr) => {
+        let got = run::<$type>($n, 20, &Selection::ALL);
+        let mut state: Vec<_> = noise(1, $n)
+            .into_iter()
+            .map(|p| [p as $type, 0.0, 0.0])
+            .collect();
+        for at in 1..=20 {
+            $reference(&mut state, &grad(at, $n), at as i32, &OPTIONS);
+        }
+        for (i, expected) in state.iter().enumerate() {
+            assert_eq!(
+                [got[0][i], got[1][i], got[2][i]],
+                *expected,
+                "element {i} of {}",
+                $n
+            );
+        }
+    };
+}
+
+#[test]
+fn agrees_with_the_formulas_of_torch() {
+    for n in [1, 15, 16, 17, 33, 40_003] {
+        check!(f32, reference_f32, n);
+        check!(f64, reference_f64, n);
+    }
+}
+
+#[test]
+fn rows_that_are_not_visible_are_left_alone() {
+    for width in [1, 3, 45] {
+        let rows = 1000;
+        let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
+        let [all, some, none] =
+            [None, Some(&visible[..]), Some(&vec![0; rows][..])].map(|visible| {
+                let used = width;
+                let selection = Selection {
+                    visible,
+                    width,
+                    used,
+                };
+                run::<f32>(rows * width, 3, &selection)
+            });
+        for k in 0..3 {
+            for i in 0..rows * width {
+                let expected = if visible[i / width] != 0 { &all } else { &none };
+                assert_eq!(some[k][i], expected[k][i], "array {k}, element {i}");
+            }
+        }
+        let start: Vec<f32> = noise(1, rows * width)
+            .into_iter()
+            .map(|v| v as f32)
+            .collect();
+        assert_eq!(
+            none,
+            [start, vec![0.0; rows * width], vec![0.0; rows * width]]
+        );
+    }
+}
+
+#[test]
+fn numbers_of_a_row_that_are_not_used_are_left_alone() {
+    let (rows, width) = (1000, 45);
+    let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
+    let all = run::<f32>(rows * width, 3, &Selection::ALL);
+    for used in [0, 9, 24, 45] {
+        for visible in [None, Some(&visible[..])] {
+            let selection = Selection {
+                visible,
+                width,
+                used,
+            };
+            let some = run::<f32>(rows * width, 3, &selection);
+            for (i, start) in noise(1, rows * width).into_iter().enumerate() {
+                let updated = i % width < used && visible.is_none_or(|v| v[i / width] != 0);
+                let expected = if updated {
+                    all.each_ref().map(|a| a[i])
+                } else {
+                    [start as f32, 0.0, 0.0]
+                };
+                assert_eq!(
+                    some.each_ref().map(|a| a[i]),
+                    expected,
+                    "{used}, element {i}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn same_bits_for_any_number_of_threads() {
+    let at = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        pool.install(|| run::<f32>(70_001, 3, &Selection::ALL))
+            .map(|a| a.into_iter().map(f32::to_bits).collect::<Vec<_>>())
+    };
+    let one = at(1);
+    assert!(one == at(2) && one == at(3));
+}
+
+#[test]
+fn wrong_input_is_named() {
+    let call = |lengths: [usize; 4], at, options: AdamOptions, visible: Option<&[u8]>| {
+        let [mut param, grad, mut exp_avg, mut exp_avg_sq] = lengths.map(|n| vec![1.0f32; n]);
+        let arrays = AdamArrays {
+            param: &mut param,
+            grad: &grad,
+            exp_avg: &mut exp_avg,
+            exp_avg_sq: &mut exp_avg_sq,
+        };
+        let selection = Selection {
+            visible,
+            ..Selection::ALL
+        };
+        step(arrays, at, &options, &selection).map_err(|e| e.name)
+    };
+    let named = |name: &str| Err(name.to_owned());
+    assert_eq!(call([6, 5, 6, 6], 1, OPTIONS, None), named("grad"));
+    assert_eq!(call([6, 6, 5, 6], 1, OPTIONS, None), named("exp_avg"));
+    assert_eq!(call([6, 6, 6, 5], 1, OPTIONS, None), named("exp_avg_sq"));
+    assert_eq!(call([6; 4], 1, OPTIONS, Some(&[1; 4])), named("visible"));
+    assert_eq!(call([6; 4], 1, OPTIONS, Some(&[])), named("visible"));
+    assert_eq!(call([0; 4], 1, OPTIONS, Some(&[1; 4])), Ok(()));
+    assert_eq!(call([0; 4], 1, OPTIONS, None), Ok(()));
+    assert_eq!(call([6; 4], 0, OPTIONS, None), named("step"));
+    assert_eq!(
+        call(
+            [6; 4],
+            1,
+            AdamOptions {
+                lr: f64::NAN,
+                ..OPTIONS
+            },
+            None
+        ),
+        named("lr")
+    );
+    assert_eq!(
+        call(
+            [6; 4],
+            1,
+            AdamOptions {
+                beta1: 1.0,
+                ..OPTIONS
+            },
+            None
+        ),
+        named("beta1")
+    );
+    assert_eq!(
+        call(
+            [6; 4],
+            1,
+            AdamOptions {
+                beta2: -0.1,
+                ..OPTIONS
+            },
+            None
+        ),
+        named("beta2")
+    );
+    assert_eq!(
+        call(
+            [6; 4],
+            1,
+            AdamOptions {
+                eps: -1.0,
+                ..OPTIONS
+            },
+            None
+        ),
+        named("eps")
+    );
+}
