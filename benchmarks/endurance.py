@@ -98,7 +98,9 @@ def train_config(config: EnduranceConfig) -> TrainConfig:
     """Growth ends after half of the run, so that the memory can be judged in the other half."""
     base = TrainConfig(
         iterations=config.iterations,
+        method="3dgs",
         seed=config.seed,
+        leave_out=(),
         densify=DensifyConfig(max_gaussians=config.max_gaussians),
     ).scaled()
     return replace(base, densify=replace(base.densify, stop=config.iterations // 2))

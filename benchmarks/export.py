@@ -17,7 +17,8 @@ from benchmarks.output import Benchmark, Report
 from hqgs.base.text import markdown_table
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.evaluation.metrics import psnr
-from hqgs.export.export import READERS, ExportOptions, export, read_scene_file
+from hqgs.export.export import export
+from hqgs.export.options import ExportOptions
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import train
 from hqgs.scene.builtin import embedded_scene
@@ -65,7 +66,7 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
     for name, options in variants().items():
         print(f"bench export: {name}", file=sys.stderr, flush=True)
         written = export(gaussians, folder / f"scene.{options.format}", options)
-        renders = held_out_renders(scene, READERS[options.format](written.path))
+        renders = held_out_renders(scene, Gaussians.load(written.path, options.format))
         after = held_out_psnr(scene, renders)
         pairs = [(a.clip(0, 1), b.clip(0, 1)) for a, b in zip(renders, original, strict=True)]
         rows.append(
@@ -167,13 +168,13 @@ def run(args: argparse.Namespace) -> Report:
     if args.run_folder is None:
         width, height = (max(1, round(side / config.downscale)) for side in (WIDTH, HEIGHT))
         scene = embedded_scene(args.out / "scene", width, height)
-        train_config = TrainConfig(iterations=config.iterations, seed=config.seed).scaled()
+        train_config = TrainConfig(config.iterations, "3dgs", config.seed, leave_out=()).scaled()
         folder = args.out / "export"
-        train(scene, train_config, folder, resume=True, progress=False)
+        train(scene, config=train_config, out=folder, resume=True)
     else:
         scene, folder = load_scene(args.scene, config.downscale), args.run_folder
         settings = {"downscale": config.downscale}
-    gaussians = read_scene_file(folder)
+    gaussians = Gaussians.load(folder)
     camera = scene.test[0].camera if scene.test else scene.train[0].camera
     with tempfile.TemporaryDirectory(dir=args.out) as name:
         files = measure(scene, gaussians, Path(name))

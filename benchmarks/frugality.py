@@ -22,7 +22,6 @@ from benchmarks.quality.scenes import BUILT_IN, EMBEDDED, load_scenes
 from hqgs.base.files import write_json
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
 from hqgs.base.text import markdown_table
-from hqgs.export.ply import write_ply
 from hqgs.scene.builtin.scene import HEIGHT, WIDTH
 from hqgs.scene.scene import Scene
 from hqgs.training.checkpoint import scene_fingerprint
@@ -49,7 +48,7 @@ QUICK = FrugalityConfig(iterations=30, downscale=1.0, rows=(NONE, "growth", AUTO
 
 
 def train_config(row: str, config: FrugalityConfig, seed: int) -> TrainConfig:
-    return TrainConfig(iterations=config.iterations, seed=seed, leave_out=parse_leave_out(row)).scaled()
+    return TrainConfig(config.iterations, "3dgs", seed, leave_out=parse_leave_out(row)).scaled()
 
 
 def run_row(row: str, scene: Scene, config: TrainConfig) -> dict[str, Any]:
@@ -64,7 +63,7 @@ def run_row(row: str, scene: Scene, config: TrainConfig) -> dict[str, Any]:
     trainer.evaluate()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.ply"
-        write_ply(path, trainer.method.modulate(trainer.gaussians))
+        trainer.method.modulate(trainer.gaussians).save(path)
         size = path.stat().st_size
     last = trainer.history[-1]
     return {

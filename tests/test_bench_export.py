@@ -12,7 +12,7 @@ from tiny_scene import tiny_scene
 from benchmarks import cli
 from benchmarks import export as bench
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
-from hqgs.export.export import read_scene_file
+from hqgs.model.gaussians import Gaussians
 
 
 def call(*arguments: str | Path) -> int:
@@ -28,7 +28,7 @@ def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     result = report["results"]
     files = {row["name"]: row for row in result["files"]}
     assert list(files) == list(bench.variants())
-    scene, trained = tiny_scene(), read_scene_file(tmp_path / "export")
+    scene, trained = tiny_scene(), Gaussians.load(tmp_path / "export")
     assert result["psnr"] == pytest.approx(held_out_psnr(scene, held_out_renders(scene, trained)))
     assert result["gaussians"] == len(trained)
     assert report["settings"]["iterations"] == 20

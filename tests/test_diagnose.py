@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter1d
 
-from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene, format_diagnosis
+from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
 from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import encode_jpeg
@@ -209,7 +209,7 @@ def test_report_is_json_and_names_every_part() -> None:
         ("noise", False),
         ("jpeg", False),
     ]
-    text = format_diagnosis(found)
+    text = str(found)
     assert all(view.name in text for view in scene.train)
     assert all(reason in text for _, _, reason in found.needs())
     assert diagnose_scene(scene) == found

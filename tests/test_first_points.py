@@ -11,7 +11,7 @@ import pytest
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.model.first_points import points_along_edges
-from hqgs.pipeline import run
+from hqgs.pipeline import run_to_end
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import HQGSConfig
 from hqgs.training.trainer import Trainer
@@ -107,7 +107,7 @@ def with_tracks(scene: Scene) -> Scene:
 
 
 def run_report(trainer: Trainer, out: Path) -> str:
-    run(trainer, out, progress=False)
+    run_to_end(trainer, out)
     return (out / "report.json").read_text()
 
 

@@ -117,10 +117,12 @@ def test_bands_go_where_the_held_back_photos_do_not_ask_for_them() -> None:
 def test_a_short_run_keeps_its_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "EARLIEST", 2_000)
     for iterations in (200, 2_900):
-        trainer = Trainer(tiny_scene(VIEWS), TrainConfig(iterations, leave_out=("harmonics",)).scaled())
+        trainer = Trainer(
+            tiny_scene(VIEWS), TrainConfig(iterations, "3dgs", leave_out=("harmonics",)).scaled()
+        )
         assert trainer.frugality.items == set()
         assert trainer.frugality.held == []
-    config = TrainConfig(3_100, leave_out=("harmonics",)).scaled()
+    config = TrainConfig(3_100, "3dgs", leave_out=("harmonics",)).scaled()
     assert Trainer(tiny_scene(VIEWS), config).frugality.items == {"harmonics"}
 
 
@@ -208,10 +210,10 @@ def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
-    result = train(tiny_scene(VIEWS), tiny_config(leave_out=("growth",)), tmp_path, progress=False)
-    assert result.left_out[0]["what"].startswith("finer Gaussians")
-    assert 0 <= result.decision_seconds < result.seconds
-    assert result.scene_bytes == (tmp_path / "scene.ply").stat().st_size
+    result = train(tiny_scene(VIEWS), config=tiny_config(leave_out=("growth",)), out=tmp_path)
+    assert result.left_out[0].what.startswith("finer Gaussians")
+    assert 0 <= result.report["decision_seconds"] < result.seconds
+    assert result.report["scene_bytes"] == (tmp_path / "scene.ply").stat().st_size
 
 
 def test_the_table() -> None:

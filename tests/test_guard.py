@@ -194,7 +194,7 @@ def test_a_photo_that_is_not_finite_is_named_and_the_others_are_trained_on(tmp_p
     image[3, 4:7, 1] = np.nan
     bad = replace(scene.train[2], image=image)
     scene = replace(scene, train=[*scene.train[:2], bad, *scene.train[3:]])
-    train(scene, tiny_config(densify=ONLY_TRAIN), tmp_path, progress=False)
+    train(scene, config=tiny_config(densify=ONLY_TRAIN), out=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     guard = report["guard"]
     assert guard["skipped_steps"] == guard["num_events"] == 6  # 30 steps, five views
@@ -251,10 +251,10 @@ def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Pa
 
 
 def test_the_report_of_a_healthy_run(tmp_path: Path) -> None:
-    result = train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    result = train(tiny_scene(), config=tiny_config(), out=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["guard"] == {"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []}
-    assert report["culled_in_a_view"] == result.culled_in_a_view
+    assert report["culled_in_a_view"] == result.report["culled_in_a_view"]
     assert 0 <= report["culled_in_a_view"] < report["gaussians"]
 
 

@@ -15,7 +15,7 @@ from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
 from hqgs.photos.formula import parse_degradation
-from hqgs.pipeline import run
+from hqgs.pipeline import run_to_end
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import View
 from hqgs.training.methods.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels
@@ -147,7 +147,7 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
     assert trainer.method.rate_left <= FACTOR**2
     errors = [error_of_grey(t, scene.train) for t in (trainer, constant)]
     assert errors[0] < 0.97 * errors[1]
-    run(trainer, tmp_path / "out", progress=False)  # which only writes
+    run_to_end(trainer, tmp_path / "out")  # which only writes
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert any(note.startswith("the learning rates fell to 1/") for note in report["notes"])
     assert any(entry["what"] == "1/50 of each photo's pixels in the loss" for entry in report["left_out"])

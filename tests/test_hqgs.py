@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -51,13 +52,11 @@ def test_clean_photos_train_as_3dgs_bit_for_bit() -> None:
 def test_auto_is_named_after_what_it_comes_to(formation: str, name: str, tmp_path: Path) -> None:
     """And it is that, bit for bit; a run goes on under the name that it was started with."""
     auto, same = (tiny_config(6, method=m, hqgs=fixed(formation)) for m in ("auto", name))
-    results = [
-        train(tiny_scene(), config, tmp_path / config.method, progress=False) for config in (auto, same)
-    ]
-    assert [result.method for result in results] == [name, name]
+    results = [train(tiny_scene(), config=config, out=tmp_path / config.method) for config in (auto, same)]
+    assert [result.report["method"] for result in results] == [name, name]
     first, second = (view.render for result in results for view in result.views)
     assert np.array_equal(first, second)
-    train(tiny_scene(), auto, tmp_path / "auto", resume=True, progress=False)
+    train(tiny_scene(), config=auto, out=tmp_path / "auto", resume=True)
     paper = Trainer(tiny_scene(), tiny_config(method="auto", hqgs=HQGSConfig(guidance="paper")))
     assert paper.config.method == "hqgs"
 
@@ -209,9 +208,9 @@ def test_under_jpeg_the_budget_and_the_growth_follow_what_the_codec_kept() -> No
 
 def test_it_looks_by_itself_and_says_what_it_leaves_out(tmp_path: Path) -> None:
     scene = degrade_scene(tiny_scene(), parse_degradation("noise:40"), 0)
-    result = train(scene, tiny_config(method="hqgs"), tmp_path, progress=False)
-    assert result.config["hqgs"]["formation"] != "auto"
-    assert any("in the loss" in entry["what"] for entry in result.left_out)
+    result = train(scene, config=tiny_config(method="hqgs"), out=tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text())["config"]["hqgs"]["formation"] != "auto"
+    assert any("in the loss" in item.what for item in result.left_out)
 
 
 @pytest.mark.parametrize(

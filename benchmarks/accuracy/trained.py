@@ -23,7 +23,9 @@ def trained_inputs(
 ) -> RasterInputs:
     """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
     scene = embedded_scene(cache, *size, num_views=views)
-    config = TrainConfig(iterations=steps, seed=seed, densify=DensifyConfig(max_gaussians=most)).scaled()
+    config = TrainConfig(
+        steps, "3dgs", seed, leave_out=(), densify=DensifyConfig(max_gaussians=most)
+    ).scaled()
     trainer = Trainer(scene, replace(config, sh_interval=1))
     for _ in range(steps):
         trainer.step()

@@ -16,6 +16,7 @@ from torch.nn.functional import conv2d
 import hqgs
 from benchmarks.accuracy.knobs import Knobs, tuned
 from hqgs.model.gaussians import Gaussians
+from hqgs.model.rasterization import RasterizationMeta
 from hqgs.scene.scene import Camera
 from hqgs.training import trainer as trainer_module
 from hqgs.training.config import TrainConfig
@@ -68,7 +69,7 @@ def _in_torch(owner: Any, name: str, function: Any) -> Iterator[None]:
 
 def render_in_float64(
     gaussians: Gaussians, camera: Camera, sh_degree: int, background: tuple[float, float, float]
-) -> tuple[Tensor, dict[str, Any]]:
+) -> tuple[Tensor, RasterizationMeta]:
     """`hqgs.render.render_view` with a rasterizer in float64; the image is float32 again."""
     images, _, meta = hqgs.rasterization(
         gaussians.means.double(),

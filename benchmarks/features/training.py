@@ -21,7 +21,6 @@ from benchmarks.speed.scene import still_config
 from benchmarks.speed.timing import Seconds, interleaved
 from hqgs.base.files import CHECKPOINT, PLY, write_json
 from hqgs.evaluation.report import REPORT
-from hqgs.export.ply import read_ply
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import train
 from hqgs.scene.builtin import embedded_scene
@@ -62,7 +61,7 @@ class Training:
 
     def train_config(self, feature: Feature, seed: int) -> TrainConfig:
         densify = DensifyConfig(max_gaussians=self.config.max_gaussians)
-        config = TrainConfig(iterations=self.config.iterations, seed=seed, densify=densify)
+        config = TrainConfig(self.config.iterations, "3dgs", seed, leave_out=(), densify=densify)
         return feature.config(config.scaled())
 
     def folder(self, feature: Feature, seed: int) -> Path:
@@ -88,9 +87,7 @@ class Training:
         if (report := self.finished(feature, seed)) is None:
             print(f"bench training: {self.scene.name}, {_label(feature)}, seed {seed}", file=sys.stderr)
             with feature.switch():
-                result = train(
-                    self.scene, self.train_config(feature, seed), folder, resume=True, progress=False
-                )
+                result = train(self.scene, config=self.train_config(feature, seed), out=folder, resume=True)
             if result.iterations < self.config.iterations:
                 raise KeyboardInterrupt
             (folder / CHECKPOINT).unlink()
@@ -107,7 +104,7 @@ class Training:
             iterations = -(-self.config.iterations // REFINED_SHARE)
             config = self.train_config(feature, seed)
             config = replace(config, iterations=iterations, densify=replace(config.densify, stop=0))
-            grown = read_ply(self.folder(DEFAULT, seed) / PLY)
+            grown = Gaussians.load(self.folder(DEFAULT, seed) / PLY)
             with feature.switch():
                 trainer = trainer_from(self.scene, config, grown)
                 for _ in range(iterations):
@@ -127,7 +124,7 @@ class Training:
 
     def final_steps(self) -> dict[str, list[Seconds]]:
         """Seconds of steps on the final Gaussians of the default run, all features in turn."""
-        final = read_ply(self.folder(DEFAULT, 0) / PLY)
+        final = Gaussians.load(self.folder(DEFAULT, 0) / PLY)
         cases = {f.name: self._timed(f, final) for f in (DEFAULT, *FEATURES)}
         return interleaved(cases, self.config.repeats)
 

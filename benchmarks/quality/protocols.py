@@ -26,7 +26,7 @@ class Row:
     def config(self, seed: int, iterations: int) -> TrainConfig:
         """The training run, with the schedule fitted to its length."""
         return TrainConfig(
-            iterations=iterations, method=self.method, seed=seed, srgs=self.srgs, hqgs=self.hqgs
+            iterations=iterations, method=self.method, seed=seed, leave_out=(), srgs=self.srgs, hqgs=self.hqgs
         ).scaled()
 
 

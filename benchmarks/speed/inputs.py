@@ -17,7 +17,7 @@ from scipy.optimize import root_scalar
 from scipy.spatial.transform import Rotation
 
 from benchmarks.speed.ewa import ALPHA_MIN, EPS2D, project
-from hqgs.model.gaussians import SH_C0
+from hqgs.model.constants import SH_C0
 
 Array32 = NDArray[np.float32]
 Array64 = NDArray[np.float64]

@@ -52,7 +52,9 @@ def make_trainer(
     ]
     colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
     scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
-    config = still_config(TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig()), n)
+    config = still_config(
+        TrainConfig(method=method, seed=seed, leave_out=(), hqgs=options or HQGSConfig()), n
+    )
     trainer = Trainer(scene, config)
     gaussians = trainer.gaussians
     with torch.no_grad():

@@ -42,6 +42,19 @@ class Diagnosis:
         """Per part: its name, whether the method needs it, and why, in one sentence."""
         return [(part.name, part.needed, part.reason) for part in self.parts]
 
+    def __str__(self) -> str:
+        """One row per photo, the formation, and per part whether it is needed and why."""
+        rows = [_HEAD, *(_row(photo) for photo in self.photos)]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+        lines += ["", f"{self.scene}: {self.formation}"]
+        for name, needed, reason in self.needs():
+            lines.append(f"  {name:8}{'needed   ' if needed else 'left out '} {reason}")
+        return "\n".join(lines)
+
 
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     """Diagnose up to `max_photos` training photos, spread over the scene, and sum them up by medians.
@@ -156,19 +169,6 @@ def _pooled(photos: Sequence[PhotoDiagnosis]) -> bool:
 def _spread_of(values: Sequence[float]) -> float:
     """1.4826 times the median distance from the median: a normal distribution's standard deviation."""
     return float(1.4826 * np.median(np.abs(np.asarray(values) - np.median(values))))
-
-
-def format_diagnosis(diagnosis: Diagnosis) -> str:
-    """One row per photo, the formation, and per part whether it is needed and why."""
-    rows = [_HEAD, *(_row(photo) for photo in diagnosis.photos)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
-    lines += ["", f"{diagnosis.scene}: {diagnosis.formation}"]
-    for name, needed, reason in diagnosis.needs():
-        lines.append(f"  {name:8}{'needed   ' if needed else 'left out '} {reason}")
-    return "\n".join(lines)
 
 
 def _row(photo: PhotoDiagnosis) -> tuple[str, ...]:

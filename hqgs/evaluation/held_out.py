@@ -8,20 +8,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.render import BACKGROUND, render_view
 from hqgs.scene.scene import Scene
 
 
 def held_out_renders(scene: Scene, gaussians: Gaussians) -> list[NDArray[np.float32]]:
     """The held-out views [H, W, 3] as training renders them, not clamped."""
-    with one_torch_thread(), torch.no_grad():
-        return [
-            render_view(gaussians, view.camera, gaussians.sh_degree, BACKGROUND)[0].numpy()
-            for view in scene.test
-        ]
+    with torch.no_grad():
+        return [gaussians.render(view.camera).numpy() for view in scene.test]
 
 
 def held_out_psnr(scene: Scene, renders: list[NDArray[np.float32]]) -> float:

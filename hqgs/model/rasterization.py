@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hqgs._rust import get_num_threads, set_num_threads
 from hqgs.model.autograd import _Composite, _Project
 
-__all__ = ["get_num_threads", "rasterization", "set_num_threads"]
+__all__ = ["RasterizationMeta", "rasterization"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
+
+
+class RasterizationMeta(TypedDict):
+    """What `rasterization` knows beside its images, of N Gaussians in C cameras."""
+
+    means2d: Tensor  # [C, N, 2], pixels; call `.retain_grad()` on it to get its gradient
+    radii: Tensor  # [C, N, 2], int32, pixels; 0 where culled
+    depths: Tensor  # [C, N], world units along the viewing axis
+    conics: Tensor  # [C, N, 3], 1/px^2: the inverse 2D covariance's xx, xy, yy
+    opacities: Tensor  # [C, N], after the compensation of "antialiased"
+    width: int
+    height: int
+    tile_size: int
+    n_cameras: int
+    camera_ids: None  # gsplat has them where it packs its arrays; nothing is packed here
+    gaussian_ids: None
+    work: tuple[int, int, int]  # pairs of Gaussian and tile, blocks evaluated, blocks with a change
 
 
 def rasterization(
@@ -41,8 +57,8 @@ def rasterization(
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
-    **unsupported: Any,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    **unsupported: object,
+) -> tuple[Tensor, Tensor, RasterizationMeta]:
     """Render N Gaussians into C pinhole cameras; code written for `gsplat.rasterization` runs unchanged.
 
     Gradients flow to every tensor argument but `Ks`; what does not require one is not computed. Frames,
@@ -66,15 +82,13 @@ def rasterization(
         backgrounds: colour behind everything, [C, D]; None is 0.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), "RGB+D" or "RGB+ED"; depth is
             the last channel.
-        absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
+        absgrad: also leave the sum over pixels of |d loss / d means2d| in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
 
     Returns:
-        render_colors [C, height, width, X], render_alphas [C, height, width, 1], and a dict with means2d
-        [C, N, 2] (call `.retain_grad()` on it to get its gradient), radii [C, N, 2] int32 (0 where
-        culled), depths [C, N], conics [C, N, 3], opacities [C, N], width, height, n_cameras, tile_size
-        and work (pairs, blocks evaluated, blocks with a change; `hqgs.model.work_counts` counts more).
+        render_colors [C, height, width, X], not clamped; render_alphas [C, height, width, 1]; and
+        `RasterizationMeta`, the positions, radii and depths of the Gaussians in each camera among it.
 
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
@@ -133,7 +147,7 @@ def rasterization(
     image, alphas, work = _Composite.apply(frame, means2d, link, alphas_in, channels, backgrounds, absgrad)
     if render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    meta = {
+    meta: RasterizationMeta = {
         "means2d": means2d,
         "radii": radii,
         "depths": depths,
@@ -161,7 +175,7 @@ _NEUTRAL = {
 }
 
 
-def _refuse(unsupported: dict[str, Any]) -> None:
+def _refuse(unsupported: dict[str, object]) -> None:
     known = {
         *_NEUTRAL, "covars", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
         "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs", "extra_signals", "rays",

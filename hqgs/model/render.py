@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs import _rust
-from hqgs.model.gaussians import Gaussians
-from hqgs.model.rasterization import rasterization
+from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.scene.scene import Camera, View
 
-BACKGROUND = (0.0, 0.0, 0.0)  # RGB
+if TYPE_CHECKING:
+    from hqgs.model.gaussians import Gaussians  # which has this file's `render_view` as its method
+
 OPTIONS = (
     0.01,
     1e10,
@@ -27,8 +28,8 @@ OPTIONS = (
 
 
 def render_view(
-    gaussians: Gaussians, camera: Camera, sh_degree: int, background: tuple[float, float, float]
-) -> tuple[Tensor, dict[str, Any]]:
+    gaussians: Gaussians, camera: Camera, sh_degree: int, background: Sequence[float]
+) -> tuple[Tensor, RasterizationMeta]:
     """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
     # At degree 0 the higher harmonics are left out, so that they get no gradient full of zeros either.
     colors = (gaussians.sh0, gaussians.shN) if sh_degree else gaussians.sh0
@@ -43,7 +44,7 @@ def render_view(
         camera.width,
         camera.height,
         sh_degree=sh_degree,
-        backgrounds=torch.tensor([background]),
+        backgrounds=torch.tensor([[*background]], dtype=gaussians.means.dtype),
     )
     return images[0], meta
 

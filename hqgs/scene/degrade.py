@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path
+from hqgs.base.files import atomic_path, check_new_folder
 from hqgs.base.text import some
 from hqgs.photos.degrade import Degraded, degrade_image
 from hqgs.photos.files import PHOTO_SUFFIXES
@@ -97,12 +97,6 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
                 notes=[*scene.notes, _note(scene, degradation, seed, stored)],
             ),
         )
-
-
-def check_new_folder(out: Path) -> None:
-    """FileExistsError unless `out` is missing or an empty folder."""
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not an empty folder")
 
 
 def _degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterator[tuple[View, Degraded]]:

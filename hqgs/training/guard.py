@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hqgs.evaluation.records import GuardEvent, GuardRecord
 from hqgs.scene.scene import View
 
 LIMIT = 1e18  # larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits
@@ -37,14 +38,14 @@ class Guard:
     skipped_in_a_row: int = 0
     culled: int = 0  # Gaussians that were removed
     num_events: int = 0
-    events: list[dict[str, Any]] = field(default_factory=list)  # the first ones, as `Event`
+    events: list[GuardEvent] = field(default_factory=list)  # the first ones
 
     def add(self, event: Event) -> None:
         self.num_events += 1
         if len(self.events) < KEPT:
-            self.events.append(asdict(event))
+            self.events.append(cast(GuardEvent, asdict(event)))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> GuardRecord:
         """For report.json."""
         return {
             "skipped_steps": self.skipped,

@@ -17,7 +17,9 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import psnr, ssim
+from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
+from hqgs.model.rasterization import RasterizationMeta
 from hqgs.model.render import render_view
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.adam import Adam
@@ -68,7 +70,7 @@ class Trainer:
         self.iteration = 0  # steps done
         self.seconds = 0.0  # spent in steps
         self.guard = Guard()
-        self.history: list[dict[str, Any]] = []
+        self.history: list[HistoryEntry] = []
 
     @property
     def length(self) -> int:
@@ -92,6 +94,7 @@ class Trainer:
             self.optimizer.zero_grad()
             if self._backward(loss, render, view):
                 if self.iteration < self.densifier.config.stop:
+                    assert means2d.grad is not None  # the backward pass was sound
                     self.densifier.observe(
                         means2d.grad[0], meta["radii"][0], view.camera.width, view.camera.height
                     )
@@ -135,12 +138,19 @@ class Trainer:
         if self.history and self.history[-1]["iteration"] == self.iteration:
             return
         views = self.render_test_views()
-        entry: dict[str, Any] = {"iteration": self.iteration, "seconds": self.seconds}
+        means: dict[str, float | None] = {}
         for name, metric in {"psnr": psnr, "ssim": ssim}.items():
             values = [metric(v.render, v.photo, v.mask) for v in views]
             known = [value for value in values if value is not None]
-            entry[name] = float(np.mean(known)) if known and len(known) == len(values) else None
-        self.history.append(entry)
+            means[name] = float(np.mean(known)) if known and len(known) == len(values) else None
+        self.history.append(
+            {
+                "iteration": self.iteration,
+                "seconds": self.seconds,
+                "psnr": means["psnr"],
+                "ssim": means["ssim"],
+            }
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the whole state as one checkpoint, atomically."""
@@ -237,7 +247,7 @@ class Trainer:
         groups["means"]["lr"] = left * means
         groups["shN"]["used"] = (self._active_degree() + 1) ** 2 - 1
 
-    def _render(self, camera: Camera) -> tuple[Tensor, dict[str, Any]]:
+    def _render(self, camera: Camera) -> tuple[Tensor, RasterizationMeta]:
         gaussians = self.method.modulate(self.gaussians)
         return render_view(gaussians, camera, self._active_degree(), self.config.background)
 

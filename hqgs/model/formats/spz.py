@@ -29,12 +29,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from scipy.special import expit, logit
 
 from hqgs.base.files import atomic_path
-from hqgs.model.gaussians import MAX_SH_DEGREE, Gaussians
+from hqgs.model.constants import MAX_SH_DEGREE
+from hqgs.model.formats.arrays import Arrays
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, Gaussians, SH degree, fractional bits, flags, 0
@@ -76,15 +75,15 @@ class SpzFile:
     clipped: dict[str, int]  # values outside the format's range, by name; only what is not 0
 
 
-def write_spz(path: str | Path, gaussians: Gaussians, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
-    """Write the Gaussians atomically. See `encode_spz` for the errors."""
+def write_spz(path: str | Path, gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
+    """Write Gaussians atomically. See `encode_spz` for the errors."""
     file = encode_spz(gaussians, sh_bits)
     with atomic_path(path) as tmp:
         tmp.write_bytes(file.data)
     return file
 
 
-def encode_spz(gaussians: Gaussians, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
+def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
     """The bytes of an SPZ file, without the Gaussians that hold NaN or Inf.
 
     Args:
@@ -96,19 +95,20 @@ def encode_spz(gaussians: Gaussians, sh_bits: tuple[int, int] = SH_BITS) -> SpzF
     """
     if len(sh_bits) != 2 or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"sh_bits is {sh_bits}, wanted two numbers in 1..8")
-    if len(gaussians) > MAX_GAUSSIANS:
-        raise ValueError(f"{len(gaussians):,} Gaussians, but an SPZ file takes at most {MAX_GAUSSIANS:,}")
-    arrays = {name: t.detach().double().numpy() for name, t in gaussians.named().items()}
+    n, rest = gaussians["shN"].shape[:2]
+    if n > MAX_GAUSSIANS:
+        raise ValueError(f"{n:,} Gaussians, but an SPZ file takes at most {MAX_GAUSSIANS:,}")
+    from scipy.special import expit  # here: what reads no SPZ needs no scipy
+
+    arrays: dict[str, Array] = {name: np.asarray(a, np.float64) for name, a in gaussians.items()}
     norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         arrays["quats"] = np.roll(arrays["quats"] / norm, -1, axis=1)  # x y z w
-    n = len(gaussians)
     finite = np.all([np.isfinite(a).all(axis=tuple(range(1, a.ndim))) for a in arrays.values()], axis=0)
     arrays = {name: a[finite] for name, a in arrays.items()}
     means = FLIP_MEANS * arrays["means"]
     fraction = _fraction(means, arrays["scales"])
     clipped: dict[str, int] = {}
-    rest = arrays["shN"].shape[1]
     steps = np.repeat([1 << (8 - bits) for bits in sh_bits], [3, 12])  # gzip finds few values
 
     def byte(name: str, values: Array, step: Array | int = 1) -> Bytes:
@@ -126,14 +126,14 @@ def encode_spz(gaussians: Gaussians, sh_bits: tuple[int, int] = SH_BITS) -> SpzF
         _pack_quats(FLIP_QUATS * arrays["quats"]),
         byte("shN", FLIP_SH[:rest, None] * arrays["shN"] * SH_ONE + SH_ONE, steps[:rest, None]),
     ]
-    header = HEADER.pack(MAGIC, VERSION, len(means), gaussians.sh_degree, fraction, 0, 0)
+    header = HEADER.pack(MAGIC, VERSION, len(means), math.isqrt(rest + 1) - 1, fraction, 0, 0)
     packer = zlib.compressobj(wbits=GZIP)
     data = packer.compress(header) + b"".join(packer.compress(s.tobytes()) for s in sections) + packer.flush()
     return SpzFile(data, len(means), n - len(means), fraction, clipped)
 
 
-def read_spz(path: str | Path) -> Gaussians:
-    """Read an SPZ file of version 2 or 3 with harmonics of degree 0 to 3.
+def read_spz(path: str | Path) -> Arrays:
+    """Read an SPZ file of version 2 or 3 with harmonics of degree 0 to 3: float32 arrays.
 
     An opacity of 0 or 1 has no finite logit: it is taken a quarter of a step inwards.
 
@@ -176,15 +176,20 @@ def read_spz(path: str | Path) -> Gaussians:
     fixed = np.zeros((n, 3, 4), np.uint8)
     fixed[..., 1:] = means.reshape(n, 3, 3)  # in the upper bytes, so that the shift below keeps the sign
     xyzw = _unpack_quats(quats) if version == 3 else _first_three(quats)
-    arrays: dict[str, NDArray[Any]] = {
-        "means": FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**fraction,
-        "scales": scales / LOG_SCALE - LOG_OFFSET,
-        "quats": np.roll(FLIP_QUATS * xyzw, 1, axis=1),
-        "opacities": logit(opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255),
-        "sh0": ((colors - 127.5) / COLOR)[:, None],
-        "shN": FLIP_SH[:rest, None] * (sh.reshape(n, rest, 3) / SH_ONE - 1),
+    from scipy.special import logit
+
+    return {
+        "means": _floats(FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**fraction),
+        "scales": _floats(scales / LOG_SCALE - LOG_OFFSET),
+        "quats": _floats(np.roll(FLIP_QUATS * xyzw, 1, axis=1)),
+        "opacities": _floats(logit(opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255)),
+        "sh0": _floats(((colors - 127.5) / COLOR)[:, None]),
+        "shN": _floats(FLIP_SH[:rest, None] * (sh.reshape(n, rest, 3) / SH_ONE - 1)),
     }
-    return Gaussians(**{name: torch.from_numpy(a.astype(np.float32)) for name, a in arrays.items()})
+
+
+def _floats(values: NDArray[Any]) -> NDArray[np.float32]:
+    return values.astype(np.float32)
 
 
 def _fraction(means: Array, scales: Array) -> int:
