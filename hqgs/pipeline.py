@@ -151,14 +151,12 @@ def _rates(trainer: Trainer) -> list[str]:
 
 def _write_results(trainer: Trainer, out: Path) -> RunResult:
     scene, config = trainer.scene, trainer.config
-    left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
+    left_out = trainer.left_out()
 
     def leave_out(what: str, why: str) -> None:
         left_out.append(LeftOut(what, why))
 
-    for what, why in trainer.method.left_out():
-        leave_out(what, why)
-    rows = write_ply(out / PLY, trainer.method.modulate(trainer.gaussians))
+    rows = write_ply(out / PLY, trainer.shown())
     if rows:
         leave_out(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf")
     guard = trainer.guard
@@ -185,7 +183,7 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         history=trainer.history,
         length=trainer.length,
         left_out=[item.known() for item in left_out],
-        decision_seconds=trainer.frugality.state.decisions,
+        decision_seconds=trainer.frugality.memory.seconds,
         scene_bytes=(out / PLY).stat().st_size,
         config=asdict(config),
         sfm=None if scene.sfm is None else asdict(scene.sfm),

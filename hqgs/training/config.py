@@ -214,7 +214,7 @@ class TrainConfig:
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
     adam_eps: float = 1e-15
     selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
-    leave_out: tuple[str, ...] = ()  # of `hqgs.left_out.ITEMS`: what the run may do without, where it pays
+    leave_out: tuple[str, ...] = ()  # of `ITEMS`: what the run may do without, where it pays
     background: tuple[float, float, float] = BACKGROUND  # RGB
     eval_every: int = 3_000  # iterations between evaluations on the held-out views
     checkpoint_every: int = 1_000  # iterations; does not change the result
