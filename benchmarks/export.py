@@ -68,7 +68,7 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
         written = export(gaussians, folder / f"scene.{options.format}", options)
         renders = held_out_renders(scene, Gaussians.load(written.path, options.format))
         after = held_out_psnr(scene, renders)
-        pairs = [(a.clip(0, 1), b.clip(0, 1)) for a, b in zip(renders, original, strict=True)]
+        pairs = [(a.render.clip(0, 1), b.render.clip(0, 1)) for a, b in zip(renders, original, strict=True)]
         rows.append(
             {
                 "name": name,

@@ -76,7 +76,7 @@ def run_row(row: str, scene: Scene, config: TrainConfig) -> dict[str, Any]:
         "iterations": trainer.iteration,
         "seconds": trainer.seconds,
         "cpu_seconds": cpu,  # with the choice of photos; tells a busy machine from a slow run
-        "decision_seconds": trainer.frugality.state.decisions,
+        "decision_seconds": trainer.frugality.memory.seconds,
         "peak_rss_mb": peak,
         "gaussians": len(trainer.gaussians),
         "sh_degree": trainer.gaussians.sh_degree,

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from hqgs.base.files import CHECKPOINT, EMBEDDED, PLY, lock_folder, remove_leftovers
@@ -287,10 +286,8 @@ def _progress(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) -> P
 def _results(trainer: Trainer, out: Path | None) -> Run:
     """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
     scene, config, guard = trainer.scene, trainer.config, trainer.guard
-    with torch.no_grad():
-        model = trainer.method.modulate(trainer.gaussians).detached()
-    left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
-    left_out += [LeftOut(what, why) for what, why in trainer.method.left_out()]
+    model = trainer.shown()
+    left_out = trainer.left_out()
     if out is not None and (rows := model.save(out / PLY)):
         left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
     if guard.skipped:
@@ -318,7 +315,7 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
         history=trainer.history,
         length=trainer.length,
         left_out=[item.known() for item in left_out],
-        decision_seconds=trainer.frugality.state.decisions,
+        decision_seconds=trainer.frugality.memory.seconds,
         scene_bytes=None if out is None else (out / PLY).stat().st_size,
         config=asdict(config),
         sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),

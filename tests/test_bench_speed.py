@@ -297,7 +297,7 @@ def test_the_scene_stays_what_it_is_while_it_is_timed() -> None:
     grad = trainer.gaussians.shN.grad
     assert grad is not None
     assert (grad[:, -7:] != 0).any()  # degree 3 is trained
-    assert trainer.densifier.count.max() == 8
+    assert trainer.state.densifier.count.max() == 8
 
 
 def test_gsplat_is_left_out_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,7 +174,7 @@ def test_a_trainer_with_adam_of_torch_learns_the_same(monkeypatch: pytest.Monkey
     ours = Trainer(tiny_scene(), tiny_config())
     monkeypatch.setattr(trainer_module, "Adam", TorchAdam)
     theirs = Trainer(tiny_scene(), tiny_config())
-    assert isinstance(theirs.optimizer, torch.optim.Adam)
+    assert isinstance(theirs.state.optimizer, torch.optim.Adam)
     for _ in range(7):  # before the number of Gaussians can differ
         ours.step()
         theirs.step()

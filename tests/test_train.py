@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from example_method import Tinted, install
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
@@ -23,48 +25,41 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
 from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.scene import Scene, View
-from hqgs.training.config import METHODS, DensifyConfig, TrainConfig, check_method
-from hqgs.training.methods import MAKERS
-from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.config import DensifyConfig, TrainConfig, check_method
+from hqgs.training.methods.base import Target, ThreeDGS, photo_tensors
 from hqgs.training.trainer import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
 
 ONLY_TRAIN = DensifyConfig(stop=0)
 
 
-class Probe(ThreeDGS):
-    """3DGS whose loss can be replaced at chosen steps, with a trained colour offset of its own."""
+@dataclass(frozen=True)
+class Named(Target):
+    name: str
+
+
+class Probe(Tinted):
+    """A method whose loss can be replaced at chosen steps."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.steps = 0
-        self.offset = torch.zeros(3, requires_grad=True)
         self.at: dict[int, Any] = {}  # step -> function of the loss
         self.seen: list[str] = []
 
-    def modulate(self, gaussians: Gaussians) -> Gaussians:
-        return Gaussians(**(gaussians.named() | {"sh0": gaussians.sh0 + self.offset}))
+    def prepare(self, view: View) -> Named:
+        return Named(*photo_tensors(view), view.name)
 
-    def loss(self, render: Tensor, view: View) -> Tensor:
+    def loss(self, image: Tensor, target: Any) -> Tensor:
         self.steps += 1
-        self.seen.append(view.name)
+        self.seen.append(target.name)
         assert torch.get_num_threads() == 1  # sums in a loss depend on it
-        return self.at.get(self.steps, lambda loss: loss)(super().loss(render, view))
-
-    def param_groups(self) -> list[dict[str, Any]]:
-        return [{"name": "offset", "params": [self.offset], "lr": 0.01}]
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"offset": self.offset}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        with torch.no_grad():
-            self.offset.copy_(state["offset"])
+        return self.at.get(self.steps, lambda loss: loss)(ThreeDGS.loss(self, image, target))
 
 
 @pytest.fixture
 def probe(monkeypatch: pytest.MonkeyPatch) -> Probe:
     method = Probe()
-    monkeypatch.setitem(METHODS, "probe", "")
-    monkeypatch.setitem(MAKERS, "probe", lambda scene, config: method)
+    install(monkeypatch, "probe", method)
     return method
 
 
@@ -126,7 +121,7 @@ def test_the_learning_rates_of_3dgs() -> None:
     rates: list[dict[str, float]] = []
     for _ in range(20):
         trainer.step()
-        rates.append({g["name"]: g["lr"] for g in trainer.optimizer.param_groups})
+        rates.append({g["name"]: g["lr"] for g in trainer.state.optimizer.param_groups})
     centers = np.stack([view.camera.center for view in scene.train])
     extent = 1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     assert rates[-1]["means"] == pytest.approx(1.6e-6 * extent)
@@ -266,7 +261,7 @@ def test_a_view_that_sees_nothing_is_no_error() -> None:
     step = trainer.step()
     assert not step.render.any()
     assert bits(trainer) == before
-    assert trainer.densifier.count.sum() == 0
+    assert trainer.state.densifier.count.sum() == 0
     assert trainer.guard.skipped == 0
 
 
@@ -274,17 +269,17 @@ def test_a_method_trains_and_keeps_tensors_of_its_own(probe: Probe, tmp_path: Pa
     config = tiny_config(method="probe")
     with open_run(tiny_scene(), config, tmp_path) as trainer:
         run_to_end(trainer, tmp_path)
-    trained = probe.offset.detach().clone()
+    trained = probe.tint.detach().clone()
     assert trained.abs().max() > 0.01
     # The PLY holds what is rasterized.
     shown = trainer.gaussians.sh0.detach() + trained
     assert torch.equal(Gaussians.load(tmp_path / PLY).sh0, shown)
-    moments = trainer.optimizer.state[probe.offset]["exp_avg"].clone()
+    moments = trainer.state.optimizer.state[probe.tint]["exp_avg"].clone()
     with torch.no_grad():
-        probe.offset.zero_()
+        probe.tint.zero_()
     with open_run(tiny_scene(), config, tmp_path, resume=True) as again:
-        assert torch.equal(probe.offset, trained)
-        assert torch.equal(again.optimizer.state[probe.offset]["exp_avg"], moments)
+        assert torch.equal(probe.tint, trained)
+        assert torch.equal(again.state.optimizer.state[probe.tint]["exp_avg"], moments)
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
@@ -337,9 +332,8 @@ def test_rates_are_those_that_the_method_leaves() -> None:
     for k in range(1, 11):
         left = 1.0 if k < 6 else 0.25
         trainer.method = SimpleNamespace(rate_left=left)  # type: ignore[assignment]
-        trainer.iteration = k
-        trainer._set_rates()
-        rates = {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
+        trainer._set_rates(trainer.schedule.plan(k, trainer.state.decisions))
+        rates = {group["name"]: group["lr"] for group in trainer.state.optimizer.param_groups}
         means = config.lr_means * (config.lr_means_final / config.lr_means) ** (k / 10)
         assert rates.pop("means") == pytest.approx(left * trainer.extent * means)
         assert set(rates) == {"quats", "scales", "opacities", "sh0", "shN"}

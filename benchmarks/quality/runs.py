@@ -155,7 +155,7 @@ def run_cell(
         "render_ms": _render_ms(trainer),
         "regions": count_regions(means, clean.train),
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
-        "left_out": [{"what": what, "why": why} for what, why in trainer.method.left_out()],
+        "left_out": [item.known() for item in trainer.method_left_out],
         "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
         "notes": photos.notes,
         "sfm": None if photos.sfm is None else asdict(photos.sfm),

@@ -37,9 +37,9 @@ def places(trainer: Trainer) -> list[tuple[Any, str, str]]:
         (type(trainer.method), "modulate", "method"),
         (type(trainer.method), "loss", "loss"),
         (torch.Tensor, "backward", "autograd"),
-        (type(trainer.densifier), "observe", "density statistics"),
-        (type(trainer.densifier), "update", "density statistics"),
-        (type(trainer.optimizer), "step", "Adam"),
+        (type(trainer.state.densifier), "observe", "density statistics"),
+        (type(trainer.state.densifier), "update", "density statistics"),
+        (type(trainer.state.optimizer), "step", "Adam"),
     ]
 
 
