@@ -216,9 +216,7 @@ def train(
         eval_every=eval_every,
     )
     if config is not None and asked != run_config():
-        raise ValueError(
-            "config is the whole configuration; it takes the place of iterations, method, seed, ..."
-        )
+        raise ValueError("config is the whole configuration: nothing of it can be given beside it")
     if out is not None and (Path(out) / CHECKPOINT).exists() and not (resume or overwrite):
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
     with open_run(scene, config or asked, out, resume) as trainer:
@@ -305,7 +303,7 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
     result = RunResult(
         scene=scene.name,
         source=scene.source,
-        notes=[*scene.notes, *_first_points(trainer), *_rates(trainer)],
+        notes=[*scene.notes, *_notes(trainer)],
         method=config.method,
         seed=config.seed,
         iterations=trainer.iteration,
@@ -336,13 +334,11 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
     )
 
 
-def _first_points(trainer: Trainer) -> list[str]:
-    own = len(trainer.scene.points)
-    more = trainer.first_points - own
-    return [f"started from the scene's {own} points and {more} more along the photos' edges"] if more else []
-
-
-def _rates(trainer: Trainer) -> list[str]:
-    left = trainer.method.rate_left
-    why = "pixels held back from the noisy photos showed no gain any more"
-    return [f"the learning rates fell to 1/{1 / left:.0f}: {why}"] if left < 1 else []
+def _notes(trainer: Trainer) -> list[str]:
+    own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
+    if more := trainer.first_points - own:
+        notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+    if left < 1:
+        why = "pixels held back from the noisy photos showed no gain any more"
+        notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
+    return notes

@@ -192,7 +192,8 @@ def _degrade(args: argparse.Namespace) -> int:
 
 def _diagnose(args: argparse.Namespace) -> int:
     try:
-        diagnosis = hqgs.diagnose(_load(args))
+        scene = _load(args)
+        diagnosis = hqgs.diagnose(scene)
         if args.out is not None:
             write_json(args.out, asdict(diagnosis))
     except BAD_INPUT as error:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 from hqgs.base.threads import one_torch_thread
 from hqgs.photos.formula import Degradation, small_side
@@ -100,6 +99,8 @@ def convolve(image: Float32, kernel: NDArray[np.float64]) -> Float32:
     rows, columns = kernel.shape[0] // 2, kernel.shape[1] // 2
     _check_fits(image, max(rows, columns), f"kernel of {kernel.shape[1]} x {kernel.shape[0]} px")
     padded = np.pad(image.astype(np.float64), ((rows, rows), (columns, columns), (0, 0)), mode="reflect")
+    from scipy.signal import fftconvolve  # takes seconds to import
+
     return fftconvolve(padded, kernel[..., None], mode="valid", axes=(0, 1)).astype(np.float32)
 
 
