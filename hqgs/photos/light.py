@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-Real = TypeVar("Real", np.float32, np.float64)
+Real = TypeVar("Real", bound="np.floating[Any]")
 
 
 def to_linear(srgb: NDArray[Real]) -> NDArray[Real]:

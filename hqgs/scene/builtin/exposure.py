@@ -70,19 +70,19 @@ def rolling(camera: Camera, knots: Floats, jitter: Floats) -> Exposure:
     return Exposure([[moved] for moved in _moved(camera, knots, times)], jitter)
 
 
-def through_lens(camera: Camera, aperture: float, focus: float, count: int, turn: float) -> Exposure:
+def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> Exposure:
     """Through a thin lens of radius `aperture` (world units) that is sharp at view-space z = `focus`.
 
-    A point at depth d becomes a disc of radius fx aperture |1/d - 1/focus| px: the mean over `count` pinholes,
-    a sunflower on the lens that is turned by `turn` radians, each with the principal point that keeps the
-    plane in focus where it is.
+    A point at depth d becomes a disc of radius fx aperture |1/d - 1/focus| px: the mean over `count`
+    pinholes, a sunflower on the lens, each with the principal point that keeps the plane in focus where it
+    is.
     """
     k = np.arange(count)
-    radii, angles = aperture * np.sqrt((k + 0.5) / count), GOLDEN * k + turn
-    hexagon = np.arange(6) * math.pi / 3
+    radii, angles = aperture * np.sqrt((k + 0.5) / count), GOLDEN * k
+    hexagon = np.arange(6.0) * math.pi / 3
     around = aperture / math.cos(math.pi / 6)  # the hexagon encloses the lens
 
-    def pinholes(radii: Floats, angles: Floats) -> list[Camera]:
+    def pinholes(radii: NDArray[np.floating], angles: NDArray[np.floating]) -> list[Camera]:
         cameras = []
         for x, y in zip(radii * np.cos(angles), radii * np.sin(angles), strict=True):
             viewmat, K = camera.viewmat.copy(), camera.K.copy()

@@ -1,4 +1,4 @@
-"""Light, and the public renderers: `render_view`, `render_exposure` (photos), `render_depth` (view-space z)."""
+"""Light, and the public renderers: `render_view` and `render_exposure` (photos), `render_depth`."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class _Tile:
         square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
         def meets(corners: NDArray[np.float64], left: Any, top: Any, side: int) -> NDArray[np.bool_]:
-            """Which boxes, corners [N, 8, 3], squares of pixels [B, 1] may show to any of the cameras, [N, B]."""
+            """Which boxes, corners [N, 8, 3], the cameras may see in squares at pixels [B, 1]; [N, B]."""
             xs = left - margin + (side + 2 * margin) * square[:, 0]
             ys = top - margin + (side + 2 * margin) * square[:, 1]
             found = np.zeros((len(corners), len(xs)), bool)
