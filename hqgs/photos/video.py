@@ -13,9 +13,14 @@ from numpy.typing import NDArray
 from hqgs.photos.pixels import Float32, as_floats, to_uint8
 
 RATE = 30  # frames per second; only the rate control knows it
-CODECS = {  # the encoder, the decoder, and the encoder's options for the same bits on any machine
+_X265 = "pools=none:frame-threads=1:wpp=0:info=0:log-level=none"
+CODECS = {  # encoder, decoder, and options of the encoder for the same bits at any number of cores
     "video": ("libx264", "h264", {}),
-    "video265": ("libx265", "hevc", {"x265-params": "pools=none:frame-threads=1:wpp=0:log-level=none"}),
+    "video265": (
+        "libx265",
+        "hevc",
+        {"x265-params": "pools=none:frame-threads=1:wpp=0:info=0:log-level=none"},
+    ),
 }
 # Luma and chroma of 8 bits, ITU-R BT.601 with limited range: Y in 16..235, Cb and Cr in 16..240.
 _TO_YUV = np.array(
@@ -35,7 +40,7 @@ class Frame:
 
     image: Float32  # [H, W, 3], multiples of 1/255
     kind: str  # "I", "P" or "B"
-    bytes: int  # of the compressed frame
+    bytes: int  # of the compressed frame, in the first one with the headers
 
 
 def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[Frame]:
@@ -44,7 +49,8 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[Frame
     x264 (`video`) or x265 (`video265`) at a constant rate factor, preset medium, 30 frames per second, on one
     thread; otherwise the encoder's own defaults. Photos are BT.601 with limited range and 4:2:0 chroma, the
     mean of each 2 x 2 pixels; the way back interpolates the chroma bilinearly. Odd sides get their last row
-    or column once more, which is cut off again. ValueError without PyAV (the extra `video`) or its encoder,
+    or column once more, which is cut off again. The same photos give the same bits with the same build of
+    PyAV. ValueError without PyAV (the extra `video`) or its encoder,
     or for photos of several sizes.
     """
     av = _pyav()

@@ -12,8 +12,8 @@ from hqgs.scene.builtin.scene import FOCAL, HEIGHT, WIDTH, assemble, look_at
 from hqgs.scene.scene import Camera, Scene
 
 TABLE = (0.0, 0.40, 3.3)  # above the middle of the table top; what the cameras look at
-ARC = math.radians(65)  # to either side of the front
-RADIUS, LOW, HIGH = 2.8, -0.25, -0.95  # of the arc, and heights of the cameras (y points down)
+ARC = math.radians(52)  # to either side of the front
+RADIUS, LOW, HIGH = 2.8, -0.3, -0.85  # of the arc, and heights of the cameras (y points down)
 
 
 def sparse_room(
