@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hqgs.photos.shake import path_points
+from hqgs.photos.shake import exposure_times, path_points
 from hqgs.scene.scene import Camera
 
 Floats = NDArray[np.float64]
 
-GOLDEN = math.pi * (3 - math.sqrt(5))
-PLASTIC = 1.324717957244746  # its powers give the evenest sequence of points in the plane (Roberts 2018)
+GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
 OUTLINES = 8  # cameras that stand for all when a tile asks what it may see
 MARGIN = 2.0  # px that a tile looks beyond its border for the cameras between them
 
@@ -60,14 +59,13 @@ def still(camera: Camera, jitter: Floats) -> Exposure:
 
 def shaken(camera: Camera, knots: Floats, count: int) -> Exposure:
     """The mean over `count` equal parts of an exposure during which the camera moves; see `path_viewmats`."""
-    times = (np.arange(count) + 0.5) / count - 0.5
-    return Exposure([_moved(camera, knots, times)], spread(count))
+    return Exposure([_moved(camera, knots, exposure_times(count))], spread(count))
 
 
 def rolling(camera: Camera, knots: Floats, jitter: Floats) -> Exposure:
     """Row y of H in an instant at time (y + 1/2) / H - 1/2, while the camera moves; see `path_viewmats`."""
-    times = (np.arange(camera.height) + 0.5) / camera.height - 0.5
-    return Exposure([[moved] for moved in _moved(camera, knots, times)], jitter)
+    cameras = _moved(camera, knots, exposure_times(camera.height))
+    return Exposure([[moved] for moved in cameras], jitter)
 
 
 def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> Exposure:
@@ -83,8 +81,9 @@ def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> E
     around = aperture / math.cos(math.pi / 6)  # the hexagon encloses the lens
 
     def pinholes(radii: NDArray[np.floating], angles: NDArray[np.floating]) -> list[Camera]:
+        points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], -1)
         cameras = []
-        for x, y in zip(radii * np.cos(angles), radii * np.sin(angles), strict=True):
+        for x, y in points - points.mean(axis=0):  # a sunflower of few seeds is off its middle
             viewmat, K = camera.viewmat.copy(), camera.K.copy()
             viewmat[:2, 3] -= x, y
             K[0, 2] += K[0, 0] * x / focus
@@ -110,12 +109,18 @@ def path_viewmats(viewmat: Floats, knots: Floats, times: Floats) -> Floats:
 
 
 def spread(count: int) -> Floats:
-    """Offsets [count, 2] in the unit square: even, and any stretch of the order is even as well.
+    """Offsets [count, 2] of samples in a pixel, x and y, for samples that stand for times one after another.
 
-    So what a sample's place in the order stands for, time or a place on the lens, does not go with its place
-    in the pixel.
+    A Latin square: each axis holds `count` even places once. Of 256 seeded draws the one that goes least with
+    time and least along a diagonal, without what is left of its drift over time: it would make the path
+    longer or shorter by parts of a pixel. The mean is (1/2, 1/2).
     """
-    return (0.5 + np.arange(1, count + 1)[:, None] / np.array([PLASTIC, PLASTIC**2])) % 1
+    rng, times = np.random.default_rng(0), exposure_times(count)
+    draws = [np.stack([times, rng.permutation(times), rng.permutation(times)]) for _ in range(256)]
+    _, x, y = min(draws, key=lambda draw: float(np.square(np.triu(draw @ draw.T, 1)).sum()))
+    offsets = np.stack([x, y], -1)
+    drift = times @ offsets / max(np.square(times).sum(), 1e-12)
+    return 0.5 + offsets - times[:, None] * drift
 
 
 def _moved(camera: Camera, knots: Floats, times: Floats) -> list[Camera]:
