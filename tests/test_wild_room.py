@@ -89,10 +89,10 @@ def test_samples_are_spread_over_the_pixel_and_over_time() -> None:
         np.testing.assert_allclose(points.mean(0), 0.5, atol=1e-12)
         for axis in (0, 1):
             assert abs(np.polyfit(np.arange(count), points[:, axis], 1)[0]) < 1e-12
-            # as even as a grid: no gap is much wider than between `count` places in a row
+            # nearly even: no gap is much wider than that of `count` places in a row
             places = np.sort(points[:, axis])
             assert -0.2 < places[0] < places[-1] < 1.2
-            assert np.diff(places).max() < 2 / count
+            assert np.diff(places).max() < 2.5 / count
     assert spread(1).tolist() == [[0.5, 0.5]]
 
 
