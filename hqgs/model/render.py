@@ -84,7 +84,7 @@ def _largest(gaussians: Gaussians, views: Iterable[tuple[Camera, NDArray[np.bool
         frame, *_ = _rust.project_forward(
             means, quats, scales, opacities, no_colors, None, viewmat, K, *size, OPTIONS, None
         )
-        counted = None if mask is None else np.ascontiguousarray(mask[None])
+        counted = None if mask is None else np.ascontiguousarray(mask[None], bool).view(np.uint8)
         weights = _rust.blending_weights(frame, counted, largest.dtype == torch.float64)
         torch.maximum(largest, torch.from_numpy(weights), out=largest)
     return largest

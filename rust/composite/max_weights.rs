@@ -19,7 +19,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// The largest weight of each Gaussian over the pixels of an image, `[N]`; 0 for one that no pixel blends.
 ///
-/// `mask` [H, W] says which pixels count; None: all of them. The tile lists need no channels, and the
+/// `mask` [H, W] is not 0 in the pixels that count; None: all of them. The tile lists need no channels, and the
 /// background plays no part. The power of 2 is always that of the default knobs. A maximum is the same in any
 /// order, so that the bits depend on no number of threads.
 ///
@@ -27,7 +27,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// When the length of the mask does not fit.
 pub fn max_weights<T: Real>(
     input: &CompositeInput<T>,
-    mask: Option<&[bool]>,
+    mask: Option<&[u8]>,
 ) -> Result<Vec<T>, Error> {
     if let Some(mask) = mask {
         check_len("mask", mask, input.pixels())?;
@@ -54,7 +54,7 @@ fn weigh_tile<S: Simd, T: Real>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
-    mask: Option<&[bool]>,
+    mask: Option<&[u8]>,
     tile: usize,
     lanes: &mut Vec<T>,
     most: &[AtomicU64],
@@ -67,7 +67,7 @@ fn weigh_tile<S: Simd, T: Real>(
     let mut open = [T::ZERO; TILE_PIXELS];
     for (p, pixel, n) in input.runs(tile) {
         for k in 0..n {
-            if mask.is_none_or(|mask| mask[pixel + k]) {
+            if mask.is_none_or(|mask| mask[pixel + k] != 0) {
                 open[p + k] = T::ONE;
             }
         }
@@ -148,7 +148,7 @@ mod tests {
         (projection, tiles)
     }
 
-    fn weights<T: Real>(s: &Synthetic<T>, mask: Option<&[bool]>) -> Result<Vec<T>, Error> {
+    fn weights<T: Real>(s: &Synthetic<T>, mask: Option<&[u8]>) -> Result<Vec<T>, Error> {
         let (projection, tiles) = binned(s);
         let input = CompositeInput {
             projection: &projection,
@@ -160,7 +160,7 @@ mod tests {
     }
 
     /// By the definition: every Gaussian at every pixel, in depth order.
-    fn brute_force(s: &Synthetic<f64>, mask: Option<&[bool]>) -> Vec<f64> {
+    fn brute_force(s: &Synthetic<f64>, mask: Option<&[u8]>) -> Vec<f64> {
         let (projection, _) = binned(s);
         let mut order: Vec<usize> = (0..s.opacities.len())
             .filter(|&i| projection.splats[i].visible())
@@ -168,7 +168,7 @@ mod tests {
         order.sort_by(|&a, &b| projection.depths[a].total_cmp(&projection.depths[b]));
         let mut most = vec![0.0f64; s.opacities.len()];
         for pixel in 0..s.camera.width * s.camera.height {
-            if mask.is_some_and(|mask| !mask[pixel]) {
+            if mask.is_some_and(|mask| mask[pixel] == 0) {
                 continue;
             }
             let (x, y) = (pixel % s.camera.width, pixel / s.camera.width);
@@ -192,7 +192,7 @@ mod tests {
     fn weights_follow_the_definition() {
         for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
             let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
-            let some: Vec<bool> = (0..width * height).map(|i| i * 7 % 11 < 4).collect();
+            let some: Vec<u8> = (0..width * height).map(|i| [255, 0, 0][i * 7 % 11 / 4]).collect();
             for mask in [None, Some(&some[..])] {
                 let expected = brute_force(&s, mask);
                 assert!(expected.iter().any(|w| *w > 0.1));
@@ -221,8 +221,8 @@ mod tests {
         let empty = Synthetic::<f32>::new(0, 20, 20, 1).unwrap();
         assert!(weights(&empty, None).unwrap().is_empty());
         let s = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
-        let none = weights(&s, Some(&[false; 400])).unwrap();
+        let none = weights(&s, Some(&[0; 400])).unwrap();
         assert!(none.len() == 50 && none.iter().all(|w| *w == 0.0));
-        assert_eq!(weights(&s, Some(&[true; 399])).unwrap_err().name, "mask");
+        assert_eq!(weights(&s, Some(&[1; 399])).unwrap_err().name, "mask");
     }
 }
