@@ -57,7 +57,7 @@ fn simd_level() -> &'static str {
 /// Address of the first element of an array as the crate sees it, to test that nothing is copied.
 #[pyfunction]
 fn data_pointer(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
-    by_dtype!(array, pointer_to(array))
+    by_dtype!("array", array, pointer_to(array))
 }
 
 fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
