@@ -4,7 +4,7 @@ use crate::error::BindingResult;
 use hqgs::{Error, simd::Real};
 use numpy::{Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::{exceptions::PyValueError, prelude::*};
-use std::{any::Any, collections::HashMap, fmt::Display};
+use std::{any::Any, collections::HashMap, fmt::Display, ops::Range};
 
 /// A borrowed C-contiguous array of known type.
 pub(crate) struct Array<'py, T: Element> {
@@ -96,6 +96,29 @@ pub(crate) fn optional_of_shape<'py, T: Element>(
 ) -> BindingResult<Option<Array<'py, T>>> {
     let array = optional::<T>(name, value)?;
     Ok(array.map(|a| a.of_shape(expected)).transpose()?)
+}
+
+/// An array's name and addresses.
+pub(crate) type Place = (&'static str, Range<usize>);
+
+/// Where a slice lies.
+pub(crate) fn place<T>(name: &'static str, data: &[T]) -> Place {
+    let Range { start, end } = data.as_ptr_range();
+    (name, start.addr()..end.addr())
+}
+
+/// Refuse memory that is written under one name and read or written under another. rust-numpy knows views of
+/// one array, but two tensors over the same memory come as arrays that know nothing of each other.
+pub(crate) fn check_apart(written: &[Place], read: &[Place]) -> Result<(), Error> {
+    for (i, (name, a)) in written.iter().enumerate() {
+        for (other, b) in written[i + 1..].iter().chain(read) {
+            if a.start.max(b.start) < a.end.min(b.end) {
+                let message = format!("shares memory with {name}, which is written");
+                return Err(Error::new(*other, message));
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Whether `value` is an array of f32; otherwise it is one of f64.

@@ -1,6 +1,6 @@
 //! The binding of the loss and of the optimizer.
 
-use crate::arrays::{Array, is_f32, optional_of_shape};
+use crate::arrays::{Array, check_apart, is_f32, optional_of_shape, place};
 use crate::error::BindingResult;
 use hqgs::{
     Error,
@@ -212,6 +212,15 @@ fn adam_step_as<T: Real + Element>(
         width,
         used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
     };
+    let written = [
+        place("param", param.as_slice()?),
+        place("exp_avg", exp_avg.as_slice()?),
+        place("exp_avg_sq", exp_avg_sq.as_slice()?),
+    ];
+    check_apart(&written, &[place("grad", grad.slice()?)])?;
+    if let Some(visible) = selection.visible {
+        check_apart(&written, &[place("visible", visible)])?;
+    }
     let arrays = AdamArrays {
         param: param.as_slice_mut()?,
         grad: grad.slice()?,
