@@ -143,7 +143,8 @@ mod tests {
     fn binned<T: Real>(s: &Synthetic<T>) -> (Projection, Tiles<T>) {
         let none = Colors::Channels(&[], 0);
         let options = ProjectOptions::default();
-        let projection = project::forward(&s.gaussians(), none, &s.camera, &options).projection;
+        let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
+        let projection = projected.projection;
         let tiles = tiles::bin(&projection, &[], 0, &s.camera).unwrap();
         (projection, tiles)
     }
@@ -223,6 +224,6 @@ mod tests {
         let s = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
         let none = weights(&s, Some(&[0; 400])).unwrap();
         assert!(none.len() == 50 && none.iter().all(|w| *w == 0.0));
-        assert_eq!(weights(&s, Some(&[1; 399])).unwrap_err().name, "mask");
+        assert_eq!(weights(&s, Some(&[1; 399])).unwrap_err().name(), "mask");
     }
 }

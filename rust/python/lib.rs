@@ -1,5 +1,5 @@
 //! The Python extension `hqgs._rust`: all that knows Python. numpy arrays are borrowed, never copied; the GIL is
-//! released while the crate works; each [`hqgs::Error`] becomes a `ValueError`.
+//! released while the crate works; each [`hqgs::Error`] becomes an exception of Python.
 
 mod arrays;
 mod composite;

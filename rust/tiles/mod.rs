@@ -89,13 +89,10 @@ pub fn bin<T: Real>(
         .unzip();
     let total = source.total.into_inner();
     if total > MAX_PAIRS {
-        return Err(Error::new(
-            "means",
-            format!(
-                "the Gaussians cover {total} (Gaussian, tile) pairs, more than {MAX_PAIRS}; \
-                 use fewer or smaller Gaussians, or a smaller image"
-            ),
-        ));
+        return Err(Error::TooManyPairs {
+            pairs: total,
+            limit: MAX_PAIRS,
+        });
     }
     // Counts to places: in a tile chunk by chunk.
     let mut sums = vec![0u32; tiles_x * tiles_y];

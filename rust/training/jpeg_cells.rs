@@ -156,7 +156,7 @@ mod tests {
         assert_eq!(
             distance(&[0.0; 4], &centres[1..], &widths, 1.0, None)
                 .unwrap_err()
-                .name,
+                .name(),
             "centres"
         );
     }

@@ -155,7 +155,7 @@ fn project_backward_as<'py, T: Scalar>(
         camera,
     };
     let (sums, viewmats) = py.detach(|| {
-        threads::install(|| {
+        threads::install(|| -> Result<_, Error> {
             let mut sums: Option<GaussianGrads<T>> = None;
             let mut viewmats = Vec::with_capacity(16 * c);
             for (i, camera) in frame.cameras.iter().enumerate() {
@@ -167,16 +167,16 @@ fn project_backward_as<'py, T: Scalar>(
                     &frame.projections[i],
                     &of_view(&v, i, n),
                     wanted,
-                );
+                )?;
                 viewmats.extend(grads.camera.viewmat(camera));
                 match &mut sums {
                     None => sums = Some(grads),
                     Some(sums) => add(sums, &grads),
                 }
             }
-            (sums, viewmats)
+            Ok((sums, viewmats))
         })
-    });
+    })?;
     let grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
     let out = (
         wanted.means.then(|| grads.means.into_pyarray(py)),

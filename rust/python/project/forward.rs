@@ -138,9 +138,13 @@ fn project_as<'py, T: Scalar>(
                 );
                 project::forward(&gaussians, colors, camera, &options)
             };
-            cameras.iter().enumerate().map(project).collect()
+            cameras
+                .iter()
+                .enumerate()
+                .map(project)
+                .collect::<Result<_, Error>>()
         })
-    });
+    })?;
     let means2d = join(&mut outs, |out| &mut out.means2d);
     let depths = join(&mut outs, |out| &mut out.depths);
     let conics = join(&mut outs, |out| &mut out.conics);
