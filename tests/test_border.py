@@ -4,6 +4,7 @@ changes under its hands, processes that fork, scenes that do not fit into memory
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from scenes import random_scene
 
@@ -33,3 +34,29 @@ def test_any_byte_of_a_mask_but_0_counts() -> None:
     assert not np.array_equal(expected, _rust.blending_weights(frame, None, True))
     for byte in (2, 254, 255):
         assert np.array_equal(_rust.blending_weights(frame, some * np.uint8(byte), True), expected)
+
+
+def test_a_composite_goes_back_through_its_own_frame() -> None:
+    """Its tile lists belong to no other one: what is composited later changes nothing."""
+    arguments, (frame, *_) = project(40)
+    composite, image, _ = _rust.composite_forward(frame, arguments["colors"], None, 3)
+    v_image = np.random.default_rng(0).standard_normal((1, 20, 36, 3))
+    expected = _rust.composite_backward(composite, None, v_image, None, [True] * 4)
+    _, (other, *_) = project(7, width=100, height=90)
+    del frame
+    again = _rust.composite_backward(composite, None, v_image, None, [True] * 4)
+    for a, b in zip(again[:-1], expected[:-1], strict=True):
+        assert a is not None
+        assert np.array_equal(a, b)
+    assert np.abs(again[0]).max() > 0
+    with pytest.raises(TypeError):
+        _rust.composite_backward(other, composite, None, v_image, None, [True] * 4)  # type: ignore[call-arg]
+
+
+def test_gradients_of_another_frame_are_refused() -> None:
+    arguments, (_, *arrays) = project(40)
+    _, (other, *_) = project(7)
+    inputs = tuple(arguments[name] for name in ("means", "quats", "scales", "opacities"))
+    v_means2d = np.zeros_like(arrays[0]).reshape(1, 40, 2)
+    with pytest.raises(ValueError, match=r"^means: expected shape \[7, 3\], got \[40, 3\]$"):
+        _rust.project_backward(other, inputs, (v_means2d, *[None] * 5), [True] * 7)

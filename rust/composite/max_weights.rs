@@ -29,6 +29,7 @@ pub fn max_weights<T: Real>(
     input: &CompositeInput<T>,
     mask: Option<&[u8]>,
 ) -> Result<Vec<T>, Error> {
+    input.check()?;
     if let Some(mask) = mask {
         check_len("mask", mask, input.pixels())?;
     }
@@ -193,7 +194,9 @@ mod tests {
     fn weights_follow_the_definition() {
         for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
             let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
-            let some: Vec<u8> = (0..width * height).map(|i| [255, 0, 0][i * 7 % 11 / 4]).collect();
+            let some: Vec<u8> = (0..width * height)
+                .map(|i| [255, 0, 0][i * 7 % 11 / 4])
+                .collect();
             for mask in [None, Some(&some[..])] {
                 let expected = brute_force(&s, mask);
                 assert!(expected.iter().any(|w| *w > 0.1));

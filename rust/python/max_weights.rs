@@ -1,6 +1,10 @@
 //! The binding of the blending weights.
 
-use crate::{arrays::{Array, optional_of_shape}, error::BindingResult, project::Frame};
+use crate::{
+    arrays::{Array, optional_of_shape},
+    error::BindingResult,
+    project::Frame,
+};
 use hqgs::{
     Error,
     composite::{self, CompositeInput},
@@ -35,11 +39,8 @@ fn blending_weights_as<'py, T: Real + Element>(
     mask: Option<&Bound<'py, PyAny>>,
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = frame.py();
-    let Frame {
-        cameras,
-        projections,
-        ..
-    } = frame.get();
+    let frame = &frame.get().0;
+    let (cameras, projections) = (&frame.cameras, &frame.projections);
     let size = cameras.first().map_or([0; 2], |c| [c.height, c.width]);
     // Not bool: its bytes are 0 or 1 to Rust, and an array that is a view of another type may hold others.
     let mask = optional_of_shape::<u8>("mask", mask, &[cameras.len(), size[0], size[1]])?;

@@ -45,6 +45,11 @@ impl<T> Tiles<T> {
         self.lengths().sum()
     }
 
+    /// Number of Gaussians that were binned, visible or not.
+    pub(crate) fn gaussians(&self) -> usize {
+        self.chunks.last().map_or(0, |chunk| chunk.end)
+    }
+
     /// Number of pairs of each tile.
     pub fn lengths(&self) -> impl Iterator<Item = usize> {
         self.lists.iter().map(|list| list.records.len())

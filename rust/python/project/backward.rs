@@ -122,7 +122,7 @@ fn project_backward_as<'py, T: Scalar>(
     wanted: [bool; 7],
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = frame.py();
-    let frame = frame.get();
+    let frame = &frame.get().0;
     let arrays = Arrays::<T>::new(&inputs.0, &inputs.1, &inputs.2, &inputs.3)?;
     let gaussians = arrays.gaussians()?;
     let shadings = of_type::<Vec<Option<Shading<T>>>>(&frame.shadings, "means")?;

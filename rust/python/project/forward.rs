@@ -1,6 +1,6 @@
 //! The binding of the projection, forward.
 
-use super::{Arrays, Frame, channels_of, of_camera};
+use super::{Arrays, Frame, Projections, channels_of, of_camera};
 use crate::{
     arrays::{Array, Optional, Scalar, by_dtype, join, optional},
     error::BindingResult,
@@ -15,6 +15,7 @@ use hqgs::{
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
+use std::sync::Arc;
 
 fn cameras(
     viewmats: &Bound<'_, PyAny>,
@@ -151,7 +152,7 @@ fn project_as<'py, T: Scalar>(
     let radii = join(&mut outs, |out| &mut out.radii);
     let opacities = join(&mut outs, |out| &mut out.opacities);
     let colors = join(&mut outs, |out| &mut out.colors);
-    let frame = Frame {
+    let frame = Frame(Arc::new(Projections {
         cameras,
         counts: outs
             .iter()
@@ -164,7 +165,7 @@ fn project_as<'py, T: Scalar>(
         projections: outs.into_iter().map(|out| out.projection).collect(),
         options,
         n,
-    };
+    }));
     let out = (
         frame,
         means2d.into_pyarray(py),

@@ -15,6 +15,7 @@ use hqgs::{
 };
 use numpy::Element;
 use pyo3::prelude::*;
+use std::sync::Arc;
 
 /// Add the functions and classes of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -25,7 +26,10 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
 
 /// The projection of N Gaussians into C cameras.
 #[pyclass(frozen, module = "hqgs._rust")]
-pub(crate) struct Frame {
+pub(crate) struct Frame(pub(crate) Arc<Projections>);
+
+/// What a [`Frame`] is; it lives as long as what was made from it.
+pub(crate) struct Projections {
     pub(crate) cameras: Vec<Camera>,
     pub(crate) projections: Vec<Projection>,
     options: ProjectOptions,
@@ -40,19 +44,19 @@ impl Frame {
     /// Image width in pixels.
     #[getter]
     fn width(&self) -> usize {
-        self.cameras.first().map_or(0, |c| c.width)
+        self.0.cameras.first().map_or(0, |c| c.width)
     }
 
     /// Image height in pixels.
     #[getter]
     fn height(&self) -> usize {
-        self.cameras.first().map_or(0, |c| c.height)
+        self.0.cameras.first().map_or(0, |c| c.height)
     }
 
     /// Counts of the projection.
     #[getter]
     fn counts(&self) -> CountsByName {
-        self.counts.entries().collect()
+        self.0.counts.entries().collect()
     }
 }
 
