@@ -147,7 +147,7 @@ fn composite_as<'py, T: Scalar>(
                 join(&mut alphas, |alphas| alphas),
             ))
         })
-    })?;
+    })??;
     let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));
     Ok(out.into_bound_py_any(py)?)
 }
@@ -217,7 +217,7 @@ fn composite_backward_as<'py, T: Scalar>(
             let cameras = frame.cameras.iter().enumerate();
             cameras.map(backward).collect::<Result<_, Error>>()
         })
-    })?;
+    })??;
     let counts = outs
         .iter()
         .fold(Counts::default(), |sum, out| sum.plus(out.counts));

@@ -117,7 +117,7 @@ fn apply<'py, T: Real + Element>(
     let py = image.py();
     let image = Array::<T>::new("image", image)?;
     let (data, shape) = (image.slice()?, image.shape());
-    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))?;
+    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))??;
     Ok(out.into_pyarray(py).into_any())
 }
 
@@ -154,6 +154,6 @@ fn cell_distance_as<'py, T: Real + Element>(
     let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
     let out = want_grad.then_some(&mut grad[..]);
     let value =
-        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))?;
+        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))??;
     Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
 }

@@ -123,7 +123,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
                 loss::photometric(x, y, mask, h, w, c, lambda_dssim, knee, out, scratch)
             })
         })
-    })?;
+    })??;
     let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
     Ok((value.loss, value.l1, value.ssim, grad))
 }
@@ -152,7 +152,7 @@ fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
     let value = a.py().detach(|| {
         T::with_scratch(|scratch| threads::install(|| loss::ssim(x, y, mask, h, w, c, scratch)))
     });
-    Ok(value?)
+    Ok(value??)
 }
 
 /// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
@@ -227,7 +227,7 @@ fn adam_step_as<T: Real + Element>(
         exp_avg: exp_avg.as_slice_mut()?,
         exp_avg_sq: exp_avg_sq.as_slice_mut()?,
     };
-    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))?)
+    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
 
 /// Borrow a C-contiguous array of `shape` to write to it.

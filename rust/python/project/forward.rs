@@ -145,7 +145,7 @@ fn project_as<'py, T: Scalar>(
                 .map(project)
                 .collect::<Result<_, Error>>()
         })
-    })?;
+    })??;
     let means2d = join(&mut outs, |out| &mut out.means2d);
     let depths = join(&mut outs, |out| &mut out.depths);
     let conics = join(&mut outs, |out| &mut out.conics);
