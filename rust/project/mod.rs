@@ -17,7 +17,7 @@ use crate::{
     constants::{EPS2D, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK},
     scene::Gaussians,
     simd::{
-        Real, Wide,
+        Level, Real, Wide,
         groups::{self, Column, GROUP, wide3},
         lanes, splat,
     },
@@ -44,6 +44,8 @@ pub struct ProjectOptions {
     pub differentiable: bool,
     /// What trades accuracy for time, in this and the later stages.
     pub knobs: AccuracyKnobs,
+    /// Vector instructions of this and the later stages.
+    pub level: Level,
 }
 
 impl Default for ProjectOptions {
@@ -56,6 +58,7 @@ impl Default for ProjectOptions {
             antialiased: false,
             differentiable: true,
             knobs: AccuracyKnobs::default(),
+            level: Level::default(),
         }
     }
 }
@@ -99,8 +102,10 @@ pub struct Projection {
     pub splats: Vec<Splat>,
     /// View-space depth, `[N]`; 0 where culled.
     pub depths: Vec<f64>,
-    /// That of the options.
+    /// Those of the options.
     pub knobs: AccuracyKnobs,
+    /// That of the options.
+    pub level: Level,
 }
 
 /// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.
