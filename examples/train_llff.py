@@ -10,12 +10,12 @@ and scene.ply for any 3DGS viewer.
 import argparse
 from pathlib import Path
 
-from hqgs.config import TrainConfig
-from hqgs.data import load_scene
-from hqgs.left_out import NONE, LeftOut, format_left_out, parse_leave_out
-from hqgs.report import read_report
-from hqgs.run import train
-from hqgs.synthetic import embedded_scene
+from hqgs.base.left_out import LeftOut, format_left_out
+from hqgs.evaluation.report import read_report
+from hqgs.pipeline import train
+from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.load import load_scene
+from hqgs.training.config import NONE, TrainConfig, parse_leave_out
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 import sys
 
-from hqgs.cli import main
+from hqgs.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -56,13 +56,10 @@ def composite_forward(
     frame: Frame, colors: Array, backgrounds: Array | None, channels: int
 ) -> tuple[Composite, Array, Array]: ...
 def composite_backward(
-    frame: Frame,
     composite: Composite,
-    colors: Array,
     backgrounds: Array | None,
     v_image: Array,
     v_alphas: Array | None,
-    channels: int,
     wanted: list[bool],
 ) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...
 def blending_weights(frame: Frame, mask: Array | None, double: bool) -> Array: ...

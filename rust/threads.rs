@@ -18,7 +18,9 @@ pub fn set(threads: usize) -> Result<(), Error> {
     let pool = ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
-        .map_err(|e| Error::new("threads", format!("cannot start {threads} threads: {e}")))?;
+        .map_err(|e| Error::Threads {
+            message: format!("cannot start {threads} threads: {e}"),
+        })?;
     *POOL.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(pool));
     Ok(())
 }

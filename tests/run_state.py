@@ -6,8 +6,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from hqgs.checkpoint import load_checkpoint
-from hqgs.train import Trainer
+from hqgs.training.checkpoint import load_checkpoint
+from hqgs.training.trainer import Trainer
 
 State = tuple[dict[str, Tensor], dict[str, object]]
 

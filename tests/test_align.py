@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hqgs.align import Observations, Similarity, align, camera_centers, refine, rotation_angles
+from hqgs.scene.sfm.align import Observations, Similarity, align, camera_centers, refine, rotation_angles
 
 Floats = NDArray[np.float64]
 TRUE = Similarity(

@@ -1,8 +1,7 @@
-"""`hqgs bench accuracy` at tiny sizes, and the knobs behind it against the independent float64 renderer."""
+"""`accuracy` at tiny sizes, and the knobs behind it against the independent float64 renderer."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from dataclasses import asdict
@@ -19,22 +18,19 @@ from reference import reference_rasterization
 from scenes import random_scene
 
 import hqgs
+from benchmarks import cli
+from benchmarks.accuracy.accuracy import beats
+from benchmarks.accuracy.errors import errors_against, pareto_front
+from benchmarks.accuracy.knobs import CASES, EXACT, Knobs, TunedPass
+from benchmarks.speed.inputs import make_inputs
+from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust
-from hqgs.bench import cli
-from hqgs.bench.accuracy import beats
-from hqgs.bench.errors import errors_against, pareto_front
-from hqgs.bench.inputs import make_inputs
-from hqgs.bench.knobs import CASES, EXACT, Knobs, TunedPass
-from hqgs.bench.rasterizer import RasterPass
 
 DEFAULT = (1 / 255, 0.999e-4, "ellipse", True, 6)
 
 
 def call(*arguments: str | Path) -> int:
-    parser = argparse.ArgumentParser()
-    cli.add_parser(parser.add_subparsers(required=True))
-    args = parser.parse_args(["bench", "accuracy", *map(str, arguments)])
-    return args.run(args)
+    return cli.main(["accuracy", *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +63,7 @@ def gradient(row: dict[str, Any], oracle: str, name: str = "all") -> float:
 
 def test_the_file_says_where_it_comes_from(quick: dict[str, Any]) -> None:
     assert quick["benchmark"] == "accuracy"
-    assert quick["command"] == "python -m hqgs bench accuracy --quick --seed 5"
+    assert quick["command"] == "python -m benchmarks accuracy --quick --seed 5"
     assert datetime.fromisoformat(quick["date"]).utcoffset() is not None
     assert quick["commit"] == quick["versions"]["git_commit"]
     assert quick["machine"]["cores"] >= 1

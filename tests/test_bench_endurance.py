@@ -1,4 +1,4 @@
-"""`hqgs bench endurance`: the cases are what they claim, verdicts fail when they should, cases are kept."""
+"""`endurance`: the cases are what they claim, verdicts fail when they should, cases are kept."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from hqgs import cli
-from hqgs.bench import endurance
-from hqgs.bench.endurance import CASES, QUICK, Case, EnduranceConfig, run_case, train_config, verdict
-from hqgs.config import TrainConfig
-from hqgs.methods import ThreeDGS
+from benchmarks import cli, endurance
+from benchmarks.endurance import CASES, QUICK, Case, EnduranceConfig, run_case, train_config, verdict
+from hqgs.training.config import TrainConfig
+from hqgs.training.methods.base import ThreeDGS
 
 CONFIG = EnduranceConfig(iterations=20, max_gaussians=80)
 LONG = EnduranceConfig()
 
 
 def call(*arguments: str | Path) -> int:
-    return cli.main(["bench", "endurance", *(str(a) for a in arguments)])
+    return cli.main(["endurance", *(str(a) for a in arguments)])
 
 
 def case(name: str) -> Case:

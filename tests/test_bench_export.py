@@ -1,4 +1,4 @@
-"""`hqgs bench export`: every file is measured as it is read back, and the front is the front."""
+"""The benchmark `export`: every file is measured as it is read back, and the front is the front."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import pytest
 from PIL import Image
 from tiny_scene import tiny_scene
 
-from hqgs import cli
-from hqgs.bench import export as bench
-from hqgs.export import held_out_psnr, held_out_renders, read_scene_file
+from benchmarks import cli
+from benchmarks import export as bench
+from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
+from hqgs.export.export import read_scene_file
 
 
 def call(*arguments: str | Path) -> int:
-    return cli.main(["bench", "export", *map(str, arguments)])
+    return cli.main(["export", *map(str, arguments)])
 
 
 def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

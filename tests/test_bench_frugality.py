@@ -1,4 +1,4 @@
-"""`hqgs bench frugality`: rows, ratios, verdict, and what is kept."""
+"""The benchmark `frugality`: rows, ratios, verdict, and what is kept."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from hqgs import cli
-from hqgs.bench import frugality
-from hqgs.bench.frugality import FrugalityConfig, against_none, train_config, verdict
+from benchmarks import cli, frugality
+from benchmarks.frugality import FrugalityConfig, against_none, train_config, verdict
 
 
 def call(*arguments: str | Path) -> int:
-    return cli.main(["bench", "frugality", *(str(a) for a in arguments)])
+    return cli.main(["frugality", *(str(a) for a in arguments)])
 
 
 def run_of(scene: str, row: str, **changes: Any) -> dict[str, Any]:

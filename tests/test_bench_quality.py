@@ -1,4 +1,4 @@
-"""`hqgs bench quality` on a tiny scene: what is kept, resumed and left out, and that its tables hold the
+"""The benchmark `quality` on a tiny scene: what is kept, resumed and left out, and that its tables hold the
 numbers that follow from the runs' files."""
 
 from __future__ import annotations
@@ -15,22 +15,23 @@ from PIL import Image
 from scipy import ndimage
 
 import hqgs
-from hqgs import cli
-from hqgs.bench import quality, quality_runs, quality_scenes
-from hqgs.bench.output import Report
-from hqgs.bench.quality_estimate import GROWTH, Estimate, duration
-from hqgs.bench.quality_protocols import PROTOCOLS, Cell, cells, narrowed
-from hqgs.bench.quality_regions import count_regions, edge_robustness
-from hqgs.bench.quality_runs import RunStore
-from hqgs.bench.quality_scenes import degraded, degraded_views, load_scenes, validation_split
-from hqgs.bench.quality_summary import Group, Spread, columns, equal_time_gain, mean_of, psnr_at
-from hqgs.bench.quality_tables import courses, one_scene
-from hqgs.camera import Camera, Scene, View
-from hqgs.checkpoint import scene_fingerprint
-from hqgs.degradations import parse_degradation
-from hqgs.methods.srgs import SRGSConfig
-from hqgs.sfm import SfmReport
-from hqgs.train import TrainingError
+from benchmarks import cli
+from benchmarks.output import Report
+from benchmarks.quality import quality
+from benchmarks.quality import runs as quality_runs
+from benchmarks.quality import scenes as quality_scenes
+from benchmarks.quality.estimate import GROWTH, Estimate, duration
+from benchmarks.quality.protocols import PROTOCOLS, Cell, cells, narrowed
+from benchmarks.quality.regions import count_regions, edge_robustness
+from benchmarks.quality.runs import RunStore
+from benchmarks.quality.scenes import degraded, degraded_views, load_scenes, validation_split
+from benchmarks.quality.summary import Group, Spread, columns, equal_time_gain, mean_of, psnr_at
+from benchmarks.quality.tables import courses, one_scene
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.scene import Camera, Scene, SfmReport, View
+from hqgs.training.checkpoint import scene_fingerprint
+from hqgs.training.config import SRGSConfig
+from hqgs.training.trainer import TrainingError
 from tests.tiny_scene import tiny_scene
 
 KINDS, ROWS, SEEDS = ("none", "noise:25", "lowres:2"), ("3dgs", "srgs", "hqgs"), (0, 1)
@@ -40,7 +41,7 @@ OPTIONS = ("--degradations", *KINDS, "--seeds", *map(str, SEEDS), "--iterations"
 def call(out: Path, *options: str) -> int:
     before = hqgs.get_num_threads()
     try:
-        return cli.main(["bench", "quality", "--quick", "--threads", "1", "--out", str(out), *options])
+        return cli.main(["quality", "--quick", "--threads", "1", "--out", str(out), *options])
     finally:
         hqgs.set_num_threads(before)
 

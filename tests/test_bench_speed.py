@@ -1,5 +1,5 @@
-"""`hqgs bench speed` at tiny sizes: the fields of its JSON, numbers that agree with each other and with those
-of another computation, and what it says when something is missing."""
+"""`speed` at tiny sizes: the fields of its JSON, numbers that agree with each other and with those of another
+computation, and what it says when something is missing."""
 
 from __future__ import annotations
 
@@ -18,24 +18,22 @@ import torch
 from PIL import Image
 
 import hqgs
+from benchmarks import cli
+from benchmarks.output import command_line
+from benchmarks.speed.inputs import RasterInputs, load_inputs, make_inputs
+from benchmarks.speed.peers import find_gsplat
+from benchmarks.speed.replay import blended_counts, random_pixels
+from benchmarks.speed.scene import make_trainer, warm_up
+from benchmarks.speed.timing import StageClock, exponent, interleaved, median, median_ratio
+from benchmarks.speed.work import count_work
 from hqgs import _rust
-from hqgs.bench import cli
-from hqgs.bench.inputs import RasterInputs, load_inputs, make_inputs
-from hqgs.bench.output import command_line, markdown_table
-from hqgs.bench.peers import find_gsplat
-from hqgs.bench.replay import blended_counts, random_pixels
-from hqgs.bench.scene import make_trainer, warm_up
-from hqgs.bench.timing import StageClock, exponent, interleaved, median, median_ratio
-from hqgs.bench.work import count_work
+from hqgs.base.text import markdown_table
 
 CRATE = ["project", "bin and composite", "composite backward", "project backward"]
 
 
 def call(*arguments: str | Path) -> int:
-    parser = argparse.ArgumentParser()
-    cli.add_parser(parser.add_subparsers(required=True))
-    args = parser.parse_args(["bench", "speed", *map(str, arguments)])
-    return args.run(args)
+    return cli.main(["speed", *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +56,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def test_the_file_says_where_it_comes_from(quick: dict[str, Any]) -> None:
     assert quick["benchmark"] == "speed"
-    assert quick["command"].startswith("python -m hqgs bench speed --method 3dgs --parts rasterizer step")
+    assert quick["command"].startswith("python -m benchmarks speed --method 3dgs --parts rasterizer step")
     assert quick["command"].endswith("--quick --seed 5")
     assert datetime.fromisoformat(quick["date"]).utcoffset() is not None
     assert quick["commit"] == quick["versions"]["git_commit"]
@@ -324,7 +322,7 @@ def test_command_line_holds_no_paths() -> None:
         benchmark="speed", out=Path("/x"), inputs=Path("/home/me/raster"), quick=True, seed=3, threads=None,
         parts=["step"], run=print, command="bench",
     )  # fmt: skip
-    assert command_line(args) == "python -m hqgs bench speed --inputs raster --parts step --quick --seed 3"
+    assert command_line(args) == "python -m benchmarks speed --inputs raster --parts step --quick --seed 3"
 
 
 def test_markdown_table() -> None:

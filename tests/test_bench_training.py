@@ -1,8 +1,7 @@
-"""`hqgs bench training` at tiny sizes: its JSON, what must be equal is equal, and finished runs stay."""
+"""The benchmark `training` at tiny sizes: its JSON, what must be equal is equal, and finished runs stay."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from pathlib import Path
@@ -15,24 +14,22 @@ from PIL import Image
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-import hqgs.train
+from benchmarks import cli
+from benchmarks.features import training
+from benchmarks.features.features import FEATURES, TorchAdam, torch_loss
+from benchmarks.features.training import still_trainer
+from benchmarks.features.training_report import DEFAULT, compare, verdicts
 from hqgs import _rust
-from hqgs.bench import cli, training
-from hqgs.bench.features import FEATURES, TorchAdam, torch_loss
-from hqgs.bench.training import still_trainer
-from hqgs.bench.training_report import DEFAULT, compare, verdicts
-from hqgs.losses import photometric_loss
-from hqgs.methods import three_dgs
-from hqgs.train import Trainer
+from hqgs.training import trainer as trainer_module
+from hqgs.training.methods import base as three_dgs
+from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.trainer import Trainer
 
 SAME_BITS = ("exact spans of tiles", "skipping of blocks", "all threads")
 
 
 def call(*arguments: str | Path) -> int:
-    parser = argparse.ArgumentParser()
-    cli.add_parser(parser.add_subparsers(required=True))
-    args = parser.parse_args(["bench", "training", *map(str, arguments)])
-    return args.run(args)
+    return cli.main(["training", *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +53,7 @@ def quick(folder: Path) -> dict[str, Any]:
 
 def test_the_file_says_where_it_comes_from(quick: dict[str, Any], folder: Path) -> None:
     assert quick["benchmark"] == "training"
-    assert quick["command"] == "python -m hqgs bench training --downscale 10.0 --iterations 14 --quick"
+    assert quick["command"] == "python -m benchmarks training --downscale 10.0 --iterations 14 --quick"
     assert quick["settings"]["scenes"] == ["embedded"]
     assert quick["commit"] == quick["versions"]["git_commit"]
     with Image.open(folder / "training_embedded.png") as chart:
@@ -155,8 +152,8 @@ def test_the_loss_in_torch_is_the_loss(masked: bool, shape: tuple[int, int, int]
 def test_switches_are_undone() -> None:
     before = hqgs.get_num_threads(), torch.get_num_threads()
     places = (
-        (_rust, "project_forward"), (hqgs.train, "render_view"), (hqgs.train, "Adam"),
-        (hqgs.train, "one_torch_thread"), (three_dgs, "photometric_loss"),
+        (_rust, "project_forward"), (trainer_module, "render_view"), (trainer_module, "Adam"),
+        (trainer_module, "one_torch_thread"), (three_dgs, "photometric_loss"),
     )  # fmt: skip
     found = [getattr(*place) for place in places]
     changed: set[str] = set()
@@ -175,7 +172,7 @@ def test_switches_are_undone() -> None:
 
 def test_a_trainer_with_adam_of_torch_learns_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     ours = Trainer(tiny_scene(), tiny_config())
-    monkeypatch.setattr(hqgs.train, "Adam", TorchAdam)
+    monkeypatch.setattr(trainer_module, "Adam", TorchAdam)
     theirs = Trainer(tiny_scene(), tiny_config())
     assert isinstance(theirs.optimizer, torch.optim.Adam)
     for _ in range(7):  # before the number of Gaussians can differ

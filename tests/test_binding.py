@@ -81,8 +81,8 @@ def test_the_gil_is_released() -> None:
 
 FAULTS = """
 import resource, time
-from hqgs.bench.inputs import make_inputs
-from hqgs.bench.rasterizer import RasterPass
+from benchmarks.speed.inputs import make_inputs
+from benchmarks.speed.rasterizer import RasterPass
 
 raster = RasterPass(make_inputs(30_000))
 for wait in (0, 0, 0, 1.5, 0):

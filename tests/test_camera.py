@@ -5,7 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from hqgs.camera import Camera, project, unproject
+from hqgs.scene.geometry import project, unproject
+from hqgs.scene.scene import Camera
 
 # The camera stands at (1, 2, 3) and looks along world x: its right is -y, its down is -z.
 LOOKS_ALONG_X = np.array([[0, -1, 0, 2], [0, 0, -1, 3], [1, 0, 0, -1], [0, 0, 0, 1]], dtype=np.float64)

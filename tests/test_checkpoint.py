@@ -11,11 +11,12 @@ import torch
 from run_state import State, assert_same, whole_state
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Scene, View
-from hqgs.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
-from hqgs.densify import DensifyConfig
-from hqgs.run import CHECKPOINT, open_run, train
-from hqgs.train import Trainer
+from hqgs.base.files import CHECKPOINT
+from hqgs.pipeline import open_run, train
+from hqgs.scene.scene import Scene, View
+from hqgs.training.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
+from hqgs.training.config import DensifyConfig
+from hqgs.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

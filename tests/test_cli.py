@@ -13,12 +13,11 @@ import pytest
 from tiny_scene import tiny_scene
 
 import hqgs
-from hqgs import cli
-from hqgs.camera import Scene
-from hqgs.methods import ThreeDGS
-from hqgs.ply import read_ply
-from hqgs.run import CHECKPOINT
-from hqgs.sfm import SfmReport
+from hqgs.base.files import CHECKPOINT
+from hqgs.cli import main as cli
+from hqgs.export.ply import read_ply
+from hqgs.scene.scene import Scene, SfmReport
+from hqgs.training.methods.base import ThreeDGS
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 from fixtures_scenes import make_truth, subset, write_colmap, write_photos
 from PIL import Image
 
-from hqgs.data import load_scene
+from hqgs.scene.load import load_scene
 
 BINARY = ["cameras.bin", "images.bin", "points3D.bin"]
 

@@ -11,8 +11,9 @@ from fixtures_scenes import HEIGHT, WIDTH, make_truth, write_colmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.data import load_scene
-from hqgs.data.images import area_downscale, decode
+from hqgs.photos.files import decode
+from hqgs.photos.resize import area_downscale
+from hqgs.scene.load import load_scene
 
 
 def area_mean(image: NDArray[np.uint8], width: int, height: int) -> NDArray[np.float64]:

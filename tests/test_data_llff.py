@@ -20,7 +20,7 @@ from fixtures_scenes import (
     write_photos,
 )
 
-from hqgs.data import load_scene
+from hqgs.scene.load import load_scene
 
 CENTRED = np.array([[FX, 0, WIDTH / 2], [0, FX, HEIGHT / 2], [0, 0, 1]])
 

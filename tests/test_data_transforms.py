@@ -13,7 +13,7 @@ import pytest
 from fixtures_scenes import FX, FY, HEIGHT, WIDTH, frames, make_truth, subset, write_photos, write_transforms
 from PIL import Image
 
-from hqgs.data import load_scene
+from hqgs.scene.load import load_scene
 
 
 def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, text: bool = False) -> None:
@@ -194,7 +194,7 @@ def test_distorted_cameras(
     tmp_path: Path, values: dict[str, Any], model: str, params: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The camera handed to the undistortion; that itself is tested in test_data_undistort.py."""
-    import hqgs.data as data
+    import hqgs.scene.load as data
 
     seen = []
     real = data.load_views

@@ -14,9 +14,9 @@ from fixtures_scenes import HEIGHT, WIDTH, make_truth, write_colmap, write_trans
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.camera import View
-from hqgs.data import load_scene
-from hqgs.data.undistort import Pinhole
+from hqgs.scene.load import load_scene
+from hqgs.scene.scene import View
+from hqgs.scene.views import Pinhole
 
 F = [40.0, 42.0, 25.0, 17.5]
 MODELS = {

@@ -9,9 +9,9 @@ import pytest
 from fixtures_scenes import make_truth, write_colmap, write_llff, write_transforms
 from PIL import Image
 
-from hqgs.data import load_scene
-from hqgs.degradations import parse_degradation
-from hqgs.degrade import write_degraded_scene
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.degrade import write_degraded_scene
+from hqgs.scene.load import load_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:Truncated File Read")  # Pillow says so before it raises
 

@@ -12,20 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage, stats
 
-from hqgs.degradations import (
-    KINDS,
-    MIXED_STEPS,
-    Degradation,
-    Degraded,
-    convolve,
-    degrade_image,
-    disc_kernel,
-    gaussian_blur,
-    motion_kernel,
-    parse_degradation,
-    shrink,
-)
-from hqgs.resize import resize
+from hqgs.photos.degrade import Degraded, convolve, degrade_image, gaussian_blur, shrink
+from hqgs.photos.formula import KINDS, MIXED_STEPS, Degradation, parse_degradation
+from hqgs.photos.kernels import disc_kernel, motion_kernel
+from hqgs.photos.resize import resize
 
 
 def photo(height: int = 40, width: int = 56) -> NDArray[np.uint8]:

@@ -13,11 +13,14 @@ from fixtures_scenes import make_truth, write_colmap
 from PIL import Image
 from tiny_scene import tiny_scene
 
-import hqgs.degrade
-from hqgs.camera import Scene, Tracks
-from hqgs.data import load_scene
-from hqgs.degradations import degrade_image, encode_jpeg, parse_degradation, to_uint8
-from hqgs.degrade import degrade_scene, write_degraded_scene
+import hqgs.scene.degrade
+from hqgs.photos.degrade import degrade_image
+from hqgs.photos.formula import parse_degradation
+from hqgs.photos.jpeg import encode_jpeg
+from hqgs.photos.pixels import to_uint8
+from hqgs.scene.degrade import degrade_scene, write_degraded_scene
+from hqgs.scene.load import load_scene
+from hqgs.scene.scene import Scene, Tracks
 
 KINDS = [
     "none",
@@ -266,7 +269,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
 def test_nothing_is_left_after_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, error: type[BaseException]
 ) -> None:
-    real, calls = getattr(hqgs.degrade, place), []
+    real, calls = getattr(hqgs.scene.degrade, place), []
 
     def failing(*arguments: Any, **named: Any) -> Any:
         calls.append(arguments)
@@ -274,7 +277,7 @@ def test_nothing_is_left_after_an_error(
             raise error
         return real(*arguments, **named)
 
-    monkeypatch.setattr(hqgs.degrade, place, failing)
+    monkeypatch.setattr(hqgs.scene.degrade, place, failing)
     with pytest.raises(error):
         write(tiny_scene(), tmp_path / "out", "noise:25")
     assert calls

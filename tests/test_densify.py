@@ -10,9 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hqgs.densify import Densifier, DensifyConfig, Growth, quats_to_matrices
-from hqgs.gaussians import Gaussians
-from hqgs.optim import Adam
+from hqgs.model.gaussians import Gaussians
+from hqgs.training.adam import Adam
+from hqgs.training.config import DensifyConfig
+from hqgs.training.densify import Densifier, Growth, quats_to_matrices
 
 SIZE = 100  # pixels: a gradient of g per pixel counts as 50 g
 CONFIG = DensifyConfig(start=0, stop=1_000, every=10, reset_every=35)

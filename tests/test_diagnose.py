@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter1d
 
-from hqgs.camera import Camera, Scene, View
-from hqgs.degradations import degrade_image, encode_jpeg, parse_degradation
 from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene, format_diagnosis
+from hqgs.photos.degrade import degrade_image
+from hqgs.photos.formula import parse_degradation
+from hqgs.photos.jpeg import encode_jpeg
+from hqgs.scene.scene import Camera, Scene, View
 
 WIDTH, HEIGHT, PHOTOS = 272, 208, 3  # px; multiples of 8 and 16
 

@@ -14,21 +14,23 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 from torch import Tensor
 
 import hqgs
-import hqgs.densify as densify_module
-from hqgs.camera import Camera, Scene, View
-from hqgs.densify import Densifier, DensifyConfig
-from hqgs.edges import edge_aware_map, edge_magnitude
-from hqgs.gaussians import Gaussians
-from hqgs.losses import photometric_loss
-from hqgs.methods import METHODS
-from hqgs.methods.esfg import ESFG, ESFGConfig, FeatureRows
-from hqgs.methods.paper import CACHE_BYTES, VARIANTS, PaperConfig, PaperHQGS
-from hqgs.optim import Adam
-from hqgs.ply import read_ply
-from hqgs.run import PLY, open_run
-from hqgs.run import run as run_in_folder
-from hqgs.scs import scs_loss
-from hqgs.train import Trainer
+import hqgs.training.densify as densify_module
+from hqgs.base.files import PLY
+from hqgs.export.ply import read_ply
+from hqgs.model.gaussians import Gaussians
+from hqgs.photos.edges import edge_aware_map, edge_magnitude
+from hqgs.pipeline import open_run
+from hqgs.pipeline import run as run_in_folder
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.adam import Adam
+from hqgs.training.config import METHODS, DensifyConfig, ESFGConfig, PaperConfig
+from hqgs.training.densify import Densifier
+from hqgs.training.methods import MAKERS
+from hqgs.training.methods.esfg import ESFG, FeatureRows
+from hqgs.training.methods.paper import CACHE_BYTES, VARIANTS, PaperHQGS
+from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.methods.scs import scs_loss
+from hqgs.training.trainer import Trainer
 
 SMALL = 20  # F: more than once in the 40 points of the tiny scene
 OFF = {"concat": False, "cross_attention": False}
@@ -38,8 +40,10 @@ OFF = {"concat": False, "cross_attention": False}
 def methods(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every variant as a method with a small F, and one whose F' moves fast enough to be seen."""
     for name, config in VARIANTS.items():
-        monkeypatch.setitem(METHODS, name, maker(small(config)))
-    monkeypatch.setitem(METHODS, "fast", maker(small(VARIANTS["V7"], lr=1e-2)))
+        monkeypatch.setitem(METHODS, name, "")
+        monkeypatch.setitem(MAKERS, name, maker(small(config)))
+    monkeypatch.setitem(METHODS, "fast", "")
+    monkeypatch.setitem(MAKERS, "fast", maker(small(VARIANTS["V7"], lr=1e-2)))
 
 
 def small(config: PaperConfig, **changes: Any) -> PaperConfig:
@@ -493,7 +497,7 @@ def test_views_of_one_name_are_not_confused() -> None:
 def test_weights_beyond_the_memory_for_them_are_computed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for room in (CACHE_BYTES, 0):
-        monkeypatch.setattr("hqgs.methods.paper.CACHE_BYTES", room)
+        monkeypatch.setattr("hqgs.training.methods.paper.CACHE_BYTES", room)
         found.append(bits(run("V7", 8)))
     assert found[0] == found[1]
 

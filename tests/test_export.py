@@ -13,23 +13,22 @@ from reference import sh_basis
 from test_ply import random_gaussians
 from tiny_scene import tiny_scene
 
-from hqgs import cli
-from hqgs.camera import Camera
-from hqgs.export import (
+from hqgs.cli import main as cli
+from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
+from hqgs.export.export import (
     ExportOptions,
     along_a_curve,
     export,
     file_degree,
-    held_out_psnr,
-    held_out_renders,
     needed_degrees,
     read_scene_file,
     reduce_gaussians,
 )
-from hqgs.gaussians import Gaussians
-from hqgs.ply import read_ply, write_ply
-from hqgs.render import render_view
-from hqgs.spz import encode_spz, read_spz
+from hqgs.export.ply import read_ply, write_ply
+from hqgs.export.spz import encode_spz, read_spz
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import render_view
+from hqgs.scene.scene import Camera
 
 CAMERA = Camera(48, 32, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), np.eye(4))
 

@@ -32,19 +32,18 @@ from PIL import Image
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
-import hqgs.run
-from hqgs import cli
-from hqgs.bench.cli import BENCHMARKS
-from hqgs.bench.output import Benchmark, Report
-from hqgs.checkpoint import FolderBusyError, load_checkpoint, save_checkpoint
-from hqgs.config import TrainConfig
-from hqgs.data import load_scene
-from hqgs.data.colmap_write import write_colmap as write_model
-from hqgs.densify import DensifyConfig
-from hqgs.files import write_json
-from hqgs.ply import read_ply, write_ply
-from hqgs.run import CHECKPOINT, PLY, train
-from hqgs.train import Trainer
+from benchmarks.cli import BENCHMARKS
+from benchmarks.cli import main as benchmark
+from benchmarks.output import Benchmark, Report
+from hqgs.base.files import CHECKPOINT, PLY, FolderBusyError, write_json
+from hqgs.cli import main as cli
+from hqgs.export.ply import read_ply, write_ply
+from hqgs.pipeline import train
+from hqgs.scene.formats.colmap import write_colmap as write_model
+from hqgs.scene.load import load_scene
+from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
+from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.trainer import Trainer
 
 KILLS = 50 if os.environ.get("HQGS_LONG") else 6
 NOBODY = 65534  # the user id without rights
@@ -83,7 +82,8 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
     with stderr.open("w") as sys.stderr:
         if user is not None:
             os.setuid(user)
-        code = cli.main(arguments)
+        command, *rest = arguments
+        code = benchmark(rest) if command == "benchmarks" else cli.main(arguments)
         sys.stderr.flush()
     os._exit(code)
 
@@ -92,7 +92,7 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
 def processes() -> ForkServerContext:
     """Children that start from a process in which everything is imported already."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hqgs.cli", "tiny_scene", "piq"])
+    context.set_forkserver_preload(["hqgs.cli.main", "tiny_scene", "piq"])
     return context
 
 
@@ -365,7 +365,7 @@ def test_a_benchmark_on_a_full_disk_is_one_line(
 
     monkeypatch.setitem(BENCHMARKS, "stability", Benchmark("full", lambda parser: None, full))
     with small_files(4_000):
-        assert call("bench", "stability", "--quick", "--out", tmp_path) == 1
+        assert benchmark(["stability", "--quick", "--out", str(tmp_path)]) == 1
     assert last_line(capsys) == f"hqgs: {tmp_path}: [Errno 27] File too large"
     assert list(tmp_path.iterdir()) == []
 
@@ -388,7 +388,7 @@ def test_a_folder_that_cannot_be_written_is_bad_input(processes: ForkServerConte
             ["train", scene, "--out", f"{out}/deep/er", "--iterations", "5"],
             ["degrade", scene, "--kind", "none", "--out", f"{out}/scene"],
             ["diagnose", scene, "--out", f"{out}/a.json"],
-            ["bench", "stability", "--quick", "--out", f"{out}/bench"],
+            ["benchmarks", "stability", "--quick", "--out", f"{out}/bench"],
         ):
             child = processes.Process(target=_command_in_child, args=(command, stderr, user))
             child.start()
@@ -447,7 +447,7 @@ def test_a_clock_that_goes_backwards_gives_no_negative_time(
 
     monkeypatch.setattr(time, "time", backwards)
     monkeypatch.setattr(time, "time_ns", lambda: int(backwards() * 1e9))
-    hqgs.run.train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    train(tiny_scene(), tiny_config(), tmp_path, progress=False)
     report = json.loads((tmp_path / "report.json").read_text())
     seconds = [0.0, *(entry["seconds"] for entry in report["history"]), report["seconds"]]
     assert seconds == sorted(seconds)

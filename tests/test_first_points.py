@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Camera, Scene, View
-from hqgs.first_points import points_along_edges
-from hqgs.methods.hqgs import HQGSConfig
-from hqgs.run import run
-from hqgs.train import Trainer
+from hqgs.model.first_points import points_along_edges
+from hqgs.pipeline import run
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.config import HQGSConfig
+from hqgs.training.trainer import Trainer
 
 NORMAL, OFFSET = np.array([0.3, -0.2, 1.0]), 5.0  # the plane NORMAL . x = OFFSET
 

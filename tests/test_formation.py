@@ -8,12 +8,13 @@ import torch
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hqgs.degradations import degrade_image, parse_degradation
-from hqgs.formation import blur_matrix, formation
-from hqgs.jpeg_cells import JpegCells, tables_of_quality
-from hqgs.kernel import Kernel
-from hqgs.resize import resize_matrix
-from hqgs.separable import Separable
+from hqgs.photos.degrade import degrade_image
+from hqgs.photos.formation import blur_matrix, formation
+from hqgs.photos.formula import parse_degradation
+from hqgs.photos.jpeg import tables_of_quality
+from hqgs.photos.operators import Kernel, Separable
+from hqgs.photos.resize import resize_matrix
+from hqgs.training.methods.jpeg_cells import JpegCells
 
 
 def picture(height: int, width: int) -> NDArray[np.float32]:

@@ -11,16 +11,14 @@ import pytest
 from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
-import hqgs.frugality as module
-from hqgs import trials
-from hqgs.camera import Scene
-from hqgs.config import TrainConfig
-from hqgs.densify import DensifyConfig
-from hqgs.frugality import COARSE_PART, smaller
-from hqgs.left_out import LeftOut, format_left_out, parse_leave_out
-from hqgs.methods.hqgs import HQGSConfig
-from hqgs.run import train
-from hqgs.train import Trainer
+import hqgs.training.frugality as module
+from hqgs.base.left_out import LeftOut, format_left_out
+from hqgs.pipeline import train
+from hqgs.scene.scene import Scene
+from hqgs.training import trials
+from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig, parse_leave_out
+from hqgs.training.schedule import COARSE_PART, smaller
+from hqgs.training.trainer import Trainer
 
 VIEWS = 13  # one is a test view; of twelve, one is held back
 STILL = DensifyConfig(start=10_000, reset_every=10_000)

@@ -28,14 +28,14 @@ from PIL import Image
 from safetensors.torch import save_file
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Scene
-from hqgs.checkpoint import FORMAT, load_checkpoint, save_checkpoint
-from hqgs.data import load_scene
-from hqgs.data.degraded import DegradedFolder, write_degraded_folder
-from hqgs.gaussians import Gaussians
-from hqgs.ply import read_ply, write_ply
-from hqgs.report import read_report
-from hqgs.train import Trainer
+from hqgs.evaluation.report import read_report
+from hqgs.export.ply import read_ply, write_ply
+from hqgs.model.gaussians import Gaussians
+from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
+from hqgs.scene.load import load_scene
+from hqgs.scene.scene import Scene
+from hqgs.training.checkpoint import FORMAT, load_checkpoint, save_checkpoint
+from hqgs.training.trainer import Trainer
 
 COUNT = 3_000 if os.environ.get("HQGS_LONG") else 100  # random mutations of each file
 
@@ -159,7 +159,9 @@ def make(name: str, folder: Path) -> Target:
 @pytest.fixture(scope="module")
 def processes() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hqgs.cli", "hqgs.train", "pytest"])  # not ours: its path is not set
+    context.set_forkserver_preload(
+        ["hqgs.cli.main", "hqgs.training.trainer", "pytest"]
+    )  # not ours: its path is not set
     return context
 
 

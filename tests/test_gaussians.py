@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from hqgs.gaussians import Gaussians, mean_square_distance
+from hqgs.model.gaussians import Gaussians, mean_square_distance
 
 
 def brute_force(points: np.ndarray, rows: np.ndarray) -> np.ndarray:

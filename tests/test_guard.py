@@ -13,12 +13,15 @@ import torch
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
-from hqgs.densify import DensifyConfig, select_rows
-from hqgs.gaussians import Gaussians
-from hqgs.guard import KEPT, LISTED, bad_rows, is_sound
-from hqgs.methods import METHODS, ThreeDGS
-from hqgs.run import CHECKPOINT, train
-from hqgs.train import Trainer
+from hqgs.base.files import CHECKPOINT
+from hqgs.model.gaussians import Gaussians
+from hqgs.pipeline import train
+from hqgs.training.adam import select_rows
+from hqgs.training.config import METHODS, DensifyConfig
+from hqgs.training.guard import KEPT, LISTED, bad_rows, is_sound
+from hqgs.training.methods import MAKERS
+from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.trainer import Trainer
 
 ONLY_TRAIN = DensifyConfig(stop=0)
 
@@ -67,7 +70,8 @@ class Faulty(ThreeDGS):
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> Faulty:
     method = Faulty()
-    monkeypatch.setitem(METHODS, "faulty", lambda scene, config: method)
+    monkeypatch.setitem(METHODS, "faulty", "")
+    monkeypatch.setitem(MAKERS, "faulty", lambda scene, config: method)
     return method
 
 

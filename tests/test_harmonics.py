@@ -7,9 +7,9 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from hqgs.gaussians import Gaussians
-from hqgs.harmonics import folded, sh_basis
-from hqgs.render import render_view
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.harmonics import folded, sh_basis
+from hqgs.model.render import render_view
 
 
 def random_gaussians(seed: int = 0) -> Gaussians:

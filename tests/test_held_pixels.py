@@ -14,13 +14,13 @@ from test_hqgs import fixed
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
-from hqgs.camera import View
-from hqgs.degradations import parse_degradation
-from hqgs.degrade import degrade_scene
-from hqgs.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels
-from hqgs.methods.hqgs import HQGS
-from hqgs.run import run
-from hqgs.train import Trainer
+from hqgs.photos.formula import parse_degradation
+from hqgs.pipeline import run
+from hqgs.scene.degrade import degrade_scene
+from hqgs.scene.scene import View
+from hqgs.training.methods.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels
+from hqgs.training.methods.hqgs import HQGS
+from hqgs.training.trainer import Trainer
 
 SIZE = (20, 30)
 

@@ -13,18 +13,20 @@ from scipy.fft import dctn
 from test_srgs import fine_scene
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Scene, as_floats
-from hqgs.degradations import parse_degradation
-from hqgs.degrade import degrade_scene
-from hqgs.densify import DensifyConfig, select_rows
-from hqgs.jpeg_cells import tables_of_quality
-from hqgs.losses import photometric_loss
-from hqgs.methods.hqgs import HQGS, HQGSConfig, make_hqgs
-from hqgs.methods.paper import PaperHQGS
-from hqgs.metrics import psnr
-from hqgs.run import train
-from hqgs.smallest import photo_pixels
-from hqgs.train import Trainer
+from hqgs.evaluation.metrics import psnr
+from hqgs.photos.formula import parse_degradation
+from hqgs.photos.jpeg import tables_of_quality
+from hqgs.photos.pixels import as_floats
+from hqgs.pipeline import train
+from hqgs.scene.degrade import degrade_scene
+from hqgs.scene.geometry import photo_pixels
+from hqgs.scene.scene import Scene
+from hqgs.training.adam import select_rows
+from hqgs.training.config import DensifyConfig, HQGSConfig
+from hqgs.training.methods.hqgs import HQGS, make_hqgs
+from hqgs.training.methods.paper import PaperHQGS
+from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.trainer import Trainer
 
 
 def fixed(formation: str, **changes: float) -> HQGSConfig:
@@ -254,7 +256,7 @@ def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.methods.hqgs.REFRESH", 4)  # some of it between the save and the end
+    monkeypatch.setattr("hqgs.training.methods.hqgs.REFRESH", 4)  # some of it between the save and the end
     config = tiny_config(20, method="hqgs", hqgs=fixed("blur:1"))
     whole, first, second = (Trainer(tiny_scene(), config) for _ in range(3))
     for _ in range(20):

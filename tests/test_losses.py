@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from hqgs import _rust
-from hqgs.losses import photometric_loss
-from hqgs.rasterize import get_num_threads, set_num_threads
+from hqgs._rust import get_num_threads, set_num_threads
+from hqgs.training.methods.photometric import photometric_loss
 
 
 def reference(render: Tensor, target: Tensor, mask: Tensor | None, lambda_dssim: float) -> Tensor:

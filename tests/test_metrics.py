@@ -16,8 +16,17 @@ import numpy as np
 import pytest
 import torch
 
-from hqgs import metrics
-from hqgs.metrics import METRICS, ViewMetrics, evaluate_view, haarpsi, lpips, mean_metrics, psnr, ssim
+from hqgs.evaluation import metrics
+from hqgs.evaluation.metrics import (
+    METRICS,
+    ViewMetrics,
+    evaluate_view,
+    haarpsi,
+    lpips,
+    mean_metrics,
+    psnr,
+    ssim,
+)
 
 MISSING = "the optional package lpips is not installed (pip install 'hqgs[lpips]')"
 

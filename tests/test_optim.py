@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hqgs.optim import Adam
-from hqgs.rasterize import get_num_threads, set_num_threads
+from hqgs._rust import get_num_threads, set_num_threads
+from hqgs.training.adam import Adam
 
 SHAPES = [(257, 3), (257,), (257, 15, 3), (257, 0, 3), ()]
 

@@ -12,13 +12,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from hqgs.camera import Camera, Scene, View
-from hqgs.degradations import parse_degradation
-from hqgs.degrade import degrade_scene
-from hqgs.photo_choice import choose_photos
-from hqgs.photo_look import look_at_photos
-from hqgs.relative_blur import Sharpness
-from hqgs.sight import Sight
+from hqgs.diagnosis.choice import choose_photos
+from hqgs.diagnosis.coverage import Sight
+from hqgs.diagnosis.sharpness import Sharpness, look_at_photos
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.degrade import degrade_scene
+from hqgs.scene.scene import Camera, Scene, View
 
 WIDTH, HEIGHT, FOCAL, DEPTH, PHOTOS = 112, 96, 100.0, 4.0, 12
 STEP = DEPTH / FOCAL  # world units: moves the plane by one pixel

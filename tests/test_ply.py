@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from hqgs.gaussians import Gaussians
-from hqgs.ply import read_ply, write_ply
+from hqgs.export.ply import read_ply, write_ply
+from hqgs.model.gaussians import Gaussians
 
 
 def random_gaussians(n: int = 7, sh_degree: int = 3) -> Gaussians:

@@ -15,9 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hqgs import machine, report
-from hqgs.metrics import METRICS
-from hqgs.report import RenderedView, RunResult, read_report, write_report
+from hqgs.base import machine
+from hqgs.evaluation import report
+from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.metrics import METRICS
+from hqgs.evaluation.report import RunResult, read_report, write_report
 
 HEIGHT, WIDTH = 40, 60
 

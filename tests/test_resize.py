@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.resize import resize, resize_matrix
+from hqgs.photos.resize import resize, resize_matrix
 
 SIZES = [(12, 12), (12, 6), (12, 3), (13, 5), (378, 95), (7, 2), (2, 7), (5, 13), (95, 378), (1, 4), (4, 1)]
 

@@ -23,10 +23,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 import hqgs
-import hqgs.restore
-from hqgs.camera import Camera, Scene, View
-from hqgs.resize import resize
-from hqgs.restore import RestoreConfig, restore_scene
+import hqgs.scene.restore
+from hqgs.photos.resize import resize
+from hqgs.scene.restore import RestoreConfig, restore_scene
+from hqgs.scene.scene import Camera, Scene, View
 
 pytest.importorskip("spandrel")  # an optional package
 import spandrel
@@ -248,7 +248,7 @@ def test_networks_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytes
     know_blocks(monkeypatch, purpose="FaceSR")
     with pytest.raises(ValueError, match=r"net\.safetensors: Blocks \(FaceSR\) makes up detail"):
         restore_scene(tiny_scene(), path)
-    monkeypatch.setattr(hqgs.restore, "RANDOM", ("Blocks",))
+    monkeypatch.setattr(hqgs.scene.restore, "RANDOM", ("Blocks",))
     know_blocks(monkeypatch)
     with pytest.raises(ValueError, match=r"Blocks \(Restoration\) makes up detail"):
         restore_scene(tiny_scene(), path)

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hqgs.edges import edge_magnitude
-from hqgs.scs import DIMMEST, ScsWeights, scs_loss, weighted_scs_loss
+from hqgs.photos.edges import edge_magnitude
+from hqgs.training.methods.scs import DIMMEST, ScsWeights, scs_loss, weighted_scs_loss
 
 
 def images(

@@ -12,12 +12,12 @@ import torch
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
-from hqgs.camera import Scene
-from hqgs.config import TrainConfig
-from hqgs.densify import DensifyConfig
-from hqgs.methods import METHODS, ThreeDGS
-from hqgs.optim import Adam
-from hqgs.train import Trainer
+from hqgs.scene.scene import Scene
+from hqgs.training.adam import Adam
+from hqgs.training.config import METHODS, DensifyConfig, TrainConfig
+from hqgs.training.methods import MAKERS
+from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.trainer import Trainer
 
 SELECTIVE = tiny_config(selective_adam=True)
 
@@ -99,7 +99,8 @@ def test_the_tensors_of_a_method_are_always_updated(monkeypatch: pytest.MonkeyPa
             return super().loss(render, view) + self.offset.sum()
 
     method = Offset()
-    monkeypatch.setitem(METHODS, "offset", lambda scene, config: method)
+    monkeypatch.setitem(METHODS, "offset", "")
+    monkeypatch.setitem(MAKERS, "offset", lambda scene, config: method)
     trainer = Trainer(tiny_scene(), replace(SELECTIVE, method="offset"))
     trainer.step()
     assert torch.allclose(method.offset.detach(), torch.full((7,), -0.01))

@@ -14,12 +14,12 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 import hqgs
-from hqgs import colmap_run
-from hqgs.camera import Camera, Scene, View
-from hqgs.data import load_scene
-from hqgs.degradations import parse_degradation
-from hqgs.degrade import degrade_scene
-from hqgs.sfm import sfm_scene
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.degrade import degrade_scene
+from hqgs.scene.load import load_scene
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.sfm import run as colmap_run
+from hqgs.scene.sfm.reconstruct import sfm_scene
 
 WIDTH, HEIGHT = 192, 144
 CARDS = [

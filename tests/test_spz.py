@@ -16,12 +16,12 @@ import torch
 from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Camera
-from hqgs.gaussians import Gaussians
-from hqgs.metrics import psnr
-from hqgs.render import render_view
-from hqgs.spz import encode_spz, read_spz, write_spz
-from hqgs.train import Trainer
+from hqgs.evaluation.metrics import psnr
+from hqgs.export.spz import encode_spz, read_spz, write_spz
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import render_view
+from hqgs.scene.scene import Camera
+from hqgs.training.trainer import Trainer
 
 # The content of two files that Niantic's own C++ writer made of `golden()` without a change of frame.
 NIANTIC = {

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.camera import Camera, Scene, View
-from hqgs.densify import DensifyConfig
-from hqgs.methods import METHODS, ThreeDGS
-from hqgs.methods.srgs import SRGS, SRGSConfig
-from hqgs.metrics import psnr
-from hqgs.resize import resize, resize_matrix
-from hqgs.separable import Separable
-from hqgs.train import Trainer
+from hqgs.evaluation.metrics import psnr
+from hqgs.photos.operators import Separable
+from hqgs.photos.resize import resize, resize_matrix
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.config import METHODS, DensifyConfig, SRGSConfig
+from hqgs.training.methods import MAKERS
+from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.methods.srgs import SRGS
+from hqgs.training.trainer import Trainer
 
 FACTOR = 4
 
@@ -125,7 +126,8 @@ def test_a_photo_without_low_is_tied_at_half_its_size() -> None:
 
 
 def test_without_low_and_with_factor_1_it_is_3dgs_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(METHODS, "srgs", lambda scene, config: SRGS(scene, SRGSConfig(own_factor=1)))
+    monkeypatch.setitem(METHODS, "srgs", "")
+    monkeypatch.setitem(MAKERS, "srgs", lambda scene, config: SRGS(scene, SRGSConfig(own_factor=1)))
     trainers = [Trainer(tiny_scene(), tiny_config(12, method=name)) for name in ("srgs", "3dgs")]
     for _ in range(12):
         losses = [trainer.step().loss for trainer in trainers]
@@ -185,7 +187,8 @@ def test_a_mask_that_leaves_no_low_pixel_is_no_error() -> None:
 
 
 def test_photos_come_out_sharper_than_those_of_3dgs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(METHODS, "srgs", lambda scene, config: SRGS(scene, SRGSConfig()))
+    monkeypatch.setitem(METHODS, "srgs", "")
+    monkeypatch.setitem(MAKERS, "srgs", lambda scene, config: SRGS(scene, SRGSConfig()))
     scene, clean = fine_scene()
     values = {}
     for method in ("3dgs", "srgs"):

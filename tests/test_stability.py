@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from dataclasses import replace
@@ -14,9 +13,9 @@ import pytest
 import torch
 from reference import reference_rasterization
 
-from hqgs.bench.cli import add_parser
-from hqgs.bench.oracle import GROUPS, Oracle
-from hqgs.bench.stability import (
+from benchmarks import cli
+from benchmarks.stability.oracle import GROUPS, Oracle
+from benchmarks.stability.stability import (
     COSINE,
     GRADIENT_F64,
     VALUE_F64,
@@ -25,7 +24,7 @@ from hqgs.bench.stability import (
     input_rounding,
     misses,
 )
-from hqgs.bench.stability_cases import PIXELS, cases, scene
+from benchmarks.stability.stability_cases import PIXELS, cases, scene
 
 CASES = {case.name: case for case in cases()}
 
@@ -126,7 +125,7 @@ def test_oracle_agrees_with_autograd(antialiased: bool, degree: int | None) -> N
 
 def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The measure itself: a change of 1e-6 in one value, or of 1 % in one gradient, misses the targets."""
-    from hqgs.bench import stability
+    from benchmarks.stability import stability
 
     right = stability.render
 
@@ -155,14 +154,11 @@ def test_rounding_of_geo_referenced_inputs_is_what_spoils_them() -> None:
 def test_command_writes_tables_and_chart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hqgs.bench import stability
+    from benchmarks.stability import stability
 
     few = [CASES[name] for name in ("ordinary", "behind the camera", "NaN in means[0]", "world offset 1e6")]
     monkeypatch.setattr(stability, "cases", lambda long: few)
-    parser = argparse.ArgumentParser()
-    add_parser(parser.add_subparsers())
-    args = parser.parse_args(["bench", "stability", "--quick", "--out", str(tmp_path)])
-    assert args.run(args) == 0
+    assert cli.main(["stability", "--quick", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "| ordinary" in printed
     assert "2 of 2 culled" in printed
@@ -170,5 +166,4 @@ def test_command_writes_tables_and_chart(
     assert [case["name"] for case in results["cases"]] == [case.name for case in few]
     assert results["cases"][0]["outcomes"][1]["value_relative"] < VALUE_F64
     assert (tmp_path / "stability_errors.png").stat().st_size > 10_000
-    both = parser.parse_args(["bench", "stability", "--quick", "--long", "--out", str(tmp_path)])
-    assert both.run(both) == 2
+    assert cli.main(["stability", "--quick", "--long", "--out", str(tmp_path)]) == 2

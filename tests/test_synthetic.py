@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.camera import Camera, Scene, View
-from hqgs.synthetic import embedded_cameras, embedded_scene, render_depth, render_view, scene, shading
-from hqgs.synthetic.points import SparsePoints, sfm_points, surface_points
-from hqgs.synthetic.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
-from hqgs.synthetic.scene import look_at
-from hqgs.synthetic.studio import studio
+from hqgs.scene.builtin import embedded_cameras, embedded_scene, render_depth, render_view, scene, shading
+from hqgs.scene.builtin.points import SparsePoints, sfm_points, surface_points
+from hqgs.scene.builtin.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
+from hqgs.scene.builtin.scene import look_at
+from hqgs.scene.builtin.studio import studio
+from hqgs.scene.scene import Camera, Scene, View
 
 Points3 = NDArray[np.float64]
 

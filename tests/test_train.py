@@ -16,16 +16,17 @@ from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
 import hqgs
-import hqgs.train as train_module
-from hqgs.camera import Scene, View
-from hqgs.config import TrainConfig
-from hqgs.densify import DensifyConfig
-from hqgs.gaussians import Gaussians
-from hqgs.methods import METHODS, ThreeDGS, check_method
-from hqgs.ply import read_ply
-from hqgs.run import CHECKPOINT, ENDINGS, PLY, open_run, run, train
-from hqgs.synthetic import embedded_scene
-from hqgs.train import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
+import hqgs.training.trainer as train_module
+from hqgs.base.files import CHECKPOINT, PLY
+from hqgs.export.ply import read_ply
+from hqgs.model.gaussians import Gaussians
+from hqgs.pipeline import ENDINGS, open_run, run, train
+from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.scene import Scene, View
+from hqgs.training.config import METHODS, DensifyConfig, TrainConfig, check_method
+from hqgs.training.methods import MAKERS
+from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.trainer import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
 
 ONLY_TRAIN = DensifyConfig(stop=0)
 
@@ -62,7 +63,8 @@ class Probe(ThreeDGS):
 @pytest.fixture
 def probe(monkeypatch: pytest.MonkeyPatch) -> Probe:
     method = Probe()
-    monkeypatch.setitem(METHODS, "probe", lambda scene, config: method)
+    monkeypatch.setitem(METHODS, "probe", "")
+    monkeypatch.setitem(MAKERS, "probe", lambda scene, config: method)
     return method
 
 

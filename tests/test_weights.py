@@ -13,9 +13,9 @@ from scenes import random_scene
 from torch import Tensor
 
 import hqgs
-from hqgs.camera import Camera, View
-from hqgs.gaussians import Gaussians
-from hqgs.weights import blending_weights, largest_weights
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import blending_weights, largest_weights
+from hqgs.scene.scene import Camera, View
 
 WIDTH, HEIGHT = 45, 37  # no multiples of a tile
 N = 120

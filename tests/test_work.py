@@ -16,10 +16,10 @@ from torch import Tensor
 
 import hqgs
 from hqgs import _rust
-from hqgs.densify import DensifyConfig
-from hqgs.optim import Adam
-from hqgs.train import Trainer
-from hqgs.work import WorkCounts, work_counts
+from hqgs.model.work_counts import WorkCounts, work_counts
+from hqgs.training.adam import Adam
+from hqgs.training.config import DensifyConfig
+from hqgs.training.trainer import Trainer
 
 WIDTH, HEIGHT = 80, 48  # 5 x 3 tiles
 N = 300

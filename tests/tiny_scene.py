@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.camera import Camera, Scene, View
-from hqgs.config import TrainConfig
-from hqgs.densify import DensifyConfig
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.config import DensifyConfig, TrainConfig
 
 WIDTH, HEIGHT, DEPTH = 24, 16, 3.0
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1
 
-from hqgs.diagnosis.levels import LUMA_NOISE, Floats, luma
 from hqgs.diagnosis.spectrum import (
     FLOOR,
     HIGHEST,
@@ -22,6 +21,7 @@ from hqgs.diagnosis.spectrum import (
     rings,
     tile_size,
 )
+from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 Kind = Literal["gaussian", "defocus", "motion"]
 

@@ -14,8 +14,8 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
-from hqgs.diagnosis.jpeg import block_coefficients
-from hqgs.diagnosis.levels import LUMA_NOISE, Floats, luma
+from hqgs.diagnosis.jpeg_traces import block_coefficients
+from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 SLOPE, SLOPE_SPREAD = 2.55, 2.0  # of the power over frequency; the spread is that of one block
 VARIANCES = 13 * 6.0 ** np.arange(-1, 8)  # levels^2: of the lowest coefficient, one per class of blocks

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hqgs.diagnosis.levels import Floats
+from hqgs.photos.pixels import Floats
 
 LARGE_PATCH, SMALL_PATCH = 5, 3  # px
 FEW_PATCHES = 4_000  # below this the large patch has too many directions for the photo

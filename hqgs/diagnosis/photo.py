@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from hqgs.diagnosis.blur import Blur, estimate_blur, extra_sigma
 from hqgs.diagnosis.coefficients import MAX_BLOCKS, Hidden, estimate_hidden, quantised
-from hqgs.diagnosis.jpeg import Jpeg, find_jpeg
-from hqgs.diagnosis.levels import Floats, to_levels
+from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
 from hqgs.diagnosis.noise import estimate_noise
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
+from hqgs.photos.pixels import Floats, to_levels
 
 Table = tuple[tuple[int, ...], ...]
 Photo = NDArray[np.uint8] | NDArray[np.float32]

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from hqgs.diagnosis.levels import Floats, luma
-from hqgs.resize import resize_matrix
+from hqgs.photos.pixels import Floats, luma
+from hqgs.photos.resize import resize_matrix
 
 FACTORS = (2, 3, 4, 6, 8)
 MIN_EVIDENCE = 2.1  # JPEG blocks reach 1.8 at factor 2; bicubic enlargement kept in 8 bits starts at 4.5

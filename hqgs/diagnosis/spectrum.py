@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft2
 
-from hqgs.diagnosis.levels import Floats
+from hqgs.photos.pixels import Floats
 
 FLOOR = 0.03  # levels^2: what rounding to 8 bits leaves in the luma; nothing below it is believed
 SLOPE, SLOPE_SPREAD = 2.4, 0.35  # of the power, over photos that count as sharp

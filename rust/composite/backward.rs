@@ -69,6 +69,7 @@ pub fn backward<T: Real>(
 ) -> Result<CompositeGrads<T>, Error> {
     input.check()?;
     let (channels, tiles) = (input.channels(), input.tiles);
+    check_len("composited", &composited.depths, tiles.lists.len())?;
     check_len("v_render_colors", v.image, input.pixels() * channels)?;
     if let Some(alphas) = v.alphas {
         check_len("v_render_alphas", alphas, input.pixels())?;

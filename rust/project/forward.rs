@@ -11,6 +11,7 @@ use super::{
 use crate::{
     constants::PROJECT_CHUNK,
     counts::Counts,
+    error::Error,
     scene::{Camera, Colors, Gaussians},
     simd::{
         Real,
@@ -104,15 +105,20 @@ fn group_chunks<T: Copy>(
 /// Project all Gaussians into `camera`.
 ///
 /// Culled: outside the depth range or the image, not finite (its colour included), without rotation, too
-/// transparent, or not larger than `radius_clip`. The lengths of all slices must already agree
-/// (`Gaussians::check`).
+/// transparent, or not larger than `radius_clip`.
+///
+/// # Errors
+/// When the arrays do not describe the same number of Gaussians, or an option is out of its range.
 pub fn forward<T: Real>(
     gaussians: &Gaussians<T>,
     colors: Colors<T>,
     camera: &Camera,
     options: &ProjectOptions,
-) -> Projected<T> {
+) -> Result<Projected<T>, Error> {
     let n = gaussians.len();
+    options.check()?;
+    gaussians.check()?;
+    colors.check(n)?;
     let harmonics = match colors {
         Colors::Harmonics(h) => Some(h),
         Colors::Channels(..) => None,
@@ -175,7 +181,7 @@ pub fn forward<T: Real>(
             },
         )
         .reduce(Counts::default, Counts::plus);
-    Projected {
+    Ok(Projected {
         projection: Projection {
             splats: splats.finish(),
             depths: keys.finish(),
@@ -195,7 +201,7 @@ pub fn forward<T: Real>(
             clamped: clamps.finish(),
         }),
         counts,
-    }
+    })
 }
 
 /// Project the Gaussians from `begin` on, as many as `out` has.

@@ -15,6 +15,7 @@ pub use forward::{Projected, forward};
 use crate::{
     accuracy_knobs::AccuracyKnobs,
     constants::{EPS2D, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK},
+    error::Error,
     scene::Gaussians,
     simd::{
         Level, Real, Wide,
@@ -60,6 +61,31 @@ impl Default for ProjectOptions {
             knobs: AccuracyKnobs::default(),
             level: Level::default(),
         }
+    }
+}
+
+impl ProjectOptions {
+    /// Check the ranges.
+    ///
+    /// # Errors
+    /// Names the first option that is out of its range.
+    pub fn check(&self) -> Result<(), Error> {
+        for (name, value) in [
+            ("eps2d", self.eps2d),
+            ("near_plane", self.near_plane),
+            ("radius_clip", self.radius_clip),
+        ] {
+            if !(value >= 0.0 && value.is_finite()) {
+                let message = format!("must be finite and not negative, got {value}");
+                return Err(Error::new(name, message));
+            }
+        }
+        let (near, far) = (self.near_plane, self.far_plane);
+        if far.is_nan() || far <= near {
+            let message = format!("must be larger than near_plane {near}, got {far}");
+            return Err(Error::new("far_plane", message));
+        }
+        self.knobs.check()
     }
 }
 

@@ -1,5 +1,5 @@
 //! The Python extension `hqgs._rust`: all that knows Python. numpy arrays are borrowed, never copied; the GIL is
-//! released while the crate works; each [`hqgs::Error`] becomes a `ValueError`.
+//! released while the crate works; each [`hqgs::Error`] becomes an exception of Python.
 
 mod arrays;
 mod composite;
@@ -57,7 +57,7 @@ fn simd_level() -> BindingResult<&'static str> {
 /// Address of the first element of an array as the crate sees it, to test that nothing is copied.
 #[pyfunction]
 fn data_pointer(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
-    by_dtype!(array, pointer_to(array))
+    by_dtype!("array", array, pointer_to(array))
 }
 
 fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {

@@ -45,7 +45,7 @@ impl Typed for f64 {
 }
 
 /// A borrowed matrix.
-fn dense<'a>(name: &str, matrix: &'a Array<f64>) -> BindingResult<Dense<'a>> {
+fn dense<'a>(name: &'static str, matrix: &'a Array<f64>) -> BindingResult<Dense<'a>> {
     let &[height, width] = matrix.shape() else {
         let got = format!("{:?}", matrix.shape());
         return Err(Error::shape(name, "[height, width]", got).into());
@@ -92,7 +92,7 @@ impl Separable {
         image: &Bound<'py, PyAny>,
         transposed: bool,
     ) -> BindingResult<Bound<'py, PyAny>> {
-        by_dtype!(image, apply_either(self, image, transposed))
+        by_dtype!("image", image, apply_either(self, image, transposed))
     }
 
     /// `apply` of the operator whose weights are the absolute values, on float32.
@@ -132,7 +132,11 @@ fn cell_distance<'py>(
     scale: f64,
     want_grad: bool,
 ) -> BindingResult<Distance<'py>> {
-    by_dtype!(x, cell_distance_as(x, centres, widths, scale, want_grad))
+    by_dtype!(
+        "x",
+        x,
+        cell_distance_as(x, centres, widths, scale, want_grad)
+    )
 }
 
 fn cell_distance_as<'py, T: Real + Element>(
@@ -144,14 +148,8 @@ fn cell_distance_as<'py, T: Real + Element>(
 ) -> BindingResult<Distance<'py>> {
     let py = x.py();
     let x = Array::<T>::new("x", x)?;
-    let centres = Array::<T>::new("centres", centres)?;
-    let widths = Array::<T>::new("widths", widths)?;
-    for (name, array) in [("centres", &centres), ("widths", &widths)] {
-        if array.shape() != x.shape() {
-            let (expected, got) = (format!("{:?}", x.shape()), format!("{:?}", array.shape()));
-            return Err(Error::shape(name, expected, got).into());
-        }
-    }
+    let centres = Array::<T>::new("centres", centres)?.of_shape(x.shape())?;
+    let widths = Array::<T>::new("widths", widths)?.of_shape(x.shape())?;
     let (x, centres, widths) = (x.slice()?, centres.slice()?, widths.slice()?);
     let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
     let out = want_grad.then_some(&mut grad[..]);

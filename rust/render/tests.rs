@@ -229,7 +229,7 @@ fn knobs_out_of_range_are_named() {
             },
         ),
     ] {
-        assert_eq!(knobs.check().unwrap_err().name, name);
+        assert_eq!(knobs.check().unwrap_err().name(), name);
     }
 }
 
@@ -316,5 +316,5 @@ fn the_wrong_length_is_named() {
         ..s.gaussians()
     };
     let error = forward(&g, &harmonics(&s), &s.camera, &ProjectOptions::default()).unwrap_err();
-    assert_eq!(error.name, "scales");
+    assert_eq!(error.name(), "scales");
 }

@@ -125,7 +125,8 @@ impl Scene {
         let given_colors = harmonics
             .as_ref()
             .map_or(Colors::Channels(&given, 3), Colors::Harmonics);
-        let projected = project::forward(&gaussians, given_colors, &camera, &self.options);
+        let projected =
+            project::forward(&gaussians, given_colors, &camera, &self.options).expect("lengths");
         let (projection, radii) = (projected.projection, projected.radii);
         let colors = if harmonics.is_some() {
             &projected.colors
@@ -185,7 +186,8 @@ impl Scene {
             &projection,
             &cotangents,
             wanted,
-        );
+        )
+        .expect("lengths");
         let (g_colors, row) = if harmonics.is_some() {
             (&grads.harmonics, 3 * STORED)
         } else {

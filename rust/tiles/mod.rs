@@ -45,6 +45,11 @@ impl<T> Tiles<T> {
         self.lengths().sum()
     }
 
+    /// Number of Gaussians that were binned, visible or not.
+    pub(crate) fn gaussians(&self) -> usize {
+        self.chunks.last().map_or(0, |chunk| chunk.end)
+    }
+
     /// Number of pairs of each tile.
     pub fn lengths(&self) -> impl Iterator<Item = usize> {
         self.lists.iter().map(|list| list.records.len())
@@ -89,13 +94,10 @@ pub fn bin<T: Real>(
         .unzip();
     let total = source.total.into_inner();
     if total > MAX_PAIRS {
-        return Err(Error::new(
-            "means",
-            format!(
-                "the Gaussians cover {total} (Gaussian, tile) pairs, more than {MAX_PAIRS}; \
-                 use fewer or smaller Gaussians, or a smaller image"
-            ),
-        ));
+        return Err(Error::TooManyPairs {
+            pairs: total,
+            limit: MAX_PAIRS,
+        });
     }
     // Counts to places: in a tile chunk by chunk.
     let mut sums = vec![0u32; tiles_x * tiles_y];

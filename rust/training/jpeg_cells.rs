@@ -178,7 +178,7 @@ mod tests {
         assert_eq!(
             distance_at(level, &[0.0; 4], &centres[1..], &widths, 1.0, None)
                 .unwrap_err()
-                .name,
+                .name(),
             "centres"
         );
     }

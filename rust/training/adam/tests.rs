@@ -189,7 +189,7 @@ fn wrong_input_is_named() {
             visible,
             ..Selection::ALL
         };
-        step(arrays, at, &options, &selection).map_err(|e| e.name)
+        step(arrays, at, &options, &selection).map_err(|e| e.name().to_owned())
     };
     let named = |name: &str| Err(name.to_owned());
     assert_eq!(call([6, 5, 6, 6], 1, OPTIONS, None), named("grad"));

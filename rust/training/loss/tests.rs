@@ -482,7 +482,8 @@ fn wrong_input_is_named() {
             &mut scratch,
         )
         .unwrap_err()
-        .name
+        .name()
+        .to_owned()
     };
     assert_eq!(call(&[0; 12], None, 0.2, 0.0, [2, 2, 4]), "render");
     assert_eq!(call(&[0; 12], None, 0.2, 0.0, [0, 2, 3]), "render");

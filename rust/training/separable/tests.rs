@@ -146,8 +146,8 @@ fn wrong_shapes_are_named() {
     let (there, _) = Separable::<f32>::pair(dense(&m, 2, 3), dense(&m, 3, 2), None).unwrap();
     for shape in [&[3, 2][..], &[2, 3, 1], &[3, 2, 0]] {
         let error = there.apply(&[0.0; 6], shape).unwrap_err();
-        assert_eq!(error.name, "image");
+        assert_eq!(error.name(), "image");
     }
     let empty = Separable::<f32>::pair(dense(&m, 2, 3), dense(&[], 0, 2), None);
-    assert_eq!(empty.unwrap_err().name, "columns");
+    assert_eq!(empty.unwrap_err().name(), "columns");
 }

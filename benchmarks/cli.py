@@ -1,0 +1,81 @@
+"""`python -m benchmarks NAME`: measure, print Markdown tables, write one JSON file and charts."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import hqgs
+from benchmarks import endurance, export, frugality
+from benchmarks.accuracy import accuracy
+from benchmarks.features import training
+from benchmarks.output import Benchmark, command_line, write_results
+from benchmarks.quality import quality
+from benchmarks.speed import speed
+from benchmarks.stability import stability
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.training.trainer import TrainingError
+
+BENCHMARKS: dict[str, Benchmark] = {
+    "accuracy": accuracy.BENCHMARK,
+    "endurance": endurance.BENCHMARK,
+    "export": export.BENCHMARK,
+    "frugality": frugality.BENCHMARK,
+    "quality": quality.BENCHMARK,
+    "speed": speed.BENCHMARK,
+    "stability": stability.BENCHMARK,
+    "training": training.BENCHMARK,
+}
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """A subcommand for each benchmark."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks", description="Measure what hqgs needs and how right it is."
+    )
+    names = parser.add_subparsers(required=True, metavar="NAME", dest="benchmark")
+    for name, benchmark in BENCHMARKS.items():
+        parser_of_one = names.add_parser(name, help=benchmark.help, description=benchmark.help)
+        add = parser_of_one.add_argument
+        out = Path("out", "bench")
+        add("--out", type=Path, default=out, metavar="DIR", help=f"for {name}.json (%(default)s)")
+        add("--threads", type=int, metavar="T", help="(all cores)")
+        add("--quick", action="store_true", help="tiny sizes, seconds: only a test")
+        benchmark.add_options(parser_of_one)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a benchmark and return the exit code: 0 done, 1 failed, 2 bad input, 130 stopped by Ctrl-C."""
+    args = make_parser().parse_args(argv)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM counts as Ctrl-C
+    try:
+        return _run(args)
+    except KeyboardInterrupt:
+        return 130
+
+
+def _run(args: argparse.Namespace) -> int:
+    name = args.benchmark
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
+        if args.threads is not None:
+            hqgs.set_num_threads(args.threads)
+        report = BENCHMARKS[name].run(args)
+        files = write_results(args.out, name, command_line(args), report)
+    except BAD_INPUT as error:
+        return fail(2, str(error))
+    except TrainingError as error:
+        return fail(1, str(error))
+    except OSError as error:
+        return fail(1, f"{args.out}: {error}")
+    for table in report.tables:
+        print(table, end="\n\n")
+    for entry in report.left_out:
+        print(f"left out: {entry['what']}: {entry['why']}")
+    print(f"written: {', '.join(map(str, files))}")
+    return 0

@@ -1,0 +1,87 @@
+"""What every benchmark gives back, and how it is written and printed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+import hqgs
+from hqgs.base.files import atomic_path, write_json
+from hqgs.base.machine import machine_facts, version_facts
+
+
+@dataclass
+class Report:
+    """The outcome of a benchmark. `settings`, `results` and `left_out` hold plain JSON values."""
+
+    settings: dict[str, Any]
+    part: str = ""  # of the benchmark, where it has several: each is written to files of its own
+    results: dict[str, Any] = field(default_factory=dict)
+    tables: list[str] = field(default_factory=list)  # Markdown
+    figures: dict[str, Figure] = field(default_factory=dict)  # by what they show
+    left_out: list[dict[str, str]] = field(default_factory=list)  # {"what", "why"}
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A subcommand of `python -m benchmarks`."""
+
+    help: str
+    add_options: Callable[[argparse.ArgumentParser], None]  # beyond --out, --threads and --quick
+    run: Callable[[argparse.Namespace], Report]  # raises ValueError or FileNotFoundError for bad options
+
+
+def write_results(out: Path, name: str, command: str, report: Report) -> list[Path]:
+    """Write `NAME_PART.json` and `NAME_PART_FIGURE.png` into `out`; return their paths, JSON first."""
+    versions = version_facts()
+    facts = {
+        "benchmark": name,
+        "command": command,
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "commit": versions["git_commit"],
+        "threads": hqgs.get_num_threads(),
+        "machine": machine_facts(),
+        "versions": versions,
+        "settings": report.settings,
+        "results": report.results,
+        "left_out": report.left_out,
+    }
+    stem = f"{name}_{report.part}" if report.part else name
+    pictures = {out / f"{stem}_{what}.png": figure for what, figure in report.figures.items()}
+    for path, figure in pictures.items():
+        with atomic_path(path) as tmp:
+            figure.savefig(tmp)
+    write_json(out / f"{stem}.json", facts)
+    return [out / f"{stem}.json", *pictures]
+
+
+def kept(path: Path) -> dict[str, Any] | None:
+    """What an earlier call kept in this file; None where there is none, ValueError where it is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("it holds no object")
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
+    return found
+
+
+def command_line(args: argparse.Namespace) -> str:
+    """The command that gives these results again, every option written out, folders by their name alone."""
+    words = ["python", "-m", "benchmarks", args.benchmark]
+    for name, value in sorted(vars(args).items()):
+        if name in ("benchmark", "command", "out") or value is None or value is False or callable(value):
+            continue
+        values = value if isinstance(value, list) else [] if value is True else [value]
+        words += [f"--{name.replace('_', '-')}", *(v.name if isinstance(v, Path) else str(v) for v in values)]
+    return shlex.join(words)

@@ -1,0 +1,77 @@
+"""How long the runs of a quality benchmark will take."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.quality.protocols import Cell
+from benchmarks.quality.runs import FIRST_STEPS, first_step, train
+from hqgs.scene.scene import Scene
+from hqgs.training.trainer import Trainer
+
+# A whole run's seconds per step over those of its first steps, until runs are finished that tell: the
+# built-in scene at 504 px takes 22 ms in its first 400 steps and 55 ms on average over 2,000. Runs that start
+# with nearly all the Gaussians that they may have do not get slower.
+GROWTH = 2.5
+
+Kind = tuple[str, str]  # scene, row: what a cell's speed depends on most
+
+
+class Estimate:
+    """Seconds per step by scene and row: from finished runs, else from a few steps and their growth."""
+
+    def __init__(self) -> None:
+        self._finished: defaultdict[Kind, list[float]] = defaultdict(list)
+        self._first: dict[Kind, tuple[float, float]] = {}  # and how many times the Gaussians may grow
+        self._growth: list[float] = []  # of the runs that had room for it
+
+    def add(self, cell: Cell, run: dict[str, Any]) -> None:
+        """Learn from a finished run."""
+        per_step = run["wall_seconds"] / run["iterations"]
+        self._finished[_kind(cell)].append(per_step)
+        if _room(run["config"]["densify"]["max_gaussians"], run["initial_points"]) > GROWTH:
+            self._growth.append(per_step / run["first_step_seconds"])
+
+    def knows(self, cell: Cell) -> bool:
+        return _kind(cell) in self._finished or _kind(cell) in self._first
+
+    def probe(self, cell: Cell, photos: Scene) -> None:
+        """Train a few steps of a cell."""
+        trainer = Trainer(photos, cell.config)
+        room = _room(trainer.config.densify.max_gaussians, len(trainer.gaussians))
+        steps, _ = train(trainer, min(cell.iterations, FIRST_STEPS.stop))
+        self._first[_kind(cell)] = first_step(steps), room
+
+    def seconds(self, cells: Iterable[Cell]) -> float:
+        """What these cells will take together, each of which is known."""
+        growth = float(np.median(self._growth)) if self._growth else GROWTH
+        total = 0.0
+        for cell in cells:
+            done = self._finished.get(_kind(cell))
+            if done:
+                per_step = float(np.mean(done))
+            else:
+                first, room = self._first[_kind(cell)]
+                per_step = first * min(growth, room)
+            total += cell.iterations * per_step
+        return total
+
+
+def duration(seconds: float) -> str:
+    """`45 s`, `12 min` or `3 h 05 min`."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def _room(most: int, gaussians: int) -> float:
+    return most / max(gaussians, 1)
+
+
+def _kind(cell: Cell) -> Kind:
+    return cell.scene, cell.row.label

@@ -1,0 +1,1 @@
+"""The rasterizer's and a training step's time."""

@@ -1,0 +1,163 @@
+"""Inputs of the rasterizer's benchmark: a seeded cloud of Gaussians in front of one camera.
+
+The size of the Gaussians follows from their number and the image, so that 37 to 40 of them blend per pixel,
+whatever the two are: the work per pixel is that of a trained scene.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import root_scalar
+from scipy.spatial.transform import Rotation
+
+from benchmarks.speed.ewa import ALPHA_MIN, EPS2D, project
+from hqgs.model.gaussians import SH_C0
+
+Array32 = NDArray[np.float32]
+Array64 = NDArray[np.float64]
+
+SIZE = (504, 378)  # pixels; other sizes scale the focal length with them
+FOCAL = 400.0  # pixels, at 504
+NEAR, FAR = 2.0, 6.0  # depths of the cloud, world units
+MARGIN = 0.05  # of the image, on each side, that the cloud reaches beyond it
+COVERAGE = 39.0  # supports per pixel; a few pixels are full before their last one
+SAMPLE = 20_000  # Gaussians from which the size is computed
+
+
+@dataclass(frozen=True)
+class RasterInputs:
+    """What the rasterizer takes, and the gradient of a loss with respect to its image."""
+
+    means: Array32  # [N, 3], world
+    quats: Array32  # [N, 4], w x y z, unit
+    scales: Array32  # [N, 3], world
+    opacities: Array32  # [N], after the sigmoid
+    sh: Array32  # [N, 16, 3]
+    v_image: Array32  # [H, W, 3]
+    viewmat: Array64  # [4, 4], world to camera
+    K: Array64  # [3, 3], pixels
+    background: Array32  # [3]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def width(self) -> int:
+        return self.v_image.shape[1]
+
+    @property
+    def height(self) -> int:
+        return self.v_image.shape[0]
+
+
+def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int = 2026) -> RasterInputs:
+    """N Gaussians, uniform in the volume that a camera of this size sees between two depths.
+
+    Scales are log-normal (0.5 per axis), rotations uniform, opacities the sigmoid of a normal (-0.5, 1.5),
+    harmonics of degree 3 normal (0.1). The camera is turned and shifted, so that no matrix is trivial.
+
+    Raises ValueError where the image is so small that even points would overlap more than wanted.
+    """
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-0.5 - MARGIN, 0.5 + MARGIN, n) * SIZE[0] / FOCAL
+    y = rng.uniform(-0.5 - MARGIN, 0.5 + MARGIN, n) * SIZE[1] / FOCAL
+    z = np.cbrt(rng.uniform(NEAR**3, FAR**3, n))  # the cross-section grows with z^2
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_euler("yxz", [0.4, -0.3, 0.2]).as_matrix()
+    viewmat[:3, 3] = [-0.2, 0.4, 0.3]
+    quats = rng.standard_normal((n, 4))
+    sh = 0.1 * rng.standard_normal((n, 16, 3), dtype=np.float32)
+    sh[:, 0] = (rng.random((n, 3)) - 0.5) / SH_C0
+    inputs = RasterInputs(
+        means=_f32((np.stack([x * z, y * z, z], axis=1) - viewmat[:3, 3]) @ viewmat[:3, :3]),
+        quats=_f32(quats / np.linalg.norm(quats, axis=1, keepdims=True)),
+        scales=_f32(np.exp(0.5 * rng.standard_normal((n, 3)))),
+        opacities=_f32(1 / (1 + np.exp(0.5 - 1.5 * rng.standard_normal(n)))),
+        sh=sh,
+        v_image=np.zeros((1, 1, 3), np.float32),
+        viewmat=viewmat,
+        K=np.eye(3),
+        background=_f32([0.1, 0.2, 0.3]),
+    )
+    return fitted(inputs, n, width, height)
+
+
+def fitted(inputs: RasterInputs, n: int, width: int, height: int) -> RasterInputs:
+    """The first `n` Gaussians with the image and the overlap of `make_inputs`; other arrays are shared."""
+    focal = FOCAL * width / SIZE[0]
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    v_image = np.random.default_rng(n).standard_normal((height, width, 3), dtype=np.float32)
+    first = replace(
+        inputs,
+        means=inputs.means[:n],
+        quats=inputs.quats[:n],
+        scales=inputs.scales[:n],
+        opacities=inputs.opacities[:n],
+        sh=inputs.sh[:n],
+        v_image=v_image / np.float32(v_image.size),
+        K=K,
+    )
+    return replace(first, scales=first.scales * np.float32(_size(first)))
+
+
+def load_inputs(folder: Path, n: int) -> RasterInputs:
+    """Read `inputs_N.npz`; FileNotFoundError or ValueError names what is missing or has the wrong shape."""
+    path = folder / f"inputs_{n}.npz"
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {path}")
+    names = {"v_output": "v_image"}
+    with np.load(path, allow_pickle=False) as data:
+        wanted = ("means", "quats", "scales", "opacities", "sh", "v_output", "viewmat", "K", "background")
+        if missing := [name for name in wanted if name not in data]:
+            raise ValueError(f"{path} lacks {', '.join(missing)}")
+        arrays: dict[str, Any] = {names.get(name, name): data[name] for name in wanted}
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, 16, 3)}
+    shapes |= {"viewmat": (4, 4), "K": (3, 3), "background": (3,)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"{path}: {name} has shape {list(arrays[name].shape)}, wanted {list(shape)}")
+    if arrays["v_image"].ndim != 3 or arrays["v_image"].shape[2] != 3:
+        raise ValueError(f"{path}: v_output has shape {list(arrays['v_image'].shape)}, wanted [H, W, 3]")
+    return RasterInputs(
+        **{
+            name: a.astype(np.float64 if name in ("viewmat", "K") else np.float32)
+            for name, a in arrays.items()
+        }
+    )
+
+
+def _size(inputs: RasterInputs) -> float:
+    """The factor on all scales with which the supports cover each pixel COVERAGE times on average.
+
+    A support is the ellipse where alpha >= 1/255: 2 pi ln(255 opacity) sqrt(det(cov2d)) square pixels.
+    """
+    part = slice(SAMPLE)
+    opacities = inputs.opacities[part].astype(np.float64)
+    _, _, cov = project(
+        inputs.means[part], inputs.quats[part], inputs.scales[part], inputs.viewmat, inputs.K,
+        inputs.width, inputs.height,
+    )  # fmt: skip
+    reach2 = 2 * np.log(np.maximum(opacities / ALPHA_MIN, 1))
+    area = (1 + 2 * MARGIN) ** 2 * inputs.width * inputs.height
+
+    def excess(log_factor: float) -> float:
+        scaled = math.exp(2 * log_factor) * cov + EPS2D * np.eye(2)
+        support = math.pi * reach2 * np.sqrt(np.linalg.det(scaled))
+        return len(inputs) / area * float(support.mean()) - COVERAGE
+
+    if excess(-30.0) >= 0:
+        raise ValueError(
+            f"{len(inputs)} Gaussians are too many for {inputs.width} x {inputs.height} pixels: as points "
+            f"they already cover each one {excess(-30.0) + COVERAGE:.0f} times, wanted {COVERAGE:.0f}"
+        )
+    return math.exp(root_scalar(excess, bracket=(-30.0, 10.0)).root)
+
+
+def _f32(values: Any) -> Array32:
+    return np.ascontiguousarray(values, np.float32)

@@ -1,0 +1,158 @@
+"""Forward and backward of the rasterizer, stage by stage, against the limit of its arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import torch
+
+import hqgs
+from benchmarks.speed.inputs import RasterInputs
+from benchmarks.speed.replay import blended_counts, random_pixels
+from benchmarks.speed.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
+from benchmarks.speed.work import count_work
+from hqgs import _rust
+from hqgs.base.threads import one_torch_thread
+
+STAGES = {
+    "project_forward": "project",
+    "composite_forward": "bin and composite",
+    "composite_backward": "composite backward",
+    "project_backward": "project backward",
+}
+BIN = "bin"  # the part of "bin and composite" before the first pixel
+CRATE = [(_rust, name, stage) for name, stage in STAGES.items()]
+
+
+class RasterPass:
+    """`hqgs.rasterization` with harmonics of degree 3 and its backward pass, timed; all gradients but the
+    camera's. Works the same way on another `device` with another implementation of the function, and with
+    the same numbers in another `dtype`."""
+
+    def __init__(
+        self,
+        inputs: RasterInputs,
+        rasterize: Callable[..., Any] = hqgs.rasterization,
+        device: str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        names = ("means", "quats", "scales", "opacities", "sh")
+        self.leaves = [torch.from_numpy(getattr(inputs, n)).to(device, dtype).requires_grad_() for n in names]
+        viewmat, K = (torch.from_numpy(m[None]).float().to(device) for m in (inputs.viewmat, inputs.K))
+        self.view = (viewmat, K, inputs.width, inputs.height)
+        self.background = torch.from_numpy(inputs.background[None]).to(device, dtype)
+        self.v_image = torch.from_numpy(inputs.v_image[None]).to(device, dtype)
+        self.rasterize = rasterize
+        self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change
+
+    def run(self) -> torch.Tensor:
+        """One pass; returns the image [1, H, W, 3], the gradients are in the leaves."""
+        image, _, meta = self.rasterize(*self.leaves, *self.view, sh_degree=3, backgrounds=self.background)
+        image.backward(self.v_image)
+        self.work = meta.get("work", self.work)
+        return image.detach()
+
+    def __call__(self) -> Seconds:
+        clock, bins = StageClock(), list[float]()
+        with one_torch_thread(), clock.watching(CRATE), _binning(bins):
+            seconds = clock.seconds(self.run, STAGES.values())
+        self.clear()
+        return seconds | {BIN: sum(bins)}
+
+    def clear(self) -> None:
+        """Free the gradients, so that the many cases of a benchmark fit into memory together."""
+        for leaf in self.leaves:
+            leaf.grad = None
+
+
+@contextmanager
+def _binning(bins: list[float]) -> Iterator[None]:
+    """Add to `bins` the seconds of the tile lists, which the crate itself takes."""
+    forward = _rust.composite_forward
+
+    def call(*args: Any) -> Any:
+        out = forward(*args)
+        bins.append(out[0].bin_seconds)
+        return out
+
+    with patch.object(_rust, "composite_forward", call):
+        yield
+
+
+def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
+    """The second of two passes in a row: as in training, its memory is what the one before gave back."""
+
+    def call() -> Seconds:
+        case()
+        return case()
+
+    return call
+
+
+def measure(inputs: Sequence[RasterInputs], repeats: int, samples: int) -> list[dict[str, Any]]:
+    """Time and work of each of the inputs. `samples`: pixels in which the blended Gaussians are counted."""
+    passes = {str(len(x)): RasterPass(x) for x in inputs}
+    measured = interleaved({name: warmed(case) for name, case in passes.items()}, repeats)
+    rows = []
+    for x, (name, rounds) in zip(inputs, measured.items(), strict=True):
+        counts = blended_counts(x, random_pixels(x, samples, seed=0))
+        stages = {stage: median(rounds, stage) for stage in [*STAGES.values(), "rest"]}
+        work = count_work(counts, x.width * x.height, *passes[name].work)
+        limit = work["limit_core_seconds"] / hqgs.get_num_threads()
+        compositing = [r["bin and composite"] - r[BIN] + r["composite backward"] for r in rounds]
+        rows.append(
+            {
+                "gaussians": len(x),
+                "width": x.width,
+                "height": x.height,
+                "seconds": median(rounds),
+                "seconds_quartiles": quartiles(rounds),
+                "stages": stages,
+                "limit_seconds": limit,
+                "times_limit": median(rounds) / limit,
+                "bin_seconds": median(rounds, BIN),
+                "compositing_seconds": float(np.median(compositing)),
+                "compositing_times_limit": float(np.median(compositing)) / limit,
+                "work": work,
+                "rounds": rounds,
+            }
+        )
+    return rows
+
+
+def thread_counts() -> list[int]:
+    """1, 2, 4, ... up to the number of threads in use, which is the last."""
+    most = hqgs.get_num_threads()
+    return [*(1 << k for k in range(most.bit_length()) if 1 << k < most), most]
+
+
+def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> list[dict[str, Any]]:
+    """Each case with each number of threads; the speed-up is that of the same round."""
+    threads = thread_counts()
+
+    def with_threads(case: Callable[[], Seconds], count: int) -> Callable[[], Seconds]:
+        def call() -> Seconds:
+            hqgs.set_num_threads(count)
+            return warmed(case)()  # new threads start with no memory of their own
+
+        return call
+
+    try:
+        jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
+        measured = interleaved(jobs, repeats)
+    finally:
+        hqgs.set_num_threads(threads[-1])
+    return [
+        {
+            "case": name,
+            "threads": t,
+            "seconds": median(measured[f"{name}/{t}"]),
+            "speedup": median_ratio(measured[f"{name}/1"], measured[f"{name}/{t}"]),
+        }
+        for name in cases
+        for t in threads
+    ]

@@ -1,0 +1,82 @@
+"""A trainer at the size that a benchmark asks for: noise photos of a cloud of Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from benchmarks.speed.inputs import FAR, NEAR, RasterInputs, make_inputs
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
+from hqgs.training.trainer import Trainer
+
+TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
+WARM_UP = 3  # steps
+
+
+def still_config(config: TrainConfig, n: int) -> TrainConfig:
+    """Steps that do all the work of a step on `n` Gaussians, the statistics for their number included, but
+    change next to nothing. The SH degree rises by one in each of the first."""
+    iterations = 1_000_000
+    return replace(
+        config,
+        iterations=iterations,
+        sh_interval=1,
+        lr_means=TINY,
+        lr_means_final=TINY,
+        lr_scales=TINY,
+        lr_quats=TINY,
+        lr_opacities=TINY,
+        lr_sh0=TINY,
+        lr_shN=TINY,
+        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
+    )
+
+
+def make_trainer(
+    n: int, width: int, height: int, photos: int, method: str, seed: int, options: HQGSConfig | None = None
+) -> Trainer:
+    """A trainer that holds the N Gaussians of `make_inputs`. `options`: of method hqgs.
+
+    It never changes their number, but gathers the statistics for it in each step. Raises ValueError as
+    `make_inputs` and `Trainer` do.
+    """
+    inputs = make_inputs(n, width, height, seed)
+    rng = np.random.default_rng(seed)
+    views = [
+        View(f"{k:03d}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8))
+        for k, camera in enumerate(_cameras(inputs, photos, rng))
+    ]
+    colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
+    scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
+    config = still_config(TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig()), n)
+    trainer = Trainer(scene, config)
+    gaussians = trainer.gaussians
+    with torch.no_grad():
+        gaussians.scales.copy_(torch.from_numpy(inputs.scales).log())
+        gaussians.quats.copy_(torch.from_numpy(inputs.quats))
+        gaussians.opacities.copy_(torch.from_numpy(inputs.opacities).logit())
+        gaussians.sh0.copy_(torch.from_numpy(inputs.sh[:, :1]))
+        gaussians.shN.copy_(torch.from_numpy(inputs.sh[:, 1:]))
+    return trainer
+
+
+def warm_up(trainer: Trainer) -> None:
+    """The steps until harmonics of degree 3 are trained."""
+    for _ in range(WARM_UP):
+        trainer.step()
+
+
+def _cameras(inputs: RasterInputs, count: int, rng: np.random.Generator) -> list[Camera]:
+    """Cameras that look at the middle of the cloud from about the same side, a few degrees apart."""
+    middle = np.array([0, 0, (NEAR + FAR) / 2])
+    cameras = []
+    for _ in range(count):
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(rng.uniform(-0.05, 0.05, 3)).as_matrix()
+        turn[:3, 3] = middle - turn[:3, :3] @ middle
+        cameras.append(Camera(inputs.width, inputs.height, inputs.K, turn @ inputs.viewmat))
+    return cameras

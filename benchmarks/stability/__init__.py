@@ -1,0 +1,1 @@
+"""Errors of the rasterizer in extreme cases, against many digits."""

@@ -1,0 +1,1 @@
+"""What every room stands on: files, threads, machine, text, records. It imports nothing of hqgs."""

@@ -1,0 +1,99 @@
+"""Writing files so that a reader sees the old one or the new one, never half of one."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+LOCK = ".lock"
+SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
+CHECKPOINT, PLY = "checkpoint.safetensors", "scene.ply"
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success flush it to disk and rename it over `path`.
+
+    On any exception (disk full and Ctrl-C included) the temporary file is removed and `path` is untouched.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fd, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=path.suffix)
+    os.close(fd)
+    tmp = Path(name)
+    try:
+        yield tmp
+        with tmp.open("rb+") as f:
+            os.fsync(f.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        tmp.chmod(0o666 & ~umask)  # mkstemp makes it private; give it the usual permissions
+        tmp.replace(path)
+    finally:
+        tmp.unlink(missing_ok=True)
+
+
+def keep_folder(source: Path, target: Path) -> None:
+    """Copy a folder of files, flushed to disk, under a name that it gets when it is complete.
+
+    A `target` that is there by then stays.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as name:
+        copy = Path(name) / target.name
+        shutil.copytree(source, copy)
+        for file in copy.iterdir():
+            with file.open("rb+") as f:
+                os.fsync(f.fileno())
+        if not target.exists():
+            copy.rename(target)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write `text` (UTF-8) atomically."""
+    with atomic_path(path) as tmp:
+        tmp.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write `value` as indented JSON atomically; NaN and Inf are refused (JSON has no such numbers)."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+class FolderBusyError(RuntimeError):
+    """Another run writes into the same folder."""
+
+
+@contextmanager
+def lock_folder(folder: str | Path) -> Iterator[None]:
+    """Hold the folder (made if it is missing) for one run; FolderBusyError if another run holds it.
+
+    The system frees the lock when its process ends, however it ends, so a lock never outlives its run.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise FolderBusyError(f"another run is writing into {folder}") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def remove_leftovers(path: str | Path) -> None:
+    """Delete the temporary files that a killed run left beside this one. Call it under the lock."""
+    path = Path(path)
+    for pattern in (f".{path.stem}.*{path.suffix}", SAFETENSORS_TMP):
+        for leftover in path.parent.glob(pattern):
+            leftover.unlink()

@@ -1,0 +1,39 @@
+"""What a run leaves out because the scene does not need it: the names, and the record of each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """One thing that a run did without. None: not known or not measured."""
+
+    what: str
+    why: str
+    evidence: str | None = None  # what was measured to decide it
+    seconds: float | None = None  # of run time saved, an estimate
+    memory_mb: float | None = None  # saved
+    bytes: int | None = None  # of the scene file saved
+    cost_db: float | None = None  # lost in PSNR on training photos that were held back; below 0: gained
+
+    def known(self) -> dict[str, Any]:
+        """The fields that are known, as plain JSON values."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+def format_left_out(items: Sequence[LeftOut]) -> str:
+    """A short table of what was left out and what that saved; empty if nothing was."""
+    rows = []
+    for item in items:
+        saved = [] if item.seconds is None else [f"{item.seconds:.0f} s"]
+        saved += [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
+        saved += [] if item.cost_db is None else [f"{-item.cost_db:+.2f} dB"]
+        rows.append((item.what, ", ".join(saved), item.why))
+    if not rows:
+        return ""
+    widths = [max(len(row[k]) for row in rows) for k in range(2)]
+    lines = [f"  {what:{widths[0]}}  {saved:{widths[1]}}  {why}" for what, saved, why in rows]
+    return "\n".join(["left out:", *lines])

@@ -1,0 +1,112 @@
+"""What the choice of photos keeps of each photo's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.diagnosis.blur import RING_ERROR, RING_SAMPLES
+from hqgs.diagnosis.spectrum import SLOPE, fit_blurs, power_spectrum, rings, tile_size
+from hqgs.photos.pixels import Floats, luma, to_levels
+from hqgs.scene.scene import View
+
+Rings = tuple[Floats, Floats, Floats]  # as `rings` returns them
+SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the others
+DOUBT = 2.0  # of the log-likelihood: two standard deviations
+LEAST_SIGNAL = 1e-3  # of the power of details that may be noise alone
+BLOCK = 8  # px: the mean over a block hides noise
+FLAT_LEVELS = 3.0  # that a block may be off the colour of an empty photo
+FLAT_SHARE = 0.99  # of the blocks of an empty photo
+FLAT_NOISE = 8.0  # levels: standard deviation of an empty photo's luma
+SAMPLES = 4096  # pixels of each photo, by which pictures are compared
+
+
+@dataclass(frozen=True)
+class Look:
+    """A photo in numbers."""
+
+    colour: Floats | None  # [3] levels, where it shows one colour and, at most, noise
+    spread: float  # of the luma, levels: standard deviation
+    size: tuple[int, int]  # px
+    samples: NDArray[np.float32]  # of the luma, levels
+    gradient: float  # of the luma, levels per px, root mean square
+    rings: Rings | None  # of its spectrum; None: a photo of the scene is too small for one
+
+
+def look_at_photos(views: Sequence[View]) -> list[Look]:
+    """One for each view; of the small photos, where all views have them: enlargement adds nothing.
+
+    ValueError for values that are not finite; it names the photo.
+    """
+    photos: list[NDArray[Any]] = [view.image if view.low is None else view.low for view in views]
+    factors = {view.image.shape[0] // small.shape[0] for view, small in zip(views, photos, strict=True)}
+    if len(factors) > 1:
+        photos = [view.image for view in views]
+    tiles = [tile_size(photo[..., 0]) for photo in photos]
+    known = [tile for tile in tiles if tile is not None]
+    # One size for all, so that their frequencies are the same.
+    tile = min(known) if len(known) == len(views) > 0 else None
+    return [_look(photo, view.name, tile) for photo, view in zip(photos, views, strict=True)]
+
+
+def _look(photo: NDArray[Any], name: str, tile: int | None) -> Look:
+    levels = to_levels(photo, f"photo {name!r}")
+    grey = luma(levels)
+    spread = float(grey.std())
+    steps = [np.square(np.diff(grey, axis=axis)).mean() for axis in (0, 1)]
+    places = np.linspace(0, grey.size - 1, min(SAMPLES, grey.size)).astype(np.int64)
+    return Look(
+        colour=_flat_colour(levels) if spread <= FLAT_NOISE else None,
+        spread=spread,
+        size=(grey.shape[1], grey.shape[0]),
+        samples=grey.ravel()[places].astype(np.float32),
+        gradient=float(np.sqrt(sum(steps))),
+        rings=None if tile is None else rings(power_spectrum(grey, tile)),
+    )
+
+
+def _flat_colour(levels: Floats) -> Floats | None:
+    """The colour [3] of (nearly) all blocks of a photo [H, W, 3]; None where they differ."""
+    rows, columns = (side // BLOCK for side in levels.shape[:2])
+    if not rows or not columns:
+        return None
+    blocks = levels[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK, 3).mean((1, 3))
+    colour = np.median(blocks, axis=(0, 1))
+    off = np.abs(blocks - colour).max(-1)
+    return colour if (off <= FLAT_LEVELS).mean() >= FLAT_SHARE else None
+
+
+class Sharpness:
+    """The power spectra of photos, which tell how sharp each is."""
+
+    def __init__(self, spectra: Sequence[Rings]) -> None:
+        """Of N photos, all from tiles of one size."""
+        self._frequency, _, number = spectra[0]
+        self._log_power = np.stack([log_power for _, log_power, _ in spectra])  # [N, rings]
+        self._weights = np.minimum(number / RING_SAMPLES, 1) / (2 * RING_ERROR**2)
+
+    def fine(self) -> NDArray[np.float64]:
+        """[N]: the log power of the finer half of the details."""
+        return np.asarray(self._log_power[:, self._log_power.shape[1] // 2 :].mean(1))
+
+    def extra_blur(self, photo: int, others: NDArray[np.int64]) -> float:
+        """Signed sigma (px) of the Gaussian that makes the median spectrum of `others` that of `photo`.
+
+        Contrast and, within limits, the slope of the spectrum are the photo's own. The power of its finest
+        details may be noise and does not count as sharpness. When in doubt, the least blur: a photo in which
+        little stands out of the noise is not called blurred.
+        """
+        mine = self._log_power[photo]
+        noise = np.exp(mine.min())
+        usual = np.exp(np.median(self._log_power[others], axis=0))
+        usual = np.log(np.maximum(usual - noise, LEAST_SIGNAL * usual))
+        squares = (SIGMAS * np.abs(SIGMAS))[:, None]
+        # `fit_blurs` expects a power law: the usual spectrum, as a blur of that law, takes its place.
+        blurred = usual + SLOPE * np.log(self._frequency) - squares * self._frequency**2
+        fit = fit_blurs(self._frequency, mine, self._weights, blurred, float(noise))
+        likely = SIGMAS[fit.costs <= fit.cost + DOUBT]
+        return float(likely[np.abs(likely).argmin()])

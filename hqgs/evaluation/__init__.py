@@ -1,0 +1,1 @@
+"""How good a scene is: metrics, held-out views, the report."""

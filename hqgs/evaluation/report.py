@@ -1,0 +1,236 @@
+"""The report of a training run: report.json, side-by-side pictures and the error-over-time chart."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
+from hqgs.base.files import atomic_path, write_json
+from hqgs.base.machine import machine_facts, version_facts
+from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.metrics import METRICS, ViewMetrics, evaluate_view, mean_metrics
+
+REPORT, CHART, PICTURES = "report.json", "error_vs_time.png", "comparison"
+AMPLIFICATION = 4  # of the difference in the pictures
+GAP = 8  # pixels between the panels of a picture
+MASKED = (
+    150,
+    158,
+    170,
+)  # difference panel where the mask leaves the photo out: no grey that a difference has
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a training run hands to `write_report`. `config` and the lists hold plain JSON values."""
+
+    scene: str
+    source: str  # format the scene was read from
+    notes: list[str]
+    method: str
+    seed: int
+    iterations: int
+    seconds: float  # training time, without loading and without this report
+    gaussians: int
+    peak_rss_mb: float | None
+    history: list[dict[str, Any]]  # {"iteration", "seconds", "psnr", "ssim"}: held-out means while training
+    length: int  # iterations of the whole run; fewer were done where it was stopped
+    left_out: list[dict[str, Any]]  # `LeftOut.known`
+    decision_seconds: float  # of `seconds`: to find out what may be left out
+    scene_bytes: int  # of scene.ply
+    config: dict[str, Any]
+    guard: dict[str, Any]  # what was not finite: `Guard.summary`
+    culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
+    views: list[RenderedView] = field(repr=False)
+    sfm: dict[str, Any] | None = None  # `SfmReport`; None: poses and points are the scene's own
+
+
+def write_report(out_dir: str | Path, result: RunResult) -> dict[str, Any]:
+    """Measure the held-out views and write the report into `out_dir`; return what report.json holds.
+
+    Files: `comparison/<view>.png` (photo | render | amplified difference), `error_vs_time.png` and
+    `report.json`, which names the pictures. They are made beside their places and then moved there;
+    report.json is moved last, so where it exists everything else does. A run that fails before the move
+    leaves an older report as it was. Pictures of other view names are not removed.
+
+    Raises ValueError where a field is no JSON value, or a view's render, photo and mask do not fit.
+    """
+    out_dir = Path(out_dir)
+    head = _head(result)
+    metrics = [_evaluate(view) for view in result.views]
+    mean = mean_metrics(metrics)
+    files = _file_names([view.name for view in result.views])
+    measured = {
+        "metrics": {
+            "mean": _values(mean),
+            "views": [
+                {"name": view.name, **_values(m), "picture": f"{PICTURES}/{file}"}
+                for view, m, file in zip(result.views, metrics, files, strict=True)
+            ],
+            "reasons": mean.reasons,
+        }
+    }
+    report = measured | head | {"machine": machine_facts(), "versions": version_facts()}
+
+    out_dir.mkdir(parents=True, exist_ok=True)
+    for leftover in out_dir.glob(".report.*"):  # of a run that was killed
+        shutil.rmtree(leftover)
+    with tempfile.TemporaryDirectory(dir=out_dir, prefix=".report.") as name:
+        stage = Path(name)
+        for view, m, file in zip(result.views, metrics, files, strict=True):
+            with atomic_path(stage / PICTURES / file) as tmp:
+                comparison_picture(view, m).save(tmp)
+        with atomic_path(stage / CHART) as tmp:
+            error_chart(result).savefig(tmp)
+        write_json(stage / REPORT, report)
+
+        (out_dir / PICTURES).mkdir(exist_ok=True)
+        (out_dir / REPORT).unlink(missing_ok=True)  # from here on the old report has lost its pictures
+        for file in (*(f"{PICTURES}/{file}" for file in files), CHART, REPORT):
+            (stage / file).replace(out_dir / file)
+    return report
+
+
+def read_report(path: str | Path) -> dict[str, Any]:
+    """Read a report.json. Raises FileNotFoundError, or ValueError where the file is no report."""
+    path = Path(path)
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
+        raise ValueError(f"{path} is no hqgs report: it has no metrics")
+    missing = {"mean", "views", "reasons"} - report["metrics"].keys()
+    if missing:
+        raise ValueError(f"{path} is no hqgs report: its metrics lack {', '.join(sorted(missing))}")
+    return report
+
+
+def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
+    """Photo, render and absolute difference (times 4, cut at white) side by side, a caption above each.
+
+    The size is 3 W + 16 by H plus the height of the caption.
+    """
+    photo = view.photo / 255.0 if view.photo.dtype == np.uint8 else view.photo.clip(0, 1)
+    render = np.clip(view.render.astype(np.float64), 0.0, 1.0)
+    difference = np.minimum(AMPLIFICATION * np.abs(render - photo), 1.0)
+    panels = [np.round(panel * 255).astype(np.uint8) for panel in (photo, render, difference)]
+    amplified = f"absolute difference x{AMPLIFICATION}"
+    if view.mask is not None:
+        panels[2][~view.mask] = MASKED
+        amplified += ", grey: masked out"
+    numbers = [] if metrics.psnr is None else [f"{metrics.psnr:.2f} dB"]
+    numbers += [] if metrics.ssim is None else [f"SSIM {metrics.ssim:.3f}"]
+    captions = [f"photo  {_printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]
+
+    height, width = photo.shape[:2]
+    font, line = _caption_font(captions, width, height)
+    picture = Image.new("RGB", (3 * width + 2 * GAP, height + line), "white")
+    for i, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
+        strip = Image.new("RGB", (width, line), "white")  # a caption never runs into the next panel
+        ImageDraw.Draw(strip).text((2, line // 2), caption, fill=(25, 25, 25), font=font, anchor="lm")
+        picture.paste(strip, (i * (width + GAP), 0))
+        picture.paste(Image.fromarray(panel), (i * (width + GAP), line))
+    return picture
+
+
+def error_chart(result: RunResult) -> Figure:
+    """Held-out PSNR and SSIM against training time, one panel each."""
+    figure = Figure(figsize=(7, 5.2), dpi=150, layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    title = f"{result.scene}, {result.method}, seed {result.seed}: held-out views while training"
+    top.set_title(_printable(title, 90), fontsize=11, loc="left", parse_math=False)
+    _curve(top, result.history, "psnr", "PSNR (dB)", "{:.2f} dB", "#1f6fb2")
+    _curve(bottom, result.history, "ssim", "SSIM", "{:.3f}", "#c2571a")
+    bottom.set_xlabel("training time (s)")
+    figure.align_ylabels()
+    return figure
+
+
+def _curve(axes: Axes, history: list[dict[str, Any]], key: str, label: str, last: str, color: str) -> None:
+    points = [(h["seconds"], h[key]) for h in history if h[key] is not None]
+    axes.set_ylabel(label)
+    axes.grid(color="#dddddd", linewidth=0.7)
+    axes.spines[["top", "right"]].set_visible(False)
+    if not points:
+        axes.text(0.5, 0.5, "not measured while training", transform=axes.transAxes, ha="center", va="center")
+        axes.set_yticks([])
+        return
+    seconds, values = zip(*points, strict=True)
+    axes.plot(seconds, values, color=color, marker="o", markersize=3.5, linewidth=1.6)
+    axes.margins(x=0.02, y=0.18)
+    axes.set_xlim(left=0, right=max(seconds) * 1.12 or 1)  # room for the last value's label
+    axes.annotate(
+        last.format(values[-1]),
+        (seconds[-1], values[-1]),
+        xytext=(6, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=9,
+        color=color,
+    )
+
+
+def _head(result: RunResult) -> dict[str, Any]:
+    """The fields that go into the report as they are; all but the pictures."""
+    head = {name: value for name, value in vars(result).items() if name != "views"}
+    for name, value in head.items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"RunResult.{name} cannot be written as JSON: {error}") from error
+    return head
+
+
+def _evaluate(view: RenderedView) -> ViewMetrics:
+    try:
+        return evaluate_view(view.render, view.photo, view.mask)
+    except ValueError as error:
+        raise ValueError(f"view {view.name!r}: {error}") from error
+
+
+def _values(metrics: ViewMetrics) -> dict[str, float | None]:
+    values = asdict(metrics)
+    return {metric: values[metric] for metric in METRICS}
+
+
+def _file_names(views: list[str]) -> list[str]:
+    """A PNG file name for each view: letters, digits, . _ - only, no two equal on any file system."""
+    taken: set[str] = set()
+    names = []
+    for view in views:
+        stem = view[: view.rfind(".")] if view.lower().endswith(PHOTO_SUFFIXES) else view
+        stem = re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("._")[:80] or "view"
+        name, number = stem, 2
+        while name.lower() in taken:
+            name, number = f"{stem}-{number}", number + 1
+        taken.add(name.lower())
+        names.append(f"{name}.png")
+    return names
+
+
+def _printable(text: str, longest: int = 60) -> str:
+    """The text with everything but printable ASCII replaced (fonts lack the rest), cut to `longest`."""
+    text = re.sub(r"[^ -~]", "?", text)
+    return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def _caption_font(captions: list[str], width: int, height: int) -> tuple[Any, int]:
+    """The largest font, in proportion to the picture, in which all captions fit; and the line's height."""
+    size = min(max(height // 26, 14), 40)
+    font = ImageFont.load_default(size)
+    while size > 9 and max(font.getlength(caption) for caption in captions) > width - 4:
+        size -= 1
+        font = ImageFont.load_default(size)
+    return font, round(1.8 * size)

@@ -1,0 +1,1 @@
+"""Scene files: PLY, SPZ, fewer bands of the harmonics."""

@@ -1,0 +1,228 @@
+"""Scene files with no more than a scene needs: fewer Gaussians, fewer SH bands, fewer bits.
+
+A Gaussian is left out where no pixel can show it. It loses its highest SH bands where they cannot change the
+colour that it adds to a pixel by more than a tolerance, and the file loses a band that (next to) no Gaussian
+uses. The bound: by Unsöld's theorem the functions of degree l have the norm sqrt((2 l + 1) / (4 pi)) in every
+direction, so the band adds at most that times the norm of its coefficients to a channel, in any view; the
+Gaussian's opacity bounds its weight in a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hqgs.base.files import PLY
+from hqgs.base.left_out import LeftOut
+from hqgs.export.ply import read_ply, write_ply
+from hqgs.export.spz import SH_BITS, encode_spz, read_spz, write_spz
+from hqgs.model.gaussians import MAX_SH_DEGREE, Gaussians
+
+READERS: dict[str, Callable[[Path], Gaussians]] = {"ply": read_ply, "spz": read_spz}
+ALPHA_MIN = 1 / 255  # docs/conventions.md: no pixel shows less
+QUAT_NORM2_MIN = 1e-12  # docs/conventions.md: such a rotation is culled
+BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
+CURVE_BITS = 10  # of a cell along each axis
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What is written of a scene."""
+
+    format: str  # "ply" or "spz"
+    sh_degree: int = MAX_SH_DEGREE  # at most
+    band_tolerance: float = 0.004  # of a colour, white at 1: a level of an 8-bit picture; 0: every band stays
+    sh_bits: tuple[int, int] = SH_BITS  # SPZ: of the coefficients of degree 1, and of degrees 2 and 3
+
+    def __post_init__(self) -> None:
+        if self.format not in READERS:
+            raise ValueError(f"format is {self.format!r}, wanted one of: {', '.join(READERS)}")
+        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree is {self.sh_degree}, wanted 0..{MAX_SH_DEGREE}")
+        if not 0 <= self.band_tolerance < math.inf:
+            raise ValueError(f"band_tolerance is {self.band_tolerance}, wanted a number that is not negative")
+        if not all(1 <= bits <= 8 for bits in self.sh_bits):
+            raise ValueError(f"sh_bits is {self.sh_bits}, wanted two numbers in 1..8")
+
+
+@dataclass(frozen=True)
+class Export:
+    """A file that was written."""
+
+    path: Path
+    bytes: int
+    gaussians: int
+    sh_degree: int
+    left_out: list[LeftOut]
+    clipped: dict[str, int]  # SPZ: values outside its ranges, by name
+
+
+def read_scene_file(path: str | Path) -> Gaussians:
+    """The Gaussians of a PLY or SPZ file, or of scene.ply in the folder of a run.
+
+    Raises FileNotFoundError, or ValueError where it is no such file; the message names it.
+    """
+    path = scene_file(path)
+    return READERS[format_of(path)](path)
+
+
+def scene_file(path: str | Path) -> Path:
+    """The file itself, or scene.ply of a run's folder. FileNotFoundError where there is none."""
+    path = Path(path)
+    file = path / PLY if path.is_dir() else path
+    if not file.is_file():
+        raise FileNotFoundError(f"there is no {file}")
+    return file
+
+
+def format_of(path: Path) -> str:
+    """The format that a file's suffix names. ValueError for another suffix."""
+    name = path.suffix[1:].lower()
+    if name not in READERS:
+        raise ValueError(f"{path}: the suffix says no format; wanted .{' or .'.join(READERS)}")
+    return name
+
+
+def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Export:
+    """Write what the options leave of the Gaussians, atomically.
+
+    The Gaussians of a PLY file keep their order, those of an SPZ file get one that packs well.
+
+    Raises ValueError where SPZ cannot hold the scene (see `hqgs.spz.encode_spz`).
+    """
+    path = Path(path)
+    steps = reduce_gaussians(gaussians, options)
+    reduced = steps[-1].gaussians if steps else gaussians
+    clipped: dict[str, int] = {}
+    if options.format == "ply":
+        write_ply(path, reduced)
+    else:
+        clipped = write_spz(path, along_a_curve(reduced), options.sh_bits).clipped
+    written = path.stat().st_size
+    sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
+    sizes.append(_size(reduced, options) if options.format == "ply" else written)
+    left_out = []
+    for step, (before, after) in zip(steps, pairwise(sizes), strict=True):
+        saved = None if before is None or after is None else before - after
+        left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
+    return Export(path, written, len(reduced), reduced.sh_degree, left_out, clipped)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A part that was left out, and the Gaussians after that."""
+
+    gaussians: Gaussians
+    what: str
+    why: str
+    evidence: str | None = None
+
+
+def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]:
+    """What is left out in turn; nothing: an empty list. The Gaussians given stay what they are."""
+    steps: list[Step] = []
+    g = gaussians.detached()
+    n = len(g)
+    finite = torch.stack(
+        [t.isfinite().reshape(n, math.prod(t.shape[1:])).all(dim=1) for t in g.named().values()]
+    ).all(dim=0)
+    visible = (g.activated_opacities() >= ALPHA_MIN) & (g.quats.square().sum(dim=1) >= QUAT_NORM2_MIN)
+    for keep, others, why in (
+        (finite, n, "they hold NaN or Inf"),
+        (finite & visible, int(finite.sum()), "no pixel can show them: opacity below 1/255 or no rotation"),
+    ):
+        if (gone := others - int(keep.sum())) > 0:
+            steps.append(Step(_select(gaussians.detached(), keep), f"{gone:,} Gaussians", why))
+    g = steps[-1].gaussians if steps else g
+
+    degrees = needed_degrees(g, options.band_tolerance)
+    degree = file_degree(degrees, min(options.sh_degree, g.sh_degree))
+    if degree < g.sh_degree:
+        cut = int((degrees > degree).sum())
+        asked = degree == options.sh_degree
+        why = (
+            "--sh-degree asks for it" if asked else f"at most 1 in {1 / BAND_SHARE:,.0f} Gaussians needs them"
+        )
+        evidence = f"{cut:,} of {len(g):,} Gaussians change a colour by over {options.band_tolerance:g} there"
+        bands = (
+            f"degree {degree + 1}" if degree + 1 == g.sh_degree else f"degrees {degree + 1} to {g.sh_degree}"
+        )
+        g = _cut(g, degree)
+        steps.append(Step(g, f"harmonics of {bands}", why, evidence))
+    if options.format == "spz":  # zeros save nothing in a PLY file
+        fewer = _without_bands(g, degrees)
+        if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
+            why = f"they change a colour by at most {options.band_tolerance:g}"
+            steps.append(Step(fewer, f"the highest harmonics of {changed:,} Gaussians", why))
+    return steps
+
+
+def needed_degrees(gaussians: Gaussians, tolerance: float) -> Tensor:
+    """[N] int64: the lowest degree at which a Gaussian's harmonics may end.
+
+    What lies above changes no channel of the colour that it adds to a pixel by more than the tolerance (white
+    is 1), from any direction: opacity times the sum of the bounds of the bands that go.
+    """
+    n, rest = len(gaussians), gaussians.shN.double()
+    opacities = gaussians.activated_opacities().double()
+    degrees = torch.zeros(n, dtype=torch.int64)
+    change = torch.zeros(n, 3, dtype=torch.float64)
+    for degree in range(gaussians.sh_degree, 0, -1):
+        band = rest[:, degree**2 - 1 : (degree + 1) ** 2 - 1]
+        change += band.square().sum(dim=1).sqrt() * math.sqrt((2 * degree + 1) / (4 * math.pi))
+        needed = opacities * change.amax(dim=1) > tolerance
+        degrees = torch.where((degrees == 0) & needed, degree, degrees)
+    return degrees
+
+
+def file_degree(degrees: Tensor, most: int) -> int:
+    """The degree of a file: that which all but a share of BAND_SHARE of the Gaussians do with."""
+    allowed = BAND_SHARE * len(degrees)
+    return next((d for d in range(most) if int((degrees > d).sum()) <= allowed), most)
+
+
+def along_a_curve(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians along a Morton curve: neighbours in the file are neighbours in space, and pack better."""
+    means = gaussians.means.double().numpy()
+    if not len(means):
+        return gaussians
+    low, high = np.quantile(means, [0.01, 0.99], axis=0)  # a few far ones must not make the cells large
+    cells = (means - low) / np.maximum(high - low, np.finfo(np.float64).tiny) * (2**CURVE_BITS - 1)
+    cells = cells.clip(0, 2**CURVE_BITS - 1).astype(np.int64)
+    code = np.zeros(len(means), np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return _select(gaussians, torch.from_numpy(np.argsort(code, kind="stable")))
+
+
+def _select(gaussians: Gaussians, rows: Tensor) -> Gaussians:
+    return Gaussians(**{name: tensor[rows] for name, tensor in gaussians.named().items()})
+
+
+def _cut(gaussians: Gaussians, degree: int) -> Gaussians:
+    return Gaussians(**(gaussians.named() | {"shN": gaussians.shN[:, : (degree + 1) ** 2 - 1]}))
+
+
+def _without_bands(gaussians: Gaussians, degrees: Tensor) -> Gaussians:
+    """With zeros for the coefficients above each Gaussian's degree."""
+    places = torch.arange(gaussians.shN.shape[1])
+    keep = places < ((degrees + 1).square() - 1)[:, None]
+    return Gaussians(**(gaussians.named() | {"shN": gaussians.shN * keep[:, :, None]}))
+
+
+def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
+    """Bytes of the file without the text of a PLY header; None where SPZ cannot hold them."""
+    if options.format == "ply":
+        return 4 * len(gaussians) * (3 + 3 + gaussians.shN.shape[1] * 3 + 1 + 3 + 4)
+    try:
+        return len(encode_spz(along_a_curve(gaussians), options.sh_bits).data)
+    except ValueError:
+        return None

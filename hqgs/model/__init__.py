@@ -1,0 +1,1 @@
+"""The Gaussians, their rasterization and its gradients, and where they start."""

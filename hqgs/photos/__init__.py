@@ -1,0 +1,1 @@
+"""Pictures as arrays: pixels, files, degradations and the operators that imitate them."""

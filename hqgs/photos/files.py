@@ -1,0 +1,74 @@
+"""Photo and mask files: their suffixes, sizes and pixels."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+_DECODE_ERRORS = (
+    *(OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError),
+    MemoryError,  # Pillow reads as many bytes as a chunk says it has
+)
+
+
+class UnreadableError(ValueError):
+    """A photo or mask that cannot be decoded; the message names the file."""
+
+
+def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
+    """Width and height that the photo's header promises, for a look before memory is taken for the pixels.
+
+    Pillow refuses more than 179 million of them. Raises UnreadableError.
+    """
+    try:
+        with Image.open(path) as photo:
+            return photo.size
+    except _DECODE_ERRORS as e:
+        raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
+
+
+def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """The photo as uint8 RGB [H, W, 3], and its mask [H, W] (alpha >= 128) where it is not opaque everywhere.
+
+    Greyscale becomes three equal channels, 16 bits become 8. Colours are as stored: nothing is composited,
+    no colour profile is applied. EXIF orientation is not applied either: the cameras were computed for the
+    pixels as stored, and a turned photo would no longer fit them. Raises UnreadableError.
+    """
+    try:
+        with Image.open(path) as photo:
+            if photo.mode == "F":
+                raise ValueError("floating-point pixels have no agreed white")
+            if photo.mode.startswith("I"):
+                grey = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
+                if grey.min() < 0 or grey.max() > 65535:
+                    raise ValueError(f"pixel values {grey.min()}..{grey.max()} are not 16 bit")
+                return np.repeat(((grey + 128) // 257).astype(np.uint8)[..., None], 3, -1), None
+            if photo.has_transparency_data:
+                rgba = np.array(photo.convert("RGBA"))
+                opaque = bool((rgba[..., 3] == 255).all())
+                return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
+            return np.array(photo.convert("RGB")), None
+    except _DECODE_ERRORS as e:
+        raise UnreadableError(f"cannot read the photo {path}: {e}") from e
+
+
+def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
+    """The mask file as [height, width], True where it is not zero; the nearest pixel at another size."""
+    w, h = stored_size(path, "mask")
+    if abs(w * height - h * width) > width + height:
+        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
+    try:
+        with Image.open(path) as file:
+            pixels = np.asarray(file.convert("RGB") if file.mode == "P" else file)
+    except _DECODE_ERRORS as e:
+        raise UnreadableError(f"cannot read the mask {path}: {e}") from e
+    if pixels.ndim == 3:
+        pixels = pixels[..., :3].max(-1)  # without alpha, which says nothing here
+    rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64)
+    return pixels[rows][:, columns] != 0

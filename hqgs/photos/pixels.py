@@ -1,0 +1,44 @@
+"""Pixels between 8 bits, floats and levels: the one place that converts them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+Float32 = NDArray[np.float32]
+Floats = NDArray[np.floating]
+LUMA = np.array([0.299, 0.587, 0.114])  # of JPEG (ITU-R BT.601)
+LUMA_NOISE = float(np.sqrt(np.square(LUMA).sum()))  # of the luma of white noise of 1 in each channel
+
+
+def as_floats(photo: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy of a photo with white at 1."""
+    return np.divide(photo, 255 if photo.dtype == np.uint8 else 1, dtype=np.float32)
+
+
+def to_uint8(image: Float32) -> NDArray[np.uint8]:
+    """The picture with 8 bits: clipped to [0, 1], 255 levels, rounded."""
+    return np.rint(image.clip(0, 1) * 255).astype(np.uint8)
+
+
+def floats(photo: Tensor) -> Tensor:
+    """A photo with white at 1."""
+    return photo if photo.is_floating_point() else photo / 255
+
+
+def to_levels(image: NDArray[np.uint8] | NDArray[np.float32], what: str) -> Floats:
+    """A photo [H, W, 3], uint8 or float32 with white at 1, in levels of 1/255.
+
+    ValueError, which begins with `what`, for another shape or type or for values that are not finite.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype not in (np.uint8, np.float32):
+        raise ValueError(f"{what} must be [H, W, 3] uint8 or float32, got {image.shape} {image.dtype}")
+    if not np.isfinite(image).all():
+        raise ValueError(f"{what} holds NaN or Inf")
+    return image.astype(np.float64) * (1 if image.dtype == np.uint8 else 255)
+
+
+def luma(levels: Floats) -> Floats:
+    """[H, W] from [H, W, 3]."""
+    return levels @ LUMA

@@ -1,0 +1,112 @@
+"""Antialiased bicubic resizing, as MATLAB's imresize defines it.
+
+Own code because no library at hand computes it: OpenCV, and torch and kornia without antialiasing, use
+a = -0.75; torch's antialiased mode and Pillow (a = -0.5) cut the kernel off at the border, where imresize
+mirrors the picture.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+Pixels = NDArray[np.uint8] | NDArray[np.float32]
+A = -0.5  # of Keys's cubic: the value at which it reproduces quadratics
+RADIUS = 2  # of the cubic, in samples
+
+
+def resize_matrix(size_in: int, size_out: int) -> NDArray[np.float64]:
+    """The matrix [size_out, size_in] that resizes one axis; each row sums to 1.
+
+    Keys's cubic (1981, equation 4 with a = -0.5). Where the axis shrinks, the kernel is widened by
+    size_in / size_out. Pixel centres are at half-integers, so that both borders of the picture stay where
+    they are. Beyond a border the picture goes on mirrored with the edge pixel repeated (c b a | a b c).
+    ValueError for a size below 1.
+    """
+    if size_in < 1 or size_out < 1:
+        raise ValueError(f"sizes must be at least 1, got size_in {size_in}, size_out {size_out}")
+    step = size_in / size_out
+    widening = max(step, 1.0)
+    centers = (np.arange(size_out) + 0.5) * step - 0.5
+    first = np.floor(centers - RADIUS * widening).astype(np.int64)
+    at = first[:, None] + np.arange(int(np.ceil(2 * RADIUS * widening)) + 2)
+    weights = _cubic((at - centers[:, None]) / widening)
+    weights /= weights.sum(axis=1, keepdims=True)
+
+    at %= 2 * size_in  # the mirrored picture repeats after twice its size
+    at = np.minimum(at, 2 * size_in - 1 - at)
+    matrix = np.zeros((size_out, size_in))
+    np.add.at(matrix, (np.arange(size_out)[:, None], at), weights)
+    return matrix
+
+
+def resize(image: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Resize `image` [H, W, C] to [height, width, C], computed in float64. The result may overshoot [0, 1].
+
+    ValueError for an image of another shape or for a size below 1.
+    """
+    if image.ndim != 3:
+        raise ValueError(f"image must be [H, W, C], got the shape {image.shape}")
+    rows = csr_array(resize_matrix(image.shape[0], height))
+    columns = csr_array(resize_matrix(image.shape[1], width))
+    channels = image.shape[2]
+    tall = rows @ image.astype(np.float64).reshape(image.shape[0], -1)  # [height, W C]
+    turned = tall.reshape(height, -1, channels).swapaxes(0, 1).reshape(image.shape[1], -1)  # [W, height C]
+    out = (columns @ turned).reshape(width, height, channels).swapaxes(0, 1)
+    return np.ascontiguousarray(out, dtype=np.float32)
+
+
+def _cubic(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    x = np.abs(x)
+    inner = (A + 2) * x**3 - (A + 3) * x**2 + 1
+    outer = A * (x**3 - 5 * x**2 + 8 * x - 4)
+    return np.where(x <= 1, inner, np.where(x < RADIUS, outer, 0.0))
+
+
+def area_downscale(
+    image: Pixels, mask: NDArray[np.bool_] | None, width: int, height: int
+) -> tuple[Pixels, NDArray[np.bool_] | None]:
+    """Mean over each new pixel's area in the old photo; parts of old pixels count by their share.
+
+    With a mask, only what counts enters the mean (hidden colours must not bleed over the edge), and the new
+    pixel counts where at least half of its area does. Not Pillow's BOX filter: that takes old pixels whole or
+    not at all, which moves the picture by up to half a pixel at factors that are not whole.
+    """
+    if image.shape[:2] == (height, width):
+        return image, mask
+    area = image.shape[0] * image.shape[1] / (height * width)
+    if mask is None:
+        return _as(image, _area_sum(image, height, width) / area), None
+    share = _area_sum(mask.astype(np.uint8), height, width)
+    visible = _area_sum(np.where(mask[..., None], image, 0), height, width)
+    hidden = _area_sum(np.where(mask[..., None], 0, image), height, width)
+    seen = share > 1e-6 * area
+    mean = np.where(seen[..., None], visible / np.where(seen, share, 1.0)[..., None], hidden / area)
+    return _as(image, mean), share >= 0.5 * area
+
+
+def _as(image: Pixels, values: NDArray[np.float64]) -> Pixels:
+    """The values as the image's type; whole numbers are rounded."""
+    if image.dtype == np.uint8:
+        return np.rint(values).clip(0, 255).astype(np.uint8)
+    return values.astype(np.float32)
+
+
+def _area_sum(image: Pixels | NDArray[np.uint8], height: int, width: int) -> NDArray[np.float64]:
+    """Sums over the new pixels' areas, [height, width, ...]. Whole numbers stay exact at whole factors."""
+    return _sum_rows(_sum_rows(image, height).swapaxes(0, 1), width).swapaxes(0, 1)
+
+
+def _sum_rows(
+    a: NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Merge the rows of `a` into `count` equal stretches by differences of the running sum."""
+    total = np.uint32 if a.dtype == np.uint8 else np.float64  # 255 * MAX_SIDE fits into 32 bits
+    running = np.zeros((len(a) + 1, *a.shape[1:]), total)
+    np.cumsum(a, axis=0, dtype=total, out=running[1:])
+    edges = np.arange(count + 1) * len(a) / count
+    below = np.minimum(edges.astype(np.int64), len(a) - 1)
+    part = (edges - below).reshape(-1, *[1] * (a.ndim - 1))
+    at_edges = running[below] + part * (running[below + 1] - running[below])
+    return np.diff(at_edges, axis=0)

@@ -1,0 +1,1 @@
+"""Cameras, views and scenes, and everything that makes or changes one."""

@@ -1,0 +1,135 @@
+"""What each format reader hands over: photos on disk with their cameras, before any pixel is decoded."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.scene.scene import Tracks
+
+MAX_SIDE = 65_535  # the largest side a JPEG can have; larger ones come from damaged files
+LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One registered photo. `camera` may be distorted and may be declared at another size than the file's."""
+
+    name: str
+    path: Path
+    camera: pycolmap.Camera
+    viewmat: NDArray[np.float64]  # [4, 4], world to camera, OpenCV frame
+    mask_path: Path | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A scene as its files describe it."""
+
+    source: str
+    photos: list[Photo]
+    downscale: float  # what is left to do on the photos' stored size
+    points: NDArray[np.float32]  # [P, 3], world; P may be 0
+    point_colors: NDArray[np.uint8]  # [P, 3]
+    folder: Path | None = (
+        None  # where every photo lies, registered or not; None: the photos have no one folder
+    )
+    test_names: frozenset[str] | None = None  # the test views, where the format names them
+    near_far: dict[str, tuple[float, float]] = field(default_factory=dict)  # depth range by photo name
+    notes: list[str] = field(default_factory=list)
+    tracks: Tracks | None = None  # px of the cameras' own size
+    seen: dict[str, NDArray[np.intp]] | None = None  # by photo, rows of the points that it shows
+
+
+def no_points() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """An empty point cloud: points [0, 3] and colours [0, 3]."""
+    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+
+
+def keep_finite(
+    points: NDArray[np.float64], colors: NDArray[np.uint8], notes: list[str]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Points as float32 without those that are not finite there; how many were dropped goes to `notes`."""
+    with np.errstate(over="ignore"):
+        points32 = points.astype(np.float32)
+    finite = np.isfinite(points32).all(1)
+    if not finite.all():
+        notes.append(f"{int((~finite).sum())} of {len(points)} points are not finite and were dropped")
+    return points32[finite], colors[finite]
+
+
+def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: bool) -> NDArray[np.float64]:
+    """World-to-camera matrix [4, 4] from the first three rows [3, 4] of a pose in the OpenCV frame.
+
+    Poses printed with few digits are a little off a rotation: the nearest rotation (polar factor) is taken.
+    Raises ValueError that names the photo when the pose is not finite, too large, or no rotation.
+    """
+    if not (np.abs(pose) < LARGEST).all():
+        raise ValueError(f"photo {name!r}: its pose is not finite or beyond {LARGEST:g}: {pose.tolist()}")
+    R, t = pose[:, :3], pose[:, 3]
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > 1e-2 or np.linalg.det(R) < 0:
+        raise ValueError(
+            f"photo {name!r}: its pose holds no rotation (R R^T is {error:.3g} off): {R.tolist()}"
+        )
+    u, _, vt = np.linalg.svd(R)
+    R = u @ vt
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = R.T if camera_to_world else R
+    viewmat[:3, 3] = -R.T @ t if camera_to_world else t
+    return viewmat
+
+
+def list_photos(folder: Path) -> list[str]:
+    """Photos below `folder` as relative POSIX paths, sorted; hidden files are left out."""
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
+    names = (p.relative_to(folder) for p in found)
+    return sorted(n.as_posix() for n in names if not any(part.startswith(".") for part in n.parts))
+
+
+def inside(root: Path, name: str, what: str) -> Path:
+    """`root / name`, or ValueError when that leaves `root` (a resolved path) by `..` or as an absolute path.
+
+    Links inside the folder are followed as the user set them up: the written path is judged first, and what
+    it resolves to only where that is outside.
+    """
+    if "\0" in name:
+        raise ValueError(f"{what} {name!r} is no path in {root}")
+    path = Path(os.path.normpath(root / name))
+    if not path.is_relative_to(root):
+        path = path.resolve()
+    if not path.is_relative_to(root):
+        raise ValueError(f"{what} {name!r} leaves the folder {root}")
+    return path
+
+
+def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] | None:
+    """The folder of photos to read, the downscale left to do, and notes; None when there is no such folder.
+
+    `images_N` holds the photos scaled down by N: it is used when N is the downscale asked for. `images_1`
+    stands in for `images` where only that is there (the Deblur-NeRF layout).
+    """
+    ready = root / f"images_{downscale:g}"
+    if ready.is_dir():
+        return (
+            ready,
+            1.0,
+            [f"photos were read from {ready.name}, which holds them at downscale {downscale:g}"],
+        )
+    for folder in (root / "images", root / "images_1"):
+        if folder.is_dir():
+            return folder, downscale, []
+    return None
+
+
+def find_mask(root: Path, name: str) -> Path | None:
+    """The mask of photo `name`: `masks/` with the same name, with `.png` added, or with `.png` instead."""
+    masks = root / "masks"
+    options = (masks / name, masks / f"{name}.png", (masks / name).with_suffix(".png"))
+    return next((p for p in options if p.is_file()), None)

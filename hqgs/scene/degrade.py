@@ -1,0 +1,170 @@
+"""Scenes with degraded training photos: in memory, or written as a folder that `load_scene` reads."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.files import atomic_path
+from hqgs.base.text import some
+from hqgs.photos.degrade import Degraded, degrade_image
+from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.formula import Degradation
+from hqgs.photos.pixels import to_uint8
+from hqgs.scene.capture import inside
+from hqgs.scene.formats.colmap import write_colmap
+from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
+from hqgs.scene.scene import Scene, View
+
+
+def degrade_scene(scene: Scene, degradation: Degradation, seed: int) -> Scene:
+    """The scene with degraded training photos (float32, `View.low` with low-res); held-out ones as they are.
+
+    Each photo has a generator of its own, from the seed and the photo's place among all names, so that no
+    photo depends on another. `Scene.notes` gets a line with the kind, the seed and the photos. ValueError for
+    a negative seed, or a photo that is too small for a blur; it names the photo.
+    """
+    train = [
+        replace(view, image=result.image, low=result.low)
+        for view, result in _degraded_views(scene, degradation, seed)
+    ]
+    note = _note(scene, degradation, seed, "kept as 32-bit floats")
+    return replace(scene, train=train, notes=[*scene.notes, note])
+
+
+def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation, seed: int) -> None:
+    """Degrade as `degrade_scene` does and write a scene folder with the same cameras, points and split.
+
+    It holds a COLMAP model (pinhole cameras), `images` and, where the scene has masks, `masks`. Held-out
+    photos are PNGs of the clean pixels. Where JPEG is the last step, the training photos are the JPEG files
+    themselves, otherwise PNGs, clipped and rounded to 8 bits. With low-res, the small photos are stored in
+    this way in `low`, and `images` holds PNGs of the enlarged ones. The suffixes of names follow the files.
+    `degradation.json` tells kind, seed and photos.
+
+    All is written beside `out` and then moved there: after an error or Ctrl-C `out` is as it was. Raises
+    FileExistsError unless `out` is missing or an empty folder; ValueError as `degrade_scene` does, or where
+    the new suffixes would mix up the photos' names.
+    """
+    kinds = [step.kind for step in degradation.steps]
+    jpeg_last, enlarged = kinds[-1:] == ["jpeg"], "lowres" in kinds
+    suffix = ".jpg" if jpeg_last else ".png"
+    names = {view.name: _with_suffix(view.name, ".png" if enlarged else suffix) for view in scene.train}
+    names |= {view.name: _with_suffix(view.name, ".png") for view in scene.test}
+    _check_names(names)
+    with _new_folder(Path(out).resolve()) as root:
+        train: dict[str, str | None] = {}
+        for view, result in _degraded_views(scene, degradation, seed):
+            name, last = names[view.name], result.image if result.low is None else result.low
+            content = last if result.jpeg is None else result.jpeg
+            if enlarged:
+                small = _with_suffix(name, suffix)
+                train[name] = f"low/{small}"
+                _store(root / "low", small, content)
+                _store(root / "images", name, result.image)
+            else:
+                train[name] = None
+                _store(root / "images", name, content)
+        for view in scene.test:
+            _store(root / "images", names[view.name], view.image)
+        views = {names[view.name]: view for view in (*scene.train, *scene.test)}
+        for name, view in views.items():
+            if view.mask is not None:
+                _store(root / "masks", _with_suffix(name, ".png"), view.mask.astype(np.uint8) * 255)
+        cameras = {name: view.camera for name, view in views.items()}
+        seen = None
+        if scene.seen is not None:
+            seen = {names[name]: rows for name, rows in scene.seen.items() if name in names}
+        error = 0.0 if scene.tracks is None else scene.tracks.error
+        write_colmap(root / "sparse" / "0", cameras, scene.points, scene.point_colors, seen, error)
+        stored = "stored as the last step's JPEG files" if jpeg_last else "clipped and rounded to 8-bit PNGs"
+        if enlarged:
+            stored += " in low and enlarged to 8-bit PNGs"
+        write_degraded_folder(
+            root,
+            DegradedFolder(
+                kind=str(degradation),
+                seed=seed,
+                train=train,
+                held_out=[names[view.name] for view in scene.test],
+                notes=[*scene.notes, _note(scene, degradation, seed, stored)],
+            ),
+        )
+
+
+def check_new_folder(out: Path) -> None:
+    """FileExistsError unless `out` is missing or an empty folder."""
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise FileExistsError(f"{out} exists and is not an empty folder")
+
+
+def _degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterator[tuple[View, Degraded]]:
+    """The training views with what becomes of their photos."""
+    if seed < 0:
+        raise ValueError(f"seed is {seed}, wanted at least 0")
+    names = sorted(view.name for view in (*scene.train, *scene.test))
+    for view in scene.train:
+        rng = np.random.default_rng([seed, names.index(view.name)])
+        try:
+            result = degrade_image(view.image, degradation, rng)
+        except ValueError as error:
+            raise ValueError(f"photo {view.name!r}: {error}") from error
+        yield view, result
+
+
+def _note(scene: Scene, degradation: Degradation, seed: int, stored: str) -> str:
+    widths = sorted({view.camera.width for view in scene.train})
+    exact = {str(degradation.for_width(width)): width for width in widths}
+    kind = str(degradation)
+    if set(exact) != {kind}:
+        kind += f" ({', '.join(f'{steps} at a width of {width} px' for steps, width in exact.items())})"
+    return (
+        f"degradation {kind}, seed {seed}: all training photos ({len(scene.train)}), {stored}; "
+        f"held-out photos ({len(scene.test)}) are clean"
+    )
+
+
+def _with_suffix(name: str, suffix: str) -> str:
+    """The photo's name with this suffix; its own only goes if it is a photo's."""
+    own = Path(name).suffix
+    stem = name[: -len(own)] if own.lower() in PHOTO_SUFFIXES else name
+    return stem + suffix
+
+
+def _check_names(names: dict[str, str]) -> None:
+    """ValueError unless the new names are in the order of the old ones and differ up to the suffix."""
+    stems = {_with_suffix(name, "") for name in names}
+    new = [names[name] for name in sorted(names)]
+    if len(stems) < len(names) or new != sorted(new):
+        raise ValueError(
+            "the photos' names must differ, and be in the same order, when their suffixes are replaced by "
+            f".jpg or .png; they are {some(sorted(names))}"
+        )
+
+
+def _store(folder: Path, name: str, content: bytes | NDArray[Any]) -> None:
+    """Write a file's bytes, or pixels [H, W, 3] or [H, W] as a PNG; floats are clipped and rounded."""
+    with atomic_path(inside(folder, name, "the photo's name")) as tmp:
+        if isinstance(content, bytes):
+            tmp.write_bytes(content)
+        else:
+            Image.fromarray(content if content.dtype == np.uint8 else to_uint8(content)).save(tmp, "PNG")
+
+
+@contextmanager
+def _new_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder that is moved to `out`, a resolved path, at the end; after an error it is gone."""
+    check_new_folder(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as name:
+        folder = Path(name) / "scene"  # with the usual permissions; those around it are private
+        folder.mkdir()
+        yield folder.resolve()
+        folder.replace(out)

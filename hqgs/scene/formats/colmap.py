@@ -1,0 +1,278 @@
+"""COLMAP models (binary or text) with their photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from hqgs.base.text import some
+from hqgs.scene.capture import (
+    Capture,
+    Photo,
+    find_mask,
+    inside,
+    keep_finite,
+    list_photos,
+    photo_folder,
+    viewmat_from_pose,
+)
+from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model
+from hqgs.scene.geometry import project
+from hqgs.scene.scene import Camera, Tracks
+
+LEAST_PHOTOS = 3  # of a reconstruction
+LEAST_SHARE = 0.5  # of the photos must find their place in it
+_FILES = ("cameras", "images", "points3D")
+
+
+def find_models(root: Path) -> list[Path]:
+    """Folders with a complete COLMAP model: those below `sparse/`, else `sparse` itself, else `root`."""
+    sparse = root / "sparse"
+    fragments = sorted(p for p in sparse.iterdir() if _kind(p)) if sparse.is_dir() else []
+    return fragments or [p for p in (sparse, root) if _kind(p)][:1]
+
+
+def read_colmap(root: Path, downscale: float) -> Capture:
+    """Read the largest COLMAP model of the scene in `root`.
+
+    COLMAP's camera frame and pixel centres (half-integers) are ours. Raises ValueError for a damaged model,
+    FileNotFoundError for a camera whose photo is missing.
+    """
+    found = photo_folder(root, downscale)
+    if found is None:
+        raise ValueError(f"{root} has a COLMAP model but no photos: looked for images, images_{downscale:g}")
+    folder, left, notes = found
+    models = {path: _read_model(path) for path in find_models(root)}
+    path = max(models, key=lambda p: (len(_registered(models[p])), models[p].num_points3D()))
+    model = models.pop(path)
+    if models:
+        others = ", ".join(f"{p.name}: {len(_registered(m))}" for p, m in models.items())
+        notes.append(
+            f"{len(models) + 1} COLMAP models: took the largest, {path.relative_to(root)}, with "
+            f"{len(_registered(model))} photos (photos in the others: {others})"
+        )
+    try:
+        by_name = sorted((image.name, image.image_id) for image in _registered(model))
+    except UnicodeDecodeError as e:
+        raise ValueError(f"{path}: a photo name is not UTF-8: {e}") from e
+    if not by_name:
+        raise ValueError(f"{path}: the COLMAP model has no registered photo")
+    names = [name for name, _ in by_name]
+    twice = sorted({n for n in names if names.count(n) > 1}) if len(set(names)) < len(names) else []
+    if twice:
+        raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
+
+    files = _match_files(names, root, folder, notes)
+    photos = []
+    for name, image_id in by_name:
+        image = model.images[image_id]
+        camera = model.cameras[image.camera_id]
+        photos.append(Photo(name, files[name], camera, _viewmat(image), find_mask(root, name)))
+    used = set(files.values())
+    if len(used) < len(files):
+        shared = [n for n, p in files.items() if list(files.values()).count(p) > 1]
+        raise ValueError(f"{folder}: several cameras have the same photo: {some(shared)}")
+    unused = [n for n in list_photos(folder) if folder / n not in used]
+    if unused:
+        notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
+    points, colors = keep_finite(*model_points(model), notes)
+    tracks = _tracks(model, path)
+    seen = None
+    if tracks is not None and len(points) == model.num_points3D():  # else the rows would not be those
+        seen = seen_points(model)
+    return Capture(
+        "colmap", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks, seen=seen
+    )
+
+
+def _tracks(model: pycolmap.Reconstruction, path: Path) -> Tracks | None:
+    """How the photos saw the points; None where the model does not tell."""
+    try:
+        if not model.compute_num_observations():
+            return None
+        return Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    except ValueError as e:
+        raise ValueError(f"{path}: a point was seen by a photo that the model lacks: {e}") from e
+
+
+def _kind(folder: Path) -> str:
+    """ "bin", "txt" or "" (no complete model). COLMAP itself prefers the binary files."""
+    for kind in ("bin", "txt"):
+        if all((folder / f"{name}.{kind}").is_file() for name in _FILES):
+            return kind
+    return ""
+
+
+def _read_model(folder: Path) -> pycolmap.Reconstruction:
+    model = pycolmap.Reconstruction()
+    binary = _kind(folder) == "bin"
+    if binary:
+        check_binary_model(folder)
+    try:
+        if binary:
+            model.read_binary(folder)
+        else:
+            model.read_text(folder)
+    except (ValueError, IndexError, RuntimeError) as e:
+        raise ValueError(f"{folder}: COLMAP cannot read its model there: {e}") from e
+    if binary:
+        size = cameras_file_size([len(c.params) for c in model.cameras.values()])
+        actual = (folder / "cameras.bin").stat().st_size
+        if actual != size:
+            raise ValueError(f"{folder / 'cameras.bin'} is damaged: {size} bytes expected, it has {actual}")
+    return model
+
+
+def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    return [image for image in model.images.values() if image.has_pose]
+
+
+def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
+    pose = image.cam_from_world()
+    viewmat = viewmat_from_pose(pose.matrix(), image.name, camera_to_world=False)
+    quat = pose.rotation.quat
+    if abs(np.linalg.norm(quat) - 1) > 1e-2:  # the matrix does not show it: that of a zero quaternion is I
+        raise ValueError(
+            f"photo {image.name!r}: its quaternion (x, y, z, w) is not of length 1: {quat.tolist()}"
+        )
+    return viewmat
+
+
+def _match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:
+    """The file of each photo: by name; by name up to the suffix; in `images_N` also by sorted position.
+
+    LLFF's scaled photos have names of their own (image000.png for IMG_4026.JPG) in the same order.
+    """
+    present = list_photos(folder)
+    by_stem: dict[str, list[str]] = {}
+    for n in present:
+        by_stem.setdefault(_stem(n), []).append(n)
+    files: dict[str, Path] = {}
+    missing = []
+    for name in names:
+        exact = inside(folder, name, "the COLMAP model's photo")
+        similar = by_stem.get(_stem(name), [])
+        if exact.is_file():
+            files[name] = exact
+        elif len(similar) == 1:
+            files[name] = folder / similar[0]
+        else:
+            missing.append(name)
+    if not missing:
+        return files
+    originals = root / "images"
+    originals_names = list_photos(originals) if originals.is_dir() else names
+    renamed = folder != originals and len(missing) == len(names) and len(originals_names) == len(present)
+    if renamed and set(names) <= set(originals_names):
+        notes.append(f"{folder.name} has other file names than the cameras: matched by sorted position")
+        return {n: folder / p for n, p in zip(originals_names, present, strict=True) if n in set(names)}
+    raise FileNotFoundError(f"{len(missing)} cameras have no photo in {folder}: {some(missing)}")
+
+
+def _stem(name: str) -> str:
+    return name.rsplit(".", 1)[0]
+
+
+def seen_points(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.intp]]:
+    """By photo, the rows of `model_points` that it shows, ascending; photos without a place show none.
+
+    Points that the model lacks do not count: tools remove some and leave the photos as they are.
+    """
+    row = {point: k for k, point in enumerate(sorted(model.points3D))}
+    return {
+        image.name: np.array(
+            sorted({row[p.point3D_id] for p in image.points2D if p.point3D_id in row}), dtype=np.intp
+        )
+        for image in model.images.values()
+        if image.has_pose
+    }
+
+
+def registered(model: pycolmap.Reconstruction, photos: int) -> dict[str, NDArray[np.float64]]:
+    """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few of the `photos` have one."""
+    poses = {}
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if image.has_pose:
+            poses[image.name] = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+    if len(poses) < max(LEAST_PHOTOS, LEAST_SHARE * photos):
+        raise ValueError(
+            f"COLMAP registered only {len(poses)} of {photos} photos, wanted at least {LEAST_PHOTOS} and "
+            f"{LEAST_SHARE:.0%}; the others do not match them well enough"
+        )
+    return poses
+
+
+def model_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Points [P, 3] and colours [P, 3] by ascending id: COLMAP keeps them in a hash map without an order."""
+    points = [point for _, point in sorted(model.points3D.items(), key=lambda item: item[0])]
+    xyz = np.array([p.xyz for p in points], np.float64).reshape(-1, 3)
+    return xyz, np.array([p.color for p in points], np.uint8).reshape(-1, 3)
+
+
+def write_colmap(
+    folder: Path,
+    cameras: dict[str, Camera],
+    points: NDArray[np.float32],
+    colors: NDArray[np.uint8],
+    seen: dict[str, NDArray[np.intp]] | None = None,
+    reprojection_error: float = 0.0,
+) -> None:
+    """Write a binary model into `folder`: the camera of each photo name, points [P, 3] and colours [P, 3].
+
+    Photos with equal intrinsics share a PINHOLE camera. The names are COLMAP's, relative to the folder of
+    photos. `seen` has for each of them the rows of the points that it shows; where it shows them is not
+    known, so they are written where the camera sees them. Every point gets `reprojection_error`, px, as its
+    mean distance from the photos. Without `seen` the points have no tracks. Raises OSError if the files are
+    not whole.
+    """
+    model = pycolmap.Reconstruction()
+    ids: dict[tuple[float, ...], int] = {}
+    for image_id, (name, camera) in enumerate(sorted(cameras.items()), start=1):
+        params = (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2])
+        key = (camera.width, camera.height, *params)
+        if key not in ids:
+            ids[key] = len(ids) + 1
+            pinhole = pycolmap.Camera(
+                camera_id=ids[key], model="PINHOLE", width=camera.width, height=camera.height, params=params
+            )
+            model.add_camera_with_trivial_rig(pinhole)
+        image = pycolmap.Image(name=name, camera_id=ids[key], image_id=image_id)
+        rotation = pycolmap.Rotation3d(camera.viewmat[:3, :3])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(rotation, camera.viewmat[:3, 3]))
+    ids_of_points = [
+        model.add_point3D(point.astype(np.float64), pycolmap.Track(), color)
+        for point, color in zip(points, colors, strict=True)
+    ]
+    if seen is not None:
+        _add_tracks(model, cameras, points.astype(np.float64), ids_of_points, seen, reprojection_error)
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write_binary(folder)
+    # COLMAP takes no notice of a full disk.
+    cameras_file = folder / "cameras.bin"
+    try:
+        check_binary_model(folder)
+        if cameras_file.stat().st_size != cameras_file_size([4] * len(ids)):
+            raise ValueError(f"{cameras_file} is damaged")
+    except ValueError as error:
+        raise OSError(f"cannot write the COLMAP model (is the disk full?): {error}") from error
+
+
+def _add_tracks(
+    model: pycolmap.Reconstruction,
+    cameras: dict[str, Camera],
+    points: NDArray[np.float64],
+    ids: list[int],
+    seen: dict[str, NDArray[np.intp]],
+    reprojection_error: float,
+) -> None:
+    for image in model.images.values():
+        camera, rows = cameras[image.name], seen.get(image.name, np.zeros(0, np.intp))
+        pixels, _ = project(camera, points[rows])
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
+        for k, row in enumerate(rows.tolist()):
+            model.add_observation(ids[row], pycolmap.TrackElement(image.image_id, k))
+    for point in model.points3D.values():
+        point.error = reprojection_error

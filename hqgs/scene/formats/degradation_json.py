@@ -1,0 +1,71 @@
+"""degradation.json: what a scene folder with degraded training photos says of itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hqgs.base.files import write_json
+from hqgs.photos.files import decode, stored_size
+from hqgs.photos.pixels import as_floats
+from hqgs.scene.capture import inside
+from hqgs.scene.scene import View
+
+FILE = "degradation.json"
+
+
+@dataclass(frozen=True)
+class DegradedFolder:
+    """The contents of degradation.json. Photo names are those of the COLMAP model."""
+
+    kind: str  # what parse_degradation reads
+    seed: int
+    train: dict[str, str | None]  # the degraded photos, each with its small photo's path in the scene folder
+    held_out: list[str]  # the clean photos
+    notes: list[str]  # for `Scene.notes`
+
+
+def write_degraded_folder(root: Path, folder: DegradedFolder) -> None:
+    """Write degradation.json into the scene folder `root`."""
+    write_json(root / FILE, vars(folder))
+
+
+def read_degraded_folder(root: Path) -> DegradedFolder | None:
+    """Read degradation.json of the scene folder `root`; None where there is none, ValueError if damaged."""
+    path = root / FILE
+    if not path.is_file():
+        return None
+    try:
+        folder = DegradedFolder(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    lists = (folder.held_out, folder.notes)
+    sound = all(isinstance(items, list) and all(isinstance(i, str) for i in items) for items in lists)
+    if not (sound and isinstance(folder.train, dict)):
+        raise ValueError(f"{path} is damaged: train must be an object, held_out and notes lists of text")
+    for name, low in folder.train.items():
+        if not (low is None or isinstance(low, str)):
+            raise ValueError(f"{path} is damaged: the small photo of {name!r} is {low!r:.80}")
+    return folder
+
+
+def with_low(view: View, folder: DegradedFolder, root: Path) -> View:
+    """The view with its small photo in `low`, where the folder has one.
+
+    Raises FileNotFoundError for a missing small photo, ValueError for one that is no smaller than the photo.
+    """
+    file = folder.train.get(view.name)
+    if file is None:
+        return view
+    path = inside(root, file, f"{FILE}: the small photo")
+    if not path.is_file():
+        raise FileNotFoundError(f"photo {view.name!r} has no small photo {path}")
+    width, height = stored_size(path)
+    if width > view.camera.width or height > view.camera.height:
+        raise ValueError(
+            f"the small photo {path} is {width} x {height}, its photo "
+            f"{view.camera.width} x {view.camera.height}"
+        )
+    low = as_floats(decode(path)[0])
+    return replace(view, low=low)

@@ -1,0 +1,187 @@
+"""transforms.json (nerfstudio, instant-ngp) and transforms_train.json, transforms_test.json (Blender)."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
+from hqgs.scene.capture import (
+    MAX_SIDE,
+    Capture,
+    Photo,
+    find_mask,
+    inside,
+    keep_finite,
+    no_points,
+    viewmat_from_pose,
+)
+from hqgs.scene.formats.ply_points import read_ply
+
+SINGLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
+
+# Where only the photo tells the size and cannot be read: `load_views` meets the same error, and names it.
+UNKNOWN_CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0.5, 0.5])
+
+_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+_FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # y up and z back become y down and z forward
+
+
+def read_transforms(root: Path, downscale: float) -> Capture:
+    """Read `transforms.json`, or the Blender pair, whose test file names the test views.
+
+    Poses are camera to world in the OpenGL frame (x right, y up, z back). Intrinsics stand in the file or in
+    a frame, which wins. Distortion follows OpenCV: k1, k2, p1, p2, k3, or k1..k4 for a fisheye. Raises
+    ValueError, FileNotFoundError for a photo or PLY that is missing; both name the file.
+    """
+    notes: list[str] = []
+    if (root / SINGLE).is_file():
+        meta = _read_json(root / SINGLE)
+        photos, test_names = _read_frames(root, SINGLE, meta), None
+    else:
+        meta = _read_json(root / TRAIN)
+        photos, test_names = _read_frames(root, TRAIN, meta), None
+        if (root / TEST).is_file():
+            test = _read_frames(root, TEST, _read_json(root / TEST))
+            photos, test_names = photos + test, frozenset(p.name for p in test)
+            notes.append(f"the test views are the {len(test)} of {TEST}; test_every has no say")
+    names = [p.name for p in photos]
+    if len(set(names)) < len(names):
+        twice = next(n for n in names if names.count(n) > 1)
+        raise ValueError(f"{root}: photo {twice!r} appears more than once in the transforms")
+    photos.sort(key=lambda p: p.name)
+    points, colors = no_points()
+    ply = meta.get("ply_file_path")
+    if ply is not None:
+        path = inside(root, _text(ply, "ply_file_path", root), "ply_file_path")
+        if not path.is_file():
+            raise FileNotFoundError(f"ply_file_path {ply!r} names no file in {root}")
+        points, colors = keep_finite(*read_ply(path), notes)
+    return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as e:
+        raise ValueError(f"cannot read {path}: {e}") from e
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+        raise ValueError(f"{path}: expected an object with a list 'frames' that is not empty")
+    return meta
+
+
+def _read_frames(root: Path, file: str, meta: dict[str, Any]) -> list[Photo]:
+    photos = []
+    for i, frame in enumerate(meta["frames"]):
+        where = f"{root / file}, frame {i}"
+        if not isinstance(frame, dict):
+            raise ValueError(f"{where}: expected an object, got {frame!r:.80}")
+        path = _photo_path(root, _text(frame.get("file_path"), "file_path", where))
+        name = path.relative_to(root).as_posix()
+        where = f"{where} ({name})"
+        c2w = _matrix(frame.get("transform_matrix"), where)
+        c2w[:, :3] *= _OPENGL_TO_OPENCV
+        viewmat = viewmat_from_pose(c2w, name, camera_to_world=True)
+        mask = frame.get("mask_path")
+        mask_path = find_mask(root, name.removeprefix("images/"))
+        if mask is not None:
+            mask_path = inside(root, _text(mask, "mask_path", where), "mask_path")
+            if not mask_path.is_file():
+                raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
+        try:
+            camera = _camera({**meta, **frame}, path, where)
+        except UnreadableError:
+            camera = UNKNOWN_CAMERA
+        photos.append(Photo(name, path, camera, viewmat, mask_path))
+    return photos
+
+
+def _photo_path(root: Path, file_path: str) -> Path:
+    """The photo of `file_path`, which may lack its suffix (Blender sets)."""
+    path = inside(root, file_path, "file_path")
+    for option in (path, *(path.with_name(path.name + s) for s in PHOTO_SUFFIXES)):
+        if option.is_file():
+            return option
+    raise FileNotFoundError(f"the camera of {file_path!r} has no photo in {root}")
+
+
+def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
+    """The camera from the file's values, overridden by the frame's."""
+
+    def number(key: str, default: float | None = None) -> float | None:
+        value = values.get(key, default)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1e300 < value < 1e300:
+            raise ValueError(f"{where}: {key} must be a finite number, got {value!r:.80}")
+        return float(value)
+
+    def coefficient(key: str) -> float:
+        return number(key) or 0.0
+
+    model = values.get("camera_model", "OPENCV")
+    if model not in _PERSPECTIVE | _FISHEYE:
+        raise ValueError(f"{where}: camera_model {model!r:.80} is none of {sorted(_PERSPECTIVE | _FISHEYE)}")
+    width, height = number("w"), number("h")
+    if width is None or height is None:
+        width, height = stored_size(path)
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise ValueError(f"{where}: w, h = {width}, {height} is no photo size")
+    fx = _focal(number("fl_x"), number("camera_angle_x"), width, where)
+    fy = _focal(number("fl_y"), number("camera_angle_y"), height, where)
+    if fx is None and fy is None:
+        raise ValueError(f"{where}: no focal length: looked for fl_x, fl_y, camera_angle_x, camera_angle_y")
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    pinhole = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
+
+    k1, k2, k3, k4 = (coefficient(k) for k in ("k1", "k2", "k3", "k4"))
+    p1, p2 = coefficient("p1"), coefficient("p2")
+    if model in _FISHEYE or values.get("is_fisheye"):
+        if p1 or p2:
+            raise ValueError(f"{where}: a fisheye with p1, p2 = {p1}, {p2} is no OpenCV fisheye")
+        kind, params = "OPENCV_FISHEYE", [*pinhole, k1, k2, k3, k4]
+    elif k4:
+        # The one k4 of a perspective camera is r^8 here and a denominator in OpenCV.
+        raise ValueError(f"{where}: k4 = {k4} has no agreed meaning for a {model} camera")
+    elif k3:
+        kind, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0, 0, 0]
+    elif k1 or k2 or p1 or p2:
+        kind, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
+    else:
+        kind, params = "PINHOLE", pinhole
+    return pycolmap.Camera(model=kind, width=round(width), height=round(height), params=params)
+
+
+def _focal(focal: float | None, angle: float | None, size: float, where: str) -> float | None:
+    """Focal length in pixels, as given or from the full angle of view in radians."""
+    if focal is not None or angle is None:
+        return focal
+    if not 0 < angle < math.pi:
+        raise ValueError(f"{where}: the angle of view {angle} is not between 0 and pi")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+def _matrix(value: object, where: str) -> NDArray[np.float64]:
+    """Rows of a camera-to-world matrix, [3, 4], from nested lists of 3 or 4 rows."""
+    try:
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as e:
+        raise ValueError(f"{where}: transform_matrix must be numbers: {e}") from e
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise ValueError(f"{where}: transform_matrix must be 4 x 4, got shape {list(matrix.shape)}")
+    if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError(f"{where}: the last row of transform_matrix is {matrix[3].tolist()}, not 0 0 0 1")
+    return matrix[:3]
+
+
+def _text(value: object, key: str, where: object) -> str:
+    if not isinstance(value, str) or not value:
+        raise ValueError(f"{where}: {key} must be a path, got {value!r:.80}")
+    return value

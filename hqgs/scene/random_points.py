@@ -1,0 +1,61 @@
+"""Points to start from where a scene brings none, and points from a PLY file."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.scene.geometry import unproject
+from hqgs.scene.scene import View
+
+COUNT = 20_000
+SEED = 0
+
+
+def random_points(
+    views: list[View], near_far: dict[str, tuple[float, float]]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
+    """Seeded random points in the frusta of the training `views`, coloured by the pixel they were drawn at.
+
+    Depths are uniform in the logarithm between the view's near and far bound. Where a view has none in
+    `near_far`, it is guessed: 0.3 to 3 times the distance to the point the cameras look at, or, for cameras
+    that look in nearly one direction, 0.5 to 50 times the radius of their positions. Returns points [P, 3]
+    in world units, colours [P, 3], and a note that says what was done.
+    """
+    rng = np.random.default_rng(SEED)
+    guessed = {} if all(v.name in near_far for v in views) else _guess_near_far(views)
+    points, colors = [], []
+    for i, view in enumerate(views):
+        count = COUNT * (i + 1) // len(views) - COUNT * i // len(views)
+        cells = np.arange(view.image.shape[0] * view.image.shape[1])
+        if view.mask is not None:
+            cells = cells[view.mask.ravel()]
+        if len(cells) == 0:
+            continue
+        rows, columns = np.divmod(rng.choice(cells, count), view.camera.width)
+        near, far = near_far.get(view.name) or guessed[view.name]
+        depth = np.exp(rng.uniform(np.log(near), np.log(far), count))
+        points.append(unproject(view.camera, np.stack([columns + 0.5, rows + 0.5], 1), depth))
+        colors.append(view.image[rows, columns])
+    if not points:
+        raise ValueError("the masks hide every pixel of every training view")
+    depths = "a guessed depth range" if guessed else "the given depth bounds"
+    note = (
+        f"no points in the scene: {COUNT} random points (seed {SEED}) within {depths} of the training views"
+    )
+    return np.concatenate(points).astype(np.float32), np.concatenate(colors), note
+
+
+def _guess_near_far(views: list[View]) -> dict[str, tuple[float, float]]:
+    centers = np.stack([v.camera.center for v in views])
+    axes = np.stack([v.camera.viewmat[2, :3] for v in views])
+    # The point nearest to all optical axes, by least squares: sum (I - d d^T) (x - c) = 0.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.mean(0)
+    if np.linalg.eigvalsh(normal)[0] > 0.05:  # the axes spread by about 13 degrees or more
+        focus = np.linalg.solve(normal, (across @ centers[:, :, None]).mean(0)[:, 0])
+        depths = ((focus - centers) * axes).sum(1)
+        if (depths > 0).all():
+            return {v.name: (0.3 * d, 3 * d) for v, d in zip(views, depths.tolist(), strict=True)}
+    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
+    return {v.name: (0.5 * radius, 50 * radius) for v in views}

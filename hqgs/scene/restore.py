@@ -1,0 +1,236 @@
+"""Restore the training photos with an existing image network before anything is reconstructed."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import importlib.util
+import io
+import pickle
+import struct
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import safetensors.torch
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from torch import Tensor
+from tqdm import tqdm
+
+from hqgs._rust import get_num_threads
+from hqgs.base.threads import one_torch_thread
+from hqgs.photos.pixels import as_floats
+from hqgs.photos.resize import resize
+from hqgs.scene.scene import Scene, View
+
+if TYPE_CHECKING:
+    from spandrel import ImageModelDescriptor
+
+    Network = ImageModelDescriptor[torch.nn.Module]
+
+RANDOM = ("AuraSR",)  # these networks draw other detail in every view and every run
+PICKLED = (".pth", ".pt", ".ckpt")
+# What weights or a photo that do not fit raise inside a network of somebody else's, lack of memory included.
+NETWORK_ERRORS = (
+    RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError,
+    MemoryError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RestoreConfig:
+    """How a photo is cut up for the network; bounds the memory. ValueError for a value out of range."""
+
+    tile: int = 256  # px at the network's input; a photo with a longer side goes through it in tiles
+    overlap: int = 32  # px of the photo around a tile that the network sees too; their output is dropped
+
+    def __post_init__(self) -> None:
+        if self.tile < 1:
+            raise ValueError(f"tile is {self.tile}, wanted at least 1 px")
+        if self.overlap < 0:
+            raise ValueError(f"overlap is {self.overlap}, wanted at least 0 px")
+
+
+DEFAULTS = RestoreConfig()
+
+
+def restore_scene(scene: Scene, weights: str | Path, config: RestoreConfig = DEFAULTS) -> Scene:
+    """The scene with its training photos as a restoration network gives them back.
+
+    The network sees a photo as it was taken: `View.low` where there is one, else `View.image`, clipped to
+    [0, 1] as such networks want. Its output becomes `image` (in the photo's dtype). Where its size is not
+    the camera's it is resized by antialiased bicubic: a network of scale 4 that sees a photo without
+    `low` gives a picture 4 times too large, which shrinks to the camera's size. `low` stays, because it is
+    the measurement. So do masks, and the held-out views are not touched. `Scene.notes` says what was done.
+
+    Any network will do that the optional package spandrel knows: denoising, deblurring, JPEG and
+    super-resolution, with RGB or grey input (a grey network sees each channel). In tiles the result is that
+    of the whole photo if `overlap` covers the network's field of view. A network that advises against tiles
+    gets them four times as large, and one that makes its own gets the whole photo. Photos run in parallel,
+    each on one thread of torch, so that no number of threads changes a bit; the memory grows with the
+    threads.
+
+    Args:
+        scene: its training photos are restored.
+        weights: .safetensors, or .pth, .pt, .ckpt. Pickled files are read as tensors only: one that holds
+            anything that could run is refused.
+        config: the tiles.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: spandrel is missing, the file does not hold a network that fits, or the network fails on
+            a photo, which the message names.
+    """
+    weights = Path(weights)
+    started = time.perf_counter()
+    network, digest = _load(weights)
+    local = threading.local()
+
+    def restored(view: View) -> View:
+        if not hasattr(local, "network"):
+            local.network = copy.deepcopy(network)  # some networks keep values of a call in their modules
+        try:
+            return replace(view, image=_restored_image(local.network, view, config))
+        except NETWORK_ERRORS as error:
+            height, width = _as_taken(view).shape[:2]
+            raise ValueError(
+                f"{weights} cannot restore the photo {view.name!r} ({width} x {height} px): {error}"
+            ) from error
+
+    with one_torch_thread(), ThreadPoolExecutor(get_num_threads()) as pool:
+        photos = pool.map(restored, scene.train)
+        train = list(tqdm(photos, "restore", len(scene.train), unit="photo", disable=None))
+    note = (
+        f"training photos restored by {network.architecture.name} (scale {network.scale}) from "
+        f"{weights.name}, SHA-256 {digest[:12]}, in {time.perf_counter() - started:.1f} s"
+    )
+    return replace(scene, train=train, notes=[*scene.notes, note])
+
+
+def _load(weights: Path) -> tuple[Network, str]:
+    """The network of a file and the file's SHA-256."""
+    if importlib.util.find_spec("spandrel") is None:
+        raise ValueError(
+            "restoring photos needs the optional package spandrel, which is not installed "
+            "(pip install 'hqgs[restore]')"
+        )
+    import spandrel  # takes a second, and is optional
+
+    data = weights.read_bytes()
+    state = _state_dict(weights, data)
+    try:
+        network = spandrel.ModelLoader().load_from_state_dict(state)
+    except spandrel.UnsupportedModelError as error:
+        raise ValueError(f"{weights}: spandrel knows no network with these tensors") from error
+    except NETWORK_ERRORS as error:
+        raise ValueError(f"{weights}: the tensors do not make up a network: {error}") from error
+    invents = network.purpose == "FaceSR" or network.architecture.id in RANDOM
+    if not isinstance(network, spandrel.ImageModelDescriptor) or invents:
+        raise ValueError(
+            f"{weights}: {network.architecture.name} ({network.purpose}) makes up detail; wanted "
+            "a network for denoising, deblurring, JPEG or super-resolution"
+        )
+    channels = network.input_channels, network.output_channels
+    if channels not in ((3, 3), (1, 1)):
+        raise ValueError(
+            f"{weights}: {network.architecture.name} turns {channels[0]} channels into {channels[1]}, wanted "
+            "3 into 3 or 1 into 1"
+        )
+    return network.float().eval(), hashlib.sha256(data).hexdigest()
+
+
+def _state_dict(weights: Path, data: bytes) -> dict[str, Any]:
+    """The tensors of a file by name. Nothing in the file is run."""
+    suffix = weights.suffix.lower()
+    if suffix not in (".safetensors", *PICKLED):
+        raise ValueError(f"{weights}: wanted a file that ends in .safetensors, {', '.join(PICKLED)}")
+    try:
+        if suffix == ".safetensors":
+            state = safetensors.torch.load(data)
+        else:
+            # spandrel's own reader is avoided: it turns torch's restricted unpickler off in favour of its
+            # own, and runs TorchScript archives through torch's loader for programs.
+            state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except SafetensorError as error:
+        raise ValueError(f"{weights} is damaged or no safetensors file: {error}") from error
+    except (pickle.UnpicklingError, struct.error, EOFError, *NETWORK_ERRORS) as error:
+        raise ValueError(
+            f"{weights} is refused: it is damaged, or holds more than tensors, which could run code "
+            "(convert weights that you trust to .safetensors)"
+        ) from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{weights} holds a {type(state).__name__}, wanted a dictionary of tensors")
+    return state
+
+
+def _as_taken(view: View) -> NDArray[np.uint8] | NDArray[np.float32]:
+    return view.image if view.low is None else view.low
+
+
+def _restored_image(
+    network: Network, view: View, config: RestoreConfig
+) -> NDArray[np.uint8] | NDArray[np.float32]:
+    photo = _as_taken(view)
+    values = as_floats(photo).clip(0, 1)
+    channels = torch.from_numpy(values).permute(2, 0, 1)[:, None]  # [3, 1, h, w]
+    images = [channels.transpose(0, 1)] if network.input_channels == 3 else list(channels.split(1))
+    out = (
+        torch.cat([_in_tiles(network, image, config) for image in images], dim=1)[0].permute(1, 2, 0).numpy()
+    )
+    if not np.isfinite(out).all():
+        raise ValueError("its output holds NaN or Inf")
+    if out.shape != view.image.shape:
+        out = resize(out, *view.image.shape[:2]).clip(0, 1)
+    if view.image.dtype == np.uint8:
+        return np.rint(out * 255).astype(np.uint8)
+    return np.ascontiguousarray(out)
+
+
+def _in_tiles(network: Network, image: Tensor, config: RestoreConfig) -> Tensor:
+    """[1, C, h, w] to [1, C, h scale, w scale], tile by tile."""
+    scale, multiple = network.scale, network.size_requirements.multiple_of
+    height, width = image.shape[2:]
+    # Tiles start at multiples of what the network wants, so that its windows lie as in the whole photo.
+    overlap = _up(config.overlap, multiple)
+    side = _longest_side(network, config)
+    rows, columns = _spans(height, side, multiple), _spans(width, side, multiple)
+    out = torch.empty(1, image.shape[1], height * scale, width * scale)
+    for top, bottom in rows:
+        for left, right in columns:
+            first_row, first_column = max(top - overlap, 0), max(left - overlap, 0)
+            seen = image[:, :, first_row : bottom + overlap, first_column : right + overlap]
+            tile = network(seen.contiguous())
+            wanted = (1, seen.shape[1], seen.shape[2] * scale, seen.shape[3] * scale)
+            if tile.shape != wanted:
+                raise ValueError(f"its output is {list(tile.shape)}, wanted {list(wanted)}")
+            y, x = (top - first_row) * scale, (left - first_column) * scale
+            h, w = (bottom - top) * scale, (right - left) * scale
+            target = out[:, :, top * scale : bottom * scale, left * scale : right * scale]
+            target.copy_(tile[:, :, y : y + h, x : x + w])
+    return out
+
+
+def _longest_side(network: Network, config: RestoreConfig) -> int | None:
+    """Of a tile, in px; None: the whole photo at once."""
+    from spandrel import ModelTiling
+
+    if network.tiling == ModelTiling.INTERNAL:
+        return None
+    return config.tile if network.tiling == ModelTiling.SUPPORTED else 4 * config.tile
+
+
+def _spans(length: int, side: int | None, multiple: int) -> list[tuple[int, int]]:
+    """`length` px cut into spans of one size, a multiple of `multiple`, that is about `side` at most."""
+    count = 1 if side is None else -(-length // side)
+    step = _up(-(-length // count), multiple)
+    return [(start, min(start + step, length)) for start in range(0, length, step)]
+
+
+def _up(value: int, multiple: int) -> int:
+    return -(-value // multiple) * multiple

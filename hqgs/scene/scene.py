@@ -1,0 +1,124 @@
+"""Cameras, views and scenes: what every loader produces and every consumer reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in the OpenCV frame (x right, y down, z forward; see docs/conventions.md)."""
+
+    width: int
+    height: int
+    K: NDArray[np.float64]  # [3, 3], pixels, skew 0
+    viewmat: NDArray[np.float64]  # [4, 4], world to camera
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """Camera centre in world coordinates, [3]."""
+        return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class View:
+    """A photo with its camera.
+
+    A photo from a file stays uint8 in memory. One that was degraded in memory is float32, where 1 is white
+    and noise may leave [0, 1].
+    """
+
+    name: str
+    camera: Camera
+    image: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3] sRGB, the camera's size
+    mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts; None: everywhere
+    low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """How the photos bear out the points of a COLMAP model."""
+
+    length: float  # photos that see a point, mean
+    error: float  # px, mean distance between a point and where the photos see it
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Training views, held-out views and the sparse points that initialise the Gaussians."""
+
+    name: str
+    train: list[View]
+    test: list[View]
+    points: NDArray[np.float32]  # [P, 3], world
+    point_colors: NDArray[np.uint8]  # [P, 3]
+    source: str  # the format it was read from: "colmap", "llff", "transforms", "embedded"
+    notes: list[str] = field(default_factory=list)  # what a reader of the report should know
+    tracks: Tracks | None = None  # of the points, px of the views; None: its files do not tell
+    seen: dict[str, NDArray[np.intp]] | None = None  # rows of the points that each photo shows; None as above
+    sfm: SfmReport | None = None  # how poses and points differ from its files'; None: they are those
+
+    @property
+    def extent(self) -> float:
+        """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera."""
+        centers = np.stack([v.camera.center for v in self.train])
+        radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+        return 1.1 * radius if radius > 0 else 1.0
+
+    @property
+    def reach(self) -> float:
+        """The extent, or the median depth of the points before the training views where that is larger.
+
+        Photos taken side by side may show things that are many times farther away than the cameras are apart.
+        """
+        points, depths = self.points.astype(np.float64), []
+        for view in self.train:
+            depth = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
+            depths.append(depth[depth > 0])
+        seen = np.concatenate(depths)
+        return max(self.extent, float(np.median(seen))) if seen.size else self.extent
+
+
+@dataclass(frozen=True)
+class SfmReport:
+    """How poses and points from the photos differ from the scene's own. JSON values only.
+
+    Distances are in units of the scene's extent, after the alignment of the two frames.
+    """
+
+    photos: int  # that were given
+    not_registered: list[str]  # those that COLMAP found no place for
+    outliers: list[str]  # those that the alignment of the two frames left out
+    rotation_error_deg: dict[str, float]  # of the cameras: "median", "max"
+    translation_error: dict[str, float]
+    own_cameras_px: (
+        float  # median distance from where the scene's own cameras see the new points to the photos
+    )
+    points: int
+    point_distance: float  # median over the new points to the nearest of the scene's own, which may be random
+    track_length: float  # photos that see a point, mean
+    reprojection_error_px: float  # mean
+    own_points: int  # the scene's, and of them
+    own_track_length: float | None  # None: its files do not tell
+    own_reprojection_error_px: float | None
+
+    def __str__(self) -> str:
+        rotation, translation = self.rotation_error_deg, self.translation_error
+        found = self.photos - len(self.not_registered)
+        text = (
+            f"poses and points by COLMAP from the training photos: {found} of {self.photos} registered; "
+            f"rotations off the scene's own by {rotation['median']:.3f} deg (median) and "
+            f"{rotation['max']:.3f} deg (max), centres by {translation['median']:.2%} and "
+            f"{translation['max']:.2%} of the extent, so that its own cameras see the new points "
+            f"{self.own_cameras_px:.2f} px off the photos (median); {self.points} points, its own "
+            f"{self.own_points}, the nearest {self.point_distance:.2%} of the extent away (median); "
+            f"{self.track_length:.1f} photos a point, {self.reprojection_error_px:.2f} px off (mean)"
+        )
+        if self.own_track_length is not None:
+            text += f", its own {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px"
+        if self.not_registered:
+            text += f"; left out, as COLMAP found no place for them: {', '.join(self.not_registered)}"
+        return text

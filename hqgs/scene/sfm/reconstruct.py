@@ -1,0 +1,114 @@
+"""Poses and points from the photos themselves (`--sfm`), by COLMAP in a process of its own."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial import KDTree
+
+from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.scene.formats.colmap import model_points, registered, seen_points
+from hqgs.scene.scene import Scene, SfmReport, Tracks, View
+from hqgs.scene.sfm.align import Observations, align, camera_centers, refine, rotation_angles
+from hqgs.scene.sfm.run import run_colmap
+
+KEPT = "sfm"  # in the folder of a run: its reconstructions
+
+
+def sfm_scene(scene: Scene, keep: Path | None = None) -> Scene:
+    """The scene with poses and points from its training photos as they are, in its own frame.
+
+    COLMAP (SIFT, exhaustive matching, incremental mapping) sees the training photos alone, clipped and
+    rounded to 8 bits, with the scene's intrinsics, which stay as they are: held-out views share them. The
+    reconstruction is moved into the scene's frame by the training cameras (`align`, `refine`), so that the
+    held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.
+    `Scene.sfm` and `Scene.notes` compare the two. The same photos give the same bits, whatever the number of
+    threads. `keep` is a folder for the reconstruction, which the next call with the same photos takes from
+    there.
+
+    ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
+    """
+    views = {f"{k:05d}.png": view for k, view in enumerate(scene.train)}
+    with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
+        directory = Path(name)
+        _write_photos(directory, views)
+        cameras = [view.camera for view in scene.train]
+        model = run_colmap(directory, directory / "photos", list(views), cameras, keep)
+    poses = registered(model, len(views))
+    kept = [views[file] for file in poses]
+    viewmats, own = np.stack(list(poses.values())), np.stack([view.camera.viewmat for view in kept])
+    points, colors = model_points(model)
+    similarity, inliers = align(viewmats, own)
+    Ks = np.stack([view.camera.K for view in kept])
+    similarity, misses = refine(similarity, points, _observations(model, list(poses)), Ks, own)
+    viewmats, points = similarity.viewmats(viewmats), similarity.points(points)
+
+    train = [
+        replace(view, camera=replace(view.camera, viewmat=viewmat))
+        for view, viewmat in zip(kept, viewmats, strict=True)
+    ]
+    degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", viewmats[:, :3, :3], own[:, :3, :3])))
+    apart = np.linalg.norm(camera_centers(viewmats) - camera_centers(own), axis=1) / scene.extent
+    distances, _ = KDTree(scene.points).query(points)
+    tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    report = SfmReport(
+        photos=len(views),
+        not_registered=[view.name for file, view in views.items() if file not in poses],
+        outliers=[view.name for view, inlier in zip(kept, inliers, strict=True) if not inlier],
+        rotation_error_deg=_median_and_max(degrees),
+        translation_error=_median_and_max(apart),
+        own_cameras_px=float(np.median(misses)),
+        points=len(points),
+        point_distance=float(np.median(distances)) / scene.extent,
+        track_length=tracks.length,
+        reprojection_error_px=tracks.error,
+        own_points=len(scene.points),
+        own_track_length=None if scene.tracks is None else scene.tracks.length,
+        own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
+    )
+    return replace(
+        scene,
+        train=train,
+        points=points.astype(np.float32),
+        point_colors=colors,
+        notes=[*scene.notes, str(report)],
+        tracks=tracks,
+        seen={views[file].name: rows for file, rows in seen_points(model).items()},
+        sfm=report,
+    )
+
+
+def _observations(model: pycolmap.Reconstruction, names: list[str]) -> Observations:
+    """Which of these photos sees which point of `model_points`, and where."""
+    row = {point: k for k, point in enumerate(sorted(model.points3D))}
+    images = {image.name: image for image in model.images.values()}
+    found = [
+        (k, row[seen.point3D_id], *seen.xy)
+        for k, name in enumerate(names)
+        for seen in images[name].points2D
+        if seen.has_point3D()
+    ]
+    table = np.array(found, np.float64).reshape(-1, 4)
+    return Observations(table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), table[:, 2:])
+
+
+def _write_photos(directory: Path, views: dict[str, View]) -> None:
+    """The photos as PNG files in `photos`, and masks in `masks` where a view has one."""
+    masked = any(view.mask is not None for view in views.values())
+    for folder in ("photos", "masks") if masked else ("photos",):
+        (directory / folder).mkdir()
+    for file, view in views.items():
+        Image.fromarray(to_uint8(as_floats(view.image))).save(directory / "photos" / file, compress_level=1)
+        if masked:
+            counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+            Image.fromarray(counts.astype(np.uint8) * 255).save(directory / "masks" / f"{file}.png")
+
+
+def _median_and_max(values: NDArray[np.float64]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "max": float(values.max())}

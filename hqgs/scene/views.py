@@ -1,0 +1,217 @@
+"""Photos from disk to views: decode, undistort at the stored size, then downscale."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+
+from hqgs.photos.files import UnreadableError, decode, decode_mask, stored_size
+from hqgs.photos.resize import area_downscale
+from hqgs.scene.capture import MAX_SIDE, Photo
+from hqgs.scene.scene import Camera, View
+
+STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is not resampled
+MAX_SHARE = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
+BAND = 1 << 20  # pixels mapped at a time, to bound memory
+SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
+MAX_WORKERS = 4  # each holds a few photos at their stored size
+_CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
+_CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
+
+
+def load_views(
+    photos: list[Photo], downscale: float, optional: frozenset[str] = frozenset()
+) -> tuple[list[View], dict[str, UnreadableError]]:
+    """Decode `photos`, in their order, as pinhole views scaled down by `downscale` (at least 1).
+
+    Intrinsics scale with the true ratio of sizes, per axis. The second result tells, by name, why photos of
+    the names in `optional` have no view: they, or their masks, cannot be decoded.
+
+    Raises FileNotFoundError for a camera without photo, ValueError for a photo that does not fit its camera
+    or gets smaller than 8 px, UnreadableError for another that cannot be decoded; each names the photo.
+    """
+    for photo in photos:
+        if not photo.path.is_file():
+            raise FileNotFoundError(f"the camera of photo {photo.name!r} has no photo: {photo.path}")
+        check_camera(photo.camera, photo.name)
+
+    @lru_cache(maxsize=_CAMERAS_KEPT)
+    def pinhole(key: _CameraKey) -> Pinhole:
+        model, params, camera_width, camera_height, width, height = key
+        camera = pycolmap.Camera(model=model, params=params, width=camera_width, height=camera_height)
+        return to_pinhole(camera, width, height)
+
+    unreadable: dict[str, UnreadableError] = {}
+
+    def load(photo: Photo) -> View | None:
+        try:
+            return _load_view(photo, downscale, pinhole)
+        except UnreadableError as error:
+            if photo.name not in optional:
+                raise
+            unreadable[photo.name] = error
+            return None
+
+    with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
+        jobs = [pool.submit(load, photo) for photo in photos]
+        try:
+            views = [view for job in jobs if (view := job.result()) is not None]
+        finally:
+            pool.shutdown(cancel_futures=True)  # after an error the photos still waiting are not wanted
+    return views, {photo.name: unreadable[photo.name] for photo in photos if photo.name in unreadable}
+
+
+def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], Pinhole]) -> View:
+    check_size(photo.camera, *stored_size(photo.path), photo.name)
+    image, mask = decode(photo.path)
+    height, width = image.shape[:2]
+    if photo.mask_path is not None:
+        counts = decode_mask(photo.mask_path, width, height)
+        mask = counts if mask is None else mask & counts
+
+    camera = photo.camera
+    key = (camera.model.name, tuple(camera.params), camera.width, camera.height, width, height)
+    try:
+        flat = pinhole(key)
+    except ValueError as e:  # from pycolmap: the message does not say which camera
+        raise ValueError(f"the camera of photo {photo.name!r} cannot be undistorted: {e}") from e
+    image, mask = flat.picture(image), flat.mask(mask)
+
+    width, height = round(flat.width / downscale), round(flat.height / downscale)
+    if min(width, height) < SMALLEST_SIDE:
+        raise ValueError(
+            f"photo {photo.name!r} is {width} x {height} pixels after downscale {downscale:g}; "
+            f"each side needs {SMALLEST_SIDE}"
+        )
+    image, mask = area_downscale(image, mask, width, height)
+    K = np.diag([width / flat.width, height / flat.height, 1.0]) @ flat.K
+    if mask is not None and mask.all():
+        mask = None
+    return View(photo.name, Camera(width, height, K, photo.viewmat), image, mask)
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A pinhole camera and, where the photo needs resampling, how to get its picture from the stored one."""
+
+    width: int
+    height: int
+    K: NDArray[np.float64]  # [3, 3]
+    grid: torch.Tensor | None  # [1, height, width, 2] float32, sampling positions; None: keep the photo
+    inside: NDArray[np.bool_] | None  # [height, width], True where the position lies in the photo
+
+    def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Resample `image` [H, W, C] by bicubic interpolation, clamped at the border; uint8 again.
+
+        Bicubic, not bilinear: this happens at the stored size, and bilinear would soften a sharp photo.
+        """
+        if self.grid is None:
+            return image
+        channels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+        out = torch.nn.functional.grid_sample(
+            channels, self.grid, mode="bicubic", padding_mode="border", align_corners=False
+        )
+        return out[0].round_().clamp_(0, 255).byte().permute(1, 2, 0).contiguous().numpy()
+
+    def mask(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        """Resample `mask` [H, W] (None: everywhere): a pixel counts where all that it is made of counts."""
+        if self.grid is None or self.inside is None:
+            return mask
+        if mask is None:
+            return None if self.inside.all() else self.inside
+        # A bicubic sample reads 4 x 4 pixels: what is hidden grows by one pixel before the 2 x 2 sampling.
+        hidden = torch.from_numpy(~mask)[None, None].float()
+        hidden = torch.nn.functional.max_pool2d(hidden, 3, stride=1, padding=1)
+        out = torch.nn.functional.grid_sample(
+            hidden, self.grid, mode="bilinear", padding_mode="border", align_corners=False
+        )
+        return (out[0, 0] < 1e-3).numpy() & self.inside
+
+
+def check_camera(camera: pycolmap.Camera, name: str) -> None:
+    """Raise ValueError, naming the photo, when the camera's size or parameters cannot be a camera's."""
+    if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
+        raise ValueError(f"the camera of photo {name!r} has the size {camera.width} x {camera.height}")
+    focals = camera.params[camera.focal_length_idxs()]
+    if len(focals) == 0:
+        raise ValueError(f"photo {name!r}: a {camera.model.name} camera has no pinhole view")
+    shares = np.array([*focals, camera.principal_point_x, camera.principal_point_y])
+    shares = shares / max(camera.width, camera.height)
+    sound = np.isfinite(camera.params).all() and (np.abs(shares) < MAX_SHARE).all()
+    if not (sound and (shares[: len(focals)] > 1 / MAX_SHARE).all()):
+        raise ValueError(
+            f"the camera of photo {name!r} ({camera.model.name}) has the parameters {camera.params.tolist()}"
+        )
+
+
+def check_size(camera: pycolmap.Camera, width: int, height: int, name: str) -> None:
+    """Raise ValueError when a photo of `width` x `height` is no scaled version of what the camera describes.
+
+    Each side may be off by one pixel of rounding.
+    """
+    if abs(width * camera.height - height * camera.width) > camera.width + camera.height:
+        raise ValueError(
+            f"photo {name!r} is {width} x {height}, but its camera is for {camera.width} x {camera.height}: "
+            "another shape (was the photo rotated or cropped after the cameras were computed?)"
+        )
+
+
+def to_pinhole(camera: pycolmap.Camera, width: int, height: int) -> Pinhole:
+    """The pinhole view of a photo of `width` x `height` taken with `camera`, whatever size that declares.
+
+    The new camera is pycolmap's `undistort_camera` with no blank pixels (focal lengths kept, size chosen so
+    that the picture is filled; where extreme distortion prevents that, `inside` is False). Pixel centres are
+    at half-integers in COLMAP, in `grid_sample(align_corners=False)` and here. Raises ValueError when nothing
+    of the photo would remain or pycolmap cannot undistort the camera.
+    """
+    sx, sy = width / camera.width, height / camera.height
+    K = camera.calibration_matrix()
+    if _is_straight(camera, K):
+        return Pinhole(width, height, np.diag([sx, sy, 1.0]) @ K, None, None)
+    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(blank_pixels=0.0), camera)
+    if not (1 <= flat.width <= 4 * camera.width and 1 <= flat.height <= 4 * camera.height):
+        raise ValueError(f"{camera.model.name} camera undistorts to {flat.width} x {flat.height} pixels")
+    w, h = max(1, round(flat.width * sx)), max(1, round(flat.height * sy))
+    K = np.diag([w / flat.width, h / flat.height, 1.0]) @ flat.calibration_matrix()
+
+    grid = np.empty((h, w, 2), np.float32)
+    inside = np.empty((h, w), np.bool_)
+    rows = max(1, BAND // w)
+    for top in range(0, h, rows):
+        ys, xs = np.mgrid[top : min(top + rows, h), :w] + 0.5
+        pixels = np.stack([xs, ys], -1)
+        # Position in the stored photo as a share of its size, so that the declared size drops out.
+        at = _project(camera, (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]) / (camera.width, camera.height)
+        inside[top : top + rows] = ((at >= 0) & (at <= 1)).all(-1)
+        grid[top : top + rows] = 2 * np.nan_to_num(at, nan=0.5, posinf=2, neginf=-1).clip(-1, 2) - 1
+    if not inside.any():
+        raise ValueError(
+            f"{camera.model.name} with parameters {camera.params.tolist()} shows nothing of the photo"
+        )
+    return Pinhole(w, h, K, torch.from_numpy(grid)[None], inside)
+
+
+def _project(camera: pycolmap.Camera, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixel positions [..., 2] of the viewing directions (x/z, y/z) [..., 2]; NaN where there is none."""
+    rays = np.concatenate([directions, np.ones_like(directions[..., :1])], -1)
+    return np.asarray(camera.img_from_cam(rays.reshape(-1, 3))).reshape(directions.shape)
+
+
+def _is_straight(camera: pycolmap.Camera, K: NDArray[np.float64]) -> bool:
+    """Whether the model maps like a pinhole, tested on a lattice over the photo, border included.
+
+    Not asked of `is_undistorted()`: that says yes to a fisheye whose coefficients are zero.
+    """
+    xs = np.linspace(0, camera.width, 33)
+    ys = np.linspace(0, camera.height, 33)
+    pixels = np.stack(np.meshgrid(xs, ys), -1)
+    moved = _project(camera, (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]) - pixels
+    return bool(np.abs(moved).max() < STRAIGHT)

@@ -1,0 +1,1 @@
+"""The loop, growth, schedule and decisions; `methods` holds what can be trained."""

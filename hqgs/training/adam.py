@@ -1,0 +1,166 @@
+"""Adam on the CPU, in place and in parallel, with the formulas and the state of `torch.optim.Adam`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.graph import increment_version
+from torch.optim import Optimizer
+from torch.optim.optimizer import ParamsT
+
+from hqgs import _rust
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.work_counts import add_counts, is_counting
+
+UNSUPPORTED = (
+    "weight_decay",
+    "amsgrad",
+    "maximize",
+    "differentiable",
+)  # a loaded state dict may ask for these
+
+
+class Adam(torch.optim.Optimizer):
+    """Adam (Kingma and Ba 2015) as `torch.optim.Adam` with its defaults; state `step, exp_avg, exp_avg_sq`.
+
+    Parameters are contiguous CPU tensors, float32 or float64. Same bits for any number of threads.
+
+    Args:
+        params: tensors, or groups of them, each with its own `lr`, `betas` or `eps`. A group of tensors
+            [N, K, ...] may have `used`: only the first so many of the K are updated. For those that never had
+            a gradient that is the same, bit for bit; the step still counts.
+        lr: learning rate; may be changed in `param_groups` between steps, and so may `used`.
+        betas: decay of the two moments, in [0, 1).
+        eps: added to the square root of the second moment.
+
+    Raises:
+        ValueError: in `step`, a setting out of its range, or a tensor that it cannot work on.
+    """
+
+    def __init__(
+        self,
+        params: ParamsT,
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's base says None)
+        self, closure: Callable[[], Tensor] | None = None, visible: Tensor | None = None
+    ) -> Tensor | None:
+        """Update every parameter that has a gradient.
+
+        Args:
+            closure: evaluated first, with gradients enabled; its value is returned.
+            visible: bool [N] for parameters [N, ...]: rows where it is False are left as they are, moments
+                included (the selective Adam of Taming 3DGS, Mallick et al. 2024). None: all rows. Groups with
+                `every_row` take no notice of it.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        if visible is not None and visible.dtype != torch.bool:
+            raise ValueError(f"visible: must be bool, got {visible.dtype}")
+        rows = None if visible is None else visible.contiguous().numpy().view(np.uint8)
+        for group in self.param_groups:
+            if asked := [name for name in UNSUPPORTED if group.get(name)]:
+                raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
+            chosen = None if group.get("every_row") else rows
+            for param in group["params"]:
+                if param.grad is not None or group.get("used") == 0:
+                    self._update(param, group, chosen)
+        return loss
+
+    def _update(self, param: Tensor, group: dict[str, Any], rows: np.ndarray[Any, Any] | None) -> None:
+        state = self.state[param]
+        if not state:
+            state["step"] = torch.tensor(0.0)
+            state["exp_avg"] = torch.zeros_like(param)
+            state["exp_avg_sq"] = torch.zeros_like(param)
+        step = state["step"] + 1
+        if group.get("used") != 0:
+            self._write(param, int(step), group, rows)
+        state["step"] = step  # a new tensor: a loaded state dict may share the old one
+
+    def _write(
+        self, param: Tensor, step: int, group: dict[str, Any], rows: np.ndarray[Any, Any] | None
+    ) -> None:
+        grad = param.grad
+        assert grad is not None
+        if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
+            raise ValueError(
+                "param: must be a contiguous CPU tensor with a dense gradient, got shape "
+                f"{list(param.shape)}, strides {param.stride()}, {param.device}, gradient {grad.layout}"
+            )
+        moments = self.state[param]["exp_avg"], self.state[param]["exp_avg_sq"]
+        values, first, second = (t.detach().numpy() for t in (param, *moments))
+        beta1, beta2 = group["betas"]
+        options = (float(group["lr"]), beta1, beta2, group["eps"])
+        used = group.get("used")
+        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, rows, used)
+        for tensor in (param, *moments):
+            increment_version(tensor)  # written behind torch's back
+        if is_counting():
+            share = 1.0 if rows is None or not rows.size else float(rows.mean())
+            share *= 1.0 if used is None else used / param.shape[1]
+            add_counts({"adam_numbers": round(param.numel() * share)})
+
+
+def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: int) -> None:
+    """Make row i of every tensor the former row `rows[i]`, in the parameters and in the optimizer's state.
+
+    Rows up to `old` keep their moments. Those after it are new Gaussians: their moments start at zero.
+    """
+    for name, tensor in gaussians.named().items():
+        chosen = tensor.detach()[rows].requires_grad_()
+        state = {}
+        for key, value in optimizer.state.pop(tensor, {}).items():
+            if isinstance(value, Tensor) and value.shape == tensor.shape:
+                value = value[rows]
+                value[old:] = 0
+            state[key] = value
+        _replace(gaussians, optimizer, name, chosen, state)
+
+
+def cut_harmonics(gaussians: Gaussians, optimizer: Optimizer, sh0: Tensor, shN: Tensor) -> None:
+    """Take these coefficients over, fewer than before. The moments of what stays are kept."""
+    for name, new in (("sh0", sh0), ("shN", shN)):
+        old = getattr(gaussians, name)
+        state = {
+            key: value[:, : new.shape[1]].clone()
+            if isinstance(value, Tensor) and value.shape == old.shape
+            else value
+            for key, value in optimizer.state.pop(old, {}).items()
+        }
+        _replace(gaussians, optimizer, name, new.clone().requires_grad_(), state)
+
+
+def reset_opacities(gaussians: Gaussians, optimizer: Optimizer, highest: float) -> None:
+    """Cut the opacities to `highest` and forget the moments that led to them."""
+    old = gaussians.opacities
+    logit = math.log(highest / (1 - highest))
+    state = {
+        key: torch.zeros_like(value) if isinstance(value, Tensor) and value.shape == old.shape else value
+        for key, value in optimizer.state.pop(old, {}).items()
+    }
+    _replace(gaussians, optimizer, "opacities", old.detach().clamp(max=logit).requires_grad_(), state)
+
+
+def _replace(
+    gaussians: Gaussians, optimizer: Optimizer, name: str, tensor: Tensor, state: dict[str, Any]
+) -> None:
+    """Put a new leaf in the place of an old one: in the Gaussians, in its parameter group, in the state."""
+    old = getattr(gaussians, name)
+    group = next(g for g in optimizer.param_groups if any(p is old for p in g["params"]))
+    group["params"] = [tensor if p is old else p for p in group["params"]]
+    if state:
+        optimizer.state[tensor] = state
+    setattr(gaussians, name, tensor)

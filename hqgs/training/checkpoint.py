@@ -1,0 +1,105 @@
+"""Checkpoints: all that a run needs to go on, in one safetensors file; and the lock of its folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from hqgs.base.files import atomic_path
+from hqgs.scene.scene import Scene
+
+FORMAT = 3  # raised when a newer reader could not use an older file
+
+
+def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
+    """Write tensors and JSON values as one file, atomically. OSError names the path (a full disk)."""
+    path = Path(path)
+    contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+    text = json.dumps(meta, allow_nan=False)
+    header = {"format": str(FORMAT), "meta": text, "crc32": str(_crc32(text, contiguous))}
+    try:
+        with atomic_path(path) as tmp:
+            save_file(contiguous, tmp, metadata=header)
+    except (OSError, SafetensorError) as error:  # the library reports a full disk as its own error
+        raise OSError(f"cannot write the checkpoint {path}: {error}") from error
+
+
+def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_checkpoint` wrote: tensors (fresh copies) and JSON values.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: damaged, cut off, or of another format. The message names the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no checkpoint {path}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ValueError(f"the checkpoint {path} is damaged: {error}") from error
+    if header.get("format") != str(FORMAT) or "meta" not in header:
+        raise ValueError(
+            f"{path} is no checkpoint of this version: format {header.get('format')}, wanted {FORMAT}"
+        )
+    if header.get("crc32") != str(_crc32(header["meta"], tensors)):
+        raise ValueError(f"the checkpoint {path} is damaged: its checksum does not match")
+    try:
+        meta = json.loads(header["meta"])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the checkpoint {path} is damaged: {error}") from error
+    if not isinstance(meta, dict):
+        raise ValueError(f"the checkpoint {path} is damaged: its values are no JSON object")
+    return tensors, meta
+
+
+def scene_fingerprint(scene: Scene) -> dict[str, str]:
+    """Digests of what a run reads of a scene, each under the name of what it covers.
+
+    The same on every machine: cameras count to 1e-9 and to float32, since linear algebra rounds by CPU.
+    """
+
+    def digest(arrays: Iterable[NDArray[Any]]) -> str:
+        sha = hashlib.sha256()
+        for array in arrays:
+            sha.update(f"{array.dtype} {array.shape}".encode())
+            sha.update(np.ascontiguousarray(array).data)
+        return sha.hexdigest()[:16]
+
+    views = [*scene.train, *scene.test]
+    names = "\n".join([*(v.name for v in scene.train), "", *(v.name for v in scene.test)])
+    return {
+        "views": hashlib.sha256(names.encode()).hexdigest()[:16],
+        "cameras": digest(
+            np.round(array, 9).astype(np.float32) + 0.0  # -0 becomes 0
+            for v in views
+            for array in (v.camera.K, v.camera.viewmat)
+        ),
+        "photos": digest(v.image for v in views),
+        "low": digest(v.low for v in views if v.low is not None),
+        "masks": digest(v.mask for v in views if v.mask is not None),
+        "points": digest([scene.points, scene.point_colors]),
+    }
+
+
+def _crc32(text: str, tensors: dict[str, Tensor]) -> int:
+    """Checksum of the JSON text and of each tensor's name, type, shape and bytes."""
+    crc = zlib.crc32(text.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
+        crc = zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, crc)
+    return crc

@@ -1,0 +1,254 @@
+"""The configuration of a training run: everything but the photos that its result depends on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+from hqgs.model.gaussians import MAX_SH_DEGREE
+from hqgs.model.render import BACKGROUND
+from hqgs.photos.formula import parse_degradation
+
+AUTO, NONE = "auto", "none"
+METHODS = {
+    "3dgs": "3D Gaussian Splatting",
+    "srgs": "renders are judged at the size of low-resolution photos as well",
+    "hqgs": "renders are degraded as the photos were before they are compared",
+    AUTO: "hqgs with what the diagnosis asks for, 3dgs where it asks for nothing",
+}
+ITEMS = {
+    "photos": "training photos that repeat others or show nothing",
+    "growth": "Gaussians finer than the photos' pixels",
+    "weight": "Gaussians that no photo shows",
+    "harmonics": "bands of the harmonics that held-back photos do not ask for",
+    "resolution": "full resolution in the first part of the run",
+    "iterations": "the rest of a run that has stopped improving",
+}
+ASKED_FOR = ("resolution", "iterations")  # not automatic: the first costs, a number of iterations means it
+FORMATION, PAPER = GUIDANCES = ("formation", "paper")
+Loss = Literal["l1", "l1+dssim", "l1+scs"]
+
+
+def parse_leave_out(text: str) -> tuple[str, ...]:
+    """The items of "auto" (all but ASKED_FOR), "none" or a list with commas, in the order of ITEMS."""
+    if text == AUTO:
+        return tuple(item for item in ITEMS if item not in ASKED_FOR)
+    names = set() if text == NONE else {name.strip() for name in text.split(",")}
+    check_items(names)
+    return tuple(item for item in ITEMS if item in names)
+
+
+def check_items(names: set[str]) -> None:
+    """ValueError, which lists the items there are, for an unknown one."""
+    if unknown := sorted(names - ITEMS.keys()):
+        raise ValueError(
+            f"leave out: there is no {unknown[0]!r}; there are: {AUTO}, {NONE}, or some of {', '.join(ITEMS)}"
+        )
+
+
+def check_method(name: str) -> None:
+    """ValueError, which lists the methods there are, for an unknown name."""
+    if name not in METHODS:
+        raise ValueError(f"unknown method {name!r}; the methods are: {', '.join(METHODS)}")
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When and how densely Gaussians are added and removed. The defaults are those of 3DGS at 30,000.
+
+    Pruning by size on the screen (20 px in the paper's code) is left out: there it tests radii that were
+    just set to zero, so that no published figure contains it. Pruning by size in the world goes by the
+    scene's reach, not its extent: photos taken side by side have a small extent, so that it would remove all
+    that is far away, in each round (docs/robustness.md has what that does).
+    """
+
+    start: int = 500  # iterations before the first round
+    stop: int = 15_000  # no round and no reset from this iteration on
+    every: int = 100  # iterations between rounds
+    grad_threshold: float = 2e-4  # mean gradient norm of the 2D mean, in half images, that calls for growth
+    percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
+    prune_opacity: float = 0.005  # more transparent Gaussians are removed
+    prune_scale: float = 0.1  # of the scene's reach: larger Gaussians are removed, after the first reset
+    reset_every: int = 3_000  # iterations between opacity resets
+    reset_opacity: float = 0.01  # opacities are cut to this
+    max_gaussians: int = 1_000_000  # growth stops here, the highest gradients go first; bounds the memory
+
+    def __post_init__(self) -> None:
+        for name in ("every", "reset_every", "max_gaussians"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        for name in ("start", "stop", "grad_threshold", "percent_dense", "prune_scale"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        for name in ("prune_opacity", "reset_opacity"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted a value between 0 and 1")
+
+    def scaled(self, iterations: int) -> DensifyConfig:
+        """The schedule for a run of another length than 30,000.
+
+        Growth ends after two thirds of the run, at 15,000 at the latest. A short run starts it sooner and has
+        its rounds closer together. Resets keep their interval: a run that ends growth before the first one
+        has none, since it would have no time to recover (it costs 3 dB at 2,000 iterations).
+        """
+        return replace(
+            self,
+            start=min(self.start, iterations // 14),
+            stop=min(self.stop, iterations * 2 // 3),
+            every=min(self.every, max(1, iterations // 20)),
+        )
+
+
+@dataclass(frozen=True)
+class SRGSConfig:
+    """The options of SRGS. ValueError for a value out of range."""
+
+    texture_weight: float = 0.4  # of the texture term; the sub-pixel term gets the rest
+    own_factor: int = 2  # a photo without `low` is tied at 1 / own_factor of its own size
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.texture_weight <= 1:
+            raise ValueError(f"texture_weight is {self.texture_weight}, wanted 0..1")
+        if self.own_factor < 1:
+            raise ValueError(f"own_factor is {self.own_factor}, wanted at least 1")
+
+
+@dataclass(frozen=True)
+class ESFGConfig:
+    """The parts of ESFG, which the ablation switches, and its sizes."""
+
+    saf: bool = True  # semantic-aware feature, from the photos I
+    eaf: bool = True  # edge-aware feature, from the maps E
+    cross_attention: bool = True  # queries from the EAF, keys and values from the SAF
+    concat: bool = True  # put the EAF behind the SAF or the attention's result; without: see `ESFG.forward`
+    downscale: int = 2  # of I and E before the MLPs, in each direction: 1, 2 or 4
+    feature_size: int = 1000  # F, the rows of F'
+    lr: float = 1e-6  # of Adam
+
+    def __post_init__(self) -> None:
+        if not (self.saf or self.eaf):
+            raise ValueError("saf and eaf are both off, so there is no feature; leave the whole ESFG out")
+        for name in ("cross_attention", "concat"):
+            if getattr(self, name) and not (self.saf and self.eaf):
+                raise ValueError(f"{name} needs both saf and eaf, got saf={self.saf}, eaf={self.eaf}")
+        if self.downscale not in (1, 2, 4):
+            raise ValueError(f"downscale is {self.downscale}, wanted 1, 2 or 4")
+        if self.feature_size < 1 or (self.concat and self.feature_size % 2):
+            kind = "even number" if self.concat else "number"
+            raise ValueError(f"feature_size is {self.feature_size}, wanted a positive {kind}")
+        if not 0 < self.lr < math.inf:
+            raise ValueError(f"lr is {self.lr}, wanted a positive number")
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """The method, or a part of it. `VARIANTS` has those of the paper's ablation.
+
+    The paper gives one row of figures, V1 (3DGS) to V7 (everything), for five parts. Read so that each
+    variant is a method and that V4 may be worse than V3, as it is there:
+
+    =======  ===  ===  ======  ==  ===========  ==========
+    variant  SAF  EAF  concat  CA  loss         F'
+    =======  ===  ===  ======  ==  ===========  ==========
+    V1                             L1 + D-SSIM  none: 3DGS
+    V2       x                     L1 + D-SSIM  SAF
+    V3            x                L1 + D-SSIM  EAF
+    V4       x    x                L1 + D-SSIM  SAF + EAF
+    V5       x    x    x           L1 + D-SSIM  [SAF; EAF]
+    V6       x    x    x       x   L1 + D-SSIM  [CA; EAF]
+    V7       x    x    x       x   L1 + 5 SCS   [CA; EAF]
+    =======  ===  ===  ======  ==  ===========  ==========
+
+    L1 + D-SSIM is 3DGS's, with the weights 0.8 and 0.2. The ablation of losses is V7 with each `loss`.
+    """
+
+    esfg: ESFGConfig | None = field(default_factory=ESFGConfig)  # None: the means are rasterized as they are
+    loss: Loss = "l1+scs"
+
+    def __post_init__(self) -> None:
+        if self.loss not in get_args(Loss):
+            raise ValueError(f"loss is {self.loss!r}, wanted one of {', '.join(get_args(Loss))}")
+
+
+@dataclass(frozen=True)
+class HQGSConfig:
+    """What HQGS assumes and how it weighs its terms. ValueError for a value out of range."""
+
+    guidance: str = FORMATION  # or "paper": `PaperHQGS` instead of everything below
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    formation: str = AUTO  # what happened to the photos, as `parse_degradation` reads it; "auto": diagnosed
+    jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
+    smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
+    gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
+    first_points: float = 1.0  # share of that number to start from, filled up along edges; 0: no filling up
+
+    def __post_init__(self) -> None:
+        if self.guidance not in GUIDANCES:
+            raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
+        if self.formation != AUTO:
+            parse_degradation(self.formation)
+        for name in ("jpeg_pixels", "smallest", "gaussians_per_pixel"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        if not 0 <= self.first_points <= 1:
+            raise ValueError(f"first_points is {self.first_points}, wanted 0 to 1")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything but the photos that a result depends on. The defaults are those of 3DGS.
+
+    `scaled()` fits the schedule to a run of another length than 30,000 iterations.
+    """
+
+    iterations: int = 30_000
+    method: str = "3dgs"
+    seed: int = 0
+    sh_degree: int = MAX_SH_DEGREE
+    sh_interval: int = 1_000  # iterations until the next SH degree is trained
+    lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
+    lr_means_final: float = 1.6e-6  # this at the end of the run
+    lr_scales: float = 5e-3
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    lr_sh0: float = 2.5e-3
+    lr_shN: float = 2.5e-3 / 20  # noqa: N815
+    adam_eps: float = 1e-15
+    selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
+    leave_out: tuple[str, ...] = ()  # of `hqgs.left_out.ITEMS`: what the run may do without, where it pays
+    background: tuple[float, float, float] = BACKGROUND  # RGB
+    eval_every: int = 3_000  # iterations between evaluations on the held-out views
+    checkpoint_every: int = 1_000  # iterations; does not change the result
+    densify: DensifyConfig = field(default_factory=DensifyConfig)
+    srgs: SRGSConfig = field(default_factory=SRGSConfig)  # of the method of that name, as the next
+    hqgs: HQGSConfig = field(default_factory=HQGSConfig)
+
+    def __post_init__(self) -> None:
+        check_method(self.method)
+        check_items(set(self.leave_out))
+        for name in ("iterations", "sh_interval", "eval_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        if self.seed < 0:
+            raise ValueError(f"seed is {self.seed}, wanted at least 0")
+        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree is {self.sh_degree}, wanted 0..{MAX_SH_DEGREE}")
+        for name, value in vars(self).items():
+            if name.startswith("lr_") and not 0 < value < math.inf:
+                raise ValueError(f"{name} is {value}, wanted a positive number")
+
+    def scaled(self) -> TrainConfig:
+        """The same run with the schedule fitted to `iterations`; see `DensifyConfig.scaled` too.
+
+        The SH degrees come in within three sevenths of a short run. Evaluates 10 times; saves every 1,000
+        iterations, in short runs 10 times.
+        """
+        tenth = math.ceil(self.iterations / 10)
+        return replace(
+            self,
+            sh_interval=min(self.sh_interval, max(1, self.iterations // 7)),
+            eval_every=tenth,
+            checkpoint_every=min(self.checkpoint_every, tenth),
+            densify=self.densify.scaled(self.iterations),
+        )

@@ -1,0 +1,173 @@
+"""Adaptive density control of 3DGS: grow where the image gradient is high, prune what is transparent or huge.
+
+Kerbl et al. 2023, section 5.2. Every change of the number of Gaussians is a selection of rows, done by
+`select_rows` on the parameters and on the optimizer's state alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from hqgs.model.gaussians import Gaussians
+from hqgs.training.adam import reset_opacities, select_rows
+from hqgs.training.config import DensifyConfig
+
+SPLIT_CHILDREN = 2
+SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN  # a child's scales are its parent's over this
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What one call of `Densifier.update` did."""
+
+    cloned: int = 0
+    split: int = 0
+    pruned: int = 0
+    refused: int = 0  # Gaussians that would have grown but are too fine
+
+
+class Densifier:
+    """Gathers image gradients and changes the set of Gaussians on schedule.
+
+    The random numbers of a round follow from (seed, iteration) alone, so there is no generator to save.
+    """
+
+    def __init__(
+        self, config: DensifyConfig, extent: float, reach: float, seed: int, num_gaussians: int
+    ) -> None:
+        """`extent`, `reach`: the scene's, world units. `num_gaussians`: N at the start."""
+        if num_gaussians > config.max_gaussians:
+            raise ValueError(
+                f"max_gaussians is {config.max_gaussians}, but the scene starts with {num_gaussians} points"
+            )
+        self.config = config
+        self.extent = extent
+        self.reach = reach
+        self.seed = seed
+        self.grad_sum = torch.zeros(num_gaussians)  # of gradient norms, half images
+        self.count = torch.zeros(num_gaussians)  # views in which the Gaussian was visible
+
+    def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
+        # A pixel is 2 / width of normalised device coordinates, in which the threshold is published.
+        norm = torch.hypot(means2d_grad[:, 0] * (width / 2), means2d_grad[:, 1] * (height / 2))
+        visible = (radii > 0).all(dim=1)
+        self.grad_sum += torch.where(visible, norm, 0.0)
+        self.count += visible
+
+    def update(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer,
+        finest: Callable[[Tensor], Tensor] | None = None,
+    ) -> Growth:
+        """Grow and prune, as far as the schedule asks for it after this iteration (1, 2, ...).
+
+        `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` gives for means [N, 3]
+        the largest scales [N], world units, of Gaussians that are too fine to be cloned or split.
+        """
+        c = self.config
+        if iteration >= c.stop:
+            return Growth()
+        cloned = split = pruned = refused = 0
+        if iteration > c.start and iteration % c.every == 0:
+            cloned, split, refused = self._grow(iteration, gaussians, optimizer, finest)
+            pruned = self._prune(iteration, gaussians, optimizer)
+            self.grad_sum = torch.zeros(len(gaussians))
+            self.count = torch.zeros(len(gaussians))
+        return Growth(cloned, split, pruned, refused)
+
+    def reset(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> bool:
+        """Cut the opacities where the schedule asks for it; whether it did.
+
+        To be called before the next step, not after the one that it is due at: what is looked at or written
+        in between is the scene before its opacities are cut, and a run that ends there keeps it.
+        """
+        due = 0 < iteration < self.config.stop and iteration % self.config.reset_every == 0
+        if due:
+            reset_opacities(gaussians, optimizer, self.config.reset_opacity)
+        return due
+
+    def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> None:
+        """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay."""
+        kept = torch.nonzero(~bad)[:, 0]
+        select_rows(gaussians, optimizer, kept, old=len(kept))
+        self.grad_sum, self.count = self.grad_sum[kept], self.count[kept]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"grad_sum": self.grad_sum, "count": self.count}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.grad_sum, self.count = state["grad_sum"], state["count"]
+
+    def _grow(
+        self,
+        iteration: int,
+        gaussians: Gaussians,
+        optimizer: Optimizer,
+        finest: Callable[[Tensor], Tensor] | None,
+    ) -> tuple[int, int, int]:
+        """Clone the small and split the large among those with a high mean gradient; how many each, and how
+        many were too fine for it."""
+        n = len(gaussians)
+        grad = self.grad_sum / self.count.clamp(min=1)
+        refused = 0
+        if finest is not None:
+            fine = _largest_scale(gaussians) <= finest(gaussians.means.detach())
+            refused = int((fine & (grad >= self.config.grad_threshold)).sum())
+            grad = torch.where(fine, -1.0, grad)
+        # Either way a candidate adds one Gaussian to the total.
+        order = torch.argsort(grad, descending=True, stable=True)[: self.config.max_gaussians - n]
+        grow = torch.zeros(n, dtype=torch.bool)
+        grow[order] = grad[order] >= self.config.grad_threshold
+        large = _largest_scale(gaussians) > self.config.percent_dense * self.extent
+        kept = torch.nonzero(~(grow & large))[:, 0]
+        cloned = torch.nonzero(grow & ~large)[:, 0]
+        split = torch.nonzero(grow & large)[:, 0]
+
+        select_rows(gaussians, optimizer, torch.cat([kept, cloned, *[split] * SPLIT_CHILDREN]), old=len(kept))
+        children = slice(len(kept) + len(cloned), len(gaussians))
+        rng = np.random.default_rng([self.seed, iteration])
+        with torch.no_grad():
+            scales = gaussians.activated_scales()[children]
+            normal = torch.from_numpy(rng.standard_normal(tuple(scales.shape), dtype=np.float32))
+            rotation = quats_to_matrices(gaussians.quats[children])
+            gaussians.means[children] += (rotation @ (scales * normal)[:, :, None])[:, :, 0]
+            gaussians.scales[children] -= math.log(SPLIT_SHRINK)
+        return len(cloned), len(split), refused
+
+    def _prune(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> int:
+        with torch.no_grad():
+            bad = gaussians.activated_opacities() < self.config.prune_opacity
+            if iteration > self.config.reset_every:
+                bad |= _largest_scale(gaussians) > self.config.prune_scale * self.reach
+        pruned = int(bad.sum())
+        if pruned:
+            kept = torch.nonzero(~bad)[:, 0]
+            select_rows(gaussians, optimizer, kept, old=len(kept))
+        return pruned
+
+
+def quats_to_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4], w x y z, any non-zero norm."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(dim=1)
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], dim=1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], dim=1),
+        ],
+        dim=1,
+    )
+
+
+def _largest_scale(gaussians: Gaussians) -> Tensor:
+    return gaussians.scales.detach().amax(dim=1).exp()

@@ -1,0 +1,83 @@
+"""Whether a scene learns the noise of its photos: told by a few pixels that it is not trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hqgs.photos.pixels import as_floats
+
+SHARE = 1 / 50  # of the pixels of each photo
+STEPS = 200  # at least, from one look to the next
+FACTOR = 0.5  # what is left of the learning rates after a look without a gain
+LEAST = FACTOR**20  # share of the rates below which nothing moves any more
+
+
+class HeldPixels:
+    """Pixels of each photo that the loss leaves out, and the learning rates that they ask for.
+
+    White noise in a pixel tells nothing of the noise beside it, so a render comes nearer to these pixels only
+    where it comes nearer to the scene. Every `STEPS` steps, rounded up to whole epochs, their mean squared
+    error is looked at. They are the same pixels each time, so their noise is in each error alike. Where it is
+    not smaller than at the best look, the rates are halved, as on a plateau of any held-back error.
+    """
+
+    def __init__(self, photos: Mapping[str, tuple[Tensor, Tensor | None]]) -> None:
+        """`photos`: at least one, by name: [H, W, 3] uint8 or float, and the mask of the pixels that count,
+        bool [H, W]. The draw is always the same."""
+        self.rate_left = 1.0  # share of the learning rates
+        self.masks: dict[str, Tensor] = {}  # bool [H, W], without the pixels that are held back
+        self._rows = {name: k for k, name in enumerate(photos)}
+        self._held: list[tuple[Tensor, Tensor]] = []  # their places, and colours [P, 3] with white at 1
+        for k, (name, (photo, mask)) in enumerate(photos.items()):
+            counts = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
+            places = torch.nonzero(counts.ravel())[:, 0].numpy()
+            drawn = np.random.default_rng(k).choice(places, math.ceil(SHARE * len(places)), replace=False)
+            held = torch.from_numpy(drawn)
+            counts.view(-1)[held] = False
+            self.masks[name] = counts
+            self._held.append((held, torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))))
+        self._interval = len(photos) * math.ceil(STEPS / len(photos))
+        self._steps = 0
+        self._sums, self._counts = torch.zeros(2, len(photos), dtype=torch.float64)
+        self._best = torch.full((len(photos),), torch.nan, dtype=torch.float64)
+
+    def see(self, name: str, image: Tensor) -> None:
+        """Note a step: `image` [H, W, 3], what is compared with that photo."""
+        row = self._rows[name]
+        held, colors = self._held[row]
+        error = (image.detach().reshape(-1, 3)[held] - colors).square().double().mean()
+        if torch.isfinite(error):  # otherwise the step is skipped, or all of the photo is masked
+            self._sums[row] += error
+            self._counts[row] += 1
+        self._steps += 1
+        if self._steps % self._interval == 0:
+            self._look()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        rate, steps = torch.tensor(self.rate_left, dtype=torch.float64), torch.tensor(self._steps)
+        errors = {"sums": self._sums, "counts": self._counts, "best": self._best}
+        return {"rate_left": rate, "steps": steps} | {name: t.clone() for name, t in errors.items()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """KeyError where a part is missing, ValueError where it is of other photos."""
+        for name in ("sums", "counts", "best"):
+            if state[name].shape != self._best.shape:
+                raise ValueError(f"{name} is {list(state[name].shape)}, wanted {list(self._best.shape)}")
+        self.rate_left, self._steps = float(state["rate_left"]), int(state["steps"])
+        self._sums, self._counts, self._best = (state[name].clone() for name in ("sums", "counts", "best"))
+
+    def _look(self) -> None:
+        now = self._sums / self._counts  # NaN for a photo that no step has seen since the last look
+        gains = self._best - now
+        known = torch.isfinite(gains)
+        if known.any() and gains[known].mean() <= 0:
+            self.rate_left = max(self.rate_left * FACTOR, LEAST)
+        else:
+            self._best = torch.where(torch.isfinite(now), now, self._best)
+        self._sums.zero_()
+        self._counts.zero_()
