@@ -143,8 +143,8 @@ fn composite_as<'py, T: Scalar>(
                     counts: total,
                     bin_seconds,
                 },
-                join(&mut images, |image| image),
-                join(&mut alphas, |alphas| alphas),
+                join(&mut images, |image| image)?,
+                join(&mut alphas, |alphas| alphas)?,
             ))
         })
     })??;
@@ -221,12 +221,12 @@ fn composite_backward_as<'py, T: Scalar>(
     let counts = outs
         .iter()
         .fold(Counts::default(), |sum, out| sum.plus(out.counts));
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let whitened = join(&mut outs, |out| &mut out.whitened);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let absolutes = join(&mut outs, |out| &mut out.absolute);
-    let v_colors = join(&mut outs, |out| &mut out.colors);
-    let v_background = join(&mut outs, |out| &mut out.background);
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let whitened = join(&mut outs, |out| &mut out.whitened)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let absolutes = join(&mut outs, |out| &mut out.absolute)?;
+    let v_colors = join(&mut outs, |out| &mut out.colors)?;
+    let v_background = join(&mut outs, |out| &mut out.background)?;
     let out = (
         geometry.then(|| means2d.into_pyarray(py)),
         geometry.then(|| whitened.into_pyarray(py)),

@@ -1,6 +1,6 @@
 //! The binding of the operators on pictures.
 
-use crate::arrays::{Array, by_dtype};
+use crate::arrays::{Array, by_dtype, gradient};
 use crate::error::BindingResult;
 use hqgs::{
     Error,
@@ -151,7 +151,7 @@ fn cell_distance_as<'py, T: Real + Element>(
     let centres = Array::<T>::new("centres", centres)?.of_shape(x.shape())?;
     let widths = Array::<T>::new("widths", widths)?.of_shape(x.shape())?;
     let (x, centres, widths) = (x.slice()?, centres.slice()?, widths.slice()?);
-    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let mut grad = gradient::<T>(x.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value =
         py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))??;

@@ -1,6 +1,6 @@
 //! The binding of the loss and of the optimizer.
 
-use crate::arrays::{Array, check_apart, is_f32, optional_of_shape, place};
+use crate::arrays::{Array, check_apart, gradient, is_f32, optional_of_shape, place};
 use crate::error::BindingResult;
 use hqgs::{
     Error,
@@ -115,7 +115,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
         unreachable!("checked above")
     };
     let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
-    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let mut grad = gradient::<T>(x.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value = py.detach(|| {
         T::with_scratch(|scratch| {
