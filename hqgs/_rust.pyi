@@ -4,6 +4,18 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+# The constants of the rasterizer; rust/constants.rs has each with its reason.
+ALPHA_MIN: float
+ALPHA_MAX: float
+TRANSMITTANCE_MIN: float
+EPS2D: float
+NEAR_PLANE: float
+FAR_PLANE: float
+FOV_MARGIN: float
+QUAT_NORM2_MIN: float
+TILE: int
+BLOCK: int
+
 Array = NDArray[Any]
 Maybe = Array | None
 
@@ -56,13 +68,10 @@ def composite_forward(
     frame: Frame, colors: Array, backgrounds: Array | None, channels: int
 ) -> tuple[Composite, Array, Array]: ...
 def composite_backward(
-    frame: Frame,
     composite: Composite,
-    colors: Array,
     backgrounds: Array | None,
     v_image: Array,
     v_alphas: Array | None,
-    channels: int,
     wanted: list[bool],
 ) -> tuple[Maybe, Maybe, Maybe, Maybe, Maybe, Maybe, dict[str, int]]: ...
 def blending_weights(frame: Frame, mask: Array | None, double: bool) -> Array: ...

@@ -2,33 +2,103 @@
 
 use std::fmt;
 
-/// An input that cannot be used: which one, and what is wrong with it.
+/// Why a call did not do its work. Nothing has been changed then, and the call can be made again.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Error {
-    /// The argument at fault, by its public name.
-    pub name: String,
-    /// What was expected and what was got.
-    pub message: String,
+#[non_exhaustive]
+pub enum Error {
+    /// An argument has a value that cannot be used.
+    InvalidArgument {
+        /// The argument, by its public name.
+        name: String,
+        /// What was expected and what was got.
+        message: String,
+    },
+    /// An array has another shape than the other arguments ask for.
+    Shape {
+        /// The array, by its public name.
+        name: String,
+        /// The shape that would fit.
+        expected: String,
+        /// The shape that it has.
+        got: String,
+    },
+    /// The Gaussians reach more tiles than one view may hold.
+    TooManyPairs {
+        /// Gaussians of the view.
+        gaussians: u64,
+        /// Tiles of the image.
+        tiles: u64,
+        /// The most (Gaussian, tile) pairs that are allowed.
+        limit: u64,
+        /// What so many may take.
+        bytes: u64,
+    },
+    /// The system does not give the memory that a buffer needs.
+    OutOfMemory {
+        /// What the buffer would have held.
+        name: String,
+        /// Its size.
+        bytes: u64,
+    },
+    /// The threads cannot be started, or are no longer there.
+    Threads {
+        /// What failed.
+        message: String,
+    },
 }
 
 impl Error {
-    /// An error about the argument `name`.
+    /// [`Error::InvalidArgument`].
     pub fn new(name: impl Into<String>, message: impl Into<String>) -> Self {
-        Self {
+        Self::InvalidArgument {
             name: name.into(),
             message: message.into(),
         }
     }
 
-    /// An error about the shape of `name`.
+    /// [`Error::Shape`].
     pub fn shape(name: &str, expected: impl fmt::Display, got: impl fmt::Display) -> Self {
-        Self::new(name, format!("expected shape {expected}, got {got}"))
+        Self::Shape {
+            name: name.into(),
+            expected: expected.to_string(),
+            got: got.to_string(),
+        }
+    }
+
+    /// The argument or the resource that the message begins with.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::InvalidArgument { name, .. }
+            | Self::Shape { name, .. }
+            | Self::OutOfMemory { name, .. } => name,
+            Self::TooManyPairs { .. } => "means",
+            Self::Threads { .. } => "threads",
+        }
     }
 }
 
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.name, self.message)
+        write!(f, "{}: ", self.name())?;
+        match self {
+            Self::InvalidArgument { message, .. } | Self::Threads { message } => {
+                f.write_str(message)
+            }
+            Self::Shape { expected, got, .. } => {
+                write!(f, "expected shape {expected}, got {got}")
+            }
+            Self::TooManyPairs {
+                gaussians,
+                tiles,
+                limit,
+                bytes,
+            } => write!(
+                f,
+                "{gaussians} Gaussians reach more than {limit} times one of the {tiles} tiles of the image; so many \
+                 pairs take up to {bytes} bytes; use fewer or smaller Gaussians, a smaller image or float32"
+            ),
+            Self::OutOfMemory { bytes, .. } => write!(f, "cannot allocate {bytes} bytes"),
+        }
     }
 }
 
@@ -44,5 +114,49 @@ pub(crate) fn check_len<T>(name: &str, data: &[T], expected: usize) -> Result<()
             format!("{expected} elements"),
             format!("{} elements", data.len()),
         ))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_message_begins_with_what_is_at_fault() {
+        for (error, message) in [
+            (
+                Error::new("lr", "must be finite and not negative, got -1"),
+                "lr: must be finite and not negative, got -1",
+            ),
+            (
+                Error::shape("scales", "30 elements", "29 elements"),
+                "scales: expected shape 30 elements, got 29 elements",
+            ),
+            (
+                Error::TooManyPairs {
+                    gaussians: 9,
+                    tiles: 4,
+                    limit: 8,
+                    bytes: 800,
+                },
+                "means: 9 Gaussians reach more than 8 times one of the 4 tiles of the image; so many pairs take up \
+                 to 800 bytes; use fewer or smaller Gaussians, a smaller image or float32",
+            ),
+            (
+                Error::OutOfMemory {
+                    name: "image".into(),
+                    bytes: 1 << 40,
+                },
+                "image: cannot allocate 1099511627776 bytes",
+            ),
+            (
+                Error::Threads {
+                    message: "cannot start 9 threads".into(),
+                },
+                "threads: cannot start 9 threads",
+            ),
+        ] {
+            assert_eq!(error.to_string(), message);
+        }
     }
 }

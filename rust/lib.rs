@@ -23,6 +23,7 @@ pub mod accuracy_knobs;
 pub mod constants;
 pub mod counts;
 pub mod error;
+mod memory;
 pub mod simd;
 pub mod threads;
 mod uninit;

@@ -105,7 +105,7 @@ class _Composite(torch.autograd.Function):
         width, height = frame.width, frame.height
         image = torch.from_numpy(image).view(c, height, width, channels)
         alphas = torch.from_numpy(alphas).view(c, height, width, 1)
-        ctx.frame, ctx.state, ctx.absgrad = frame, state, absgrad
+        ctx.state, ctx.absgrad = state, absgrad
         ctx.save_for_backward(means2d, colors, backgrounds)
         ctx.image_shape = image.shape
         ctx.set_materialize_grads(False)
@@ -121,10 +121,10 @@ class _Composite(torch.autograd.Function):
             return (None,) * 7
         c, n, channels = means2d.shape[0], means2d.shape[1], colors.shape[-1]
         v_image = means2d.new_zeros(ctx.image_shape) if v_image is None else v_image
+        wanted = [geometry, ctx.absgrad, need_colors, need_backgrounds]
         *v_inputs, counts = _rust.composite_backward(
-            ctx.frame, ctx.state, _numpy(colors), _optional(backgrounds), _numpy(v_image),
-            _optional(v_alphas), channels, [geometry, ctx.absgrad, need_colors, need_backgrounds],
-        )  # fmt: skip
+            ctx.state, _optional(backgrounds), _numpy(v_image), _optional(v_alphas), wanted
+        )
         if is_counting():
             add_gradients(v_inputs, counts)
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs

@@ -17,14 +17,8 @@ from hqgs.scene.scene import Camera, View
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians  # which has this file's `render_view` as its method
 
-OPTIONS = (
-    0.01,
-    1e10,
-    0.0,
-    0.3,
-    False,
-    False,
-)  # near, far, radius_clip, eps2d, antialiased, as `render_view` renders; differentiable
+# As `render_view` renders: near, far, radius_clip, eps2d, antialiased; and not to be differentiated.
+OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D, False, False)
 
 
 def render_view(
@@ -85,7 +79,7 @@ def _largest(gaussians: Gaussians, views: Iterable[tuple[Camera, NDArray[np.bool
         frame, *_ = _rust.project_forward(
             means, quats, scales, opacities, no_colors, None, viewmat, K, *size, OPTIONS, None
         )
-        counted = None if mask is None else np.ascontiguousarray(mask[None])
+        counted = None if mask is None else np.ascontiguousarray(mask[None], bool).view(np.uint8)
         weights = _rust.blending_weights(frame, counted, largest.dtype == torch.float64)
         torch.maximum(largest, torch.from_numpy(weights), out=largest)
     return largest

@@ -45,6 +45,7 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
             &s.camera,
             &options,
         )
+        .expect("right lengths")
     };
     let mut group = c.benchmark_group(name);
     group.sample_size(20);
@@ -117,6 +118,7 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
                 &cotangents,
                 wanted,
             )
+            .expect("right lengths")
         });
     });
     group.finish();

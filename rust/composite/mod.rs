@@ -34,11 +34,20 @@ pub struct CompositeInput<'a, T> {
 }
 
 impl<T: Real> CompositeInput<'_, T> {
-    /// Check the lengths of the arrays.
+    /// Check the lengths of the arrays, and that the tile lists are those of the projection and the camera.
     ///
     /// # Errors
-    /// Names `backgrounds`.
+    /// Names `backgrounds`, or `tiles`.
     fn check(&self) -> Result<(), Error> {
+        let sides = [self.camera.width, self.camera.height].map(|side| side.div_ceil(TILE));
+        let (n, binned) = (self.projection.splats.len(), self.tiles.gaussians());
+        if sides != [self.tiles.tiles_x, self.tiles.tiles_y] || n != binned {
+            let message = format!(
+                "are those of {binned} Gaussians and {} x {} tiles, not of {n} and {} x {}",
+                self.tiles.tiles_x, self.tiles.tiles_y, sides[0], sides[1]
+            );
+            return Err(Error::new("tiles", message));
+        }
         self.background
             .map_or(Ok(()), |b| check_len("backgrounds", b, self.channels()))
     }
@@ -124,3 +133,60 @@ macro_rules! for_vectors {
 }
 
 use {for_alpha, for_vectors};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        project::{self, ProjectOptions},
+        scene::{Colors, synthetic::Synthetic},
+        tiles,
+    };
+
+    #[test]
+    fn what_does_not_belong_together_is_refused() {
+        let none = || Colors::<f32>::Channels(&[], 0);
+        let binned = |n, width, height| {
+            let s = Synthetic::<f32>::new(n, width, height, 1).unwrap();
+            let options = ProjectOptions::default();
+            let projected = project::forward(&s.gaussians(), none(), &s.camera, &options).unwrap();
+            let tiles = tiles::bin::<f32>(&projected.projection, &[], 0, &s.camera).unwrap();
+            (projected.projection, tiles, s.camera)
+        };
+        let (projection, tiles, camera) = binned(300, 70, 45);
+        let input = CompositeInput {
+            projection: &projection,
+            tiles: &tiles,
+            camera: &camera,
+            background: None,
+        };
+        let image = forward(&input).unwrap();
+        for (n, width, height) in [(20, 70, 45), (300, 90, 45), (300, 70, 90)] {
+            let (projection, _, camera) = binned(n, width, height);
+            let other = CompositeInput {
+                projection: &projection,
+                camera: &camera,
+                ..input
+            };
+            assert_eq!(forward(&other).unwrap_err().name(), "tiles");
+            assert_eq!(max_weights(&other, None).unwrap_err().name(), "tiles");
+        }
+        let (projection, tiles, camera) = binned(300, 20, 20);
+        let other = CompositeInput {
+            projection: &projection,
+            tiles: &tiles,
+            camera: &camera,
+            background: None,
+        };
+        let v = CompositeCotangents {
+            image: &[],
+            alphas: None,
+        };
+        let wanted = Wanted {
+            geometry: true,
+            ..Wanted::default()
+        };
+        let error = backward(&other, &image.composited, &v, wanted).unwrap_err();
+        assert_eq!(error.name(), "composited");
+    }
+}

@@ -11,6 +11,7 @@ use super::{
 use crate::{
     constants::PROJECT_CHUNK,
     counts::Counts,
+    error::{Error, check_len},
     scene::{Camera, CameraGrad, Gaussians},
     simd::{
         Real, Wide,
@@ -20,7 +21,7 @@ use crate::{
     },
     uninit::{UninitPiece, UninitVec},
 };
-use fearless_simd::{Level, Select, Simd, dispatch};
+use fearless_simd::{Select, Simd, dispatch};
 use rayon::prelude::*;
 use std::slice::from_ref;
 
@@ -39,6 +40,23 @@ pub struct ProjectCotangents<'a, T> {
     pub conics: Option<&'a [T]>,
     /// Of `colors` from the harmonics, [N, 3].
     pub colors: Option<&'a [T]>,
+}
+
+impl<T> ProjectCotangents<'_, T> {
+    /// Check that they are those of `n` Gaussians.
+    fn check(&self, n: usize) -> Result<(), Error> {
+        for (name, row, array) in [
+            ("v_means2d", 2, self.means2d),
+            ("v_whitened", 3, self.whitened),
+            ("v_opacities", 1, self.opacities),
+            ("v_depths", 1, self.depths),
+            ("v_conics", 3, self.conics),
+            ("v_colors", 3, self.colors),
+        ] {
+            array.map_or(Ok(()), |array| check_len(name, array, row * n))?;
+        }
+        Ok(())
+    }
 }
 
 /// The cotangents of a group, a column per number.
@@ -213,6 +231,10 @@ impl<T: Real> BackwardChunk<'_, T> {
 /// out, and so is the geometry where the colours alone have cotangents.
 ///
 /// `projection` and `shading` must be those that `forward` made from the same inputs.
+///
+/// # Errors
+/// When the length of an array does not fit, or `colors` have a cotangent without the `shading` of as many
+/// Gaussians.
 pub fn backward<T: Real>(
     gaussians: &Gaussians<T>,
     shading: Option<&Shading<T>>,
@@ -221,8 +243,19 @@ pub fn backward<T: Real>(
     projection: &Projection,
     v: &ProjectCotangents<T>,
     wanted: Wanted,
-) -> GaussianGrads<T> {
+) -> Result<GaussianGrads<T>, Error> {
     let n = gaussians.len();
+    gaussians.check()?;
+    check_len("projection", &projection.splats, n)?;
+    v.check(n)?;
+    match shading {
+        None if v.colors.is_some() => {
+            let message = "the forward pass was not to be differentiated";
+            return Err(Error::new("v_colors", message));
+        }
+        Some(shading) => check_len("shading", &shading.clamped, n.div_ceil(GROUP))?,
+        None => {}
+    }
     let (row, rest_row) = shading.map_or((0, 0), |s| s.rows);
     let rows = [
         (wanted.means, 3),
@@ -233,7 +266,7 @@ pub fn backward<T: Real>(
         (wanted.harmonics_rest, rest_row),
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
-    let mut arrays = rows.map(|row| UninitVec::<T>::new(row * n));
+    let mut arrays = UninitVec::<T>::several(rows.map(|row| row * n), "gradients")?;
     let [means, quats, scales, opacities, sh, rest] = &mut arrays;
     let jobs: Vec<_> = chunks(means, n, rows[0])
         .into_iter()
@@ -243,7 +276,7 @@ pub fn backward<T: Real>(
         .zip(chunks(sh, n, rows[4]))
         .zip(chunks(rest, n, rows[5]))
         .collect();
-    let level = Level::new();
+    let level = projection.level.token;
     let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()
@@ -263,7 +296,7 @@ pub fn backward<T: Real>(
         counts = counts.plus(*more);
     }
     let [means, quats, scales, opacities, sh, rest] = arrays.map(UninitVec::finish);
-    GaussianGrads {
+    Ok(GaussianGrads {
         means,
         quats,
         scales,
@@ -272,7 +305,7 @@ pub fn backward<T: Real>(
         harmonics_rest: rest,
         camera: camera_grad,
         counts,
-    }
+    })
 }
 
 /// VJP of the Gaussians of one chunk.

@@ -11,6 +11,7 @@ use super::{
 use crate::{
     constants::PROJECT_CHUNK,
     counts::Counts,
+    error::Error,
     scene::{Camera, Colors, Gaussians},
     simd::{
         Real,
@@ -18,7 +19,7 @@ use crate::{
     },
     uninit::{UninitPiece, UninitVec},
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 
 /// What the projection gives; zeros where a Gaussian is culled.
@@ -104,15 +105,20 @@ fn group_chunks<T: Copy>(
 /// Project all Gaussians into `camera`.
 ///
 /// Culled: outside the depth range or the image, not finite (its colour included), without rotation, too
-/// transparent, or not larger than `radius_clip`. The lengths of all slices must already agree
-/// (`Gaussians::check`).
+/// transparent, or not larger than `radius_clip`.
+///
+/// # Errors
+/// When the arrays do not describe the same number of Gaussians, or an option is out of its range.
 pub fn forward<T: Real>(
     gaussians: &Gaussians<T>,
     colors: Colors<T>,
     camera: &Camera,
     options: &ProjectOptions,
-) -> Projected<T> {
+) -> Result<Projected<T>, Error> {
     let n = gaussians.len();
+    options.check()?;
+    gaussians.check()?;
+    colors.check(n)?;
     let harmonics = match colors {
         Colors::Harmonics(h) => Some(h),
         Colors::Channels(..) => None,
@@ -122,14 +128,13 @@ pub fn forward<T: Real>(
     let clamped = usize::from(shaded.is_some());
     let sloped = usize::from(shaded.is_some_and(|h| h.degree > 0));
     let groups = n.div_ceil(GROUP);
-    let (mut splats, mut keys) = (UninitVec::new(n), UninitVec::new(n));
-    let (mut means2d, mut depths) = (UninitVec::new(2 * n), UninitVec::new(n));
-    let (mut conics, mut radii) = (UninitVec::new(3 * n), UninitVec::new(2 * n));
-    let (mut opacities, mut rgb) = (UninitVec::new(n), UninitVec::new(channels * n));
-    let (mut slopes, mut clamps) = (
-        UninitVec::new(sloped * groups),
-        UninitVec::new(clamped * groups),
-    );
+    let name = "splats";
+    let (mut splats, mut keys) = (UninitVec::new(n, name)?, UninitVec::new(n, name)?);
+    let [mut means2d, mut depths, mut conics, mut opacities, mut rgb] =
+        UninitVec::several([2 * n, n, 3 * n, n, channels * n], name)?;
+    let mut radii = UninitVec::new(2 * n, name)?;
+    let mut slopes = UninitVec::new(sloped * groups, name)?;
+    let mut clamps = UninitVec::new(clamped * groups, name)?;
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))
@@ -142,7 +147,7 @@ pub fn forward<T: Real>(
         .zip(group_chunks(&mut slopes, n, sloped))
         .zip(group_chunks(&mut clamps, n, clamped))
         .collect();
-    let level = Level::new();
+    let level = options.level.token;
     let counts = jobs
         .into_par_iter()
         .enumerate()
@@ -175,11 +180,12 @@ pub fn forward<T: Real>(
             },
         )
         .reduce(Counts::default, Counts::plus);
-    Projected {
+    Ok(Projected {
         projection: Projection {
             splats: splats.finish(),
             depths: keys.finish(),
             knobs: options.knobs,
+            level: options.level,
         },
         means2d: means2d.finish(),
         depths: depths.finish(),
@@ -194,7 +200,7 @@ pub fn forward<T: Real>(
             clamped: clamps.finish(),
         }),
         counts,
-    }
+    })
 }
 
 /// Project the Gaussians from `begin` on, as many as `out` has.

@@ -15,9 +15,10 @@ pub use forward::{Projected, forward};
 use crate::{
     accuracy_knobs::AccuracyKnobs,
     constants::{EPS2D, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK},
+    error::Error,
     scene::Gaussians,
     simd::{
-        Real, Wide,
+        Level, Real, Wide,
         groups::{self, Column, GROUP, wide3},
         lanes, splat,
     },
@@ -44,6 +45,8 @@ pub struct ProjectOptions {
     pub differentiable: bool,
     /// What trades accuracy for time, in this and the later stages.
     pub knobs: AccuracyKnobs,
+    /// Vector instructions of this and the later stages.
+    pub level: Level,
 }
 
 impl Default for ProjectOptions {
@@ -56,7 +59,33 @@ impl Default for ProjectOptions {
             antialiased: false,
             differentiable: true,
             knobs: AccuracyKnobs::default(),
+            level: Level::default(),
         }
+    }
+}
+
+impl ProjectOptions {
+    /// Check the ranges.
+    ///
+    /// # Errors
+    /// Names the first option that is out of its range.
+    pub fn check(&self) -> Result<(), Error> {
+        for (name, value) in [
+            ("eps2d", self.eps2d),
+            ("near_plane", self.near_plane),
+            ("radius_clip", self.radius_clip),
+        ] {
+            if !(value >= 0.0 && value.is_finite()) {
+                let message = format!("must be finite and not negative, got {value}");
+                return Err(Error::new(name, message));
+            }
+        }
+        let (near, far) = (self.near_plane, self.far_plane);
+        if far.is_nan() || far <= near {
+            let message = format!("must be larger than near_plane {near}, got {far}");
+            return Err(Error::new("far_plane", message));
+        }
+        self.knobs.check()
     }
 }
 
@@ -99,8 +128,10 @@ pub struct Projection {
     pub splats: Vec<Splat>,
     /// View-space depth, `[N]`; 0 where culled.
     pub depths: Vec<f64>,
-    /// That of the options.
+    /// Those of the options.
     pub knobs: AccuracyKnobs,
+    /// That of the options.
+    pub level: Level,
 }
 
 /// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.

@@ -1,9 +1,11 @@
 //! The binding of the tile lists and of compositing.
 
 use crate::{
-    arrays::{AnyType, Array, CountsByName, Optional, Scalar, by_dtype, join, of_type, optional},
+    arrays::{
+        AnyType, Array, CountsByName, Optional, Scalar, by_dtype, join, of_type, optional_of_shape,
+    },
     error::BindingResult,
-    project::{Frame, check_colors, of_camera},
+    project::{Frame, Projections, channels_of, of_camera},
 };
 use hqgs::{
     Error,
@@ -14,7 +16,7 @@ use hqgs::{
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
 /// Add the functions and classes of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -26,6 +28,9 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
 /// Tile lists and replay state of a composited frame.
 #[pyclass(frozen, module = "hqgs._rust")]
 struct Composite {
+    /// What was composited: another frame's splats would not be those of the tile lists.
+    frame: Arc<Projections>,
+    channels: usize,
     /// Of each camera; a `Vec<View<T>>`.
     views: AnyType,
     counts: Counts,
@@ -69,26 +74,6 @@ impl Composite {
     }
 }
 
-fn check_inputs<T>(
-    frame: &Frame,
-    colors: &[T],
-    background: Option<&[T]>,
-    channels: usize,
-) -> Result<(), Error> {
-    let (n, c) = (frame.n, frame.cameras.len());
-    check_colors(colors, n, c, channels)?;
-    match background {
-        Some(b) if b.len() != c * channels => {
-            let (expected, got) = (
-                format!("[{c}, {channels}]"),
-                format!("{} elements", b.len()),
-            );
-            Err(Error::shape("backgrounds", expected, got))
-        }
-        _ => Ok(()),
-    }
-}
-
 /// Bin and composite a frame.
 #[pyfunction]
 #[pyo3(signature = (frame, colors, backgrounds, channels))]
@@ -98,7 +83,11 @@ fn composite_forward<'py>(
     backgrounds: Optional<'_, 'py>,
     channels: usize,
 ) -> BindingResult<Bound<'py, PyAny>> {
-    by_dtype!(colors, composite_as(frame, colors, backgrounds, channels))
+    by_dtype!(
+        "colors",
+        colors,
+        composite_as(frame, colors, backgrounds, channels)
+    )
 }
 
 fn composite_as<'py, T: Scalar>(
@@ -108,12 +97,16 @@ fn composite_as<'py, T: Scalar>(
     channels: usize,
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = colors.py();
-    let frame = frame.get();
+    let frame = &frame.get().0;
+    let c = frame.cameras.len();
     let colors = Array::<T>::new("colors", colors)?;
-    let backgrounds = optional::<T>("backgrounds", backgrounds)?;
-    let colors = colors.slice()?;
+    let (colors, given) = channels_of(&colors, frame.n, c)?;
+    if given != channels {
+        let message = format!("the colors have {given}, got {channels}");
+        return Err(Error::new("channels", message).into());
+    }
+    let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
     let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
-    check_inputs(frame, colors, backgrounds, channels)?;
     let (state, image, alphas) = py.detach(|| {
         threads::install(|| -> Result<_, Error> {
             let (mut images, mut alphas) = (Vec::new(), Vec::new());
@@ -144,88 +137,61 @@ fn composite_as<'py, T: Scalar>(
             }
             Ok((
                 Composite {
+                    frame: Arc::clone(frame),
+                    channels,
                     views: Box::new(views),
                     counts: total,
                     bin_seconds,
                 },
-                join(&mut images, |image| image),
-                join(&mut alphas, |alphas| alphas),
+                join(&mut images, |image| image)?,
+                join(&mut alphas, |alphas| alphas)?,
             ))
         })
-    })?;
+    })??;
     let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));
     Ok(out.into_bound_py_any(py)?)
 }
 
 /// VJP of `composite_forward`. `wanted`: geometry, absolute, colors, backgrounds.
 #[pyfunction]
-#[pyo3(signature = (frame, composite, colors, backgrounds, v_image, v_alphas, channels, wanted))]
+#[pyo3(signature = (composite, backgrounds, v_image, v_alphas, wanted))]
 fn composite_backward<'py>(
-    frame: &Bound<'py, Frame>,
     composite: &Bound<'py, Composite>,
-    colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
     v_image: &Bound<'py, PyAny>,
     v_alphas: Optional<'_, 'py>,
-    channels: usize,
     wanted: [bool; 4],
 ) -> BindingResult<Bound<'py, PyAny>> {
     by_dtype!(
-        colors,
-        composite_backward_as(
-            frame,
-            composite,
-            colors,
-            backgrounds,
-            v_image,
-            v_alphas,
-            channels,
-            wanted
-        )
+        "v_image",
+        v_image,
+        composite_backward_as(composite, backgrounds, v_image, v_alphas, wanted)
     )
 }
 
 fn composite_backward_as<'py, T: Scalar>(
-    frame: &Bound<'py, Frame>,
     composite: &Bound<'py, Composite>,
-    colors: &Bound<'py, PyAny>,
     backgrounds: Optional<'_, 'py>,
     v_image: &Bound<'py, PyAny>,
     v_alphas: Optional<'_, 'py>,
-    channels: usize,
     wanted: [bool; 4],
 ) -> BindingResult<Bound<'py, PyAny>> {
-    let py = colors.py();
-    let (frame, composite) = (frame.get(), composite.get());
-    let views = of_type::<Vec<View<T>>>(&composite.views, "colors")?;
-    let colors = Array::<T>::new("colors", colors)?;
-    let backgrounds = optional::<T>("backgrounds", backgrounds)?;
-    let v_image = Array::<T>::new("v_render_colors", v_image)?;
-    let v_alphas = optional::<T>("v_render_alphas", v_alphas)?;
-    let colors = colors.slice()?;
+    let py = composite.py();
+    let composite = composite.get();
+    let (frame, channels) = (&composite.frame, composite.channels);
+    let views = of_type::<Vec<View<T>>>(&composite.views, "v_image")?;
+    let c = frame.cameras.len();
+    let [width, height] = frame
+        .cameras
+        .first()
+        .map_or([0; 2], |c| [c.width, c.height]);
+    let pixels = width * height;
+    let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
+    let v_image = Array::<T>::new("v_image", v_image)?.of_shape(&[c, height, width, channels])?;
+    let v_alphas = optional_of_shape::<T>("v_alphas", v_alphas, &[c, height, width, 1])?;
     let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
-    check_inputs(frame, colors, backgrounds, channels)?;
     let v_image = v_image.slice()?;
     let v_alphas = v_alphas.as_ref().map(Array::slice).transpose()?;
-    let c = frame.cameras.len();
-    let pixels = frame.cameras.first().map_or(0, |c| c.width * c.height);
-    for (name, got, expected) in [
-        ("v_render_colors", v_image.len(), c * pixels * channels),
-        (
-            "v_render_alphas",
-            v_alphas.map_or(c * pixels, <[T]>::len),
-            c * pixels,
-        ),
-    ] {
-        if got != expected {
-            return Err(Error::shape(
-                name,
-                format!("{expected} elements"),
-                format!("{got} elements"),
-            )
-            .into());
-        }
-    }
     let [geometry, absolute, want_colors, background] = wanted;
     let wanted = composite::Wanted {
         geometry,
@@ -251,16 +217,16 @@ fn composite_backward_as<'py, T: Scalar>(
             let cameras = frame.cameras.iter().enumerate();
             cameras.map(backward).collect::<Result<_, Error>>()
         })
-    })?;
+    })??;
     let counts = outs
         .iter()
         .fold(Counts::default(), |sum, out| sum.plus(out.counts));
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let whitened = join(&mut outs, |out| &mut out.whitened);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let absolutes = join(&mut outs, |out| &mut out.absolute);
-    let v_colors = join(&mut outs, |out| &mut out.colors);
-    let v_background = join(&mut outs, |out| &mut out.background);
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let whitened = join(&mut outs, |out| &mut out.whitened)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let absolutes = join(&mut outs, |out| &mut out.absolute)?;
+    let v_colors = join(&mut outs, |out| &mut out.colors)?;
+    let v_background = join(&mut outs, |out| &mut out.background)?;
     let out = (
         geometry.then(|| means2d.into_pyarray(py)),
         geometry.then(|| whitened.into_pyarray(py)),

@@ -2,7 +2,10 @@
 
 use hqgs::Error;
 use numpy::AsSliceError;
-use pyo3::{CastError, PyErr, exceptions::PyValueError};
+use pyo3::{
+    CastError, PyErr,
+    exceptions::{PyMemoryError, PyRuntimeError, PyValueError},
+};
 
 /// An error of the crate, or one of Python's own.
 #[derive(Debug)]
@@ -12,7 +15,13 @@ pub(crate) type BindingResult<T> = Result<T, BindingError>;
 
 impl From<Error> for BindingError {
     fn from(error: Error) -> Self {
-        Self(PyValueError::new_err(error.to_string()))
+        let message = error.to_string();
+        Self(match error {
+            Error::OutOfMemory { .. } => PyMemoryError::new_err(message),
+            Error::Threads { .. } => PyRuntimeError::new_err(message),
+            // What the caller can mend by giving something else.
+            _ => PyValueError::new_err(message),
+        })
     }
 }
 

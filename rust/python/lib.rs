@@ -1,5 +1,5 @@
 //! The Python extension `hqgs._rust`: all that knows Python. numpy arrays are borrowed, never copied; the GIL is
-//! released while the crate works; each [`hqgs::Error`] becomes a `ValueError`.
+//! released while the crate works; each [`hqgs::Error`] becomes an exception of Python.
 
 mod arrays;
 mod composite;
@@ -10,8 +10,8 @@ mod project;
 mod training;
 
 use arrays::{Array, by_dtype};
-use error::BindingResult;
-use hqgs::{simd, threads};
+use error::{BindingError, BindingResult};
+use hqgs::{constants, simd, threads};
 use numpy::Element;
 use pyo3::prelude::*;
 use std::ffi::{c_int, c_long};
@@ -44,34 +44,54 @@ fn set_num_threads(threads: usize) -> BindingResult<()> {
 
 /// Number of threads in use.
 #[pyfunction]
-fn get_num_threads() -> usize {
-    threads::get()
+fn get_num_threads() -> BindingResult<usize> {
+    Ok(threads::get()?)
 }
 
-/// The vector instructions that the crate uses on this CPU; results may differ by rounding between them.
+/// The vector instructions in use: the best of this CPU, or those that HQGS_SIMD names.
 #[pyfunction]
-fn simd_level() -> &'static str {
-    simd::level_name()
+fn simd_level() -> BindingResult<&'static str> {
+    Ok(simd::level()?.name())
 }
 
 /// Address of the first element of an array as the crate sees it, to test that nothing is copied.
 #[pyfunction]
 fn data_pointer(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
-    by_dtype!(array, pointer_to(array))
+    by_dtype!("array", array, pointer_to(array))
 }
 
 fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
     Ok(Array::<T>::new("array", array)?.slice()?.as_ptr() as usize)
 }
 
+/// The constants that define an image, for Python to use the same ones.
+fn add_constants(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    for (name, value) in [
+        ("ALPHA_MIN", constants::ALPHA_MIN),
+        ("ALPHA_MAX", constants::ALPHA_MAX),
+        ("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN),
+        ("EPS2D", constants::EPS2D),
+        ("NEAR_PLANE", constants::NEAR_PLANE),
+        ("FAR_PLANE", constants::FAR_PLANE),
+        ("FOV_MARGIN", constants::FOV_MARGIN),
+        ("QUAT_NORM2_MIN", constants::QUAT_NORM2_MIN),
+    ] {
+        m.add(name, value)?;
+    }
+    m.add("TILE", constants::TILE)?;
+    m.add("BLOCK", constants::BLOCK)
+}
+
 /// The extension module `hqgs._rust`.
 #[pymodule]
 fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     keep_freed_memory();
+    simd::level().map_err(BindingError::from)?; // a wrong HQGS_SIMD is told at once
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(simd_level, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
+    add_constants(m)?;
     project::register(m)?;
     composite::register(m)?;
     training::register(m)?;

@@ -1,6 +1,10 @@
 //! The binding of the blending weights.
 
-use crate::{arrays::Array, error::BindingResult, project::Frame};
+use crate::{
+    arrays::{Array, optional_of_shape},
+    error::BindingResult,
+    project::Frame,
+};
 use hqgs::{
     Error,
     composite::{self, CompositeInput},
@@ -15,8 +19,8 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(blending_weights, m)?)
 }
 
-/// `composite::max_weights` of each camera of a frame, flat [C, N], computed in float64 or in float32. `mask`: bool
-/// [C, H, W].
+/// `composite::max_weights` of each camera of a frame, flat [C, N], computed in float64 or in float32. `mask`: uint8
+/// [C, H, W], not 0 in the pixels that count.
 #[pyfunction]
 fn blending_weights<'py>(
     frame: &Bound<'py, Frame>,
@@ -35,21 +39,11 @@ fn blending_weights_as<'py, T: Real + Element>(
     mask: Option<&Bound<'py, PyAny>>,
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = frame.py();
-    let Frame {
-        cameras,
-        projections,
-        ..
-    } = frame.get();
-    let mask = mask.map(|m| Array::<bool>::new("mask", m)).transpose()?;
+    let frame = &frame.get().0;
+    let (cameras, projections) = (&frame.cameras, &frame.projections);
     let size = cameras.first().map_or([0; 2], |c| [c.height, c.width]);
-    let expected = [cameras.len(), size[0], size[1]];
-    if let Some(got) = mask
-        .as_ref()
-        .map(Array::shape)
-        .filter(|got| *got != expected)
-    {
-        return Err(Error::shape("mask", format!("{expected:?}"), format!("{got:?}")).into());
-    }
+    // Not bool: its bytes are 0 or 1 to Rust, and an array that is a view of another type may hold others.
+    let mask = optional_of_shape::<u8>("mask", mask, &[cameras.len(), size[0], size[1]])?;
     let mask = mask.as_ref().map(Array::slice).transpose()?;
     let pixels = size[0] * size[1];
     let out = py.detach(|| {
@@ -67,6 +61,6 @@ fn blending_weights_as<'py, T: Real + Element>(
             }
             Ok(out)
         })
-    })?;
+    })??;
     Ok(out.into_pyarray(py).into_any())
 }

@@ -1,6 +1,6 @@
 //! The binding of the operators on pictures.
 
-use crate::arrays::{Array, by_dtype};
+use crate::arrays::{Array, by_dtype, gradient};
 use crate::error::BindingResult;
 use hqgs::{
     Error,
@@ -45,7 +45,7 @@ impl Typed for f64 {
 }
 
 /// A borrowed matrix.
-fn dense<'a>(name: &str, matrix: &'a Array<f64>) -> BindingResult<Dense<'a>> {
+fn dense<'a>(name: &'static str, matrix: &'a Array<f64>) -> BindingResult<Dense<'a>> {
     let &[height, width] = matrix.shape() else {
         let got = format!("{:?}", matrix.shape());
         return Err(Error::shape(name, "[height, width]", got).into());
@@ -92,7 +92,7 @@ impl Separable {
         image: &Bound<'py, PyAny>,
         transposed: bool,
     ) -> BindingResult<Bound<'py, PyAny>> {
-        by_dtype!(image, apply_either(self, image, transposed))
+        by_dtype!("image", image, apply_either(self, image, transposed))
     }
 
     /// `apply` of the operator whose weights are the absolute values, on float32.
@@ -117,7 +117,7 @@ fn apply<'py, T: Real + Element>(
     let py = image.py();
     let image = Array::<T>::new("image", image)?;
     let (data, shape) = (image.slice()?, image.shape());
-    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))?;
+    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))??;
     Ok(out.into_pyarray(py).into_any())
 }
 
@@ -132,7 +132,11 @@ fn cell_distance<'py>(
     scale: f64,
     want_grad: bool,
 ) -> BindingResult<Distance<'py>> {
-    by_dtype!(x, cell_distance_as(x, centres, widths, scale, want_grad))
+    by_dtype!(
+        "x",
+        x,
+        cell_distance_as(x, centres, widths, scale, want_grad)
+    )
 }
 
 fn cell_distance_as<'py, T: Real + Element>(
@@ -144,18 +148,12 @@ fn cell_distance_as<'py, T: Real + Element>(
 ) -> BindingResult<Distance<'py>> {
     let py = x.py();
     let x = Array::<T>::new("x", x)?;
-    let centres = Array::<T>::new("centres", centres)?;
-    let widths = Array::<T>::new("widths", widths)?;
-    for (name, array) in [("centres", &centres), ("widths", &widths)] {
-        if array.shape() != x.shape() {
-            let (expected, got) = (format!("{:?}", x.shape()), format!("{:?}", array.shape()));
-            return Err(Error::shape(name, expected, got).into());
-        }
-    }
+    let centres = Array::<T>::new("centres", centres)?.of_shape(x.shape())?;
+    let widths = Array::<T>::new("widths", widths)?.of_shape(x.shape())?;
     let (x, centres, widths) = (x.slice()?, centres.slice()?, widths.slice()?);
-    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let mut grad = gradient::<T>(x.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value =
-        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))?;
+        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))??;
     Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
 }

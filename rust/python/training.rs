@@ -1,6 +1,6 @@
 //! The binding of the loss and of the optimizer.
 
-use crate::arrays::{Array, is_f32};
+use crate::arrays::{Array, check_apart, gradient, is_f32, optional_of_shape, place};
 use crate::error::BindingResult;
 use hqgs::{
     Error,
@@ -42,8 +42,8 @@ buffered!(f64);
 
 /// Call `$function::<T, Y>` for the dtypes of a render (f32 or f64) and of its target (u8 or the render's).
 macro_rules! by_dtypes {
-    ($render:expr, $target:expr, $function:ident($($argument:expr),*)) => {
-        match (is_f32($render), $target.cast::<PyArrayDyn<u8>>().is_ok()) {
+    ($name:literal, $render:expr, $target:expr, $function:ident($($argument:expr),*)) => {
+        match (is_f32($name, $render)?, $target.cast::<PyArrayDyn<u8>>().is_ok()) {
             (true, true) => $function::<f32, u8>($($argument),*),
             (true, false) => $function::<f32, f32>($($argument),*),
             (false, true) => $function::<f64, u8>($($argument),*),
@@ -61,28 +61,19 @@ struct Images<'py, T: Element, Y: Element> {
 
 impl<'py, T: Element, Y: Element> Images<'py, T, Y> {
     fn new(
-        [x_name, y_name]: [&str; 2],
+        [x_name, y_name]: [&'static str; 2],
         x: &Bound<'py, PyAny>,
         y: &Bound<'py, PyAny>,
         mask: Option<&Bound<'py, PyAny>>,
     ) -> BindingResult<Self> {
-        let (x, y) = (Array::new(x_name, x)?, Array::new(y_name, y)?);
-        let mask = mask.map(|m| Array::new("mask", m)).transpose()?;
-        let images = Self { x, y, mask };
-        let shape = images.x.shape();
+        let x = Array::new(x_name, x)?;
+        let shape = x.shape();
         if shape.len() != 3 {
             return Err(Error::shape(x_name, "[H, W, C]", format!("{shape:?}")).into());
         }
-        for (name, expected, got) in [
-            (y_name, shape, Some(images.y.shape())),
-            ("mask", &shape[..2], images.mask.as_ref().map(Array::shape)),
-        ] {
-            if let Some(got) = got.filter(|got| *got != expected) {
-                let (expected, got) = (format!("{expected:?}"), format!("{got:?}"));
-                return Err(Error::shape(name, expected, got).into());
-            }
-        }
-        Ok(images)
+        let y = Array::new(y_name, y)?.of_shape(shape)?;
+        let mask = optional_of_shape("mask", mask, &shape[..2])?;
+        Ok(Self { x, y, mask })
     }
 
     fn mask(&self) -> BindingResult<Option<&[u8]>> {
@@ -103,6 +94,7 @@ fn photometric<'py>(
     want_grad: bool,
 ) -> BindingResult<Loss<'py>> {
     by_dtypes!(
+        "render",
         render,
         target,
         photometric_as(render, target, mask, lambda_dssim, knee, want_grad)
@@ -123,7 +115,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
         unreachable!("checked above")
     };
     let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
-    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let mut grad = gradient::<T>(x.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value = py.detach(|| {
         T::with_scratch(|scratch| {
@@ -131,7 +123,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
                 loss::photometric(x, y, mask, h, w, c, lambda_dssim, knee, out, scratch)
             })
         })
-    })?;
+    })??;
     let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
     Ok((value.loss, value.l1, value.ssim, grad))
 }
@@ -144,7 +136,7 @@ fn ssim(
     b: &Bound<'_, PyAny>,
     mask: Option<&Bound<'_, PyAny>>,
 ) -> BindingResult<f64> {
-    by_dtypes!(a, b, ssim_as(a, b, mask))
+    by_dtypes!("a", a, b, ssim_as(a, b, mask))
 }
 
 fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
@@ -160,7 +152,7 @@ fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
     let value = a.py().detach(|| {
         T::with_scratch(|scratch| threads::install(|| loss::ssim(x, y, mask, h, w, c, scratch)))
     });
-    Ok(value?)
+    Ok(value??)
 }
 
 /// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
@@ -183,7 +175,7 @@ fn adam_step(
         beta2,
         eps,
     };
-    let update = if is_f32(param) {
+    let update = if is_f32("param", param)? {
         adam_step_as::<f32>
     } else {
         adam_step_as::<f64>
@@ -207,27 +199,9 @@ fn adam_step_as<T: Real + Element>(
         writable::<T>("exp_avg", &shape, in_place[1])?,
         writable::<T>("exp_avg_sq", &shape, in_place[2])?,
     ];
-    let grad = Array::<T>::new("grad", grad)?;
-    if grad.shape() != shape {
-        return Err(
-            Error::shape("grad", format!("{shape:?}"), format!("{:?}", grad.shape())).into(),
-        );
-    }
-    let visible = visible
-        .map(|v| Array::<u8>::new("visible", v))
-        .transpose()?;
-    if let Some(got) = visible
-        .as_ref()
-        .map(Array::shape)
-        .filter(|got| *got != &shape[..shape.len().min(1)])
-    {
-        return Err(Error::shape(
-            "visible",
-            format!("{:?}", &shape[..shape.len().min(1)]),
-            format!("{got:?}"),
-        )
-        .into());
-    }
+    let grad = Array::<T>::new("grad", grad)?.of_shape(&shape)?;
+    let rows = &shape[..shape.len().min(1)];
+    let visible = optional_of_shape::<u8>("visible", visible, rows)?;
     if let Some(used) = used.filter(|used| shape.len() < 2 || *used > shape[1]) {
         let message = format!("cannot update {used} columns of {shape:?}");
         return Err(Error::new("used", message).into());
@@ -238,25 +212,31 @@ fn adam_step_as<T: Real + Element>(
         width,
         used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
     };
+    let written = [
+        place("param", param.as_slice()?),
+        place("exp_avg", exp_avg.as_slice()?),
+        place("exp_avg_sq", exp_avg_sq.as_slice()?),
+    ];
+    check_apart(&written, &[place("grad", grad.slice()?)])?;
+    if let Some(visible) = selection.visible {
+        check_apart(&written, &[place("visible", visible)])?;
+    }
     let arrays = AdamArrays {
         param: param.as_slice_mut()?,
         grad: grad.slice()?,
         exp_avg: exp_avg.as_slice_mut()?,
         exp_avg_sq: exp_avg_sq.as_slice_mut()?,
     };
-    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))?)
+    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
 
 /// Borrow a C-contiguous array of `shape` to write to it.
 fn writable<'py, T: Element>(
-    name: &str,
+    name: &'static str,
     shape: &[usize],
     value: &Bound<'py, PyAny>,
 ) -> BindingResult<PyReadwriteArrayDyn<'py, T>> {
-    let got = Array::<T>::new(name, value)?.shape().to_vec();
-    if got != shape {
-        return Err(Error::shape(name, format!("{shape:?}"), format!("{got:?}")).into());
-    }
+    Array::<T>::new(name, value)?.of_shape(shape)?;
     let array = value.cast::<PyArrayDyn<T>>()?;
     Ok(array
         .try_readwrite()

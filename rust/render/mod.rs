@@ -51,16 +51,13 @@ pub fn forward<T: Real>(
     camera: &Camera,
     options: &ProjectOptions,
 ) -> Result<Rendered<T>, Error> {
-    let n = gaussians.len();
-    gaussians.check()?;
-    harmonics.check(n)?;
     let Projected {
         projection,
         radii,
         colors,
         shading,
         ..
-    } = project::forward(gaussians, Colors::Harmonics(harmonics), camera, options);
+    } = project::forward(gaussians, Colors::Harmonics(harmonics), camera, options)?;
     let tiles = tiles::bin(&projection, &colors, 3, camera)?;
     let input = CompositeInput {
         projection: &projection,
@@ -138,7 +135,7 @@ pub fn backward<T: Real>(
         projection,
         &cotangents,
         wanted,
-    );
+    )?;
     Ok(Gradients {
         viewmat: grads.camera.viewmat(camera),
         means: grads.means,

@@ -99,3 +99,24 @@ pub enum Colors<'a, T> {
     /// [N, channels], given. The projection only culls what is not finite.
     Channels(&'a [T], usize),
 }
+
+impl<T: Real> Colors<'_, T> {
+    /// Channels of the image.
+    pub fn channels(&self) -> usize {
+        match *self {
+            Self::Harmonics(_) => 3,
+            Self::Channels(_, channels) => channels,
+        }
+    }
+
+    /// Check that they are those of `n` Gaussians.
+    ///
+    /// # Errors
+    /// Names `sh_degree` or `colors`.
+    pub fn check(&self, n: usize) -> Result<(), Error> {
+        match *self {
+            Self::Harmonics(harmonics) => harmonics.check(n),
+            Self::Channels(data, channels) => check_len("colors", data, n.saturating_mul(channels)),
+        }
+    }
+}

@@ -2,7 +2,7 @@
 
 use super::{Arrays, Frame};
 use crate::{
-    arrays::{Array, CountsByName, Scalar, by_dtype, of_type, optional},
+    arrays::{Array, CountsByName, Scalar, by_dtype, of_type, optional_of_shape},
     error::BindingResult,
 };
 use hqgs::{
@@ -23,6 +23,7 @@ pub(super) fn project_backward<'py>(
     wanted: [bool; 7],
 ) -> BindingResult<Bound<'py, PyAny>> {
     by_dtype!(
+        "means",
         &inputs.0,
         project_backward_as(frame, &inputs, cotangents, wanted)
     )
@@ -57,34 +58,16 @@ struct CotangentArrays<'py, T: Element> {
 }
 
 impl<'py, T: Scalar> CotangentArrays<'py, T> {
-    fn new(v: Cotangents<'py>) -> BindingResult<Self> {
+    /// Those for c cameras and n Gaussians.
+    fn new(v: &Cotangents<'py>, c: usize, n: usize) -> BindingResult<Self> {
         Ok(Self {
-            means2d: optional("v_means2d", v.0.as_ref())?,
-            whitened: optional("v_whitened", v.1.as_ref())?,
-            opacities: optional("v_opacities", v.2.as_ref())?,
-            depths: optional("v_depths", v.3.as_ref())?,
-            conics: optional("v_conics", v.4.as_ref())?,
-            colors: optional("v_colors", v.5.as_ref())?,
+            means2d: optional_of_shape("v_means2d", v.0.as_ref(), &[c, n, 2])?,
+            whitened: optional_of_shape("v_whitened", v.1.as_ref(), &[c, n, 3])?,
+            opacities: optional_of_shape("v_opacities", v.2.as_ref(), &[c, n])?,
+            depths: optional_of_shape("v_depths", v.3.as_ref(), &[c, n])?,
+            conics: optional_of_shape("v_conics", v.4.as_ref(), &[c, n, 3])?,
+            colors: optional_of_shape("v_colors", v.5.as_ref(), &[c, n, 3])?,
         })
-    }
-
-    /// Check the sizes for c cameras and n Gaussians, of which there are `given` now.
-    fn check(&self, c: usize, n: usize, given: usize) -> Result<(), Error> {
-        for (name, rows, array) in [
-            ("v_means2d", 2, &self.means2d),
-            ("v_whitened", 3, &self.whitened),
-            ("v_opacities", 1, &self.opacities),
-            ("v_depths", 1, &self.depths),
-            ("v_conics", 3, &self.conics),
-            ("v_colors", 3, &self.colors),
-        ] {
-            let got = array.as_ref().map(|a| a.shape().iter().product::<usize>());
-            if got.is_some_and(|g| g != rows * c * n) || given != n {
-                let (expected, got) = (format!("[{c}, {n}, {rows}]"), format!("{got:?} elements"));
-                return Err(Error::shape(name, expected, got));
-            }
-        }
-        Ok(())
     }
 
     /// Those of all cameras.
@@ -139,13 +122,16 @@ fn project_backward_as<'py, T: Scalar>(
     wanted: [bool; 7],
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = frame.py();
-    let frame = frame.get();
+    let frame = &frame.get().0;
     let arrays = Arrays::<T>::new(&inputs.0, &inputs.1, &inputs.2, &inputs.3)?;
     let gaussians = arrays.gaussians()?;
     let shadings = of_type::<Vec<Option<Shading<T>>>>(&frame.shadings, "means")?;
-    let v = CotangentArrays::<T>::new(v)?;
     let (n, c) = (frame.n, frame.cameras.len());
-    v.check(c, n, gaussians.len())?;
+    if gaussians.len() != n {
+        let (expected, got) = (format!("[{n}, 3]"), format!("[{}, 3]", gaussians.len()));
+        return Err(Error::shape("means", expected, got).into());
+    }
+    let v = CotangentArrays::<T>::new(&v, c, n)?;
     if v.colors.is_some() && shadings.iter().any(Option::is_none) {
         return Err(Error::new("v_colors", "the forward pass was not to be differentiated").into());
     }
@@ -169,7 +155,7 @@ fn project_backward_as<'py, T: Scalar>(
         camera,
     };
     let (sums, viewmats) = py.detach(|| {
-        threads::install(|| {
+        threads::install(|| -> Result<_, Error> {
             let mut sums: Option<GaussianGrads<T>> = None;
             let mut viewmats = Vec::with_capacity(16 * c);
             for (i, camera) in frame.cameras.iter().enumerate() {
@@ -181,16 +167,16 @@ fn project_backward_as<'py, T: Scalar>(
                     &frame.projections[i],
                     &of_view(&v, i, n),
                     wanted,
-                );
+                )?;
                 viewmats.extend(grads.camera.viewmat(camera));
                 match &mut sums {
                     None => sums = Some(grads),
                     Some(sums) => add(sums, &grads),
                 }
             }
-            (sums, viewmats)
+            Ok((sums, viewmats))
         })
-    });
+    })??;
     let grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
     let out = (
         wanted.means.then(|| grads.means.into_pyarray(py)),

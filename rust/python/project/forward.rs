@@ -1,6 +1,6 @@
 //! The binding of the projection, forward.
 
-use super::{Arrays, Frame, check_colors, of_camera};
+use super::{Arrays, Frame, Projections, channels_of, of_camera};
 use crate::{
     arrays::{Array, Optional, Scalar, by_dtype, join, optional},
     error::BindingResult,
@@ -11,28 +11,29 @@ use hqgs::{
     counts::Counts,
     project::{self, ProjectOptions},
     scene::{Camera, Colors, Harmonics},
-    threads,
+    simd, threads,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
+use std::sync::Arc;
 
 fn cameras(
-    viewmats: &[f64],
-    ks: &[f64],
+    viewmats: &Bound<'_, PyAny>,
+    ks: &Bound<'_, PyAny>,
     width: usize,
     height: usize,
-) -> Result<Vec<Camera>, Error> {
-    let (views, left_over) = viewmats.as_chunks::<16>();
-    if !left_over.is_empty() || views.len() * 9 != ks.len() {
-        let got = format!("{} and {} elements", viewmats.len(), ks.len());
-        return Err(Error::shape("viewmats, Ks", "[C, 4, 4] and [C, 3, 3]", got));
-    }
-    let (ks, _) = ks.as_chunks::<9>();
-    views
-        .iter()
-        .zip(ks)
+) -> BindingResult<Vec<Camera>> {
+    let viewmats = Array::<f64>::new("viewmats", viewmats)?;
+    let &[c, 4, 4] = viewmats.shape() else {
+        let got = format!("{:?}", viewmats.shape());
+        return Err(Error::shape("viewmats", "[C, 4, 4]", got).into());
+    };
+    let ks = Array::<f64>::new("Ks", ks)?.of_shape(&[c, 3, 3])?;
+    let ((views, _), (ks, _)) = (viewmats.slice()?.as_chunks(), ks.slice()?.as_chunks());
+    let cameras = views.iter().zip(ks);
+    Ok(cameras
         .map(|(v, k)| Camera::new(v, k, width, height))
-        .collect()
+        .collect::<Result<_, _>>()?)
 }
 
 /// alpha_min, transmittance_min, spans, skip_blocks, exp2_degree
@@ -62,7 +63,7 @@ fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
     Ok(knobs)
 }
 
-/// Project Gaussians; see `hqgs/rasterize.py` for the shapes. `colors` are harmonics if there is a degree.
+/// Project Gaussians; see `hqgs/model/rasterization.py` for the shapes. `colors` are harmonics if there is a degree.
 /// `knobs`, which also hold for the later stages, are for the benchmark of error against run time alone.
 #[pyfunction]
 #[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, knobs=None))]
@@ -90,8 +91,10 @@ pub(super) fn project_forward<'py>(
         antialiased,
         differentiable,
         knobs: accuracy_knobs(knobs)?,
+        level: simd::level()?,
     };
     by_dtype!(
+        "means",
         means,
         project_as(
             means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options,
@@ -117,12 +120,8 @@ fn project_as<'py, T: Scalar>(
     let py = means.py();
     let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
     let colors = Array::<T>::new("colors", colors)?;
-    let rest = optional::<T>("colors", rest)?;
-    let (viewmats, ks) = (
-        Array::<f64>::new("viewmats", viewmats)?,
-        Array::<f64>::new("Ks", ks)?,
-    );
-    let cameras = cameras(viewmats.slice()?, ks.slice()?, width, height)?;
+    let rest = optional::<T>("colors[1]", rest)?;
+    let cameras = cameras(viewmats, ks, width, height)?;
     let gaussians = arrays.gaussians()?;
     let n = gaussians.len();
     let harmonics = sh_degree
@@ -141,16 +140,20 @@ fn project_as<'py, T: Scalar>(
                 );
                 project::forward(&gaussians, colors, camera, &options)
             };
-            cameras.iter().enumerate().map(project).collect()
+            cameras
+                .iter()
+                .enumerate()
+                .map(project)
+                .collect::<Result<_, Error>>()
         })
-    });
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let depths = join(&mut outs, |out| &mut out.depths);
-    let conics = join(&mut outs, |out| &mut out.conics);
-    let radii = join(&mut outs, |out| &mut out.radii);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let colors = join(&mut outs, |out| &mut out.colors);
-    let frame = Frame {
+    })??;
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let depths = join(&mut outs, |out| &mut out.depths)?;
+    let conics = join(&mut outs, |out| &mut out.conics)?;
+    let radii = join(&mut outs, |out| &mut out.radii)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let colors = join(&mut outs, |out| &mut out.colors)?;
+    let frame = Frame(Arc::new(Projections {
         cameras,
         counts: outs
             .iter()
@@ -163,7 +166,7 @@ fn project_as<'py, T: Scalar>(
         projections: outs.into_iter().map(|out| out.projection).collect(),
         options,
         n,
-    };
+    }));
     let out = (
         frame,
         means2d.into_pyarray(py),
@@ -176,31 +179,34 @@ fn project_as<'py, T: Scalar>(
     Ok(out.into_bound_py_any(py)?)
 }
 
-/// Colours as channels: the data and their number.
-fn channels_of<'a, T: Scalar>(
-    colors: &'a Array<'_, T>,
-    n: usize,
-    cameras: usize,
-) -> BindingResult<(&'a [T], usize)> {
-    let (data, channels) = (colors.slice()?, colors.shape().last().copied().unwrap_or(0));
-    check_colors(data, n, cameras, channels)?;
-    Ok((data, channels))
-}
-
 fn harmonics<'a, T: Scalar>(
     colors: &'a Array<'_, T>,
     rest: Option<&'a Array<'_, T>>,
     n: usize,
     degree: usize,
 ) -> BindingResult<Harmonics<'a, T>> {
-    let count = |array: &Array<'_, T>| match array.shape() {
-        &[_, k, 3] => Ok(k),
-        other => Err(Error::shape("colors", "[N, K, 3]", format!("{other:?}"))),
+    let count = |name: &str, array: &Array<'_, T>| match *array.shape() {
+        [given, k, 3] if given == n => Ok(k),
+        ref shape => {
+            let expected = format!("[{n}, K, 3]");
+            Err(Error::shape(name, expected, format!("{shape:?}")))
+        }
+    };
+    let stored = match rest {
+        None => count("colors", colors)?,
+        Some(rest) => {
+            let constant = count("colors[0]", colors)?;
+            if constant != 1 {
+                let (expected, got) = (format!("[{n}, 1, 3]"), format!("[{n}, {constant}, 3]"));
+                return Err(Error::shape("colors[0]", expected, got).into());
+            }
+            1 + count("colors[1]", rest)?
+        }
     };
     let harmonics = Harmonics {
         coefficients: colors.slice()?,
         rest: rest.map(Array::slice).transpose()?,
-        stored: count(colors)? + rest.map_or(Ok(0), count)?,
+        stored,
         degree,
     };
     harmonics.check(n)?;

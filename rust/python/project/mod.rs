@@ -15,6 +15,7 @@ use hqgs::{
 };
 use numpy::Element;
 use pyo3::prelude::*;
+use std::sync::Arc;
 
 /// Add the functions and classes of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -25,7 +26,10 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
 
 /// The projection of N Gaussians into C cameras.
 #[pyclass(frozen, module = "hqgs._rust")]
-pub(crate) struct Frame {
+pub(crate) struct Frame(pub(crate) Arc<Projections>);
+
+/// What a [`Frame`] is; it lives as long as what was made from it.
+pub(crate) struct Projections {
     pub(crate) cameras: Vec<Camera>,
     pub(crate) projections: Vec<Projection>,
     options: ProjectOptions,
@@ -40,19 +44,19 @@ impl Frame {
     /// Image width in pixels.
     #[getter]
     fn width(&self) -> usize {
-        self.cameras.first().map_or(0, |c| c.width)
+        self.0.cameras.first().map_or(0, |c| c.width)
     }
 
     /// Image height in pixels.
     #[getter]
     fn height(&self) -> usize {
-        self.cameras.first().map_or(0, |c| c.height)
+        self.0.cameras.first().map_or(0, |c| c.height)
     }
 
     /// Counts of the projection.
     #[getter]
     fn counts(&self) -> CountsByName {
-        self.counts.entries().collect()
+        self.0.counts.entries().collect()
     }
 }
 
@@ -65,17 +69,19 @@ struct Arrays<'py, T: Element> {
 }
 
 impl<'py, T: Scalar> Arrays<'py, T> {
+    /// Arrays of as many Gaussians as there are means.
     fn new(
         means: &Bound<'py, PyAny>,
         quats: &Bound<'py, PyAny>,
         scales: &Bound<'py, PyAny>,
         opacities: &Bound<'py, PyAny>,
     ) -> BindingResult<Self> {
+        let (means, n) = Array::new("means", means)?.of_width(3)?;
         Ok(Self {
-            means: Array::new("means", means)?,
-            quats: Array::new("quats", quats)?,
-            scales: Array::new("scales", scales)?,
-            opacities: Array::new("opacities", opacities)?,
+            means,
+            quats: Array::new("quats", quats)?.of_shape(&[n, 4])?,
+            scales: Array::new("scales", scales)?.of_shape(&[n, 3])?,
+            opacities: Array::new("opacities", opacities)?.of_shape(&[n])?,
         })
     }
 
@@ -91,22 +97,20 @@ impl<'py, T: Scalar> Arrays<'py, T> {
     }
 }
 
-/// Check that there is one set of colours for all cameras, or one each.
-pub(crate) fn check_colors<T>(
-    data: &[T],
+/// Colours as channels, one set for all cameras or one each: the data and the number of channels.
+pub(crate) fn channels_of<'a, T: Scalar>(
+    colors: &'a Array<'_, T>,
     n: usize,
     cameras: usize,
-    channels: usize,
-) -> Result<(), Error> {
-    if data.len() == n * channels || data.len() == cameras * n * channels {
-        return Ok(());
+) -> BindingResult<(&'a [T], usize)> {
+    match *colors.shape() {
+        [given, channels] if given == n => Ok((colors.slice()?, channels)),
+        [c, given, channels] if (c, given) == (cameras, n) => Ok((colors.slice()?, channels)),
+        ref shape => {
+            let expected = format!("[{n}, D] or [{cameras}, {n}, D]");
+            Err(Error::shape("colors", expected, format!("{shape:?}")).into())
+        }
     }
-    let expected = format!("[{n}, {channels}] or [{cameras}, {n}, {channels}]");
-    Err(Error::shape(
-        "colors",
-        expected,
-        format!("{} elements", data.len()),
-    ))
 }
 
 /// Colours of camera `i`: one set for all cameras, or one each.

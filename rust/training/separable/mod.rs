@@ -2,10 +2,11 @@
 
 use crate::{
     error::{Error, check_len},
+    memory,
     simd::groups::{GROUP, sixteen, transpose},
-    simd::{Lanes, Real},
+    simd::{self, Lanes, Level, Real},
 };
-use fearless_simd::{Level, Simd, SimdBase, SimdFloat, dispatch};
+use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use rayon::prelude::*;
 
 /// A matrix whose rows are kept from their first weight to their last: the zeros between them count, too.
@@ -167,6 +168,11 @@ impl<T: Real> Separable<T> {
     /// # Errors
     /// As for [`Self::shape`], or when `image` has another length.
     pub fn apply(&self, image: &[T], shape: &[usize]) -> Result<Vec<T>, Error> {
+        self.apply_at(simd::level()?, image, shape)
+    }
+
+    /// [`Self::apply`] with the vector instructions of `level`.
+    fn apply_at(&self, level: Level, image: &[T], shape: &[usize]) -> Result<Vec<T>, Error> {
         let [h, w, d] = self.shape(shape)?;
         let (row, mut pitch) = (shape[1] * shape[2], shape[1] * shape[2]);
         check_len("image", image, shape[0] * row)?;
@@ -174,7 +180,7 @@ impl<T: Real> Separable<T> {
         let mut padded = Vec::new();
         if row < GROUP {
             pitch = GROUP;
-            padded.resize(shape[0] * pitch, T::ZERO);
+            padded = memory::filled(T::ZERO, shape[0] * pitch, "image")?;
             for (to, from) in padded.chunks_exact_mut(pitch).zip(image.chunks_exact(row)) {
                 to[..row].copy_from_slice(from);
             }
@@ -184,8 +190,8 @@ impl<T: Real> Separable<T> {
             pitch,
             channels: shape[2],
         };
-        let mut out = vec![T::ZERO; h * w * d];
-        let level = Level::new();
+        let mut out = memory::filled(T::ZERO, h * w * d, "image")?;
+        let level = level.token;
         out.par_chunks_mut(GROUP * w * d).enumerate().for_each_init(
             Buffers::default,
             |buffers, (group, out)| {
