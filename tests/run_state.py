@@ -16,7 +16,7 @@ def read_state(path: Path) -> State:
     """All tensors and values of a checkpoint but those that measure time."""
     tensors, meta = load_checkpoint(path)
     for name in ("seconds", "history"):
-        del meta["state"][name]
+        del meta[name]
     return tensors, meta
 
 

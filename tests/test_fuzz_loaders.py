@@ -345,6 +345,8 @@ def test_a_link_to_a_device_or_a_loop_is_refused(tmp_path: Path) -> None:
         {"meta": {"config": None, "scene": []}},
         {"drop": "iteration"},
         {"drop": "guard"},
+        {"drop": "decisions"},
+        {"set": {"decisions": {"length": 30}}},
         {"set": {"guard": {"rude": 1}}},
         {"set": {"guard": []}},
         {"tensor": ("gaussians.means", None)},

@@ -177,8 +177,7 @@ class Trainer:
     def save(self, path: str | Path) -> None:
         """Write the whole state as one checkpoint, atomically."""
         of_method = {f"method.{name}": tensor for name, tensor in self.method.state_dict().items()}
-        meta = {
-            "state": self.state.values(),
+        meta = self.state.values() | {
             "frugality": self.frugality.state_dict(),
             "config": asdict(self.config),
             "scene": scene_fingerprint(self.scene),
@@ -196,7 +195,7 @@ class Trainer:
             # The scene first: methods fit the configuration to it.
             check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
             check_same(path, "", meta["config"], asdict(self.config) | lists)
-            state = self.state.restored(path, tensors, meta["state"], self._optimizer)
+            state = self.state.restored(path, tensors, meta, self._optimizer)
             self.frugality.load_state_dict(meta["frugality"])
             self.method.load_state_dict(part("method.", tensors))
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
