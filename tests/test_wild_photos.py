@@ -286,6 +286,7 @@ def test_a_phone_is_unbiased_in_the_light_and_noisier_without() -> None:
 def test_a_phone_stores_a_jpeg_of_its_own() -> None:
     image = picture()
     out = degrade_image(image, parse_degradation("phone"), np.random.default_rng(1))
+    assert out.jpeg is not None
     assert out.jpeg == phone_jpeg(image, 4, np.random.default_rng(1))
     with Image.open(io.BytesIO(out.jpeg)) as stored:
         np.testing.assert_array_equal(np.rint(out.image * 255), np.asarray(stored))

@@ -152,7 +152,7 @@ def test_a_written_scene_tells_what_happened(tmp_path: Path, kind: str) -> None:
     write_degraded_scene(scene, tmp_path / "out", parse_degradation(kind), 3)
     back, memory = load_scene(tmp_path / "out"), degrade(scene, kind, 3)
     for new, old in zip(back.train, memory.train, strict=True):
-        np.testing.assert_array_equal(new.image, to_uint8(np.float32(old.image)))
+        np.testing.assert_array_equal(new.image, to_uint8(old.image.astype(np.float32)))
     for new, old in zip(back.test, scene.test, strict=True):
         np.testing.assert_array_equal(new.image, old.image)
     folder = read_degraded_folder(tmp_path / "out")
