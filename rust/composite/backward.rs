@@ -12,7 +12,7 @@ use crate::{
     error::{Error, check_len},
     simd::Real,
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 
 /// Cotangents of the compositor's outputs.
@@ -90,7 +90,7 @@ pub fn backward<T: Real>(
         });
     }
     let grid = Grid::new();
-    let level = Level::new();
+    let level = input.projection.level.token;
     let degree = input.projection.knobs.exp2_degree;
     let (pair_grads, counts): (Vec<_>, Vec<_>) = (0..tiles.lists.len())
         .into_par_iter()

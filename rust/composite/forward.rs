@@ -12,7 +12,7 @@ use crate::{
     simd::Real,
     uninit::UninitVec,
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 use std::iter::repeat_n;
 
@@ -41,7 +41,7 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
     let mut transmittance = UninitVec::new(count * TILE_PIXELS);
     let mut colors = UninitVec::new(count * channels);
     let grid = Grid::new();
-    let level = Level::new();
+    let level = input.projection.level.token;
     let degree = input.projection.knobs.exp2_degree;
     let counts = depths
         .par_iter_mut()

@@ -10,7 +10,7 @@ use crate::{
     tiles::{Chunk, UNIT},
     uninit::UninitVec,
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 use std::hint::black_box;
 
@@ -68,7 +68,7 @@ pub(super) fn gather<T: Real>(
         .zip(cut(absolute, rows[3]))
         .zip(cut(colors, rows[4]))
         .collect();
-    let level = Level::new();
+    let level = input.projection.level.token;
     jobs.into_par_iter().for_each(
         |(((((chunk, means2d), whitened), opacities), absolute), colors)| {
             let out = Gather {

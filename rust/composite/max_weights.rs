@@ -13,7 +13,7 @@ use crate::{
     error::{Error, check_len},
     simd::{Lanes, Real},
 };
-use fearless_simd::{Level, Select, Simd, SimdBase, dispatch};
+use fearless_simd::{Select, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -37,7 +37,7 @@ pub fn max_weights<T: Real>(
     // The bits of a number that is not negative are ordered as the number is.
     let most: Vec<AtomicU64> = (0..n).into_par_iter().map(|_| AtomicU64::new(0)).collect();
     let grid = Grid::new();
-    let level = Level::new();
+    let level = input.projection.level.token;
     (0..input.tiles.lists.len())
         .into_par_iter()
         .for_each_init(Vec::new, |lanes, tile| {
@@ -137,21 +137,29 @@ mod tests {
     use crate::{
         project::{self, ProjectOptions, Projection},
         scene::{Colors, synthetic::Synthetic},
+        simd::{Level, at_each_level},
         tiles::{self, Tiles},
     };
     use rayon::ThreadPoolBuilder;
 
-    fn binned<T: Real>(s: &Synthetic<T>) -> (Projection, Tiles<T>) {
+    fn binned<T: Real>(level: Level, s: &Synthetic<T>) -> (Projection, Tiles<T>) {
         let none = Colors::Channels(&[], 0);
-        let options = ProjectOptions::default();
+        let options = ProjectOptions {
+            level,
+            ..ProjectOptions::default()
+        };
         let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
         let projection = projected.projection;
         let tiles = tiles::bin(&projection, &[], 0, &s.camera).unwrap();
         (projection, tiles)
     }
 
-    fn weights<T: Real>(s: &Synthetic<T>, mask: Option<&[u8]>) -> Result<Vec<T>, Error> {
-        let (projection, tiles) = binned(s);
+    fn weights<T: Real>(
+        level: Level,
+        s: &Synthetic<T>,
+        mask: Option<&[u8]>,
+    ) -> Result<Vec<T>, Error> {
+        let (projection, tiles) = binned(level, s);
         let input = CompositeInput {
             projection: &projection,
             tiles: &tiles,
@@ -162,8 +170,8 @@ mod tests {
     }
 
     /// By the definition: every Gaussian at every pixel, in depth order.
-    fn brute_force(s: &Synthetic<f64>, mask: Option<&[u8]>) -> Vec<f64> {
-        let (projection, _) = binned(s);
+    fn brute_force(level: Level, s: &Synthetic<f64>, mask: Option<&[u8]>) -> Vec<f64> {
+        let (projection, _) = binned(level, s);
         let mut order: Vec<usize> = (0..s.opacities.len())
             .filter(|&i| projection.splats[i].visible())
             .collect();
@@ -192,15 +200,24 @@ mod tests {
 
     #[test]
     fn weights_follow_the_definition() {
+        at_each_level(check_weights);
+    }
+
+    fn check_weights(level: Level) {
         for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
             let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
             let some: Vec<u8> = (0..width * height)
                 .map(|i| [255, 0, 0][i * 7 % 11 / 4])
                 .collect();
             for mask in [None, Some(&some[..])] {
-                let expected = brute_force(&s, mask);
+                let expected = brute_force(level, &s, mask);
                 assert!(expected.iter().any(|w| *w > 0.1));
-                for (i, (a, b)) in weights(&s, mask).unwrap().iter().zip(&expected).enumerate() {
+                for (i, (a, b)) in weights(level, &s, mask)
+                    .unwrap()
+                    .iter()
+                    .zip(&expected)
+                    .enumerate()
+                {
                     assert!((a - b).abs() < 1e-13, "seed {seed}, {i}: {a}, not {b}");
                 }
             }
@@ -210,23 +227,34 @@ mod tests {
     #[test]
     fn any_number_of_threads_gives_the_same_bits() {
         let s = Synthetic::<f32>::new(5000, 150, 97, 1).unwrap();
-        let run = |threads| {
+        let run = |level, threads| {
             let pool = ThreadPoolBuilder::new().num_threads(threads);
-            pool.build().unwrap().install(|| weights(&s, None).unwrap())
+            pool.build()
+                .unwrap()
+                .install(|| weights(level, &s, None).unwrap())
         };
-        let one = run(1);
-        for threads in [2, 3, 7] {
-            assert!(run(threads) == one, "{threads} threads");
-        }
+        at_each_level(|level| {
+            let one = run(level, 1);
+            for threads in [2, 3, 7] {
+                assert!(run(level, threads) == one, "{threads} threads");
+            }
+        });
     }
 
     #[test]
     fn no_gaussians_and_no_pixels_that_count() {
+        at_each_level(check_nothing);
+    }
+
+    fn check_nothing(level: Level) {
         let empty = Synthetic::<f32>::new(0, 20, 20, 1).unwrap();
-        assert!(weights(&empty, None).unwrap().is_empty());
+        assert!(weights(level, &empty, None).unwrap().is_empty());
         let s = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
-        let none = weights(&s, Some(&[0; 400])).unwrap();
+        let none = weights(level, &s, Some(&[0; 400])).unwrap();
         assert!(none.len() == 50 && none.iter().all(|w| *w == 0.0));
-        assert_eq!(weights(&s, Some(&[1; 399])).unwrap_err().name(), "mask");
+        assert_eq!(
+            weights(level, &s, Some(&[1; 399])).unwrap_err().name(),
+            "mask"
+        );
     }
 }

@@ -21,7 +21,7 @@ use crate::{
     },
     uninit::{UninitPiece, UninitVec},
 };
-use fearless_simd::{Level, Select, Simd, dispatch};
+use fearless_simd::{Select, Simd, dispatch};
 use rayon::prelude::*;
 use std::slice::from_ref;
 
@@ -276,7 +276,7 @@ pub fn backward<T: Real>(
         .zip(chunks(sh, n, rows[4]))
         .zip(chunks(rest, n, rows[5]))
         .collect();
-    let level = Level::new();
+    let level = projection.level.token;
     let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()

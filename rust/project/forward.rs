@@ -19,7 +19,7 @@ use crate::{
     },
     uninit::{UninitPiece, UninitVec},
 };
-use fearless_simd::{Level, Simd, dispatch};
+use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 
 /// What the projection gives; zeros where a Gaussian is culled.
@@ -148,7 +148,7 @@ pub fn forward<T: Real>(
         .zip(group_chunks(&mut slopes, n, sloped))
         .zip(group_chunks(&mut clamps, n, clamped))
         .collect();
-    let level = Level::new();
+    let level = options.level.token;
     let counts = jobs
         .into_par_iter()
         .enumerate()
@@ -186,6 +186,7 @@ pub fn forward<T: Real>(
             splats: splats.finish(),
             depths: keys.finish(),
             knobs: options.knobs,
+            level: options.level,
         },
         means2d: means2d.finish(),
         depths: depths.finish(),

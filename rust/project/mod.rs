@@ -18,7 +18,7 @@ use crate::{
     error::Error,
     scene::Gaussians,
     simd::{
-        Real, Wide,
+        Level, Real, Wide,
         groups::{self, Column, GROUP, wide3},
         lanes, splat,
     },
@@ -45,6 +45,8 @@ pub struct ProjectOptions {
     pub differentiable: bool,
     /// What trades accuracy for time, in this and the later stages.
     pub knobs: AccuracyKnobs,
+    /// Vector instructions of this and the later stages.
+    pub level: Level,
 }
 
 impl Default for ProjectOptions {
@@ -57,6 +59,7 @@ impl Default for ProjectOptions {
             antialiased: false,
             differentiable: true,
             knobs: AccuracyKnobs::default(),
+            level: Level::default(),
         }
     }
 }
@@ -125,8 +128,10 @@ pub struct Projection {
     pub splats: Vec<Splat>,
     /// View-space depth, `[N]`; 0 where culled.
     pub depths: Vec<f64>,
-    /// That of the options.
+    /// Those of the options.
     pub knobs: AccuracyKnobs,
+    /// That of the options.
+    pub level: Level,
 }
 
 /// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.

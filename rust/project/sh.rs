@@ -111,30 +111,34 @@ pub(crate) fn basis_vjp<S: Simd, T: Real>(
 #[cfg(test)]
 mod tests {
     use super::{basis as lanes_basis, basis_vjp as lanes_vjp, *};
-    use crate::simd::{Wide, vec3::splat3};
-    use fearless_simd::{Level, dispatch};
+    use crate::simd::{Level, Wide, at_each_level, vec3::splat3};
+    use fearless_simd::dispatch;
     use glam::DVec3;
 
-    fn basis(degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
+    fn basis(level: Level, degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
         #[inline(always)]
         fn run<S: Simd>(simd: S, degree: usize, d: [f64; 3]) -> [f64; MAX_COUNT] {
             lanes_basis::<S, f64>(simd, degree, splat3(simd, DVec3::from(d))).map(|b| b[0])
         }
-        dispatch!(Level::new(), simd => run(simd, degree, d))
+        dispatch!(level.token, simd => run(simd, degree, d))
     }
 
-    fn basis_vjp(degree: usize, d: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
+    fn basis_vjp(level: Level, degree: usize, d: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
         #[inline(always)]
         fn run<S: Simd>(simd: S, degree: usize, d: [f64; 3], w: &[f64; MAX_COUNT]) -> [f64; 3] {
             let w = w.map(|w| Wide::<S>::splat(simd, w));
             let g = lanes_vjp::<S, f64>(simd, degree, splat3(simd, DVec3::from(d)), &w);
             [g.x[0], g.y[0], g.z[0]]
         }
-        dispatch!(Level::new(), simd => run(simd, degree, d, w))
+        dispatch!(level.token, simd => run(simd, degree, d, w))
     }
 
     #[test]
     fn basis_is_orthonormal() {
+        at_each_level(check_gram);
+    }
+
+    fn check_gram(level: Level) {
         // Gauss-Legendre would be exact; a fine midpoint rule in (z, phi) is enough to see a wrong constant.
         let (nz, np) = (400, 200);
         let mut gram = [[0.0; MAX_COUNT]; MAX_COUNT];
@@ -143,7 +147,7 @@ mod tests {
             let r = (1.0 - z * z).sqrt();
             for j in 0..np {
                 let phi = std::f64::consts::TAU * (j as f64 + 0.5) / np as f64;
-                let b = basis(3, [r * phi.cos(), r * phi.sin(), z]);
+                let b = basis(level, 3, [r * phi.cos(), r * phi.sin(), z]);
                 for (row, bi) in gram.iter_mut().zip(b) {
                     for (g, bj) in row.iter_mut().zip(b) {
                         *g += bi * bj * 2.0 * std::f64::consts::TAU / (nz * np) as f64;
@@ -161,10 +165,20 @@ mod tests {
 
     #[test]
     fn gradient_is_the_limit_of_differences() {
+        at_each_level(check_gradient);
+    }
+
+    fn check_gradient(level: Level) {
         let p = [0.3, -0.8, 0.52];
         let w: [f64; MAX_COUNT] = std::array::from_fn(|k| (k as f64 * 1.7).sin());
-        let value = |p| basis(3, p).iter().zip(w).map(|(b, w)| b * w).sum::<f64>();
-        let g = basis_vjp(3, p, &w);
+        let value = |p| {
+            basis(level, 3, p)
+                .iter()
+                .zip(w)
+                .map(|(b, w)| b * w)
+                .sum::<f64>()
+        };
+        let g = basis_vjp(level, 3, p, &w);
         for axis in 0..3 {
             let h = 1e-5;
             let (mut a, mut b) = (p, p);

@@ -10,7 +10,7 @@ mod project;
 mod training;
 
 use arrays::{Array, by_dtype};
-use error::BindingResult;
+use error::{BindingError, BindingResult};
 use hqgs::{simd, threads};
 use numpy::Element;
 use pyo3::prelude::*;
@@ -48,10 +48,10 @@ fn get_num_threads() -> usize {
     threads::get()
 }
 
-/// The vector instructions that the crate uses on this CPU; results may differ by rounding between them.
+/// The vector instructions in use: the best of this CPU, or those that HQGS_SIMD names.
 #[pyfunction]
-fn simd_level() -> &'static str {
-    simd::level_name()
+fn simd_level() -> BindingResult<&'static str> {
+    Ok(simd::level()?.name())
 }
 
 /// Address of the first element of an array as the crate sees it, to test that nothing is copied.
@@ -68,6 +68,7 @@ fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
 #[pymodule]
 fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     keep_freed_memory();
+    simd::level().map_err(BindingError::from)?; // a wrong HQGS_SIMD is told at once
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(simd_level, m)?)?;

@@ -5,6 +5,7 @@ use crate::{
     accuracy_knobs::{AccuracyKnobs, Spans},
     constants::ALPHA_MIN,
     scene::synthetic::Synthetic,
+    simd::{Level, at_each_level},
 };
 use rayon::ThreadPoolBuilder;
 
@@ -17,14 +18,15 @@ fn harmonics<T: Real>(s: &Synthetic<T>) -> Harmonics<'_, T> {
     }
 }
 
-fn render<T: Real>(s: &Synthetic<T>) -> Rendered<T> {
-    forward(
-        &s.gaussians(),
-        &harmonics(s),
-        &s.camera,
-        &ProjectOptions::default(),
-    )
-    .unwrap()
+fn options(level: Level) -> ProjectOptions {
+    ProjectOptions {
+        level,
+        ..ProjectOptions::default()
+    }
+}
+
+fn render<T: Real>(level: Level, s: &Synthetic<T>) -> Rendered<T> {
+    forward(&s.gaussians(), &harmonics(s), &s.camera, &options(level)).unwrap()
 }
 
 fn cotangent<T: Real>(s: &Synthetic<T>) -> Vec<T> {
@@ -35,28 +37,30 @@ fn cotangent<T: Real>(s: &Synthetic<T>) -> Vec<T> {
 }
 
 fn gradients<T: Real>(s: &Synthetic<T>, r: &Rendered<T>) -> Gradients<T> {
-    let options = ProjectOptions::default();
+    let options = options(r.projection.level);
     backward(&s.gaussians(), &s.camera, &options, r, &cotangent(s)).unwrap()
 }
 
 #[test]
 fn any_number_of_threads_gives_the_same_bits() {
     let s = Synthetic::<f32>::new(5000, 150, 97, 1).unwrap();
-    let run = |threads| {
+    let run = |level, threads| {
         ThreadPoolBuilder::new()
             .num_threads(threads)
             .build()
             .unwrap()
             .install(|| {
-                let r = render(&s);
+                let r = render(level, &s);
                 let g = gradients(&s, &r);
                 (r.image, r.alphas, g)
             })
     };
-    let one = run(1);
-    for threads in [2, 3, 7] {
-        assert!(run(threads) == one, "{threads} threads");
-    }
+    at_each_level(|level| {
+        let one = run(level, 1);
+        for threads in [2, 3, 7] {
+            assert!(run(level, threads) == one, "{threads} threads");
+        }
+    });
 }
 
 /// The image by the definition: every Gaussian at every pixel, in depth order.
@@ -98,9 +102,13 @@ fn brute_force(s: &Synthetic<f64>, r: &Rendered<f64>) -> Vec<f64> {
 
 #[test]
 fn tiles_and_blocks_leave_no_pixel_out() {
+    at_each_level(check_pixels);
+}
+
+fn check_pixels(level: Level) {
     for (seed, width, height) in [(1, 70, 45), (2, 16, 16), (3, 1, 37), (4, 129, 5)] {
         let s = Synthetic::<f64>::new(800, width, height, seed).unwrap();
-        let r = render(&s);
+        let r = render(level, &s);
         let expected = brute_force(&s, &r);
         for (i, (a, b)) in r.image.iter().zip(&expected).enumerate() {
             assert!(
@@ -111,10 +119,14 @@ fn tiles_and_blocks_leave_no_pixel_out() {
     }
 }
 
-fn tuned(s: &Synthetic<f32>, knobs: AccuracyKnobs) -> (Rendered<f32>, Gradients<f32>) {
+fn tuned(
+    level: Level,
+    s: &Synthetic<f32>,
+    knobs: AccuracyKnobs,
+) -> (Rendered<f32>, Gradients<f32>) {
     let options = ProjectOptions {
         knobs,
-        ..ProjectOptions::default()
+        ..options(level)
     };
     let (g, h) = (s.gaussians(), harmonics(s));
     let r = forward(&g, &h, &s.camera, &options).unwrap();
@@ -124,8 +136,12 @@ fn tuned(s: &Synthetic<f32>, knobs: AccuracyKnobs) -> (Rendered<f32>, Gradients<
 
 #[test]
 fn what_is_skipped_changes_no_bit() {
+    at_each_level(check_skipped);
+}
+
+fn check_skipped(level: Level) {
     let s = Synthetic::<f32>::new(2000, 150, 97, 5).unwrap();
-    let (r, g) = tuned(&s, AccuracyKnobs::default());
+    let (r, g) = tuned(level, &s, AccuracyKnobs::default());
     for (spans, skip_blocks) in [
         (Spans::Ellipse, false),
         (Spans::Box, true),
@@ -136,7 +152,7 @@ fn what_is_skipped_changes_no_bit() {
             skip_blocks,
             ..AccuracyKnobs::default()
         };
-        let (other, v) = tuned(&s, knobs);
+        let (other, v) = tuned(level, &s, knobs);
         assert!(r.image == other.image && g == v, "{knobs:?}");
         let pairs = other.tiles.pairs();
         assert_eq!(pairs > r.tiles.pairs(), spans == Spans::Box, "{knobs:?}");
@@ -145,15 +161,19 @@ fn what_is_skipped_changes_no_bit() {
 
 #[test]
 fn looser_knobs_have_larger_errors() {
+    at_each_level(check_knobs);
+}
+
+fn check_knobs(level: Level) {
     let s = Synthetic::<f32>::new(2000, 150, 97, 6).unwrap();
     let exact = AccuracyKnobs {
         alpha_min: 1e-9,
         transmittance_min: 0.0,
         ..AccuracyKnobs::default()
     };
-    let (r, _) = tuned(&s, exact);
+    let (r, _) = tuned(level, &s, exact);
     let error = |knobs| -> f64 {
-        let (other, _) = tuned(&s, knobs);
+        let (other, _) = tuned(level, &s, knobs);
         let pairs = r.image.iter().zip(&other.image);
         pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum()
     };
@@ -215,6 +235,10 @@ fn knobs_out_of_range_are_named() {
 
 #[test]
 fn single_precision_stays_close() {
+    at_each_level(check_single);
+}
+
+fn check_single(level: Level) {
     let s = Synthetic::<f64>::new(1000, 80, 60, 8).unwrap();
     let single = |v: &[f64]| v.iter().map(|x| *x as f32).collect::<Vec<f32>>();
     let s32 = Synthetic {
@@ -235,7 +259,7 @@ fn single_precision_stays_close() {
         harmonics: double(&s32.harmonics),
         camera: s.camera,
     };
-    let (r32, r64) = (render(&s32), render(&s64));
+    let (r32, r64) = (render(level, &s32), render(level, &s64));
     // No alpha of this scene rounds to the other side of its floor, which would be a jump.
     let far = r32
         .image
@@ -265,8 +289,12 @@ fn single_precision_stays_close() {
 
 #[test]
 fn no_gaussians_and_none_visible_give_an_empty_image() {
+    at_each_level(check_empty);
+}
+
+fn check_empty(level: Level) {
     let empty = Synthetic::<f32>::new(0, 20, 20, 1).unwrap();
-    assert!(render(&empty).image.iter().all(|x| *x == 0.0));
+    assert!(render(level, &empty).image.iter().all(|x| *x == 0.0));
     let mut behind = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
     behind
         .means
@@ -274,7 +302,7 @@ fn no_gaussians_and_none_visible_give_an_empty_image() {
         .skip(2)
         .step_by(3)
         .for_each(|z| *z = -*z - 1.0);
-    let r = render(&behind);
+    let r = render(level, &behind);
     assert!(r.image.iter().chain(&r.alphas).all(|x| *x == 0.0));
     assert!(r.radii.iter().all(|x| *x == 0));
     assert!(gradients(&behind, &r).means.iter().all(|x| *x == 0.0));

@@ -266,7 +266,8 @@ pub(crate) fn write<T: Copy, const C: usize>(columns: [&[T; GROUP]; C], out: &mu
 #[cfg(test)]
 mod tests {
     use super::*;
-    use fearless_simd::{Level, dispatch};
+    use crate::simd::at_each_level;
+    use fearless_simd::dispatch;
 
     fn numbers<T: Real>(n: usize) -> Vec<T> {
         (0..n).map(|i| T::from_f64(i as f64)).collect()
@@ -310,7 +311,9 @@ mod tests {
 
     #[test]
     fn rows_come_back_from_columns() {
-        dispatch!(Level::new(), simd => check::<_, f32>(simd));
-        dispatch!(Level::new(), simd => check::<_, f64>(simd));
+        at_each_level(|level| {
+            dispatch!(level.token, simd => check::<_, f32>(simd));
+            dispatch!(level.token, simd => check::<_, f64>(simd));
+        });
     }
 }

@@ -119,10 +119,10 @@ pub(crate) fn ln<S: Simd>(simd: S, x: Wide<S>) -> Wide<S> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::Real;
-    use fearless_simd::{Level, dispatch};
+    use crate::simd::{Level, Real, at_each_level};
+    use fearless_simd::dispatch;
 
-    fn worst_error<T: Real, const DEGREE: usize>() -> f64 {
+    fn worst_error<T: Real, const DEGREE: usize>(level: Level) -> f64 {
         fn run<S: Simd, T: Real, const DEGREE: usize>(simd: S) -> f64 {
             (0..20_000)
                 .map(|i| {
@@ -132,28 +132,32 @@ mod tests {
                 })
                 .fold(0.0, f64::max)
         }
-        dispatch!(Level::new(), simd => run::<_, T, DEGREE>(simd))
+        dispatch!(level.token, simd => run::<_, T, DEGREE>(simd))
     }
 
     #[test]
     fn exp2_is_as_accurate_as_stated() {
-        let errors = [worst_error::<f32, 6>(), worst_error::<f64, 6>()];
-        assert!(errors[0] < 1.2e-7 && errors[1] < 3e-16, "{errors:?}");
+        at_each_level(|level| {
+            let errors = [worst_error::<f32, 6>(level), worst_error::<f64, 6>(level)];
+            assert!(errors[0] < 1.2e-7 && errors[1] < 3e-16, "{errors:?}");
+        });
     }
 
     #[test]
     fn fewer_terms_have_the_error_of_their_polynomial() {
         // The relative errors of the polynomials, with the roundings for the first.
-        for (error, expected) in [
-            (worst_error::<f32, 5>(), 2.1e-7),
-            (worst_error::<f32, 4>(), 2.7e-6),
-            (worst_error::<f32, 3>(), 7.5e-5),
-        ] {
-            assert!(
-                (error / expected - 1.0).abs() < 0.1,
-                "{error:e}, not {expected:e}"
-            );
-        }
+        at_each_level(|level| {
+            for (error, expected) in [
+                (worst_error::<f32, 5>(level), 2.1e-7),
+                (worst_error::<f32, 4>(level), 2.7e-6),
+                (worst_error::<f32, 3>(level), 7.5e-5),
+            ] {
+                assert!(
+                    (error / expected - 1.0).abs() < 0.1,
+                    "{error:e}, not {expected:e}"
+                );
+            }
+        });
     }
 
     #[inline(always)]
@@ -163,10 +167,12 @@ mod tests {
 
     #[test]
     fn logarithm_is_as_accurate_as_stated() {
-        for i in 0..200_000 {
-            let x = 1.0 + (f64::from(i) * 1e-4).powi(3) / 30.0;
-            let y = dispatch!(Level::new(), simd => logarithm(simd, x));
-            assert!((y - x.ln()).abs() <= 1e-15 * x.ln(), "ln {x} = {y}");
-        }
+        at_each_level(|level| {
+            for i in 0..200_000 {
+                let x = 1.0 + (f64::from(i) * 1e-4).powi(3) / 30.0;
+                let y = dispatch!(level.token, simd => logarithm(simd, x));
+                assert!((y - x.ln()).abs() <= 1e-15 * x.ln(), "ln {x} = {y}");
+            }
+        });
     }
 }

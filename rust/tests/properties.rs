@@ -7,7 +7,7 @@ use hqgs::{
     composite::{self, CompositeCotangents, CompositeInput},
     project::{self, ProjectCotangents, ProjectOptions},
     scene::{Camera, Colors, Gaussians, Harmonics},
-    simd::Real,
+    simd::{Real, levels},
     tiles,
 };
 use proptest::{collection::vec, prelude::*, sample::select, test_runner::RngSeed};
@@ -595,10 +595,26 @@ fn config(cases: u32) -> ProptestConfig {
     }
 }
 
+/// Run a check at each level of this CPU.
+fn at_each_level(
+    s: &Scene,
+    check: impl Fn(&Scene) -> Result<(), TestCaseError>,
+) -> Result<(), TestCaseError> {
+    for level in levels() {
+        let mut s = s.clone();
+        s.options.level = level;
+        check(&s).map_err(|error| match error {
+            TestCaseError::Fail(why) => TestCaseError::fail(format!("{level:?}: {why}")),
+            reject => reject,
+        })?;
+    }
+    Ok(())
+}
+
 /// The square of the scale overflows, which must not reach the gradients.
 #[test]
 fn longest_needle() {
-    let s = Scene {
+    let mut s = Scene {
         means: vec![[-4.944531440734863, 0.0, 5.228489875793457]],
         quats: vec![[-0.849, -0.298, -0.508, -0.952]],
         scales: vec![[1.0, 1e154, 1.0]],
@@ -612,9 +628,16 @@ fn longest_needle() {
             ..ProjectOptions::default()
         },
     };
-    let out = s.render::<f64>();
-    assert!(out.gaussians[0].radii[0] > 0);
-    assert!(out.numbers().all(f64::is_finite), "{:?}", out.gaussians);
+    for level in levels() {
+        s.options.level = level;
+        let out = s.render::<f64>();
+        assert!(out.gaussians[0].radii[0] > 0, "{level:?}");
+        assert!(
+            out.numbers().all(f64::is_finite),
+            "{level:?}: {:?}",
+            out.gaussians
+        );
+    }
 }
 
 proptest! {
@@ -622,12 +645,12 @@ proptest! {
 
     #[test]
     fn any_bits_in_f32(s in broken(true)) {
-        any_bits_are_survived::<f32>(&s)?;
+        at_each_level(&s, |s| any_bits_are_survived::<f32>(s))?;
     }
 
     #[test]
     fn any_bits_in_f64(s in broken(false)) {
-        any_bits_are_survived::<f64>(&s)?;
+        at_each_level(&s, |s| any_bits_are_survived::<f64>(s))?;
     }
 }
 
@@ -636,32 +659,32 @@ proptest! {
 
     #[test]
     fn convex(s in scenes()) {
-        colors_are_convex::<f32>(&s)?;
-        colors_are_convex::<f64>(&s)?;
+        at_each_level(&s, |s| colors_are_convex::<f32>(s))?;
+        at_each_level(&s, |s| colors_are_convex::<f64>(s))?;
     }
 
     #[test]
     fn order(s in scenes(), keys in vec(any::<u32>(), 24)) {
-        order_is_that_of_the_depths::<f32>(&s, &keys)?;
-        order_is_that_of_the_depths::<f64>(&s, &keys)?;
+        at_each_level(&s, |s| order_is_that_of_the_depths::<f32>(s, &keys))?;
+        at_each_level(&s, |s| order_is_that_of_the_depths::<f64>(s, &keys))?;
     }
 
     #[test]
     fn unseen(s in scenes(), hidden in vec((0..24usize, 0..6usize), 1..9)) {
-        the_unseen_change_no_bit::<f32>(&s, &hidden)?;
-        the_unseen_change_no_bit::<f64>(&s, &hidden)?;
+        at_each_level(&s, |s| the_unseen_change_no_bit::<f32>(s, &hidden))?;
+        at_each_level(&s, |s| the_unseen_change_no_bit::<f64>(s, &hidden))?;
     }
 
     #[test]
     fn linear(s in scenes()) {
-        colors_are_linear::<f32>(&s)?;
-        colors_are_linear::<f64>(&s)?;
+        at_each_level(&s, |s| colors_are_linear::<f32>(s))?;
+        at_each_level(&s, |s| colors_are_linear::<f64>(s))?;
     }
 
     #[test]
     fn unit_of_length(s in scenes(), k in -30..30) {
-        the_unit_of_length_changes_no_bit::<f32>(&s, k)?;
-        the_unit_of_length_changes_no_bit::<f64>(&s, k)?;
+        at_each_level(&s, |s| the_unit_of_length_changes_no_bit::<f32>(s, k))?;
+        at_each_level(&s, |s| the_unit_of_length_changes_no_bit::<f64>(s, k))?;
     }
 }
 
@@ -675,7 +698,7 @@ fn parts() {
     };
     let pools = [pool(1), pool(3)];
     proptest!(config(60), |(s in scenes())| {
-        work_in_parts_changes_no_bit::<f32>(&s, &pools)?;
-        work_in_parts_changes_no_bit::<f64>(&s, &pools)?;
+        at_each_level(&s, |s| work_in_parts_changes_no_bit::<f32>(s, &pools))?;
+        at_each_level(&s, |s| work_in_parts_changes_no_bit::<f64>(s, &pools))?;
     });
 }

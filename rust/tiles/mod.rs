@@ -19,7 +19,7 @@ use crate::{
     scene::Camera,
     simd::Real,
 };
-use fearless_simd::{Level, dispatch};
+use fearless_simd::dispatch;
 use lists::{List, Scratch, list};
 use pairs::Source;
 use rayon::prelude::*;
@@ -84,7 +84,7 @@ pub fn bin<T: Real>(
         tiles_y,
         total: AtomicU64::new(0),
     };
-    let level = Level::new();
+    let level = projection.level.token;
     let (mut chunks, pairs): (Vec<_>, Vec<_>) = (0..n.div_ceil(size))
         .into_par_iter()
         .map(|k| {

@@ -2,9 +2,9 @@
 
 use crate::{
     error::{Error, check_len},
-    simd::{Lanes, Real},
+    simd::{self, Lanes, Level, Real},
 };
-use fearless_simd::{Level, Select, Simd, SimdBase, dispatch};
+use fearless_simd::{Select, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
 
 /// Numbers whose distances are summed together: the order of the sums depends on nothing else.
@@ -16,6 +16,18 @@ const CHUNK: usize = 8192;
 /// # Errors
 /// Names the array whose length differs from that of `x`.
 pub fn distance<T: Real>(
+    x: &[T],
+    centres: &[T],
+    widths: &[T],
+    scale: f64,
+    grad: Option<&mut [T]>,
+) -> Result<f64, Error> {
+    distance_at(simd::level()?, x, centres, widths, scale, grad)
+}
+
+/// [`distance`] with the vector instructions of `level`.
+fn distance_at<T: Real>(
+    level: Level,
     x: &[T],
     centres: &[T],
     widths: &[T],
@@ -36,7 +48,7 @@ pub fn distance<T: Real>(
     // One piece of the gradient for each chunk, empty where it is not wanted.
     let mut grads: Vec<&mut [T]> = grad.chunks_mut(CHUNK).collect();
     grads.resize_with(sums.len(), Default::default);
-    let level = Level::new();
+    let level = level.token;
     sums.par_iter_mut()
         .zip(grads)
         .zip(x.par_chunks(CHUNK))
@@ -97,6 +109,7 @@ fn load<S: Simd, T: Real>(simd: S, data: &[T], at: usize) -> Lanes<T, S> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simd::at_each_level;
     use rayon::ThreadPoolBuilder;
 
     fn numbers<T: Real>(n: usize, k: f64) -> Vec<T> {
@@ -105,7 +118,7 @@ mod tests {
             .collect()
     }
 
-    fn check<T: Real + PartialEq + std::fmt::Debug>(tolerance: f64) {
+    fn check<T: Real + PartialEq + std::fmt::Debug>(level: Level, tolerance: f64) {
         for n in [1, 15, 16, 33, 3 * CHUNK + 5] {
             let (x, centres) = (numbers::<T>(n, 0.0), numbers::<T>(n, 2.0));
             let widths: Vec<T> = numbers::<T>(n, 1.0)
@@ -113,7 +126,7 @@ mod tests {
                 .map(|w| T::from_f64(w.to_f64().abs()))
                 .collect();
             let mut grad = vec![T::ONE; n];
-            let value = distance(&x, &centres, &widths, 0.25, Some(&mut grad)).unwrap();
+            let value = distance_at(level, &x, &centres, &widths, 0.25, Some(&mut grad)).unwrap();
             let mut expected = 0.0;
             for i in 0..n {
                 let d = x[i].to_f64() - centres[i].to_f64();
@@ -129,21 +142,29 @@ mod tests {
                 }
             }
             assert!((value - expected).abs() <= tolerance * expected, "{n}");
-            assert_eq!(distance(&x, &centres, &widths, 0.25, None).unwrap(), value);
+            let alone = distance_at(level, &x, &centres, &widths, 0.25, None).unwrap();
+            assert_eq!(alone, value);
         }
     }
 
     #[test]
     fn is_the_distance_and_its_slope() {
-        check::<f32>(1e-5);
-        check::<f64>(1e-13);
+        at_each_level(|level| {
+            check::<f32>(level, 1e-5);
+            check::<f64>(level, 1e-13);
+        });
     }
 
     #[test]
     fn within_a_cell_and_on_its_border_nothing_is_asked() {
+        at_each_level(check_border);
+    }
+
+    fn check_border(level: Level) {
         let (centres, widths) = ([0.0_f32; 4], [1.0; 4]);
         let mut grad = [1.0; 4];
-        let value = distance(
+        let value = distance_at(
+            level,
             &[0.0, 0.5, -0.5, 0.4],
             &centres,
             &widths,
@@ -151,10 +172,11 @@ mod tests {
             Some(&mut grad),
         );
         assert_eq!((value.unwrap(), grad), (0.0, [0.0; 4]));
-        let value = distance(&[f32::NAN, 0.0, 0.0, 0.0], &centres, &widths, 1.0, None);
+        let x = [f32::NAN, 0.0, 0.0, 0.0];
+        let value = distance_at(level, &x, &centres, &widths, 1.0, None);
         assert!(value.unwrap().is_nan());
         assert_eq!(
-            distance(&[0.0; 4], &centres[1..], &widths, 1.0, None)
+            distance_at(level, &[0.0; 4], &centres[1..], &widths, 1.0, None)
                 .unwrap_err()
                 .name(),
             "centres"
@@ -165,14 +187,15 @@ mod tests {
     fn any_number_of_threads_gives_the_same_bits() {
         let n = 5 * CHUNK + 7;
         let (x, centres, widths) = (numbers::<f32>(n, 0.0), numbers(n, 2.0), vec![0.1; n]);
-        let run = |threads| {
+        let run = |level, threads| {
             let pool = ThreadPoolBuilder::new().num_threads(threads).build();
             pool.unwrap().install(|| {
                 let mut grad = vec![0.0; n];
-                let value = distance(&x, &centres, &widths, 0.3, Some(&mut grad)).unwrap();
+                let value =
+                    distance_at(level, &x, &centres, &widths, 0.3, Some(&mut grad)).unwrap();
                 (value, grad)
             })
         };
-        assert!(run(1) == run(3));
+        at_each_level(|level| assert!(run(level, 1) == run(level, 3)));
     }
 }

@@ -11,7 +11,7 @@ use hqgs::{
     counts::Counts,
     project::{self, ProjectOptions},
     scene::{Camera, Colors, Harmonics},
-    threads,
+    simd, threads,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
@@ -91,6 +91,7 @@ pub(super) fn project_forward<'py>(
         antialiased,
         differentiable,
         knobs: accuracy_knobs(knobs)?,
+        level: simd::level()?,
     };
     by_dtype!(
         "means",

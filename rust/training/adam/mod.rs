@@ -5,9 +5,9 @@
 
 use crate::{
     error::{Error, check_len},
-    simd::{Lanes, Real},
+    simd::{self, Lanes, Level, Real},
 };
-use fearless_simd::{Level, Simd, SimdBase, SimdFloat, dispatch};
+use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use rayon::prelude::*;
 
 /// Elements per task: four arrays of this size fit in the second-level cache.
@@ -106,6 +106,17 @@ pub fn step<T: Real>(
     options: &AdamOptions,
     selection: &Selection,
 ) -> Result<(), Error> {
+    step_at(simd::level()?, arrays, step, options, selection)
+}
+
+/// [`step`] with the vector instructions of `level`.
+fn step_at<T: Real>(
+    level: Level,
+    arrays: AdamArrays<'_, T>,
+    step: u64,
+    options: &AdamOptions,
+    selection: &Selection,
+) -> Result<(), Error> {
     let AdamArrays {
         param,
         grad,
@@ -127,7 +138,7 @@ pub fn step<T: Real>(
         used,
     } = *selection;
     let chunk = (CHUNK / width).max(1) * width;
-    let level = Level::new();
+    let level = level.token;
     param
         .par_chunks_mut(chunk)
         .zip(exp_avg.par_chunks_mut(chunk))

@@ -1,7 +1,7 @@
 //! The fused step against the formulas of torch, and what must hold exactly.
 
 use super::*;
-use crate::scene::synthetic;
+use crate::{scene::synthetic, simd::at_each_level};
 
 /// torch's formulas, one element at a time.
 macro_rules! reference {
@@ -34,7 +34,7 @@ fn noise(seed: u64, n: usize) -> Vec<f64> {
 }
 
 /// param, exp_avg, exp_avg_sq after `steps` steps.
-fn run<T: Real>(n: usize, steps: u64, selection: &Selection) -> [Vec<T>; 3] {
+fn run<T: Real>(level: Level, n: usize, steps: u64, selection: &Selection) -> [Vec<T>; 3] {
     let param = noise(1, n).into_iter().map(T::from_f64).collect();
     let mut arrays = [param, vec![T::ZERO; n], vec![T::ZERO; n]];
     for at in 1..=steps {
@@ -45,7 +45,7 @@ fn run<T: Real>(n: usize, steps: u64, selection: &Selection) -> [Vec<T>; 3] {
             exp_avg,
             exp_avg_sq,
         };
-        step(arrays, at, &OPTIONS, selection).unwrap();
+        step_at(level, arrays, at, &OPTIONS, selection).unwrap();
     }
     arrays
 }
@@ -59,8 +59,8 @@ fn grad<T: Real>(at: u64, n: usize) -> Vec<T> {
 }
 
 macro_rules! check {
-    ($type:ty, $reference:ident, $n:expr) => {
-        let got = run::<$type>($n, 20, &Selection::ALL);
+    ($level:expr, $type:ty, $reference:ident, $n:expr) => {
+        let got = run::<$type>($level, $n, 20, &Selection::ALL);
         let mut state: Vec<_> = noise(1, $n)
             .into_iter()
             .map(|p| [p as $type, 0.0, 0.0])
@@ -81,14 +81,20 @@ macro_rules! check {
 
 #[test]
 fn agrees_with_the_formulas_of_torch() {
-    for n in [1, 15, 16, 17, 33, 40_003] {
-        check!(f32, reference_f32, n);
-        check!(f64, reference_f64, n);
-    }
+    at_each_level(|level| {
+        for n in [1, 15, 16, 17, 33, 40_003] {
+            check!(level, f32, reference_f32, n);
+            check!(level, f64, reference_f64, n);
+        }
+    });
 }
 
 #[test]
 fn rows_that_are_not_visible_are_left_alone() {
+    at_each_level(check_visible);
+}
+
+fn check_visible(level: Level) {
     for width in [1, 3, 45] {
         let rows = 1000;
         let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
@@ -100,7 +106,7 @@ fn rows_that_are_not_visible_are_left_alone() {
                     width,
                     used,
                 };
-                run::<f32>(rows * width, 3, &selection)
+                run::<f32>(level, rows * width, 3, &selection)
             });
         for k in 0..3 {
             for i in 0..rows * width {
@@ -121,9 +127,13 @@ fn rows_that_are_not_visible_are_left_alone() {
 
 #[test]
 fn numbers_of_a_row_that_are_not_used_are_left_alone() {
+    at_each_level(check_used);
+}
+
+fn check_used(level: Level) {
     let (rows, width) = (1000, 45);
     let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
-    let all = run::<f32>(rows * width, 3, &Selection::ALL);
+    let all = run::<f32>(level, rows * width, 3, &Selection::ALL);
     for used in [0, 9, 24, 45] {
         for visible in [None, Some(&visible[..])] {
             let selection = Selection {
@@ -131,7 +141,7 @@ fn numbers_of_a_row_that_are_not_used_are_left_alone() {
                 width,
                 used,
             };
-            let some = run::<f32>(rows * width, 3, &selection);
+            let some = run::<f32>(level, rows * width, 3, &selection);
             for (i, start) in noise(1, rows * width).into_iter().enumerate() {
                 let updated = i % width < used && visible.is_none_or(|v| v[i / width] != 0);
                 let expected = if updated {
@@ -151,16 +161,18 @@ fn numbers_of_a_row_that_are_not_used_are_left_alone() {
 
 #[test]
 fn same_bits_for_any_number_of_threads() {
-    let at = |threads| {
+    let at = |level, threads| {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
             .build()
             .unwrap();
-        pool.install(|| run::<f32>(70_001, 3, &Selection::ALL))
+        pool.install(|| run::<f32>(level, 70_001, 3, &Selection::ALL))
             .map(|a| a.into_iter().map(f32::to_bits).collect::<Vec<_>>())
     };
-    let one = at(1);
-    assert!(one == at(2) && one == at(3));
+    at_each_level(|level| {
+        let one = at(level, 1);
+        assert!(one == at(level, 2) && one == at(level, 3));
+    });
 }
 
 #[test]

@@ -18,10 +18,10 @@ mod band;
 
 use crate::{
     error::{Error, check_len},
-    simd::Real,
+    simd::{self, Level, Real},
 };
 use band::Band;
-use fearless_simd::{Level, dispatch};
+use fearless_simd::dispatch;
 use rayon::prelude::*;
 
 /// A band is at least this high: below it the rows shared with its neighbours cost more than they gain.
@@ -118,6 +118,35 @@ pub fn photometric<T: Real, Y: Sample<T>>(
     grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Photometric, Error> {
+    photometric_at(
+        simd::level()?,
+        render,
+        target,
+        mask,
+        height,
+        width,
+        channels,
+        lambda,
+        knee,
+        grad,
+        scratch,
+    )
+}
+
+/// [`photometric`] with the vector instructions of `level`.
+fn photometric_at<T: Real, Y: Sample<T>>(
+    level: Level,
+    render: &[T],
+    target: &[Y],
+    mask: Option<&[u8]>,
+    height: usize,
+    width: usize,
+    channels: usize,
+    lambda: f64,
+    knee: f64,
+    grad: Option<&mut [T]>,
+    scratch: &mut LossScratch<T>,
+) -> Result<Photometric, Error> {
     if !(0.0..=1.0).contains(&lambda) {
         return Err(Error::new(
             "lambda",
@@ -149,7 +178,7 @@ pub fn photometric<T: Real, Y: Sample<T>>(
         l1_scale: (1.0 - lambda) / counted.max(1) as f64,
         ssim_scale: lambda / render.len() as f64,
     };
-    let sums = run(Level::new(), images, plan, grad, scratch);
+    let sums = run(level, images, plan, grad, scratch);
     let l1 = sums.l1 / counted.max(1) as f64;
     if !plan.ssim {
         return Ok(Photometric {
@@ -179,6 +208,20 @@ pub fn ssim<T: Real, Y: Sample<T>>(
     channels: usize,
     scratch: &mut LossScratch<T>,
 ) -> Result<f64, Error> {
+    ssim_at(simd::level()?, a, b, mask, height, width, channels, scratch)
+}
+
+/// [`ssim`] with the vector instructions of `level`.
+fn ssim_at<T: Real, Y: Sample<T>>(
+    level: Level,
+    a: &[T],
+    b: &[Y],
+    mask: Option<&[u8]>,
+    height: usize,
+    width: usize,
+    channels: usize,
+    scratch: &mut LossScratch<T>,
+) -> Result<f64, Error> {
     let images = Images {
         x: a,
         y: b,
@@ -194,7 +237,7 @@ pub fn ssim<T: Real, Y: Sample<T>>(
         l1_scale: 0.0,
         ssim_scale: 0.0,
     };
-    let sums = run(Level::new(), images, plan, None, scratch);
+    let sums = run(level, images, plan, None, scratch);
     Ok(1.0 - sums.dissimilarity / a.len() as f64)
 }
 
@@ -256,7 +299,7 @@ fn run<T: Real, Y: Sample<T>>(
     jobs.into_par_iter()
         .for_each(|(first, sums, buffer, grad)| {
             let band = Band::new(images, plan, first, buffer);
-            dispatch!(level, simd => band.run(simd, grad, sums));
+            dispatch!(level.token, simd => band.run(simd, grad, sums));
         });
     scratch.sums.iter().fold(Sums::default(), |a, b| Sums {
         l1: a.l1 + b.l1,

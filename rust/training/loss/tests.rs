@@ -4,7 +4,10 @@ use super::{
     band::{C1, C2, SIGMA},
     *,
 };
-use crate::scene::synthetic::noise;
+use crate::{
+    scene::synthetic::noise,
+    simd::{at_each_level, levels},
+};
 
 /// The textbook formula with direct 11 x 11 sums: (L1, SSIM).
 fn reference(x: &[f64], y: &[f64], mask: Option<&[u8]>, [h, w, c]: [usize; 3]) -> (f64, f64) {
@@ -53,6 +56,7 @@ fn unit(y: &[u8]) -> Vec<f64> {
 }
 
 fn loss<T: Real>(
+    level: Level,
     x: &[T],
     y: &[u8],
     mask: Option<&[u8]>,
@@ -62,8 +66,8 @@ fn loss<T: Real>(
     let mut grad = vec![T::from_f64(7.0); x.len()];
     let mut scratch = LossScratch::default();
     let (out, s) = (Some(&mut grad[..]), &mut scratch);
-    let value = photometric(x, y, mask, h, w, c, lambda, 0.0, out, s).unwrap();
-    let alone = photometric(x, y, mask, h, w, c, lambda, 0.0, None, s).unwrap();
+    let value = photometric_at(level, x, y, mask, h, w, c, lambda, 0.0, out, s).unwrap();
+    let alone = photometric_at(level, x, y, mask, h, w, c, lambda, 0.0, None, s).unwrap();
     assert!(
         value == alone || value.loss.is_nan(),
         "{value:?} with the gradient, {alone:?} without"
@@ -83,6 +87,10 @@ const SIZES: [[usize; 3]; 7] = [
 
 #[test]
 fn agrees_with_the_textbook_formula() {
+    at_each_level(check_formula);
+}
+
+fn check_formula(level: Level) {
     for (seed, size) in SIZES.into_iter().enumerate() {
         let n = size.iter().product();
         let (x, y) = (noise(seed as u64, n), photo(seed as u64 + 50, n));
@@ -92,14 +100,14 @@ fn agrees_with_the_textbook_formula() {
             .collect();
         for mask in [None, Some(&mask[..])] {
             let (l1, ssim) = reference(&x, &unit(&y), mask, size);
-            let (got, _) = loss(&x, &y, mask, size, 0.3);
+            let (got, _) = loss(level, &x, &y, mask, size, 0.3);
             assert!((got.l1 - l1).abs() < 1e-14, "{size:?} {} {l1}", got.l1);
             assert!(
                 (got.ssim.unwrap() - ssim).abs() < 1e-13,
                 "{size:?} {got:?} {ssim}"
             );
             assert!((got.loss - (0.7 * l1 + 0.3 * (1.0 - ssim))).abs() < 1e-13);
-            let (got, _) = loss(&cast::<f32>(&x), &y, mask, size, 0.3);
+            let (got, _) = loss(level, &cast::<f32>(&x), &y, mask, size, 0.3);
             assert!(
                 (got.loss - (0.7 * l1 + 0.3 * (1.0 - ssim))).abs() < 1e-6,
                 "{size:?} {got:?}"
@@ -110,6 +118,10 @@ fn agrees_with_the_textbook_formula() {
 
 #[test]
 fn gradient_agrees_with_finite_differences_of_the_textbook_formula() {
+    at_each_level(check_differences);
+}
+
+fn check_differences(level: Level) {
     for (seed, size) in SIZES.into_iter().enumerate().take(6) {
         let n = size.iter().product();
         let (mut x, y) = (noise(seed as u64 + 7, n), photo(seed as u64 + 70, n));
@@ -118,7 +130,7 @@ fn gradient_agrees_with_finite_differences_of_the_textbook_formula() {
             .map(|&v| u8::from(v > 0.3))
             .collect();
         for mask in [None, Some(&mask[..])] {
-            let (_, grad) = loss(&x, &y, mask, size, 0.4);
+            let (_, grad) = loss(level, &x, &y, mask, size, 0.4);
             let value = |x: &[f64]| {
                 let (l1, ssim) = reference(x, &unit(&y), mask, size);
                 0.6 * l1 + 0.4 * (1.0 - ssim)
@@ -145,9 +157,13 @@ fn gradient_agrees_with_finite_differences_of_the_textbook_formula() {
 /// f32 against f64 on images with little texture and little error, where variances cancel most.
 #[test]
 fn f32_keeps_its_digits() {
+    at_each_level(check_digits);
+}
+
+fn check_digits(level: Level) {
     let size = [40, 37, 3];
     let n = size.iter().product();
-    for (level, amplitude) in [
+    for (gray, amplitude) in [
         (128u8, 0.5),
         (0, 0.01),
         (255, 0.01),
@@ -156,7 +172,7 @@ fn f32_keeps_its_digits() {
     ] {
         let y: Vec<u8> = photo(1, n)
             .iter()
-            .map(|&v| if v > 250 { level ^ 1 } else { level })
+            .map(|&v| if v > 250 { gray ^ 1 } else { gray })
             .collect();
         let x: Vec<f64> = unit(&y)
             .iter()
@@ -165,17 +181,18 @@ fn f32_keeps_its_digits() {
             .collect();
         let x: Vec<f32> = cast(&x);
         let (fine, fine_grad) = loss(
+            level,
             &cast::<f64>(&x.iter().map(|&v| v.into()).collect::<Vec<_>>()),
             &y,
             None,
             size,
             1.0,
         );
-        let (coarse, coarse_grad) = loss(&x, &y, None, size, 1.0);
+        let (coarse, coarse_grad) = loss(level, &x, &y, None, size, 1.0);
         let relative = (coarse.loss / fine.loss - 1.0).abs();
         assert!(
             relative < 2e-5,
-            "level {level}, noise {amplitude}: loss off by {relative:e}"
+            "gray {gray}, noise {amplitude}: loss off by {relative:e}"
         );
         let norm = |g: &mut dyn Iterator<Item = f64>| g.map(|v| v * v).sum::<f64>().sqrt();
         let off = norm(
@@ -187,17 +204,21 @@ fn f32_keeps_its_digits() {
         let off = off / norm(&mut fine_grad.iter().copied());
         assert!(
             off < 5e-5,
-            "level {level}, noise {amplitude}: gradient off by {off:e}"
+            "gray {gray}, noise {amplitude}: gradient off by {off:e}"
         );
     }
 }
 
 #[test]
 fn equal_images_have_no_loss_and_no_gradient() {
-    for level in [0u8, 255, 77] {
-        let y = vec![level; 20 * 13 * 3];
+    at_each_level(check_equal);
+}
+
+fn check_equal(level: Level) {
+    for gray in [0u8, 255, 77] {
+        let y = vec![gray; 20 * 13 * 3];
         let x: Vec<f32> = y.iter().map(|&v| Sample::<f32>::value(v)).collect();
-        let (value, grad) = loss(&x, &y, None, [20, 13, 3], 0.2);
+        let (value, grad) = loss(level, &x, &y, None, [20, 13, 3], 0.2);
         assert_eq!(
             value,
             Photometric {
@@ -212,7 +233,12 @@ fn equal_images_have_no_loss_and_no_gradient() {
 
 #[test]
 fn black_against_white_is_the_worst() {
+    at_each_level(check_worst);
+}
+
+fn check_worst(level: Level) {
     let (value, grad) = loss(
+        level,
         &vec![0.0f64; 30 * 30],
         &[255; 30 * 30],
         None,
@@ -226,8 +252,12 @@ fn black_against_white_is_the_worst() {
 
 #[test]
 fn lambda_0_is_l1_alone_and_lambda_1_ssim_alone() {
+    at_each_level(check_lambda);
+}
+
+fn check_lambda(level: Level) {
     let (x, y) = (noise(1, 60), photo(2, 60));
-    let (value, grad) = loss(&x, &y, None, [4, 5, 3], 0.0);
+    let (value, grad) = loss(level, &x, &y, None, [4, 5, 3], 0.0);
     assert_eq!((value.loss, value.ssim), (value.l1, None));
     assert!(
         grad.iter()
@@ -235,21 +265,25 @@ fn lambda_0_is_l1_alone_and_lambda_1_ssim_alone() {
             .zip(unit(&y))
             .all(|((&g, &x), y)| g == (x - y).signum() / 60.0)
     );
-    let (value, _) = loss(&x, &y, None, [4, 5, 3], 1.0);
+    let (value, _) = loss(level, &x, &y, None, [4, 5, 3], 1.0);
     assert!((value.loss - (1.0 - value.ssim.unwrap())).abs() < 1e-15);
 }
 
 #[test]
 fn masked_pixels_do_not_count() {
+    at_each_level(check_mask);
+}
+
+fn check_mask(level: Level) {
     let size @ [h, w, c] = [16, 11, 3];
     let (mut x, y) = (noise(1, h * w * c), photo(2, h * w * c));
     let mut mask = vec![1; h * w];
     mask[5] = 0;
-    let expected = loss(&x, &y, Some(&mask), size, 0.5);
+    let expected = loss(level, &x, &y, Some(&mask), size, 0.5);
     assert_eq!(expected.1[5 * c..6 * c], [0.0; 3]);
     x[5 * c] = f64::NAN;
-    assert_eq!(loss(&x, &y, Some(&mask), size, 0.5), expected);
-    let nothing = loss(&x, &y, Some(&vec![0; h * w]), size, 0.5);
+    assert_eq!(loss(level, &x, &y, Some(&mask), size, 0.5), expected);
+    let nothing = loss(level, &x, &y, Some(&vec![0; h * w]), size, 0.5);
     assert_eq!(
         nothing,
         (
@@ -265,6 +299,10 @@ fn masked_pixels_do_not_count() {
 
 #[test]
 fn nan_and_infinity_give_a_nan_or_infinite_loss() {
+    at_each_level(check_not_finite);
+}
+
+fn check_not_finite(level: Level) {
     for (bad, at) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY]
         .into_iter()
         .zip([0, 700, 33 * 17 * 3 - 1])
@@ -272,7 +310,7 @@ fn nan_and_infinity_give_a_nan_or_infinite_loss() {
         let (mut x, y) = (cast::<f32>(&noise(1, 33 * 17 * 3)), photo(2, 33 * 17 * 3));
         x[at] = bad;
         for lambda in [0.0, 0.2] {
-            let (value, _) = loss(&x, &y, None, [33, 17, 3], lambda);
+            let (value, _) = loss(level, &x, &y, None, [33, 17, 3], lambda);
             assert!(!value.loss.is_finite(), "{bad} at {at}: {value:?}");
         }
     }
@@ -280,6 +318,10 @@ fn nan_and_infinity_give_a_nan_or_infinite_loss() {
 
 #[test]
 fn same_bits_for_any_number_of_threads() {
+    at_each_level(check_threads);
+}
+
+fn check_threads(level: Level) {
     let size = [131, 23, 3];
     let n = size.iter().product();
     let (x, y) = (cast::<f32>(&noise(1, n)), photo(2, n));
@@ -288,7 +330,7 @@ fn same_bits_for_any_number_of_threads() {
             .num_threads(threads)
             .build()
             .unwrap();
-        let (value, grad) = pool.install(|| loss(&x, &y, None, size, 0.2));
+        let (value, grad) = pool.install(|| loss(level, &x, &y, None, size, 0.2));
         (
             value.loss.to_bits(),
             value.l1.to_bits(),
@@ -300,7 +342,7 @@ fn same_bits_for_any_number_of_threads() {
 }
 
 #[test]
-fn the_machines_baseline_agrees_with_its_best_level() {
+fn each_level_agrees_with_the_best() {
     let [height, width, channels] = [33, 17, 3];
     let n = height * width * channels;
     let (x, y) = (noise(1, n), photo(2, n));
@@ -318,7 +360,7 @@ fn the_machines_baseline_agrees_with_its_best_level() {
         l1_scale: 0.5,
         ssim_scale: 0.5,
     };
-    let [best, base] = [Level::new(), Level::baseline()].map(|level| {
+    let at = |level| {
         let mut grad = vec![0.0; n];
         let sums = run(
             level,
@@ -328,37 +370,54 @@ fn the_machines_baseline_agrees_with_its_best_level() {
             &mut LossScratch::default(),
         );
         (sums, grad)
+    };
+    let best = at(levels()[0]);
+    at_each_level(|level| {
+        let other = at(level);
+        assert!((best.0.l1 - other.0.l1).abs() < 1e-10);
+        assert!((best.0.dissimilarity - other.0.dissimilarity).abs() < 1e-10);
+        assert!(
+            best.1
+                .iter()
+                .zip(&other.1)
+                .all(|(a, b)| (a - b).abs() < 1e-12)
+        );
     });
-    assert!((best.0.l1 - base.0.l1).abs() < 1e-10);
-    assert!((best.0.dissimilarity - base.0.dissimilarity).abs() < 1e-10);
-    assert!(
-        best.1
-            .iter()
-            .zip(&base.1)
-            .all(|(a, b)| (a - b).abs() < 1e-12)
-    );
 }
 
 #[test]
 fn ssim_of_two_float_images() {
+    at_each_level(check_ssim);
+}
+
+fn check_ssim(level: Level) {
     let size @ [h, w, c] = [21, 14, 3];
     let (a, b) = (noise(1, h * w * c), noise(2, h * w * c));
-    let got = ssim(&a, &b, None, h, w, c, &mut LossScratch::default()).unwrap();
+    let got = ssim_at(level, &a, &b, None, h, w, c, &mut LossScratch::default()).unwrap();
     assert!((got - reference(&a, &b, None, size).1).abs() < 1e-13);
 }
 
 #[test]
 fn scratch_of_another_size_can_be_reused() {
+    at_each_level(check_scratch);
+}
+
+fn check_scratch(level: Level) {
     let mut scratch = LossScratch::default();
     for size @ [h, w, c] in SIZES.into_iter().rev() {
         let (x, y) = (noise(1, h * w * c), photo(2, h * w * c));
-        let got = photometric(&x, &y, None, h, w, c, 0.2, 0.0, None, &mut scratch).unwrap();
-        assert_eq!(got, loss(&x, &y, None, size, 0.2).0);
+        let got =
+            photometric_at(level, &x, &y, None, h, w, c, 0.2, 0.0, None, &mut scratch).unwrap();
+        assert_eq!(got, loss(level, &x, &y, None, size, 0.2).0);
     }
 }
 
 #[test]
 fn with_a_knee_small_differences_count_by_their_square() {
+    at_each_level(check_knee);
+}
+
+fn check_knee(level: Level) {
     let size @ [h, w, c] = [33, 17, 3];
     let (x, y) = (noise(1, h * w * c), photo(2, h * w * c));
     let mask: Vec<u8> = noise(3, h * w).iter().map(|&v| (v > 0.3).into()).collect();
@@ -377,7 +436,20 @@ fn with_a_knee_small_differences_count_by_their_square() {
     let mut scratch = LossScratch::default();
     let mut grad = vec![0.0; x.len()];
     let (y, m) = (&y[..], Some(&mask[..]));
-    let got = photometric(&x, y, m, h, w, c, 0.0, knee, Some(&mut grad), &mut scratch).unwrap();
+    let got = photometric_at(
+        level,
+        &x,
+        y,
+        m,
+        h,
+        w,
+        c,
+        0.0,
+        knee,
+        Some(&mut grad),
+        &mut scratch,
+    )
+    .unwrap();
     assert!((got.loss - huber.sum::<f64>()).abs() < 1e-14);
     for (i, (&g, &d)) in grad.iter().zip(&difference).enumerate() {
         assert!(
@@ -386,8 +458,8 @@ fn with_a_knee_small_differences_count_by_their_square() {
         );
     }
     assert!(difference.iter().any(|d| d.abs() < knee) && difference.iter().any(|d| d.abs() > knee));
-    let both = photometric(&x, y, m, h, w, c, 0.4, knee, None, &mut scratch).unwrap();
-    let plain = loss(&x, y, m, size, 0.4).0;
+    let both = photometric_at(level, &x, y, m, h, w, c, 0.4, knee, None, &mut scratch).unwrap();
+    let plain = loss(level, &x, y, m, size, 0.4).0;
     assert_eq!(both.ssim, plain.ssim);
     assert!((both.loss - plain.loss - 0.6 * (got.loss - plain.l1)).abs() < 1e-14);
 }

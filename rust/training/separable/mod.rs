@@ -3,9 +3,9 @@
 use crate::{
     error::{Error, check_len},
     simd::groups::{GROUP, sixteen, transpose},
-    simd::{Lanes, Real},
+    simd::{self, Lanes, Level, Real},
 };
-use fearless_simd::{Level, Simd, SimdBase, SimdFloat, dispatch};
+use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use rayon::prelude::*;
 
 /// A matrix whose rows are kept from their first weight to their last: the zeros between them count, too.
@@ -167,6 +167,11 @@ impl<T: Real> Separable<T> {
     /// # Errors
     /// As for [`Self::shape`], or when `image` has another length.
     pub fn apply(&self, image: &[T], shape: &[usize]) -> Result<Vec<T>, Error> {
+        self.apply_at(simd::level()?, image, shape)
+    }
+
+    /// [`Self::apply`] with the vector instructions of `level`.
+    fn apply_at(&self, level: Level, image: &[T], shape: &[usize]) -> Result<Vec<T>, Error> {
         let [h, w, d] = self.shape(shape)?;
         let (row, mut pitch) = (shape[1] * shape[2], shape[1] * shape[2]);
         check_len("image", image, shape[0] * row)?;
@@ -185,7 +190,7 @@ impl<T: Real> Separable<T> {
             channels: shape[2],
         };
         let mut out = vec![T::ZERO; h * w * d];
-        let level = Level::new();
+        let level = level.token;
         out.par_chunks_mut(GROUP * w * d).enumerate().for_each_init(
             Buffers::default,
             |buffers, (group, out)| {

@@ -1,6 +1,7 @@
 //! The operator against dense matrices, and what must hold exactly.
 
 use super::*;
+use crate::simd::at_each_level;
 use rayon::ThreadPoolBuilder;
 
 /// A number in [-1, 1] for each (a, b).
@@ -55,7 +56,7 @@ fn expected(
     out
 }
 
-fn check<T: Real>(tolerance: f64) {
+fn check<T: Real>(level: Level, tolerance: f64) {
     for (h, w, c, rows, columns, d, reach) in [
         (5, 7, 3, 9, 4, 0, 3),
         (1, 1, 1, 1, 1, 0, 1),
@@ -76,7 +77,7 @@ fn check<T: Real>(tolerance: f64) {
         let channels = (d > 0).then_some(mix);
         let (there, back) = Separable::<T>::pair(m, k, channels).unwrap();
         let typed: Vec<T> = image.iter().map(|x| T::from_f64(*x)).collect();
-        let out = there.apply(&typed, &[h, w, c]).unwrap();
+        let out = there.apply_at(level, &typed, &[h, w, c]).unwrap();
         let right = expected(&image, [h, w], c, m, k, mix);
         assert_eq!(out.len(), right.len());
         for (a, b) in out.iter().zip(&right) {
@@ -84,7 +85,9 @@ fn check<T: Real>(tolerance: f64) {
         }
         // <A x, y> = <x, A^T y>
         let y: Vec<T> = (0..out.len()).map(|i| T::from_f64(noise(i, 5))).collect();
-        let v = back.apply(&y, &[rows, columns, mix.height]).unwrap();
+        let v = back
+            .apply_at(level, &y, &[rows, columns, mix.height])
+            .unwrap();
         let dot = |a: &[T], b: &[T]| -> f64 {
             a.iter().zip(b).map(|(a, b)| a.to_f64() * b.to_f64()).sum()
         };
@@ -95,8 +98,10 @@ fn check<T: Real>(tolerance: f64) {
 
 #[test]
 fn is_the_product_with_dense_matrices() {
-    check::<f64>(1e-12);
-    check::<f32>(5e-6);
+    at_each_level(|level| {
+        check::<f64>(level, 1e-12);
+        check::<f32>(level, 5e-6);
+    });
 }
 
 #[test]
@@ -105,23 +110,29 @@ fn any_number_of_threads_gives_the_same_bits() {
     let (m, k) = (dense(&m, 67, 90), dense(&k, 50, 80));
     let (there, _) = Separable::<f32>::pair(m, k, None).unwrap();
     let image: Vec<f32> = (0..90 * 80 * 3).map(|i| noise(i, 7) as f32).collect();
-    let run = |threads| {
+    let run = |level, threads| {
         let pool = ThreadPoolBuilder::new().num_threads(threads).build();
         pool.unwrap()
-            .install(|| there.apply(&image, &[90, 80, 3]).unwrap())
+            .install(|| there.apply_at(level, &image, &[90, 80, 3]).unwrap())
     };
-    let one = run(1);
-    assert!(run(2) == one && run(5) == one);
+    at_each_level(|level| {
+        let one = run(level, 1);
+        assert!(run(level, 2) == one && run(level, 5) == one);
+    });
 }
 
 #[test]
 fn what_is_not_finite_stays_in_its_reach() {
+    at_each_level(check_reach);
+}
+
+fn check_reach(level: Level) {
     let m = banded(30, 30, 5);
     let (there, _) = Separable::<f32>::pair(dense(&m, 30, 30), dense(&m, 30, 30), None).unwrap();
     for bad in [f32::NAN, f32::INFINITY] {
         let mut image = vec![1.0; 900];
         image[10 * 30 + 20] = bad;
-        let out = there.apply(&image, &[30, 30, 1]).unwrap();
+        let out = there.apply_at(level, &image, &[30, 30, 1]).unwrap();
         for (i, x) in out.iter().enumerate() {
             let reached = m[i / 30 * 30 + 10] != 0.0 && m[i % 30 * 30 + 20] != 0.0;
             assert_eq!(x.is_finite(), !reached, "{i}");
