@@ -1,7 +1,7 @@
 //! Arrays in and out.
 
 use crate::error::BindingResult;
-use hqgs::{Error, simd::Real};
+use hqgs::internals::{Error, simd::Real};
 use numpy::{Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::{exceptions::PyValueError, prelude::*};
 use std::{any::Any, collections::HashMap, fmt::Display, ops::Range};
