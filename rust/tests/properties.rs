@@ -657,12 +657,12 @@ proptest! {
 
     #[test]
     fn any_bits_in_f32(s in broken(true)) {
-        at_each_level(&s, |s| any_bits_are_survived::<f32>(s))?;
+        at_each_level(&s, any_bits_are_survived::<f32>)?;
     }
 
     #[test]
     fn any_bits_in_f64(s in broken(false)) {
-        at_each_level(&s, |s| any_bits_are_survived::<f64>(s))?;
+        at_each_level(&s, any_bits_are_survived::<f64>)?;
     }
 }
 
@@ -671,8 +671,8 @@ proptest! {
 
     #[test]
     fn convex(s in scenes()) {
-        at_each_level(&s, |s| colors_are_convex::<f32>(s))?;
-        at_each_level(&s, |s| colors_are_convex::<f64>(s))?;
+        at_each_level(&s, colors_are_convex::<f32>)?;
+        at_each_level(&s, colors_are_convex::<f64>)?;
     }
 
     #[test]
@@ -689,8 +689,8 @@ proptest! {
 
     #[test]
     fn linear(s in scenes()) {
-        at_each_level(&s, |s| colors_are_linear::<f32>(s))?;
-        at_each_level(&s, |s| colors_are_linear::<f64>(s))?;
+        at_each_level(&s, colors_are_linear::<f32>)?;
+        at_each_level(&s, colors_are_linear::<f64>)?;
     }
 
     #[test]
