@@ -67,6 +67,7 @@ mod accuracy_knobs;
 mod constants;
 mod counts;
 mod error;
+mod memory;
 mod simd;
 mod threads;
 mod uninit;

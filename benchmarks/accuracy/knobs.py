@@ -10,7 +10,6 @@ from unittest.mock import patch
 
 import torch
 
-from benchmarks.speed.ewa import ALPHA_MIN, TRANSMITTANCE_MIN
 from benchmarks.speed.inputs import RasterInputs
 from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust
@@ -20,11 +19,11 @@ NO_FLOOR = 1e-12  # alpha: what lies below it in all layers together is less tha
 
 @dataclass(frozen=True)
 class Knobs:
-    """The settings of `Tuning` in rust/tuning.rs, and the dtype."""
+    """The settings of `AccuracyKnobs` in rust/accuracy_knobs.rs, and the dtype."""
 
     dtype: str = "float32"
-    alpha_min: float = ALPHA_MIN  # smallest alpha that is blended
-    transmittance_min: float = TRANSMITTANCE_MIN  # compositing stops there
+    alpha_min: float = _rust.ALPHA_MIN  # smallest alpha that is blended
+    transmittance_min: float = _rust.TRANSMITTANCE_MIN  # compositing stops there
     spans: str = "ellipse"  # the tiles of a Gaussian: of its support, its "box", or a 3-sigma "square"
     skip_blocks: bool = True  # leave out the 4 x 4 blocks that a Gaussian does not reach
     exp2_degree: int = 6  # of the polynomial in float32

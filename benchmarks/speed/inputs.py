@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import root_scalar
 from scipy.spatial.transform import Rotation
 
-from benchmarks.speed.ewa import ALPHA_MIN, EPS2D, project
+from benchmarks.speed.ewa import project
+from hqgs._rust import ALPHA_MIN, EPS2D
 from hqgs.model.gaussians import SH_C0
 
 Array32 = NDArray[np.float32]

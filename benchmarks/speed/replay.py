@@ -1,6 +1,6 @@
 """An independent count of the work that an image needs: single pixels, composited in float64 numpy.
 
-It shares no code with the crate; the formulas are those of docs/conventions.md.
+It shares the constants with the crate, and no code; the formulas are those of docs/conventions.md.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.speed.ewa import ALPHA_MAX, ALPHA_MIN, EPS2D, NEAR_PLANE, TRANSMITTANCE_MIN, project
+from benchmarks.speed.ewa import project
+from hqgs._rust import ALPHA_MAX, ALPHA_MIN, EPS2D, NEAR_PLANE, TRANSMITTANCE_MIN
 
 if TYPE_CHECKING:
     from benchmarks.speed.inputs import RasterInputs

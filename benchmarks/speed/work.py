@@ -1,6 +1,6 @@
 """How much work an image is: counted, not timed.
 
-Operations are read off rust/kernel.rs and rust/tiles.rs for three channels in float32: one for each addition,
+Operations are read off rust/composite/kernel/ and rust/tiles/ for three channels in float32: one for each addition,
 product, division, root, minimum, comparison, logical operation, selection and shift, two for a fused product
 and sum. Moves, shuffles and counts of bits are left out, and so is what is done once for each Gaussian, row
 of tiles or pixel. Bytes are those of the lists that hold a row for each (Gaussian, tile) pair or for each

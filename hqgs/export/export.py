@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.files import PLY
 from hqgs.base.left_out import LeftOut
 from hqgs.export.ply import read_ply, write_ply
@@ -26,8 +27,6 @@ from hqgs.export.spz import SH_BITS, encode_spz, read_spz, write_spz
 from hqgs.model.gaussians import MAX_SH_DEGREE, Gaussians
 
 READERS: dict[str, Callable[[Path], Gaussians]] = {"ply": read_ply, "spz": read_spz}
-ALPHA_MIN = 1 / 255  # docs/conventions.md: no pixel shows less
-QUAT_NORM2_MIN = 1e-12  # docs/conventions.md: such a rotation is culled
 BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
 CURVE_BITS = 10  # of a cell along each axis
 

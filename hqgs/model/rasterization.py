@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hqgs._rust import get_num_threads, set_num_threads
+from hqgs._rust import EPS2D, FAR_PLANE, NEAR_PLANE, TILE, get_num_threads, set_num_threads
 from hqgs.model.autograd import _Composite, _Project
 
 __all__ = ["get_num_threads", "rasterization", "set_num_threads"]
@@ -26,13 +26,13 @@ def rasterization(
     Ks: Tensor,
     width: int,
     height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
+    near_plane: float = NEAR_PLANE,
+    far_plane: float = FAR_PLANE,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int = TILE,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,

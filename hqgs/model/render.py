@@ -16,14 +16,8 @@ from hqgs.model.rasterization import rasterization
 from hqgs.scene.scene import Camera, View
 
 BACKGROUND = (0.0, 0.0, 0.0)  # RGB
-OPTIONS = (
-    0.01,
-    1e10,
-    0.0,
-    0.3,
-    False,
-    False,
-)  # near, far, radius_clip, eps2d, antialiased, as `render_view` renders; differentiable
+# As `render_view` renders: near, far, radius_clip, eps2d, antialiased; and not to be differentiated.
+OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D, False, False)
 
 
 def render_view(

@@ -252,9 +252,7 @@ mod tests {
         let s = Synthetic::<f32>::new(50, 20, 20, 1).unwrap();
         let none = weights(level, &s, Some(&[0; 400])).unwrap();
         assert!(none.len() == 50 && none.iter().all(|w| *w == 0.0));
-        assert_eq!(
-            weights(level, &s, Some(&[1; 399])).unwrap_err().name(),
-            "mask"
-        );
+        let error = weights(level, &s, Some(&[1; 399])).unwrap_err();
+        assert_eq!(error.name(), "mask");
     }
 }

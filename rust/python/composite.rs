@@ -143,11 +143,11 @@ fn composite_as<'py, T: Scalar>(
                     counts: total,
                     bin_seconds,
                 },
-                join(&mut images, |image| image),
-                join(&mut alphas, |alphas| alphas),
+                join(&mut images, |image| image)?,
+                join(&mut alphas, |alphas| alphas)?,
             ))
         })
-    })?;
+    })??;
     let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));
     Ok(out.into_bound_py_any(py)?)
 }
@@ -217,16 +217,16 @@ fn composite_backward_as<'py, T: Scalar>(
             let cameras = frame.cameras.iter().enumerate();
             cameras.map(backward).collect::<Result<_, Error>>()
         })
-    })?;
+    })??;
     let counts = outs
         .iter()
         .fold(Counts::default(), |sum, out| sum.plus(out.counts));
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let whitened = join(&mut outs, |out| &mut out.whitened);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let absolutes = join(&mut outs, |out| &mut out.absolute);
-    let v_colors = join(&mut outs, |out| &mut out.colors);
-    let v_background = join(&mut outs, |out| &mut out.background);
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let whitened = join(&mut outs, |out| &mut out.whitened)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let absolutes = join(&mut outs, |out| &mut out.absolute)?;
+    let v_colors = join(&mut outs, |out| &mut out.colors)?;
+    let v_background = join(&mut outs, |out| &mut out.background)?;
     let out = (
         geometry.then(|| means2d.into_pyarray(py)),
         geometry.then(|| whitened.into_pyarray(py)),

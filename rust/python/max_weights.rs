@@ -61,6 +61,6 @@ fn blending_weights_as<'py, T: Real + Element>(
             }
             Ok(out)
         })
-    })?;
+    })??;
     Ok(out.into_pyarray(py).into_any())
 }

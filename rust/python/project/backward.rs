@@ -176,7 +176,7 @@ fn project_backward_as<'py, T: Scalar>(
             }
             Ok((sums, viewmats))
         })
-    })?;
+    })??;
     let grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
     let out = (
         wanted.means.then(|| grads.means.into_pyarray(py)),

@@ -146,13 +146,13 @@ fn project_as<'py, T: Scalar>(
                 .map(project)
                 .collect::<Result<_, Error>>()
         })
-    })?;
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let depths = join(&mut outs, |out| &mut out.depths);
-    let conics = join(&mut outs, |out| &mut out.conics);
-    let radii = join(&mut outs, |out| &mut out.radii);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let colors = join(&mut outs, |out| &mut out.colors);
+    })??;
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let depths = join(&mut outs, |out| &mut out.depths)?;
+    let conics = join(&mut outs, |out| &mut out.conics)?;
+    let radii = join(&mut outs, |out| &mut out.radii)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let colors = join(&mut outs, |out| &mut out.colors)?;
     let frame = Frame(Arc::new(Projections {
         cameras,
         counts: outs
