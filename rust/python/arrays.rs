@@ -1,7 +1,7 @@
 //! Arrays in and out.
 
 use crate::error::BindingResult;
-use hqgs::{Error, simd::Real};
+use hqgs::internals::{Error, simd::Real};
 use numpy::{Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::{exceptions::PyValueError, prelude::*};
 use std::{any::Any, collections::HashMap, fmt::Display, ops::Range};
@@ -21,7 +21,7 @@ impl<'py, T: Element> Array<'py, T> {
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
         let array = value
             .cast::<PyArrayDyn<T>>()
-            .map_err(|_| wrong_type(name, &T::get_dtype(value.py()), value))?;
+            .map_err(|_| wrong_type(name, T::get_dtype(value.py()), value))?;
         if !array.is_c_contiguous() {
             return Err(PyValueError::new_err(format!(
                 "{name}: must be C-contiguous, got shape {:?} with strides {:?}",

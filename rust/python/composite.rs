@@ -7,7 +7,7 @@ use crate::{
     error::BindingResult,
     project::{Frame, Projections, channels_of, of_camera},
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
     counts::Counts,
@@ -184,7 +184,7 @@ fn composite_backward_as<'py, T: Scalar>(
     let [width, height] = frame
         .cameras
         .first()
-        .map_or([0; 2], |c| [c.width, c.height]);
+        .map_or([0; 2], |c| [c.width(), c.height()]);
     let pixels = width * height;
     let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
     let v_image = Array::<T>::new("v_image", v_image)?.of_shape(&[c, height, width, channels])?;

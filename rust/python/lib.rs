@@ -11,7 +11,7 @@ mod training;
 
 use arrays::{Array, by_dtype};
 use error::{BindingError, BindingResult};
-use hqgs::{constants, simd, threads};
+use hqgs::internals::{constants, simd, threads};
 use numpy::Element;
 use pyo3::prelude::*;
 use std::ffi::{c_int, c_long};

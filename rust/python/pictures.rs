@@ -2,7 +2,7 @@
 
 use crate::arrays::{Array, by_dtype, gradient};
 use crate::error::BindingResult;
-use hqgs::{
+use hqgs::internals::{
     Error,
     simd::Real,
     threads,

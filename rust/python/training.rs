@@ -2,7 +2,7 @@
 
 use crate::arrays::{Array, check_apart, gradient, is_f32, optional_of_shape, place};
 use crate::error::BindingResult;
-use hqgs::{
+use hqgs::internals::{
     Error,
     simd::Real,
     threads,

@@ -5,7 +5,7 @@ use crate::{
     arrays::{Array, CountsByName, Scalar, by_dtype, of_type, optional_of_shape},
     error::BindingResult,
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     project::{self, GaussianGrads, ProjectCotangents, Shading},
     simd::Real,

@@ -5,7 +5,7 @@ use crate::{
     arrays::{Array, Optional, Scalar, by_dtype, join, optional},
     error::BindingResult,
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     accuracy_knobs::{AccuracyKnobs, Spans},
     counts::Counts,
