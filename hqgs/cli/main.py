@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
 
 KINDS_HELP = (
-    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], "
-    "several joined by + in their order, mixed, or none"
+    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
+    "exposure[:EV], phone[:EV], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), several joined "
+    "by + in their order, mixed, or none"
 )
 
 

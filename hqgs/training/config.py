@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE
-from hqgs.photos.formula import parse_degradation
+from hqgs.photos.formula import parse_formation
 
 AUTO, NONE = "auto", "none"
 METHODS = {
@@ -177,7 +177,7 @@ class HQGSConfig:
 
     guidance: str = FORMATION  # or "paper": `PaperHQGS` instead of everything below
     paper: PaperConfig = field(default_factory=PaperConfig)
-    formation: str = AUTO  # what happened to the photos, as `parse_degradation` reads it; "auto": diagnosed
+    formation: str = AUTO  # what happened to the photos, as `parse_formation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
     smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
     gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
@@ -187,7 +187,7 @@ class HQGSConfig:
         if self.guidance not in GUIDANCES:
             raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
         if self.formation != AUTO:
-            parse_degradation(self.formation)
+            parse_formation(self.formation)
         for name in ("jpeg_pixels", "smallest", "gaussians_per_pixel"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
@@ -275,7 +275,7 @@ def run_config(
         seed: of everything random.
         max_gaussians: bounds the memory.
         guidance: of the method hqgs, one of GUIDANCES.
-        formation: what happened to the photos, as `parse_degradation` reads it; "auto": hqgs looks.
+        formation: what happened to the photos, as `parse_formation` reads it; "auto": hqgs looks.
         eval_every: iterations between evaluations; None: a tenth of the run.
 
     Raises ValueError for a name that there is not, or a number out of range.
