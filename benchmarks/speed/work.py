@@ -1,12 +1,12 @@
 """How much work an image is: counted, not timed.
 
-Operations are read off rust/composite/kernel/ and rust/tiles/ for three channels in float32: one for each addition,
-product, division, root, minimum, comparison, logical operation, selection and shift, two for a fused product
-and sum. Moves, shuffles and counts of bits are left out, and so is what is done once for each Gaussian, row
-of tiles or pixel. Bytes are those of the lists that hold a row for each (Gaussian, tile) pair or for each
-Gaussian in a block, once for each stage that writes the row and once for each that reads it. What belongs to
-one tile (its pixels, the layers of the backward pass) stays in cache and is not counted. Whoever changes a
-kernel counts again.
+Operations are read off rust/composite/kernel/ and rust/tiles/ for three channels in float32: one for each
+addition, product, division, root, minimum, comparison, logical operation, selection and shift, two for a
+fused product and sum. Moves, shuffles and counts of bits are left out, and so is what is done once for each
+Gaussian, row of tiles or pixel. Bytes are those of the lists that hold a row for each (Gaussian, tile) pair
+or for each Gaussian in a block, once for each stage that writes the row and once for each that reads it.
+What belongs to one tile (its pixels, the layers of the backward pass) stays in cache and is not counted.
+Whoever changes a kernel counts again.
 """
 
 from __future__ import annotations

@@ -100,10 +100,12 @@ fn composite_as<'py, T: Scalar>(
     let frame = &frame.get().0;
     let c = frame.cameras.len();
     let colors = Array::<T>::new("colors", colors)?;
+    let shape = colors.shape();
     let (colors, given) = channels_of(&colors, frame.n, c)?;
     if given != channels {
-        let message = format!("the colors have {given}, got {channels}");
-        return Err(Error::new("channels", message).into());
+        let n = frame.n;
+        let expected = format!("[{n}, {channels}] or [{c}, {n}, {channels}]");
+        return Err(Error::shape("colors", expected, format!("{shape:?}")).into());
     }
     let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
     let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;

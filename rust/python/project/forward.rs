@@ -119,7 +119,12 @@ fn project_as<'py, T: Scalar>(
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = means.py();
     let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
-    let colors = Array::<T>::new("colors", colors)?;
+    let name = if rest.is_some() {
+        "colors[0]"
+    } else {
+        "colors"
+    };
+    let colors = Array::<T>::new(name, colors)?;
     let rest = optional::<T>("colors[1]", rest)?;
     let cameras = cameras(viewmats, ks, width, height)?;
     let gaussians = arrays.gaussians()?;
