@@ -40,6 +40,7 @@ def main() -> None:
     optimizer = torch.optim.Adam([tensor.requires_grad_() for tensor in trained.values()], lr=1e-2)
     viewmats = torch.eye(4)[None]  # [1, 4, 4], world to camera
     Ks = torch.tensor([[[float(size), 0, size / 2], [0, float(size), size / 2], [0, 0, 1]]])  # pixels
+    images = target[None]
     for iteration in range(args.iterations):
         images, _, meta = hqgs.rasterization(
             trained["means"],

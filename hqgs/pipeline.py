@@ -106,9 +106,9 @@ def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
 
     Args:
         kind: jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH] (white
-            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], chat[:SIDE] (each photo in its own
-            way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND (half of the photos
-            only); several joined by + in their order, mixed, or none.
+            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], chat[:SIDE] (each photo in its
+            own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND (half of the
+            photos only); several joined by + in their order, mixed, or none.
         seed: of everything random. Each photo has its own numbers, whatever the others are.
 
     Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.

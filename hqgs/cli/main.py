@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 KINDS_HELP = (
     "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
-    "exposure[:EV], phone[:EV], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), several joined "
-    "by + in their order, mixed, or none"
+    "exposure[:EV], phone[:EV], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), several "
+    "joined by + in their order, mixed, or none"
 )
 
 

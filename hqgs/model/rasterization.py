@@ -196,7 +196,7 @@ def _refuse(unsupported: dict[str, object]) -> None:
             raise NotImplementedError(f"{name}: {why}, got {_short(value)}")
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     """A value for a message of one line: of a tensor its shape alone."""
     return f"a tensor {_shape(value)}" if isinstance(value, Tensor) else repr(value)[:60]
 
