@@ -272,11 +272,11 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
     real = ThreeDGS.loss
     steps = []
 
-    def interrupting(self: ThreeDGS, render: Any, view: Any) -> Any:
-        steps.append(view.name)
+    def interrupting(self: ThreeDGS, image: Any, target: Any) -> Any:
+        steps.append(target)
         if len(steps) == 6:
             signal.raise_signal(signal.SIGINT)
-        return real(self, render, view)
+        return real(self, image, target)
 
     monkeypatch.setattr(ThreeDGS, "loss", interrupting)
     assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "20") == 130
