@@ -269,12 +269,6 @@ CALLS = {
     "image": ("limit(1500); composite(10, 1 << 14, 1 << 14)", "image"),
     "tiles": ("limit(1500); composite(10, 1 << 19, 1 << 19)", "tile lists"),
     "pairs": ("limit(1500); composite(800, 4096, 4096, 2.0)", "tile lists"),
-    "splats": ("limit(1500); project(2_000_000, 64, 64)", "splats"),
-    "backward": (
-        "c, *_ = composite(300, 1024, 1024, 1.0); image = np.ones((1, 1024, 1024, 3)); limit(16); "
-        "_rust.composite_backward(c, None, image, None, [True] * 4)",
-        "gradients",
-    ),
     "picture": (
         "o = _rust.Separable(np.eye(8192, 4), np.eye(8192, 4), None); limit(1000); "
         "o.apply(np.ones((4, 4, 3)), False)",
