@@ -21,7 +21,7 @@ impl<'py, T: Element> Array<'py, T> {
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
         let array = value
             .cast::<PyArrayDyn<T>>()
-            .map_err(|_| wrong_type(name, &T::get_dtype(value.py()), value))?;
+            .map_err(|_| wrong_type(name, T::get_dtype(value.py()), value))?;
         if !array.is_c_contiguous() {
             return Err(PyValueError::new_err(format!(
                 "{name}: must be C-contiguous, got shape {:?} with strides {:?}",
