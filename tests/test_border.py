@@ -61,23 +61,23 @@ def test_a_composite_goes_back_through_its_own_frame() -> None:
     _, (other, *_) = project(7, width=100, height=90)
     del frame
     again = _rust.composite_backward(composite, None, v_image, None, [True] * 4)
-    for a, b in zip(again[:-1], expected[:-1], strict=True):
+    for a, b in zip(again[:-1], expected[:-1], strict=True):  # not the counts
         assert a is not None
         assert b is not None
         assert np.array_equal(a, b)
-    assert again[0] is not None
-    assert np.abs(again[0]).max() > 0
+        assert a.any()
     with pytest.raises(TypeError):
-        _rust.composite_backward(other, composite, None, v_image, None, [True] * 4)  # type: ignore[call-arg]
+        _rust.composite_backward(other, None, v_image, None, [True] * 4)  # type: ignore
 
 
 def test_gradients_of_another_frame_are_refused() -> None:
     arguments, (_, *arrays) = project(40)
     _, (other, *_) = project(7)
-    inputs = tuple(arguments[name] for name in ("means", "quats", "scales", "opacities"))
+    means, quats, scales, opacities = list(arguments.values())[:4]
     v_means2d = np.zeros_like(arrays[0]).reshape(1, 40, 2)
+    cotangents = (v_means2d, None, None, None, None, None)
     with pytest.raises(ValueError, match=r"^means: expected shape \[7, 3\], got \[40, 3\]$"):
-        _rust.project_backward(other, inputs, (v_means2d, None, None, None, None, None), [True] * 7)
+        _rust.project_backward(other, (means, quats, scales, opacities), cotangents, [True] * 7)
 
 
 def test_the_constants_are_those_of_the_oracles() -> None:
@@ -106,8 +106,9 @@ def test_adam_refuses_arrays_that_overlap() -> None:
     apart = {"param": memory[:10], "grad": memory[10:20], "exp_avg": memory[20:30], "exp_avg_sq": memory[30:]}
 
     def step(visible: torch.Tensor, **arrays: torch.Tensor) -> None:
-        param, grad, first, second = (tensor.numpy() for tensor in arrays.values())
-        _rust.adam_step(param, grad, first, second, 1, (0.1, 0.9, 0.999, 1e-8), visible.numpy(), None)
+        param, grad, exp_avg, exp_avg_sq = (tensor.numpy() for tensor in arrays.values())
+        options = (0.1, 0.9, 0.999, 1e-8)
+        _rust.adam_step(param, grad, exp_avg, exp_avg_sq, 1, options, visible.numpy(), None)
 
     step(flags[:10], **apart)
     before = memory.clone()
@@ -271,12 +272,6 @@ CALLS = {
     "image": ("limit(1500); composite(10, 1 << 14, 1 << 14)", "image"),
     "tiles": ("limit(1500); composite(10, 1 << 19, 1 << 19)", "tile lists"),
     "pairs": ("limit(1500); composite(800, 4096, 4096, 2.0)", "tile lists"),
-    "splats": ("limit(1500); project(2_000_000, 64, 64)", "splats"),
-    "backward": (
-        "c, *_ = composite(300, 1024, 1024, 1.0); image = np.ones((1, 1024, 1024, 3)); limit(16); "
-        "_rust.composite_backward(c, None, image, None, [True] * 4)",
-        "gradients",
-    ),
     "picture": (
         "o = _rust.Separable(np.eye(8192, 4), np.eye(8192, 4), None); limit(1000); "
         "o.apply(np.ones((4, 4, 3)), False)",
