@@ -13,7 +13,7 @@ from benchmarks import endurance, export, frugality
 from benchmarks.accuracy import accuracy
 from benchmarks.features import training
 from benchmarks.output import Benchmark, command_line, write_results
-from benchmarks.quality import quality
+from benchmarks.quality import run as quality
 from benchmarks.speed import speed
 from benchmarks.stability import stability
 from hqgs.cli.errors import BAD_INPUT, fail

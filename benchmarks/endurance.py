@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.output import Benchmark, Report, kept
+from benchmarks.output import Benchmark, Report
+from benchmarks.study import kept
 from hqgs.base.files import write_json
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
 from hqgs.base.text import markdown_table

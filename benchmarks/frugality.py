@@ -17,8 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.output import Benchmark, Report, kept
-from benchmarks.quality.scenes import BUILT_IN, EMBEDDED, load_scenes
+from benchmarks.output import Benchmark, Report
+from benchmarks.scenes import BUILT_IN, EMBEDDED, load_scenes
+from benchmarks.study import kept
 from hqgs.base.files import write_json
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
 from hqgs.base.text import markdown_table

@@ -16,9 +16,10 @@ import torch
 
 from benchmarks.features.features import FEATURES, Feature
 from benchmarks.features.training_report import DEFAULT, chart, compare, scene_table, verdict_table, verdicts
-from benchmarks.output import Benchmark, Report, kept
+from benchmarks.output import Benchmark, Report
 from benchmarks.speed.scene import still_config
 from benchmarks.speed.timing import Seconds, interleaved
+from benchmarks.study import kept
 from hqgs.base.files import CHECKPOINT, PLY, write_json
 from hqgs.evaluation.report import REPORT
 from hqgs.export.ply import read_ply
