@@ -33,20 +33,23 @@ class Trained:
     peak_rss_mb: float | None  # up to the last step, with what the process holds
 
     def record(self) -> Run:
-        """What every study keeps of a run."""
-        trainer = self.trainer
-        return {
-            "seed": trainer.config.seed,
-            "iterations": trainer.iteration,
-            "seconds": trainer.seconds,  # in training steps
-            "cpu_seconds": self.cpu_seconds,
-            "setup_seconds": self.setup_seconds,
-            "first_step_seconds": first_step(self.steps),
-            "history": trainer.history,
-            "initial_points": self.initial_points,
-            "gaussians": len(trainer.gaussians),
-            "config": asdict(trainer.config),
-        }
+        """What a study keeps of a run."""
+        found = record(self.trainer, self.initial_points, self.steps)
+        return found | {"cpu_seconds": self.cpu_seconds, "setup_seconds": self.setup_seconds}
+
+
+def record(trainer: Trainer, initial_points: int, steps: Sequence[float]) -> Run:
+    """What every study keeps of a run. `steps`: seconds of each."""
+    return {
+        "seed": trainer.config.seed,
+        "iterations": trainer.iteration,
+        "seconds": trainer.seconds,  # in training steps
+        "first_step_seconds": first_step(steps),
+        "history": trainer.history,
+        "initial_points": initial_points,
+        "gaussians": len(trainer.gaussians),
+        "config": asdict(trainer.config),
+    }
 
 
 def train(photos: Scene, config: TrainConfig, evaluate: bool = True, at_most: int | None = None) -> Trained:
@@ -73,7 +76,7 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True, at_most: in
 
 def first_step(seconds: Sequence[float]) -> float:
     """Seconds of a step before any growth."""
-    return float(np.median(seconds[FIRST_STEPS] or seconds))
+    return float(np.median(seconds[FIRST_STEPS] or seconds or [0.0]))
 
 
 def exported(trainer: Trainer) -> Gaussians:

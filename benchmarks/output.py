@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -90,7 +90,7 @@ def number(value: Any, form: str) -> str:
     return format(value, form)
 
 
-def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]) -> str:
+def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]) -> str:
     """A Markdown table of rows. `columns`: the head and the format of each by its key."""
     body = [[number(row[key], form) for key, (_, form) in columns.items()] for row in rows]
     return markdown_table(title, [head for head, _ in columns.values()], body)

@@ -15,7 +15,7 @@ from reference import reference_rasterization
 
 from benchmarks import cli
 from benchmarks.stability.oracle import GROUPS, Oracle
-from benchmarks.stability.stability import (
+from benchmarks.stability.run import (
     COSINE,
     GRADIENT_F64,
     VALUE_F64,
@@ -24,7 +24,7 @@ from benchmarks.stability.stability import (
     input_rounding,
     misses,
 )
-from benchmarks.stability.stability_cases import PIXELS, cases, scene
+from benchmarks.stability.cases import PIXELS, cases, scene
 
 CASES = {case.name: case for case in cases()}
 
@@ -125,7 +125,7 @@ def test_oracle_agrees_with_autograd(antialiased: bool, degree: int | None) -> N
 
 def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The measure itself: a change of 1e-6 in one value, or of 1 % in one gradient, misses the targets."""
-    from benchmarks.stability import stability
+    from benchmarks.stability import run as stability
 
     right = stability.render
 
@@ -154,7 +154,7 @@ def test_rounding_of_geo_referenced_inputs_is_what_spoils_them() -> None:
 def test_command_writes_tables_and_chart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from benchmarks.stability import stability
+    from benchmarks.stability import run as stability
 
     few = [CASES[name] for name in ("ordinary", "behind the camera", "NaN in means[0]", "world offset 1e6")]
     monkeypatch.setattr(stability, "cases", lambda long: few)

@@ -3,41 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from pandas import DataFrame, Series
 
+from benchmarks.data import read_toml
 from benchmarks.output import NOTHING, number, table
 from benchmarks.quality.summary import means, spread, with_degraded
 from hqgs.base.text import markdown_table
 
-METRICS = {
-    "psnr": ("PSNR", ".2f"),
-    "ssim": ("SSIM", ".3f"),
-    "haarpsi": ("HaarPSI", ".3f"),
-    "lpips": ("LPIPS", ".3f"),
-}
-COSTS = {
-    "seconds": ("training (s)", ".1f"),
-    "cpu_seconds": ("CPU (s)", ".1f"),
-    "setup_seconds": ("set-up (s)", ".2f"),
-    "ms_per_step": ("step (ms)", ".1f"),
-    "render_ms": ("render (ms)", ".2f"),
-    "initial_points": ("first points", ",.0f"),
-    "gaussians": ("Gaussians", ",.0f"),
-    "peak_rss_mb": ("peak memory (MB)", ",.0f"),
-}
-REGIONS = {"edge": ("edges", ".1f"), "flat": ("flat", ".1f"), "ratio": ("edges / flat", ".2f")}
-SFM = {
-    "registered": ("registered", ""),
-    "rotation": ("rotation error (deg), median / max", ""),
-    "translation": ("centre error, median / max", ""),
-    "own_cameras_px": ("own cameras off (px)", ".2f"),
-    "points": ("points", ""),
-    "point_distance": ("to the nearest own point", ".2%"),
-    "track_length": ("photos a point", ""),
-    "reprojection": ("reprojection error (px)", ""),
-}
+COLUMNS = read_toml(Path(__file__).with_name("protocols.toml"))["columns"]
+METRICS, COSTS, REGIONS, SFM = (COLUMNS[name] for name in ("metrics", "costs", "regions", "sfm"))
 LABEL = {"row": ("", "")}
 
 
@@ -50,7 +27,7 @@ def by_degradation(title: str, frame: DataFrame, text: Callable[[DataFrame], str
     return markdown_table(title, ["", *kinds], body)
 
 
-def metrics(frame: DataFrame, what: str, names: Sequence[str] = tuple(METRICS)) -> str:
+def metrics(frame: DataFrame, what: str, names: Sequence[str] = ("psnr", "ssim", "haarpsi", "lpips")) -> str:
     """Those of the metrics that all runs have. `what`: which runs they are."""
     shown = [name for name in names if frame[name].notna().all()]
     title = "/".join(METRICS[name][0] for name in shown)

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 import hqgs
 from benchmarks.output import Benchmark, Report
+from benchmarks.stability.cases import Case, cases
 from benchmarks.stability.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, Pixel, load_mpmath
-from benchmarks.stability.stability_cases import Case, cases
 from hqgs.base.text import markdown_table
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
