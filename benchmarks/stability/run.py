@@ -4,222 +4,29 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
-import hqgs
-from benchmarks.output import Benchmark, Report
+from benchmarks.charts import BLUE, ORANGE, panels
+from benchmarks.output import Benchmark, Report, table
+from benchmarks.stability import measure
 from benchmarks.stability.cases import Case, cases
-from benchmarks.stability.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, Pixel, load_mpmath
-from hqgs.base.text import markdown_table
+from benchmarks.stability.measure import VALUE_F32, Condition, Outcome, misses
+from benchmarks.stability.oracle import DIGITS, load_mpmath
 
-DTYPES = {"f32": torch.float32, "f64": torch.float64}
-VALUE_F64, GRADIENT_F64 = 1e-12, 1e-9  # relative
-VALUE_F32, COSINE = 1e-5, 0.99999  # absolute, for ordinary cases; of each group of gradients
-# A group of gradients below this share of the largest, each times the size of its parameter, is rounding.
-NEGLIGIBLE = {"f32": 1e-4, "f64": 1e-6}
-NUDGES = 4  # scenes with inputs one ulp off, whose largest change is the condition
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What was measured of a case in one dtype. Errors are 0 where nothing is there to compare."""
-
-    dtype: str
-    as_expected: bool  # exactly the expected Gaussians are culled
-    finite: bool  # image and gradients
-    others_equal: bool  # without the culled Gaussians: the same bits; culled ones have gradient 0
-    value_abs: float = 0.0
-    value_relative: float = 0.0  # over the largest value of the oracle
-    gradient: float = 0.0  # largest relative L2 of any group
-    cosine: float = 1.0  # smallest of any group
-    worst_group: str = ""
-
-
-@dataclass(frozen=True)
-class Condition:
-    """The largest changes of the oracle's own results by one ulp of the inputs; as in `Outcome`."""
-
-    value_relative: float
-    gradient: float
-    cosine: float
-
-    def words(self) -> list[str]:
-        """For a table."""
-        return [f"{self.value_relative:.1e}", f"{self.gradient:.1e}", f"{self.cosine:.6f}"]
-
-
-def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
-    """Image with alpha [H, W, D + 1], radii [N, 2] and gradients by group, as float64 arrays."""
-    kind = DTYPES[dtype]
-
-    def tensor(values: Array) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(kind)
-
-    leaves: dict[str, Any] = {name: tensor(getattr(s, name)).requires_grad_() for name in GROUPS}
-    image, alphas, meta = hqgs.rasterization(
-        **leaves,
-        viewmats=tensor(s.viewmat)[None],
-        Ks=tensor(s.K)[None],
-        width=s.width,
-        height=s.height,
-        near_plane=s.near_plane,
-        far_plane=s.far_plane,
-        eps2d=s.eps2d,
-        sh_degree=s.sh_degree,
-        backgrounds=None if s.background is None else tensor(s.background)[None],
-        rasterize_mode="antialiased" if s.antialiased else "classic",
-    )
-    full = torch.cat([image, alphas], dim=-1)[0]
-    i, j = torch.tensor(list(cotangents)).T
-    (full[i, j] * tensor(np.stack(list(cotangents.values())))).sum().backward()
-    gradients = {name: _double(leaf.grad) for name, leaf in leaves.items()}
-    return _double(full), meta["radii"][0].numpy(), gradients
-
-
-def _double(values: torch.Tensor | None) -> Array:
-    assert values is not None
-    return values.detach().numpy().astype(np.float64)
-
-
-def weights(case: Case) -> dict[Pixel, Array]:
-    """The cotangents of the compared pixels, exact in float32."""
-    channels = (3 if case.scene.sh_degree is not None else case.scene.colors.shape[1]) + 1
-    values = np.cos(1.0 + np.arange(len(case.pixels) * channels)).astype(np.float32).astype(np.float64)
-    return dict(zip(case.pixels, values.reshape(-1, channels), strict=True))
-
-
-def evaluate(case: Case, dtype: str) -> Outcome:
-    """Measure one case."""
-    s = case.scene.rounded(dtype)
-    cotangents = weights(case)
-    image, radii, gradients = render(s, dtype, cotangents)
-    culled = case.expected_culled(dtype)
-    seen = (radii > 0).all(axis=1)
-    as_expected = set(np.flatnonzero(~seen)) == set(culled)
-    finite = all(np.isfinite(a).all() for a in (image, *gradients.values()))
-    equal = all((gradients[name][list(culled)] == 0).all() for name in GROUPS)
-    if culled:
-        rest = s
-        for i in sorted(culled, reverse=True):
-            rest = rest.without(i)
-        image2, _, gradients2 = render(rest, dtype, cotangents)
-        equal = equal and np.array_equal(image, image2)
-        kept = [i for i in range(len(s.means)) if i not in culled]
-        equal = equal and all(np.array_equal(gradients[name][kept], gradients2[name]) for name in GROUPS)
-    if case.poison:
-        return Outcome(dtype, as_expected, finite, equal)
-    oracle = Oracle(s)
-    checked = range(len(s.means)) if len(s.means) <= 10 else case.gradients_of or ()
-    as_expected = as_expected and all(oracle.kept(i) == (i not in culled) for i in checked)
-    wanted = [oracle.pixel(pixel) for pixel in case.pixels]
-    error = largest_difference([image[pixel] for pixel in case.pixels], wanted)
-    size = max(float(abs(w)) for row in wanted for w in row)
-    ids = case.compared
-    worst, cosine, group = compare_gradients(
-        s, dtype, {name: gradients[name][ids] for name in GROUPS}, oracle.gradients(cotangents, ids), ids
-    )
-    return Outcome(
-        dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group
-    )
-
-
-def largest_difference(got: Sequence[Any], wanted: Sequence[Any]) -> float:
-    """Largest absolute difference of two lists of pixels."""
-    pairs = [pair for a, b in zip(got, wanted, strict=True) for pair in zip(a, b, strict=True)]
-    return max(float(abs(g - w)) for g, w in pairs)
-
-
-def condition(case: Case, dtype: str) -> Condition:
-    """What one ulp of the inputs changes: no algorithm can be expected to err by less."""
-    s = case.scene.rounded(dtype)
-    cotangents, ids, rng = weights(case), case.compared, np.random.default_rng(0)
-    oracle = Oracle(s)
-    values, gradients = [oracle.pixel(p) for p in case.pixels], oracle.gradients(cotangents, ids)
-    size = max(float(abs(v)) for row in values for v in row)
-    found = []
-    for _ in range(NUDGES):
-        nudged = Oracle(s.nudged(dtype, rng))
-        change = largest_difference([nudged.pixel(p) for p in case.pixels], values) / size
-        other = {name: np.array(rows, float) for name, rows in nudged.gradients(cotangents, ids).items()}
-        found.append((change, *compare_gradients(s, dtype, other, gradients, ids)[:2]))
-    changes, worst, cosines = zip(*found, strict=True)
-    return Condition(max(changes), max(worst), min(cosines))
-
-
-def compare_gradients(
-    s: OracleScene,
-    dtype: str,
-    gradients: dict[str, Array],
-    reference: dict[str, list[list[Any]]],
-    ids: list[int],
-) -> tuple[float, float, str]:
-    """Largest relative L2 and smallest cosine over Gaussians `ids` and groups, and the group of the former.
-
-    Each Gaussian and group is compared by itself, so that a large one hides no small one. A gradient whose
-    product with its parameter is below NEGLIGIBLE of the largest such product is held against that share.
-    """
-    if not ids:
-        return 0.0, 1.0, ""
-    rows = []
-    for k, i in enumerate(ids):
-        for name in GROUPS:
-            truth = np.array([float(v) for v in reference[name][k]])
-            found = gradients[name][k].ravel()[: len(truth)]
-            parameter = np.linalg.norm(getattr(s, name)[i])
-            if name == "means":
-                parameter = np.linalg.norm(s.viewmat[:3, :3] @ s.means[i] + s.viewmat[:3, 3])
-            if not np.isfinite(parameter):  # culled
-                parameter = 0.0
-            rows.append((name, truth, found, parameter))
-    largest = max(np.linalg.norm(truth) * parameter for _, truth, _, parameter in rows)
-    worst, cosine, group = 0.0, 1.0, ""
-    for name, truth, found, parameter in rows:
-        length = float(np.linalg.norm(truth))
-        least = NEGLIGIBLE[dtype] * largest / parameter if parameter > 0 else 0.0
-        if max(length, least) == 0.0:
-            continue
-        unit = max(length, least)
-        error = float(np.linalg.norm((found - truth) / unit))
-        if error > worst:
-            worst, group = error, name
-        if length >= least:
-            f = found / unit
-            with np.errstate(invalid="ignore"):
-                cosine = min(cosine, float(f @ (truth / length) / max(np.linalg.norm(f), 1e-300)))
-    return worst, cosine, group
-
-
-def misses(case: Case, outcome: Outcome) -> list[str]:
-    """The targets that a case misses, in words."""
-    found = []
-    if not outcome.as_expected:
-        found.append("not the expected Gaussians are culled")
-    if not outcome.finite:
-        found.append("not finite")
-    if not outcome.others_equal:
-        found.append("a culled Gaussian is noticed")
-    if outcome.dtype == "f64":
-        if outcome.value_relative > VALUE_F64:
-            found.append(f"values {outcome.value_relative:.1e} > {VALUE_F64:g}")
-        if outcome.gradient > GRADIENT_F64:
-            found.append(f"gradient of {outcome.worst_group} {outcome.gradient:.1e} > {GRADIENT_F64:g}")
-    elif case.ordinary and outcome.value_abs > VALUE_F32:
-        found.append(f"values {outcome.value_abs:.1e} > {VALUE_F32:g}")
-    if outcome.cosine < COSINE:
-        found.append(f"cosine {outcome.cosine:.6f} < {COSINE}")
-    return found
-
-
-def input_rounding(case: Case) -> float:
-    """Largest change of any compared value that rounding the inputs to float32 alone causes."""
-    exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
-    return largest_difference([exact.pixel(p) for p in case.pixels], [rounded.pixel(p) for p in case.pixels])
+Rows = list[tuple[Case, list[Outcome]]]  # in float32 and in float64
+ERRORS = {
+    "name": ("case", ""), "why": ("why", ""), "culled": ("culled", ""), "max": ("f32 max", ".1e"),
+    "f32": ("f32 rel", ".1e"), "f32_gradient": ("f32 grad", ".1e"), "turn": ("f32 1-cos", ".1e"),
+    "f64": ("f64 rel", ".1e"), "f64_gradient": ("f64 grad", ".1e"), "targets": ("targets", ""),
+}  # fmt: skip
+MISSED = {
+    "name": ("case", ""), "dtype": ("dtype", ""), "by": ("by", ""),
+    "value_relative": ("1 ulp: values", ".1e"), "gradient": ("1 ulp: gradient", ".1e"),
+    "cosine": ("1 ulp: cosine", ".6f"),
+}  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -227,26 +34,27 @@ def run(args: argparse.Namespace) -> Report:
     load_mpmath()
     if args.quick and args.long:
         raise ValueError("--quick and --long exclude each other")
-    report = Report(settings={"long": args.long, "digits": DIGITS, "f64_values": VALUE_F64,
-                              "f64_gradients": GRADIENT_F64, "f32_ordinary": VALUE_F32, "cosine": COSINE,
-                              "negligible": NEGLIGIBLE})  # fmt: skip
-    rows = []
+    targets = {
+        "f64_values": measure.VALUE_F64, "f64_gradients": measure.GRADIENT_F64, "f32_ordinary": VALUE_F32,
+        "cosine": measure.COSINE, "negligible": measure.NEGLIGIBLE,
+    }  # fmt: skip
+    report = Report(settings={"long": args.long, "digits": DIGITS} | targets)
+    rows: Rows = []
     for case in cases(args.long):
-        print(f"bench stability: {case.name}", file=sys.stderr)
-        rows.append((case, [evaluate(case, dtype) for dtype in ("f32", "f64")]))
+        print(f"stability: {case.name}", file=sys.stderr)
+        rows.append((case, [measure.evaluate(case, dtype) for dtype in ("f32", "f64")]))
     conditions = {
-        (case.name, o.dtype): condition(case, o.dtype)
+        (case.name, o.dtype): measure.condition(case, o.dtype)
         for case, outcomes in rows
         for o in outcomes
         if misses(case, o)
     }
-    offset = next(case for case, _ in rows if case.name == "world offset 1e6")
-    rounding = input_rounding(offset)
+    rounding = measure.input_rounding(next(case for case, _ in rows if case.name == "world offset 1e6"))
     report.results = {
         "cases": [
             {
                 "name": case.name,
-                "reason": case.reason,
+                "reason": case.why,
                 "culled": {o.dtype: list(case.expected_culled(o.dtype)) for o in outcomes},
                 "outcomes": [{**vars(o), "misses": misses(case, o)} for o in outcomes],
             }
@@ -262,84 +70,56 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-Rows = Sequence[tuple[Case, list[Outcome]]]
-
-
-def measured(rows: Rows) -> Rows:
-    """The cases that were held against the oracle."""
-    return [row for row in rows if not row[0].poison]
-
-
 def tables(rows: Rows, conditions: dict[tuple[str, str], Condition], rounding: float) -> list[str]:
-    head = [
-        "case",
-        "why",
-        "culled",
-        "f32 max",
-        "f32 rel",
-        "f32 grad",
-        "f32 1-cos",
-        "f64 rel",
-        "f64 grad",
-        "targets",
-    ]
-    lines = []
-    for case, (single, double) in measured(rows):
+    lines, missed = [], []
+    for case, (single, double) in ((case, outcomes) for case, outcomes in rows if not case.poison):
         in_f32, in_f64 = (len(case.expected_culled(dtype)) for dtype in ("f32", "f64"))
+        numbers = {
+            "max": single.value_abs, "f32": single.value_relative, "f64": double.value_relative,
+            "f32_gradient": single.gradient, "f64_gradient": double.gradient,
+            "turn": max(0.0, 1 - single.cosine),
+        }  # fmt: skip
         culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
-        numbers = (single.value_abs, single.value_relative, single.gradient, max(0.0, 1 - single.cosine))
-        numbers += (double.value_relative, double.gradient)
-        good = not misses(case, single) + misses(case, double)
-        lines.append(
-            [case.name, case.reason, culled, *(f"{v:.1e}" for v in numbers), "met" if good else "missed"]
-        )
-    missed = [
-        [case.name, o.dtype, "; ".join(misses(case, o)), *c.words()]
-        for case, outcomes in rows
-        for o in outcomes
-        if (c := conditions.get((case.name, o.dtype))) is not None
-    ]
-    poison = [(case, outcomes) for case, outcomes in rows if case.poison]
-    good = sum(not misses(case, o) for case, outcomes in poison for o in outcomes)
+        targets = "missed" if misses(case, single) + misses(case, double) else "met"
+        lines.append(numbers | {"name": case.name, "why": case.why, "culled": culled, "targets": targets})
+    for case, outcomes in rows:
+        for o in outcomes:
+            if (found := conditions.get((case.name, o.dtype))) is not None:
+                words: dict[str, Any] = {"by": "; ".join(misses(case, o)), "dtype": o.dtype}
+                missed.append({"name": case.name} | words | vars(found))
+    poison = [misses(case, o) for case, outcomes in rows if case.poison for o in outcomes]
+    good = f"{poison.count([])} of {len(poison)}"
     return [
-        markdown_table("Error against the oracle, on the same rounded inputs", head, lines),
-        markdown_table(
-            "Targets that are missed, and what one ulp of the inputs changes",
-            ["case", "dtype", "by", "1 ulp: values", "1 ulp: gradient", "1 ulp: cosine"],
-            missed,
-        ),
-        f"Inputs that are not finite: {good} of {2 * len(poison)} culled, with every other bit unchanged.",
+        table("Error against the oracle, on the same rounded inputs", lines, ERRORS),
+        table("Targets that are missed, and what one ulp of the inputs changes", missed, MISSED),
+        f"Inputs that are not finite: {good} culled, with every other bit unchanged.",
         f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
     ]
 
 
 def chart(rows: Rows) -> Figure:
     """Two panels, values and gradients: one row per case, f32 and f64, the targets as lines."""
-    shown = measured(rows)
-    figure = Figure(figsize=(10, 2 + 0.16 * len(shown)), dpi=130, layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    shown = [(case, outcomes) for case, outcomes in rows if not case.poison]
+    figure, (left, right) = panels(10, 2 + 0.16 * len(shown), 1, 2, sharey=True)
     y = np.arange(len(shown))
-    for axes, field, limit, title in (
-        (left, "value_relative", VALUE_F64, "values, relative"),
-        (right, "gradient", GRADIENT_F64, "gradients, relative L2"),
+    for axes, field, limit, what in (
+        (left, "value_relative", measure.VALUE_F64, "values, relative"),
+        (right, "gradient", measure.GRADIENT_F64, "gradients, relative L2"),
     ):
-        for k, (dtype, color) in enumerate((("f32", "#c2571a"), ("f64", "#1f6fb2"))):
+        for k, (dtype, color) in enumerate((("f32", ORANGE), ("f64", BLUE))):
             errors = [max(getattr(outcomes[k], field), 1e-18) for _, outcomes in shown]
             axes.plot(errors, y, "o", color=color, markersize=4, label=dtype)
-        axes.axvline(limit, color="#1f6fb2", linestyle="--", linewidth=1, label=f"target f64, {limit:g}")
-        axes.set(xscale="log", xlabel=title)
-        axes.grid(color="#dddddd", linewidth=0.7)
-        axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=3)
-    left.axvline(
-        VALUE_F32, color="#c2571a", linestyle="--", linewidth=1
-    )  # absolute, but the values are near 1
+        axes.axvline(limit, color=BLUE, linestyle="--", linewidth=1, label=f"target f64, {limit:g}")
+        axes.set(xscale="log", xlabel=what)
+        axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=3, frameon=False)
+    left.axvline(VALUE_F32, color=ORANGE, linestyle="--", linewidth=1)  # absolute, but the values are near 1
     left.set_yticks(y, [case.name for case, _ in shown], fontsize=7)
     left.set_ylim(len(shown), -1)
     return figure
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--long", action="store_true", help="also deep stacks and a large image")
 
 
-BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", add_options, run)
+BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", options, run)
