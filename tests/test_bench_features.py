@@ -52,7 +52,7 @@ def test_the_file_says_where_it_comes_from(quick: dict[str, Any], folder: Path) 
     assert quick["benchmark"] == "features"
     assert (
         quick["command"]
-        == "python -m benchmarks features --downscale 10.0 --iterations 14 --quick --scenes embedded"  # noqa
+        == "python -m benchmarks features --downscale 10.0 --iterations 14 --quick --scenes embedded"
     )
     assert quick["settings"]["scenes"] == ["embedded"]
     assert quick["commit"] == quick["versions"]["git_commit"]
