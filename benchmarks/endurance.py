@@ -84,10 +84,10 @@ FILE = Path(__file__).with_suffix(".toml")
 PROTOCOLS = read_protocols(FILE, Case)
 
 
-def photos_of(cell: Cell) -> Scene:
-    """What a cell trains on."""
+def measure(cell: Cell, scene: Scene) -> Run:
+    """Train the case of a cell on what it makes of the scene, which the cases share."""
     assert isinstance(cell.row, Case)
-    return PHOTOS[cell.row.photos](cell.scene)
+    return run_case(PHOTOS[cell.row.photos](scene), cell.config)
 
 
 def run_case(scene: Scene, config: TrainConfig) -> Run:
@@ -199,9 +199,9 @@ def run(args: argparse.Namespace) -> Report:
     scenes = load_scenes(args.scenes, protocol.downscale, protocol.embedded, args.out / "scenes", False)
     more = {row.label: {"photos": row.photos} for row in protocol.rows if isinstance(row, Case)}
     cells = grid(protocol, scenes, lambda row: (row.label,), lambda row: more[row.label])
-    study = open_study(args, "endurance", cells, photos_of)
+    study = open_study(args, "endurance", cells)
     if not args.finished:
-        study.train(lambda cell, photos: run_case(photos, cell.config))
+        study.train(measure)
     alone = len(scenes) == len(protocol.seeds) == 1
     names = {cell: cell.row.label if alone else str(cell) for cell in cells}
     results = [{"case": name, **study.runs[c]} for c, name in names.items() if c in study.runs]

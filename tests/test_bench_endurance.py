@@ -148,6 +148,8 @@ def test_the_command_keeps_finished_cases(
     assert sizes == [(42, 32)]
     report = json.loads((tmp_path / "endurance.json").read_text())
     assert [c["case"] for c in report["results"]["cases"]] == ["as it is", "one photo"]
+    plain, one = (case["records"][-1]["psnr"] for case in report["results"]["cases"])
+    assert abs(plain - one) > 0.1  # each is trained on photos of its own
     assert report["settings"]["iterations"] == PROTOCOLS["quick"].iterations
     assert (tmp_path / "endurance_runs.png").stat().st_size > 10_000
     here = Store(tmp_path).here

@@ -119,7 +119,7 @@ def load_inputs(folder: Path, n: int) -> RasterInputs:
             raise ValueError(f"{path} lacks {', '.join(missing)}")
         for name, wanted in shapes.items():
             array = data[name].astype(np.float64 if name in ("viewmat", "K") else np.float32)
-            if array.shape != (array.shape[:2] + (3,) if name == "v_output" else wanted):
+            if array.shape != ((*array.shape[:2], 3) if name == "v_output" else wanted):
                 raise ValueError(f"{path}: {name} has shape {list(array.shape)}, wanted {list(wanted)}")
             arrays[name] = array
     return RasterInputs(v_image=arrays.pop("v_output"), **arrays)

@@ -46,10 +46,8 @@ def make_trainer(
     ]
     colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
     scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
-    config = still_config(
-        TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=()), n
-    )
-    trainer = Trainer(scene, config)
+    config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
+    trainer = Trainer(scene, still_config(config, n))
     gaussians = trainer.gaussians
     with torch.no_grad():
         gaussians.scales.copy_(torch.from_numpy(inputs.scales).log())
