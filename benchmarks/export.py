@@ -43,7 +43,7 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
     before = held_out_psnr(scene, original)
     rows = []
     for name, options in VARIANTS.items():
-        print(f"bench export: {name}", file=sys.stderr, flush=True)
+        print(f"export: {name}", file=sys.stderr, flush=True)
         written = export(gaussians, folder / f"scene.{options.format}", options)
         renders = held_out_renders(scene, READERS[options.format](written.path))
         after = held_out_psnr(scene, renders)
