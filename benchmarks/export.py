@@ -87,6 +87,7 @@ def files_table(result: dict[str, Any]) -> str:
         | {"mb": row["bytes"] / 1e6, "share": 100 * row["bytes"] / result["ply_of_3dgs_bytes"]}
         | {"change": 0.0 - row["cost_db"], "levels": 255 * row["largest_change"]}
         | {"best": "yes" if row["pareto"] else ""}
+        | ({"psnr_to_original": "same"} if row["psnr_to_original"] is None else {})
         for row in result["files"]
     ]
     title = (

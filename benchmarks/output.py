@@ -85,6 +85,8 @@ def number(value: Any, form: str) -> str:
     """A value in a format, `ms` for seconds as milliseconds; NOTHING for None and NaN."""
     if value is None or value != value:
         return NOTHING
+    if isinstance(value, str):
+        return value
     if form == "ms":
         return f"{1000 * value:.3g}" if value < 0.1 else f"{1000 * value:.0f}"
     return format(value, form)
