@@ -32,8 +32,7 @@ from PIL import Image
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
-from benchmarks.cli import BENCHMARKS
-from benchmarks.cli import main as benchmark
+from benchmarks import cli as benchmarks
 from benchmarks.output import Benchmark, Report
 from hqgs.base.files import CHECKPOINT, PLY, FolderBusyError, write_json
 from hqgs.cli import main as cli
@@ -83,7 +82,7 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
         if user is not None:
             os.setuid(user)
         command, *rest = arguments
-        code = benchmark(rest) if command == "benchmarks" else cli.main(arguments)
+        code = benchmarks.main(rest) if command == "benchmarks" else cli.main(arguments)
         sys.stderr.flush()
     os._exit(code)
 
@@ -363,9 +362,9 @@ def test_a_benchmark_on_a_full_disk_is_one_line(
         write_json(args.out / "run.json", "x" * 9_000)
         return Report({})
 
-    monkeypatch.setitem(BENCHMARKS, "stability", Benchmark("full", lambda parser: None, full))
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "stability", Benchmark("full", lambda parser: None, full))
     with small_files(4_000):
-        assert benchmark(["stability", "--quick", "--out", str(tmp_path)]) == 1
+        assert benchmarks.main(["stability", "--quick", "--out", str(tmp_path)]) == 1
     assert last_line(capsys) == f"hqgs: {tmp_path}: [Errno 27] File too large"
     assert list(tmp_path.iterdir()) == []
 

@@ -13,9 +13,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 BLOCK_PIXELS = 16  # lanes of a block of 4 x 4 pixels
 
 # A lane of an AVX-512 core that does nothing but blend, with all lanes in use and all data in cache (measured
@@ -45,23 +42,21 @@ BLOCK_BYTES = 3 * 4  # an index in a block's list: written, read by both passes
 
 
 def count_work(
-    counts: NDArray[np.int64], pixels: int, tile_pairs: int, blocks: int, changed_blocks: int
+    blended: int, pixels: int, tile_pairs: int, blocks: int, changed_blocks: int
 ) -> dict[str, Any]:
-    """The work of one forward and backward pass.
+    """The work of one forward and backward pass, from the crate's counters.
 
     Args:
-        counts: blended Gaussians of some random pixels.
+        blended: (Gaussian, pixel) pairs that changed a pixel.
         pixels: of the image.
-        tile_pairs, blocks, changed_blocks: the crate's counters, `meta["work"]`: (Gaussian, tile) pairs,
-            (Gaussian, block) pairs that each pass evaluates, those of them that changed a pixel.
+        tile_pairs, blocks, changed_blocks: (Gaussian, tile) pairs, (Gaussian, block) pairs that each pass
+            evaluates, those of them that changed a pixel.
     """
-    blended = float(counts.mean()) * pixels
     lanes = BLOCK_PIXELS * blocks
     operations = LANE * lanes + PAIR * tile_pairs
     size = PAIR_BYTES * tile_pairs + BLOCK_BYTES * blocks
     return {
-        "blended_per_pixel": float(counts.mean()),
-        "blended_standard_error": float(counts.std() / np.sqrt(len(counts))),
+        "blended_per_pixel": blended / pixels,
         "blended_pairs": blended,
         "tile_pairs": tile_pairs,
         "blocks": blocks,

@@ -1,17 +1,19 @@
-"""How long the runs of a quality benchmark will take."""
+"""How long the runs of a study will take."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.quality.protocols import Cell
-from benchmarks.quality.runs import FIRST_STEPS, first_step, train
+from benchmarks.measure import FIRST_STEPS, first_step, train
 from hqgs.scene.scene import Scene
-from hqgs.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from benchmarks.study import Cell
 
 # A whole run's seconds per step over those of its first steps, until runs are finished that tell: the
 # built-in scene at 504 px takes 22 ms in its first 400 steps and 55 ms on average over 2,000. Runs that start
@@ -31,9 +33,9 @@ class Estimate:
 
     def add(self, cell: Cell, run: dict[str, Any]) -> None:
         """Learn from a finished run."""
-        per_step = run["wall_seconds"] / run["iterations"]
+        per_step = run["wall_seconds"] / max(run["iterations"], 1)
         self._finished[_kind(cell)].append(per_step)
-        if _room(run["config"]["densify"]["max_gaussians"], run["initial_points"]) > GROWTH:
+        if run["config"]["densify"]["max_gaussians"] > GROWTH * max(run["initial_points"], 1):
             self._growth.append(per_step / run["first_step_seconds"])
 
     def knows(self, cell: Cell) -> bool:
@@ -41,23 +43,21 @@ class Estimate:
 
     def probe(self, cell: Cell, photos: Scene) -> None:
         """Train a few steps of a cell."""
-        trainer = Trainer(photos, cell.config)
-        room = _room(trainer.config.densify.max_gaussians, len(trainer.gaussians))
-        steps, _ = train(trainer, min(cell.iterations, FIRST_STEPS.stop))
-        self._first[_kind(cell)] = first_step(steps), room
+        done = train(photos, cell.config, evaluate=False, at_most=FIRST_STEPS.stop)
+        most = done.trainer.config.densify.max_gaussians
+        self._first[_kind(cell)] = first_step(done.steps), most / max(done.initial_points, 1)
 
     def seconds(self, cells: Iterable[Cell]) -> float:
-        """What these cells will take together, each of which is known."""
+        """What these cells will take together, as far as they are known."""
         growth = float(np.median(self._growth)) if self._growth else GROWTH
         total = 0.0
         for cell in cells:
-            done = self._finished.get(_kind(cell))
-            if done:
+            if done := self._finished.get(_kind(cell)):
                 per_step = float(np.mean(done))
             else:
-                first, room = self._first[_kind(cell)]
+                first, room = self._first.get(_kind(cell), (0.0, 1.0))
                 per_step = first * min(growth, room)
-            total += cell.iterations * per_step
+            total += cell.config.iterations * per_step
         return total
 
 
@@ -69,9 +69,5 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _room(most: int, gaussians: int) -> float:
-    return most / max(gaussians, 1)
-
-
 def _kind(cell: Cell) -> Kind:
-    return cell.scene, cell.row.label
+    return cell.scene.name, cell.row.label

@@ -5,15 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import hqgs
+from benchmarks.data import build, read_toml
 from benchmarks.output import Benchmark, Report
 from benchmarks.speed import tables
-from benchmarks.speed.inputs import SIZE, RasterInputs, load_inputs, make_inputs
+from benchmarks.speed.inputs import RasterInputs, load_inputs, make_inputs
 from benchmarks.speed.memory import MemoryConfig, measure_memory
 from benchmarks.speed.peers import measure_gsplat
 from benchmarks.speed.rasterizer import RasterPass, measure, measure_threads
@@ -24,40 +25,24 @@ from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import Trainer
 
+DATA = read_toml(Path(__file__).with_name("speed.toml"))
+
 
 @dataclass(frozen=True)
 class SpeedConfig:
     """The sizes at which things are measured."""
 
-    repeats: int = 7  # rounds of everything that is timed
+    repeats: int  # rounds of everything that is timed
+    size: tuple[int, int]  # width, height
+    gaussians: tuple[int, ...]
+    step_gaussians: tuple[int, ...]
+    step_photos: int
+    scaling_gaussians: tuple[int, ...]
+    scaling_size: tuple[int, int]
+    scaling_sizes: tuple[tuple[int, int], ...]
+    memory: MemoryConfig
     seed: int = 2026
     method: str = "3dgs"
-    size: tuple[int, int] = SIZE  # width, height
-    gaussians: tuple[int, ...] = (10_000, 100_000, 500_000)
-    samples: int = 400  # pixels in which the blended Gaussians are counted
-    step_gaussians: tuple[int, ...] = (100_000, 200_000)
-    step_photos: int = 8
-    formations: tuple[str, ...] = ("blur", "lowres:2", "jpeg:10", "blur+lowres:2+jpeg:10")
-    scaling_gaussians: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000)
-    scaling_size: tuple[int, int] = (1008, 756)  # in a smaller image 2 million points overlap by themselves
-    scaling_sizes: tuple[tuple[int, int], ...] = (
-        (368, 276), (640, 480), (1024, 768), (1632, 1224), (2448, 1836), (3264, 2448),
-    )  # fmt: skip
-    memory: MemoryConfig = field(default_factory=MemoryConfig)
-
-
-QUICK = SpeedConfig(
-    repeats=3,
-    size=(96, 72),
-    gaussians=(500, 2_000),
-    samples=50,
-    step_gaussians=(500, 1_000),
-    step_photos=2,
-    scaling_gaussians=(500, 1_000, 2_000),
-    scaling_size=(96, 72),
-    scaling_sizes=((64, 48), (96, 72), (128, 96)),
-    memory=MemoryConfig(gaussians=1_000, photos=2, width=96, height=72, steps=3),
-)
 
 
 class Speed:
@@ -77,10 +62,8 @@ class Speed:
 
     @cached_property
     def trainers(self) -> dict[str, Trainer]:
-        made = {}
-        for n in self.config.step_gaussians:
-            made[f"{self.config.method}, {n:,}"] = self._trainer(n, self.config.method)
-        return made
+        method = self.config.method
+        return {f"{method}, {n:,}": self._trainer(n, method) for n in self.config.step_gaussians}
 
     def _trainer(self, n: int, method: str, options: HQGSConfig | None = None) -> Trainer:
         c = self.config
@@ -89,30 +72,32 @@ class Speed:
         return trainer
 
     def rasterizer(self) -> None:
-        rows = measure(self.inputs, self.config.repeats, self.config.samples)
+        rows = measure(self.inputs, self.config.repeats)
         self.report.results["rasterizer"] = rows
         self.report.tables += tables.rasterizer(rows)
 
     def step(self) -> None:
-        rows = measure_steps(self.trainers, self.config.repeats)
-        self.report.results["step"] = rows
+        self._steps("step", self.trainers)
+
+    def _steps(self, part: str, trainers: dict[str, Trainer]) -> None:
+        full = self.config.size == tuple(DATA["full"]["size"])
+        rows = measure_steps(trainers, self.config.repeats, DATA["targets"] if full else {})
+        self.report.results[part] = rows
         self.report.tables.append(tables.steps(rows))
 
     def formations(self) -> None:
         n = self.config.step_gaussians[0]
         trainers = {f"3dgs, {n:,}": self._trainer(n, "3dgs")}
-        for formation in self.config.formations:
+        for formation in DATA["steps"]["formations"]:
             trainers[f"hqgs, {formation}"] = self._trainer(n, "hqgs", HQGSConfig(formation=formation))
-        for variant in ("V6", "V7"):  # the paper's module beside the loss of 3dgs, and all of it
+        for variant in DATA["steps"]["variants"]:
             config = HQGSConfig(guidance=PAPER, paper=VARIANTS[variant])
             trainers[f"hqgs, paper's {variant}"] = self._trainer(n, "hqgs", config)
-        rows = measure_steps(trainers, self.config.repeats)
-        self.report.results["formations"] = rows
-        self.report.tables.append(tables.steps(rows))
+        self._steps("formations", trainers)
 
     def threads(self) -> None:
         if hqgs.get_num_threads() == 1:
-            return self.leave_out("speed-up by threads", "there is one thread")
+            return self.report.leave_out("speed-up by threads", "there is one thread")
         middle, trainer = self.inputs[len(self.inputs) // 2], next(iter(self.trainers.values()))
         cases: dict[str, Callable[[], dict[str, float]]] = {
             f"rasterizer, {len(middle):,} Gaussians": RasterPass(middle),
@@ -136,7 +121,7 @@ class Speed:
         try:
             result = measure_memory(self.config.memory)
         except RuntimeError as error:
-            return self.leave_out("peak memory", str(error))
+            return self.report.leave_out("peak memory", str(error))
         self.report.results["memory"] = result
         self.report.tables.append(tables.memory(result))
 
@@ -144,12 +129,9 @@ class Speed:
         try:
             rows = measure_gsplat(self.inputs, self.config.repeats)
         except RuntimeError as error:
-            return self.leave_out("gsplat", str(error))
+            return self.report.leave_out("gsplat", str(error))
         self.report.results["gsplat"] = rows
         self.report.tables.append(tables.gsplat(rows))
-
-    def leave_out(self, what: str, why: str) -> None:
-        self.report.left_out.append({"what": what, "why": why})
 
 
 PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory", "peers")
@@ -158,7 +140,8 @@ PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory", "pe
 def run(args: argparse.Namespace) -> Report:
     """Measure the parts that were asked for."""
     check_method(args.method)
-    config = QUICK if args.quick else SpeedConfig()
+    part = "quick" if args.quick else "full"
+    config = build(SpeedConfig, DATA[part], f"speed.toml, {part}")
     memory = replace(config.memory, method=args.method, seed=args.seed)
     config = replace(config, method=args.method, seed=args.seed, memory=memory)
     if args.repeats is not None:
@@ -168,12 +151,12 @@ def run(args: argparse.Namespace) -> Report:
     report = Report(settings=asdict(config))
     speed = Speed(config, args.inputs, report)
     for part in args.parts:
-        print(f"bench speed: {part}", file=sys.stderr)
+        print(f"speed: {part}", file=sys.stderr)
         getattr(speed, part)()
     return report
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def options(parser: argparse.ArgumentParser) -> None:
     add: Any = parser.add_argument
     add(
         "--parts",
@@ -189,4 +172,4 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add("--inputs", type=Path, metavar="DIR", help="read inputs_N.npz there for the rasterizer")
 
 
-BENCHMARK = Benchmark("time and memory of the rasterizer and of a training step", add_options, run)
+BENCHMARK = Benchmark("time and memory of the rasterizer and of a training step", options, run)

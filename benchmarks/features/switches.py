@@ -1,11 +1,12 @@
-"""What makes training fast, each with a switch that turns it off (or on, where it is off by default)."""
+"""What makes training fast, each with a switch that puts the other choice in place."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -14,27 +15,14 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 import hqgs
+from benchmarks import places
 from benchmarks.accuracy.knobs import Knobs, tuned
+from benchmarks.protocol import Row, read_protocols
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import RasterizationMeta
 from hqgs.scene.scene import Camera
-from hqgs.training import trainer as trainer_module
-from hqgs.training.config import TrainConfig
-from hqgs.training.methods import base as three_dgs
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-
-
-@dataclass(frozen=True)
-class Feature:
-    """One choice that is made for speed, and how to train with the other one."""
-
-    name: str
-    other: str  # what is done instead in the run of this feature
-    by_default: bool  # whether the product has it on
-    switch: Callable[[], Any] = nullcontext  # a context manager: inside it the other choice is in place
-    config: Callable[[TrainConfig], TrainConfig] = lambda config: config
-    refinable: bool = True  # False: it is about how Gaussians start, which trained ones cannot tell
 
 
 @contextmanager
@@ -48,23 +36,17 @@ def _threads(count: int) -> Iterator[None]:
 
 
 @contextmanager
-def _torch_with_all_threads() -> Iterator[None]:
+def _in_torch(place: places.Place, function: Any) -> Iterator[None]:
     """What torch does instead of the crate may use as many threads as the crate."""
     before = torch.get_num_threads()
     torch.set_num_threads(hqgs.get_num_threads())
     try:
-        with patch.object(trainer_module, "one_torch_thread", nullcontext):
+        with ExitStack() as stack:
+            stack.enter_context(patch.object(*places.ONE_TORCH_THREAD, nullcontext))
+            stack.enter_context(patch.object(*place, function))
             yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def _in_torch(owner: Any, name: str, function: Any) -> Iterator[None]:
-    with ExitStack() as stack:
-        stack.enter_context(_torch_with_all_threads())
-        stack.enter_context(patch.object(owner, name, function))
-        yield
 
 
 def render_in_float64(
@@ -120,24 +102,39 @@ class TorchAdam(torch.optim.Adam):
         return super().step(closure)
 
 
-FEATURES = (
-    Feature(
-        "float32 rasterizer",
-        "float64",
-        True,
-        partial(patch.object, trainer_module, "render_view", render_in_float64),
-    ),
-    Feature("exact spans of tiles", "bounding boxes", True, partial(tuned, Knobs(spans="box"))),
-    Feature("skipping of blocks", "every block of a tile", True, partial(tuned, Knobs(skip_blocks=False))),
-    Feature("fused loss", "torch", True, partial(_in_torch, three_dgs, "photometric_loss", torch_loss)),
-    Feature("fused Adam", "torch", True, partial(_in_torch, trainer_module, "Adam", TorchAdam)),
-    Feature(
-        "rising SH degree",
-        "degree 3 from the start",
-        True,
-        config=lambda config: replace(config, sh_interval=1),
-        refinable=False,
-    ),
-    Feature("all threads", "1 thread", True, partial(_threads, 1)),
-    Feature("selective Adam", "on", False, config=lambda config: replace(config, selective_adam=True)),
-)
+SWITCHES: dict[str, Callable[[], Any]] = {  # context managers: inside them the other choice is in place
+    "": nullcontext,
+    "float64": partial(patch.object, *places.RENDER_VIEW, render_in_float64),
+    "boxes": partial(tuned, Knobs(spans="box")),
+    "every block": partial(tuned, Knobs(skip_blocks=False)),
+    "torch's loss": partial(_in_torch, places.LOSS, torch_loss),
+    "torch's Adam": partial(_in_torch, places.ADAM, TorchAdam),
+    "one thread": partial(_threads, 1),
+}
+
+
+@dataclass(frozen=True)
+class Feature(Row):
+    """One choice that is made for speed, and how to train with the other one."""
+
+    other: str = ""  # what is done instead in the run of this feature
+    by_default: bool = True  # whether the product has it on
+    switch: str = ""
+    refinable: bool = True  # whether Gaussians that were grown once and trained on can tell
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.switch not in SWITCHES:
+            raise ValueError(f"switch is {self.switch!r}, wanted one of: {', '.join(filter(None, SWITCHES))}")
+
+    def switched(self) -> Any:
+        """A context manager: inside it the other choice is in place, as far as it is none of the config."""
+        return SWITCHES[self.switch]()
+
+    @property
+    def name(self) -> str:
+        return f"{self.label}: {self.other}" if self.other else self.label
+
+
+PROTOCOLS = read_protocols(Path(__file__).with_name("features.toml"), Feature)
+DEFAULT, *FEATURES = [row for row in PROTOCOLS["standard"].rows if isinstance(row, Feature)]

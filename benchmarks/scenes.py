@@ -1,4 +1,4 @@
-"""The scenes of a quality benchmark: read, split for tuning, degraded."""
+"""The scenes of the studies: read, split for tuning, degraded."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from hqgs.scene.sfm.reconstruct import sfm_scene
 
 EMBEDDED = Path("embedded")  # stands for the built-in scene
 BUILT_IN = {EMBEDDED: None, Path("embedded-matte"): 0.0, Path("embedded-glossy"): 1.0}  # gloss
+SMALLEST = 8  # pixels: the sides of the built-in scenes' photos
 VALIDATE_EVERY = 7  # every 7th training photo
 
 
@@ -36,6 +37,9 @@ def load_scenes(
     for source in sources:
         if source in BUILT_IN:
             width, height = (round(size / downscale) for size in embedded[:2])
+            if min(width, height) < SMALLEST:
+                most = min(embedded[:2]) / SMALLEST
+                raise ValueError(f"downscale must be in 1..{most:g} for {source}, got {downscale}")
             folder = cache / f"{source}_{width}x{height}_{embedded[2]}"
             made = embedded_scene(folder, width, height, num_views=embedded[2], gloss=BUILT_IN[source])
             scene = replace(made, name=str(source))

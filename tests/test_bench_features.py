@@ -1,4 +1,4 @@
-"""The benchmark `training` at tiny sizes: its JSON, what must be equal is equal, and finished runs stay."""
+"""The benchmark `features` at tiny sizes: its JSON, what must be equal is equal, and finished runs stay."""
 
 from __future__ import annotations
 
@@ -14,14 +14,11 @@ from PIL import Image
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from benchmarks import cli
-from benchmarks.features import training
-from benchmarks.features.features import FEATURES, TorchAdam, torch_loss
-from benchmarks.features.training import still_trainer
-from benchmarks.features.training_report import DEFAULT, compare, verdicts
-from hqgs import _rust
-from hqgs.training import trainer as trainer_module
-from hqgs.training.methods import base as three_dgs
+from benchmarks import cli, places
+from benchmarks.features import report
+from benchmarks.features import run as features
+from benchmarks.features.run import still_trainer
+from benchmarks.features.switches import DEFAULT, FEATURES, PROTOCOLS, TorchAdam, torch_loss
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 
@@ -29,7 +26,7 @@ SAME_BITS = ("exact spans of tiles", "skipping of blocks", "all threads")
 
 
 def call(*arguments: str | Path) -> int:
-    return cli.main(["training", *map(str, arguments)])
+    return cli.main(["features", *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
@@ -48,21 +45,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def quick(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "training.json").read_text(encoding="utf-8"))
+    return json.loads((folder / "features.json").read_text(encoding="utf-8"))
 
 
 def test_the_file_says_where_it_comes_from(quick: dict[str, Any], folder: Path) -> None:
-    assert quick["benchmark"] == "training"
-    assert quick["command"] == "python -m benchmarks training --downscale 10.0 --iterations 14 --quick"
+    assert quick["benchmark"] == "features"
+    assert (
+        quick["command"]
+        == "python -m benchmarks features --downscale 10.0 --iterations 14 --quick --scenes embedded"
+    )
     assert quick["settings"]["scenes"] == ["embedded"]
     assert quick["commit"] == quick["versions"]["git_commit"]
-    with Image.open(folder / "training_embedded.png") as chart:
+    with Image.open(folder / "features_embedded.png") as chart:
         assert len(np.unique(np.asarray(chart.convert("RGB")).reshape(-1, 3), axis=0)) > 10
 
 
 def test_every_feature_has_a_run_and_a_verdict(quick: dict[str, Any]) -> None:
     (scene,) = quick["results"]["scenes"]
-    names = [feature.name for feature in FEATURES]
+    names = [feature.label for feature in FEATURES]
     assert [row["feature"] for row in scene["features"]] == names
     assert [row["feature"] for row in quick["results"]["verdicts"]] == names
     (default,) = scene["default"]
@@ -100,29 +100,51 @@ def test_finished_runs_are_not_repeated(
     def never(*args: Any, **options: Any) -> Any:
         raise AssertionError("trained again")
 
-    monkeypatch.setattr(training, "train", never)
-    monkeypatch.setattr(training.Training, "step_seconds", never)
+    monkeypatch.setattr(features, "train", never)
+    monkeypatch.setattr(features.Features, "refined", never)
     assert call("--quick", "--iterations", "14", "--downscale", "10", "--out", folder) == 0
-    again = json.loads((folder / "training.json").read_text(encoding="utf-8"))
+    again = json.loads((folder / "features.json").read_text(encoding="utf-8"))
     first, second = (r["results"]["scenes"][0] for r in (quick, again))
     assert first["default"] == second["default"]
     assert [row["runs"] for row in first["features"]] == [row["runs"] for row in second["features"]]
 
 
-def test_runs_of_another_length_are_refused(
+def test_runs_of_another_length_are_other_runs(
     folder: Path, quick: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert call("--quick", "--iterations", "15", "--downscale", "10", "--out", folder) == 2
-    assert "holds a run with another configuration; choose another --out" in capsys.readouterr().err
+    options = ("--quick", "--iterations", "15", "--downscale", "10", "--out", folder, "--rows", "fused loss")
+    assert call(*options, "--finished") == 0
+    written = json.loads((folder / "features.json").read_text(encoding="utf-8"))
+    assert written["results"] == {"scenes": [], "verdicts": []}
+    assert [entry["what"] for entry in written["left_out"]] == [
+        "run embedded, default, seed 0", "run embedded, fused loss, seed 0",
+    ]  # fmt: skip
+
+
+def test_a_run_that_fails_leaves_its_scene_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = features.train
+
+    def failing(photos: Any, config: Any) -> Any:
+        if config.selective_adam:
+            raise ValueError("it cannot")
+        return real(photos, config)
+
+    monkeypatch.setattr(features, "train", failing)
+    options = ("--quick", "--iterations", "3", "--downscale", "10", "--out", tmp_path)
+    assert call(*options, "--rows", "selective Adam") == 0
+    written = json.loads((tmp_path / "features.json").read_text(encoding="utf-8"))
+    assert written["results"]["scenes"] == []
+    assert written["left_out"] == [{"what": "run embedded, selective Adam, seed 0", "why": "it cannot"}]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--iterations", "0"], "iterations is 0, wanted at least 1"),
-        (["--seeds", "0"], "seeds is 0, wanted at least 1"),
+        (["--seeds", "-1"], "seed is -1, wanted at least 0"),
+        (["--repeats", "0"], "repeats is 0, wanted at least 1"),
         (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
-        (["--scene", "/no/such/folder"], "there is no scene folder /no/such/folder"),
+        (["--scenes", "/no/such/folder"], "there is no scene folder /no/such/folder"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
@@ -130,7 +152,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
 ) -> None:
     assert call("--quick", "--out", tmp_path, *arguments) == 2
     assert message in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "training.json").exists()
+    assert not (tmp_path / "features.json").exists()
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -151,28 +173,26 @@ def test_the_loss_in_torch_is_the_loss(masked: bool, shape: tuple[int, int, int]
 
 def test_switches_are_undone() -> None:
     before = hqgs.get_num_threads(), torch.get_num_threads()
-    places = (
-        (_rust, "project_forward"), (trainer_module, "render_view"), (trainer_module, "Adam"),
-        (trainer_module, "one_torch_thread"), (three_dgs, "photometric_loss"),
-    )  # fmt: skip
-    found = [getattr(*place) for place in places]
+    watched = places.PROJECT, places.RENDER_VIEW, places.ADAM, places.ONE_TORCH_THREAD, places.LOSS
+    found = [getattr(*place) for place in watched]
+    default = PROTOCOLS["quick"].train_config(DEFAULT, 0)
     changed: set[str] = set()
     for feature in FEATURES:
-        with feature.switch():
-            inside = [getattr(*place) for place in places]
+        with feature.switched():
+            inside = [getattr(*place) for place in watched]
             if hqgs.get_num_threads() == 1 < before[0] or inside != found:
-                changed.add(feature.name)
-        assert [getattr(*place) for place in places] == found
+                changed.add(feature.label)
+        assert [getattr(*place) for place in watched] == found
         assert (hqgs.get_num_threads(), torch.get_num_threads()) == before
-        if feature.config(tiny_config()) != tiny_config():
-            changed.add(feature.name)
-    expected = {f.name for f in FEATURES} - ({"all threads"} if before[0] == 1 else set())
+        if PROTOCOLS["quick"].train_config(feature, 0) != default:
+            changed.add(feature.label)
+    expected = {f.label for f in FEATURES} - ({"all threads"} if before[0] == 1 else set())
     assert changed == expected
 
 
 def test_a_trainer_with_adam_of_torch_learns_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     ours = Trainer(tiny_scene(), tiny_config())
-    monkeypatch.setattr(trainer_module, "Adam", TorchAdam)
+    monkeypatch.setattr(*places.ADAM, TorchAdam)
     theirs = Trainer(tiny_scene(), tiny_config())
     assert isinstance(theirs.state.optimizer, torch.optim.Adam)
     for _ in range(7):  # before the number of Gaussians can differ
@@ -200,8 +220,16 @@ def run_of(psnr: float, seconds: float, refined: float = 31.0) -> dict[str, Any]
     return run | {"history": []}
 
 
+def compare(*arguments: Any) -> list[dict[str, Any]]:
+    return report.compare(FEATURES, *arguments)
+
+
+def verdicts(scenes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return report.verdicts(FEATURES, scenes)
+
+
 def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:
-    runs = {f.name: [run_of(psnr, 20.0) for psnr in psnrs] for f in (DEFAULT, *FEATURES)}
+    runs = {f.label: [run_of(psnr, 20.0) for psnr in psnrs] for f in (DEFAULT, *FEATURES)}
     for run in runs["rising SH degree"]:
         run["refined_psnr"] = None
     return runs
@@ -209,8 +237,8 @@ def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:
 
 def test_costs_and_verdicts_of_a_hand_made_case() -> None:
     runs = runs_of(30.06, 30.06)
-    runs[DEFAULT.name] = [run_of(30.0, 10.0), run_of(30.02, 10.0)]
-    steps = {name: [{"total": 3.0}] * 3 for name in runs} | {DEFAULT.name: [{"total": 1.0}] * 3}
+    runs[DEFAULT.label] = [run_of(30.0, 10.0), run_of(30.02, 10.0)]
+    steps = {name: [{"total": 3.0}] * 3 for name in runs} | {DEFAULT.label: [{"total": 1.0}] * 3}
     rows = {row["feature"]: row for row in compare(runs, steps)}
     slower, selective = rows["fused loss"], rows["selective Adam"]
     assert slower["costs_db"] == pytest.approx([0.06, 0.04])

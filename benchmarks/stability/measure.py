@@ -1,22 +1,17 @@
-"""The benchmark `stability`: error of values and gradients on stiff cases, against 100 decimal digits."""
+"""Errors of values and gradients of a case against 100 decimal digits, and the targets that they miss."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.output import Benchmark, Report
-from benchmarks.stability.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, Pixel, load_mpmath
-from benchmarks.stability.stability_cases import Case, cases
-from hqgs.base.text import markdown_table
+from benchmarks.stability.cases import Case
+from benchmarks.stability.oracle import GROUPS, Array, Oracle, OracleScene, Pixel
 
 DTYPES = {"f32": torch.float32, "f64": torch.float64}
 VALUE_F64, GRADIENT_F64 = 1e-12, 1e-9  # relative
@@ -48,10 +43,6 @@ class Condition:
     value_relative: float
     gradient: float
     cosine: float
-
-    def words(self) -> list[str]:
-        """For a table."""
-        return [f"{self.value_relative:.1e}", f"{self.gradient:.1e}", f"{self.cosine:.6f}"]
 
 
 def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
@@ -220,126 +211,3 @@ def input_rounding(case: Case) -> float:
     """Largest change of any compared value that rounding the inputs to float32 alone causes."""
     exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
     return largest_difference([exact.pixel(p) for p in case.pixels], [rounded.pixel(p) for p in case.pixels])
-
-
-def run(args: argparse.Namespace) -> Report:
-    """Evaluate the catalogue."""
-    load_mpmath()
-    if args.quick and args.long:
-        raise ValueError("--quick and --long exclude each other")
-    report = Report(settings={"long": args.long, "digits": DIGITS, "f64_values": VALUE_F64,
-                              "f64_gradients": GRADIENT_F64, "f32_ordinary": VALUE_F32, "cosine": COSINE,
-                              "negligible": NEGLIGIBLE})  # fmt: skip
-    rows = []
-    for case in cases(args.long):
-        print(f"bench stability: {case.name}", file=sys.stderr)
-        rows.append((case, [evaluate(case, dtype) for dtype in ("f32", "f64")]))
-    conditions = {
-        (case.name, o.dtype): condition(case, o.dtype)
-        for case, outcomes in rows
-        for o in outcomes
-        if misses(case, o)
-    }
-    offset = next(case for case, _ in rows if case.name == "world offset 1e6")
-    rounding = input_rounding(offset)
-    report.results = {
-        "cases": [
-            {
-                "name": case.name,
-                "reason": case.reason,
-                "culled": {o.dtype: list(case.expected_culled(o.dtype)) for o in outcomes},
-                "outcomes": [{**vars(o), "misses": misses(case, o)} for o in outcomes],
-            }
-            for case, outcomes in rows
-        ],
-        "conditions": [
-            {"name": name, "dtype": dtype, **vars(found)} for (name, dtype), found in conditions.items()
-        ],
-        "world_offset_f32_input_rounding": rounding,
-    }
-    report.tables = tables(rows, conditions, rounding)
-    report.figures["errors"] = chart(rows)
-    return report
-
-
-Rows = Sequence[tuple[Case, list[Outcome]]]
-
-
-def measured(rows: Rows) -> Rows:
-    """The cases that were held against the oracle."""
-    return [row for row in rows if not row[0].poison]
-
-
-def tables(rows: Rows, conditions: dict[tuple[str, str], Condition], rounding: float) -> list[str]:
-    head = [
-        "case",
-        "why",
-        "culled",
-        "f32 max",
-        "f32 rel",
-        "f32 grad",
-        "f32 1-cos",
-        "f64 rel",
-        "f64 grad",
-        "targets",
-    ]
-    lines = []
-    for case, (single, double) in measured(rows):
-        in_f32, in_f64 = (len(case.expected_culled(dtype)) for dtype in ("f32", "f64"))
-        culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
-        numbers = (single.value_abs, single.value_relative, single.gradient, max(0.0, 1 - single.cosine))
-        numbers += (double.value_relative, double.gradient)
-        good = not misses(case, single) + misses(case, double)
-        lines.append(
-            [case.name, case.reason, culled, *(f"{v:.1e}" for v in numbers), "met" if good else "missed"]
-        )
-    missed = [
-        [case.name, o.dtype, "; ".join(misses(case, o)), *c.words()]
-        for case, outcomes in rows
-        for o in outcomes
-        if (c := conditions.get((case.name, o.dtype))) is not None
-    ]
-    poison = [(case, outcomes) for case, outcomes in rows if case.poison]
-    good = sum(not misses(case, o) for case, outcomes in poison for o in outcomes)
-    return [
-        markdown_table("Error against the oracle, on the same rounded inputs", head, lines),
-        markdown_table(
-            "Targets that are missed, and what one ulp of the inputs changes",
-            ["case", "dtype", "by", "1 ulp: values", "1 ulp: gradient", "1 ulp: cosine"],
-            missed,
-        ),
-        f"Inputs that are not finite: {good} of {2 * len(poison)} culled, with every other bit unchanged.",
-        f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
-    ]
-
-
-def chart(rows: Rows) -> Figure:
-    """Two panels, values and gradients: one row per case, f32 and f64, the targets as lines."""
-    shown = measured(rows)
-    figure = Figure(figsize=(10, 2 + 0.16 * len(shown)), dpi=130, layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    y = np.arange(len(shown))
-    for axes, field, limit, title in (
-        (left, "value_relative", VALUE_F64, "values, relative"),
-        (right, "gradient", GRADIENT_F64, "gradients, relative L2"),
-    ):
-        for k, (dtype, color) in enumerate((("f32", "#c2571a"), ("f64", "#1f6fb2"))):
-            errors = [max(getattr(outcomes[k], field), 1e-18) for _, outcomes in shown]
-            axes.plot(errors, y, "o", color=color, markersize=4, label=dtype)
-        axes.axvline(limit, color="#1f6fb2", linestyle="--", linewidth=1, label=f"target f64, {limit:g}")
-        axes.set(xscale="log", xlabel=title)
-        axes.grid(color="#dddddd", linewidth=0.7)
-        axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=3)
-    left.axvline(
-        VALUE_F32, color="#c2571a", linestyle="--", linewidth=1
-    )  # absolute, but the values are near 1
-    left.set_yticks(y, [case.name for case, _ in shown], fontsize=7)
-    left.set_ylim(len(shown), -1)
-    return figure
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--long", action="store_true", help="also deep stacks and a large image")
-
-
-BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", add_options, run)

@@ -1,4 +1,4 @@
-"""An independent count of the work that an image needs: single pixels, composited in float64 numpy.
+"""An independent count of the Gaussians that blend: single pixels, composited in float64 numpy.
 
 It shares the constants with the crate, and no code; the formulas are those of docs/conventions.md.
 """
