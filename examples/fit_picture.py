@@ -37,12 +37,13 @@ def main() -> None:
         "opacities": torch.zeros(n),  # logits
         "colors": torch.zeros(n, 3),  # logits
     }
-    optimizer = torch.optim.Adam([tensor.requires_grad_() for tensor in trained.values()], lr=1e-2)
+    optimizer = torch.optim.Adam([tensor.requires_grad_() for tensor in trained.values()], lr=2e-2)
     viewmats = torch.eye(4)[None]  # [1, 4, 4], world to camera
     Ks = torch.tensor([[[float(size), 0, size / 2], [0, float(size), size / 2], [0, 0, 1]]])  # pixels
+    image = torch.zeros_like(target)
     images = target[None]
     for iteration in range(args.iterations):
-        images, _, meta = hqgs.rasterization(
+        [image], _, meta = hqgs.rasterization(
             trained["means"],
             trained["quats"],
             trained["scales"].exp(),
@@ -53,7 +54,7 @@ def main() -> None:
             size,
             size,
         )
-        loss = (images[0] - target).square().mean()
+        loss = (image - target).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -61,7 +62,7 @@ def main() -> None:
             seen = int((meta["radii"][0] > 0).all(dim=1).sum())
             print(f"iteration {iteration + 1}: {-10 * loss.log10().item():.2f} dB, {seen} Gaussians in view")
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    both = torch.cat([target, images[0].detach().clamp(0, 1)], dim=1)
+    both = torch.cat([target, image.detach().clamp(0, 1)], dim=1)
     Image.fromarray((255 * both).round().byte().numpy()).save(args.out)
     print(f"the picture and the fit: {args.out}")
 
