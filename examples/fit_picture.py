@@ -41,7 +41,6 @@ def main() -> None:
     viewmats = torch.eye(4)[None]  # [1, 4, 4], world to camera
     Ks = torch.tensor([[[float(size), 0, size / 2], [0, float(size), size / 2], [0, 0, 1]]])  # pixels
     image = torch.zeros_like(target)
-    images = target[None]
     for iteration in range(args.iterations):
         [image], _, meta = hqgs.rasterization(
             trained["means"],
