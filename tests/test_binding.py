@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import subprocess
 import sys
 import threading
@@ -113,3 +115,22 @@ def test_threads_can_be_set_and_zero_is_refused() -> None:
         assert hqgs.get_num_threads() == 3
     finally:
         hqgs.set_num_threads(before)
+
+
+def with_simd(level: str) -> subprocess.CompletedProcess[str]:
+    code = "from hqgs import _rust; print(_rust.simd_level())"
+    env = {**os.environ, "HQGS_SIMD": level}
+    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="other levels elsewhere")
+def test_the_environment_forces_vector_instructions() -> None:
+    assert with_simd("sse4.2").stdout.strip() == "SSE4.2"
+    assert with_simd("").stdout.strip() == _rust.simd_level()
+
+
+@pytest.mark.parametrize(("level", "problem"), [("avx9", "there is no level"), ("wasm", "this CPU does not have")])
+def test_vector_instructions_that_are_not_there_are_refused(level: str, problem: str) -> None:
+    done = with_simd(level)
+    assert done.returncode == 1
+    assert f'ValueError: HQGS_SIMD: {problem} "{level}"; use one of ' in done.stderr

@@ -1,7 +1,7 @@
 //! Vector-Jacobian product of compositing.
 
 use super::{
-    CompositeInput, Composited, for_alpha, for_vectors,
+    CompositeInput, Composited, for_alpha, for_parts, for_vectors,
     gather::{PairLayout, gather},
     kernel::{self, Adjoint, Grid, LAYER, Sums},
 };
@@ -163,7 +163,7 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     counts.backward_tiles = 1;
     list.fetch();
     let begins = unblend_blocks::<S, T, D, E>(simd, input, grid, tile, &depths, adjoint, layers)?;
-    let out = sum_layers::<S, T, D>(simd, input, grid, tile, &begins, layout, adjoint, layers)?;
+    let out = for_parts!(S, T, P => sum_layers::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
     Ok((out, counts))
 }
 
@@ -239,7 +239,7 @@ fn unblend_blocks<S: Simd, T: Real, const D: usize, const E: usize>(
 
 /// Gaussian by Gaussian the sums over its blocks.
 #[inline(always)]
-fn sum_layers<S: Simd, T: Real, const D: usize>(
+fn sum_layers<S: Simd, T: Real, const D: usize, const P: usize>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
@@ -255,7 +255,7 @@ fn sum_layers<S: Simd, T: Real, const D: usize>(
     let row = layout.row();
     let mut out = memory::filled(T::ZERO, list.records.len() * row, NAME)?;
     for ((record, &mask), &place) in list.records.iter().zip(&list.masks).zip(&list.places) {
-        let mut sums = Sums::<S, T>::new(simd, record);
+        let mut sums = Sums::<S, T, P>::new(simd, record);
         let out = &mut out[place as usize * row..(place as usize + 1) * row];
         let mut rest = mask;
         while rest != 0 {

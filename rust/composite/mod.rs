@@ -132,7 +132,23 @@ macro_rules! for_vectors {
     }};
 }
 
-use {for_alpha, for_vectors};
+/// Call a function with the constant P: the number of vectors that a sum needs.
+macro_rules! for_parts {
+    ($S:ty, $T:ty, $P:ident => $call:expr) => {
+        match crate::simd::sums::parts::<$S, $T>() {
+            1 => for_parts!(@ $P = 1, $call),
+            2 => for_parts!(@ $P = 2, $call),
+            4 => for_parts!(@ $P = 4, $call),
+            _ => unreachable!("vectors have 16 to 64 bytes"),
+        }
+    };
+    (@ $P:ident = $parts:literal, $call:expr) => {{
+        const $P: usize = $parts;
+        $call
+    }};
+}
+
+use {for_alpha, for_parts, for_vectors};
 
 #[cfg(test)]
 mod tests {

@@ -17,6 +17,7 @@ use crate::{
         Real, Wide,
         groups::{self, Column, GROUP, wide3},
         lanes, splat as splat_lanes,
+        sums::{self, MAX_PARTS},
         vec3::splat3,
     },
     uninit::{UninitPiece, UninitVec},
@@ -331,7 +332,7 @@ fn backward_chunk<S: Simd, T: Real>(
         options.eps2d,
     );
     let center = splat3(simd, camera.center);
-    let mut camera_grad = CameraGradLanes::zero(simd);
+    let mut camera_grads = [CameraGradLanes::zero(simd); MAX_PARTS];
     let mut inputs = Inputs::ZERO;
     let mut cotangents = Cotangents::ZERO;
     let geometry_wanted = v.means2d.is_some()
@@ -372,6 +373,7 @@ fn backward_chunk<S: Simd, T: Real>(
         for at in (0..GROUP).step_by(lanes::<S>()) {
             // Not those that were culled, nor those beyond the end.
             let valid = lanes_in(simd, visible, at);
+            let camera_grad = &mut camera_grads[at / lanes::<S>() % sums::parts::<S, f64>()];
             let (mut grad, mut v_opacity) = (GeometryGrad::zero(simd), zero);
             if geometry_wanted {
                 let mut g = inputs.geometry(simd, at, &camera_lanes);
@@ -381,7 +383,7 @@ fn backward_chunk<S: Simd, T: Real>(
                 } else {
                     None
                 };
-                let camera_grad = camera_wanted.then_some(&mut camera_grad);
+                let camera_grad = camera_wanted.then_some(&mut *camera_grad);
                 (grad, v_opacity) =
                     cotangents.pull(simd, at, &g, opacity, &camera_lanes, camera_grad);
             }
@@ -399,7 +401,8 @@ fn backward_chunk<S: Simd, T: Real>(
         }
         chunk.put(&buffers, rows);
     }
-    (camera_grad.sum(), counts)
+    let camera_grads = &mut camera_grads[..sums::parts::<S, f64>()];
+    (CameraGradLanes::sum(camera_grads), counts)
 }
 
 /// Gradients of a group in the type of the inputs.

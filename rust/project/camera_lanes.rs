@@ -4,11 +4,13 @@ use crate::{
     scene::{Camera, CameraGrad},
     simd::{
         Real, Wide, splat,
+        sums::fold,
         vec3::{M3, V3, splat3},
     },
 };
 use fearless_simd::{Simd, SimdBase, SimdFloat};
 use glam::{DMat3, DVec2, DVec3};
+use std::ops::Add;
 
 /// A camera, the same in each lane.
 pub(crate) struct CameraLanes<S: Simd> {
@@ -81,6 +83,7 @@ fn dot_plus<S: Simd, V: SimdFloat<S>>(a: V3<V>, b: V3<V>, c: V) -> V {
 }
 
 /// Gradient of the camera, a sum per lane.
+#[derive(Clone, Copy)]
 pub(crate) struct CameraGradLanes<S: Simd> {
     pub rotation: [V3<Wide<S>>; 3],
     pub translation: V3<Wide<S>>,
@@ -98,14 +101,28 @@ impl<S: Simd> CameraGradLanes<S> {
         }
     }
 
-    /// Sum of the lanes.
+    /// Sum of the lanes of all parts.
     #[inline(always)]
-    pub fn sum(&self) -> CameraGrad {
-        let [r0, r1, r2] = self.rotation;
+    pub fn sum(parts: &mut [Self]) -> CameraGrad {
+        let all = fold(parts);
+        let [r0, r1, r2] = all.rotation;
         CameraGrad {
             rotation: DMat3::from_cols(sum::<S>(r0), sum::<S>(r1), sum::<S>(r2)).transpose(),
-            translation: sum::<S>(self.translation),
-            center: sum::<S>(self.center),
+            translation: sum::<S>(all.translation),
+            center: sum::<S>(all.center),
+        }
+    }
+}
+
+impl<S: Simd> Add for CameraGradLanes<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, o: Self) -> Self {
+        let ([a0, a1, a2], [b0, b1, b2]) = (self.rotation, o.rotation);
+        Self {
+            rotation: [a0 + b0, a1 + b1, a2 + b2],
+            translation: self.translation + o.translation,
+            center: self.center + o.center,
         }
     }
 }

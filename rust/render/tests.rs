@@ -5,7 +5,7 @@ use crate::{
     accuracy_knobs::{AccuracyKnobs, Spans},
     constants::ALPHA_MIN,
     scene::{Harmonics, synthetic::Synthetic},
-    simd::{Level, at_each_level},
+    simd::{Level, at_each_level, levels},
 };
 use rayon::ThreadPoolBuilder;
 
@@ -527,4 +527,74 @@ fn what_is_not_wanted_is_empty_and_changes_no_bit_of_the_rest() {
         }
         assert_eq!(inputs.loss(Some(none)).1, Gradients::default());
     }
+}
+
+/// All outputs and gradients by name: with harmonics, and of five channels before a background.
+fn outputs<T: Real>(level: Level, s: &Synthetic<T>) -> Vec<(&'static str, Vec<f64>)> {
+    let r = render(level, s);
+    let g = gradients(s, &r);
+    let (gaussians, n) = (s.gaussians(), s.opacities.len());
+    let wave = |n: usize| -> Vec<T> {
+        let values = (0..n).map(|i| (1.0 + i as f64 * 0.37).sin());
+        values.map(T::from_f64).collect()
+    };
+    let (colors, background) = (wave(5 * n), wave(5));
+    let channels = Colors::Channels(&colors, 5);
+    let view = forward(
+        gaussians,
+        channels,
+        Some(&background),
+        &s.camera,
+        &options(level),
+    )
+    .unwrap();
+    let (v_image, v_alphas) = (wave(view.image.len()), wave(view.alphas.len()));
+    let v = Cotangents {
+        image: &v_image,
+        alphas: Some(&v_alphas),
+    };
+    let five = backward(&view, &v, Wanted::ALL).unwrap();
+    let numbers = |v: &[T]| v.iter().map(|x| x.to_f64()).collect::<Vec<f64>>();
+    vec![
+        ("image", numbers(&r.image)),
+        ("alphas", numbers(&r.alphas)),
+        ("means", numbers(&g.means)),
+        ("quats", numbers(&g.quats)),
+        ("scales", numbers(&g.scales)),
+        ("opacities", numbers(&g.opacities)),
+        ("harmonics", numbers(&g.colors)),
+        ("viewmat", g.viewmat.unwrap().to_vec()),
+        ("5 channels", numbers(&view.image)),
+        ("their means2d", numbers(&five.means2d)),
+        ("their absolute", numbers(&five.means2d_absolute)),
+        ("their colors", numbers(&five.colors)),
+        ("their background", numbers(&five.background)),
+    ]
+}
+
+/// For each level of this CPU how far it is from the best one: numbers that differ, and the largest difference of
+/// each array over its largest number. `cargo test level_by_level -- --nocapture` prints it.
+fn check_level_by_level<T: Real>(tolerance: f64) {
+    let s = Synthetic::<T>::new(5000, 150, 97, 1).unwrap();
+    let best = outputs(levels()[0], &s);
+    for level in levels() {
+        println!("{}, f{}:", level.name(), 8 * size_of::<T>());
+        for ((name, a), (_, b)) in outputs(level, &s).iter().zip(&best) {
+            let largest = b.iter().fold(0.0f64, |m, x| m.max(x.abs()));
+            let pairs = || a.iter().zip(b);
+            let differ = pairs().filter(|(x, y)| x.to_bits() != y.to_bits()).count();
+            let worst = pairs().fold(0.0f64, |m, (x, y)| m.max((x - y).abs())) / largest;
+            println!("  {name}: {differ} of {}, at most {worst:.1e}", a.len());
+            if level.is_fused() == levels()[0].is_fused() {
+                assert_eq!(differ, 0, "{name}");
+            }
+            assert!(worst < tolerance, "{name}: {worst:e}");
+        }
+    }
+}
+
+#[test]
+fn level_by_level() {
+    check_level_by_level::<f32>(1e-4);
+    check_level_by_level::<f64>(1e-12);
 }

@@ -29,6 +29,12 @@ impl Level {
         self.names().1
     }
 
+    /// Whether the product in a sum stays unrounded (a fused multiply-add). Levels that agree in this give the same
+    /// bits.
+    pub fn is_fused(self) -> bool {
+        matches!(self.name(), "AVX-512" | "AVX2" | "NEON")
+    }
+
     fn names(self) -> (&'static str, &'static str) {
         NAMES[match self.token {
             #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]

@@ -4,6 +4,7 @@ pub(crate) mod groups;
 mod level;
 pub(crate) mod math;
 mod scalar;
+pub(crate) mod sums;
 pub(crate) mod vec3;
 
 use fearless_simd::{Simd, SimdBase};

@@ -2,7 +2,10 @@
 
 use crate::{
     error::{Error, check_len},
-    simd::{self, Lanes, Level, Real},
+    simd::{
+        self, Lanes, Level, Real,
+        sums::{MAX_PARTS, parts},
+    },
 };
 use fearless_simd::{Select, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
@@ -74,12 +77,12 @@ fn chunk<S: Simd, T: Real>(
     let n = Lanes::<T, S>::LEN;
     let splat = |x: f64| Lanes::<T, S>::splat(simd, T::from_f64(x));
     let (zero, half, up, down) = (splat(0.0), splat(0.5), splat(scale), splat(-scale));
-    let mut sums = splat(0.0);
+    let mut sums = [splat(0.0); MAX_PARTS];
     for at in (0..x.len()).step_by(n) {
         let d = load(simd, x, at) - load(simd, centres, at);
         let outside = d.abs() - load(simd, widths, at) * half;
         let inside = outside.simd_le(zero);
-        sums += inside.select(zero, outside);
+        sums[at / n % parts::<S, T>()] += inside.select(zero, outside);
         if let Some(grad) = &mut grad {
             let slope = d.simd_lt(zero).select(down, up);
             let slope = inside.select(zero, slope);
@@ -91,7 +94,10 @@ fn chunk<S: Simd, T: Real>(
             }
         }
     }
-    sums.as_slice().iter().map(|sum| sum.to_f64()).sum()
+    let lanes = sums[..parts::<S, T>()]
+        .iter()
+        .flat_map(|sum| sum.as_slice());
+    lanes.map(|sum| sum.to_f64()).sum()
 }
 
 /// The vector at `at`; 0 beyond the end.

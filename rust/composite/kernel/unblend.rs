@@ -3,7 +3,7 @@
 use super::{Decision, Grid, Layers, Pixels, RecordLanes, load, store, width};
 use crate::{
     constants::{ALPHA_MAX, BLOCK_PIXELS, TILE_PIXELS},
-    simd::{Lanes, Real},
+    simd::{Lanes, Real, sums::fold},
     tiles::Record,
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
@@ -115,19 +115,19 @@ pub fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>
     }
 }
 
-/// Running sums of one Gaussian over its blocks.
-pub struct Sums<S: Simd, T: Real> {
+/// Running sums of one Gaussian over its blocks, in P vectors each (`sums::parts`).
+pub struct Sums<S: Simd, T: Real, const P: usize> {
     record: RecordLanes<S, T>,
     /// The moments, the colours (at most 4 channels), the absolute gradients.
-    lanes: [Lanes<T, S>; MOMENTS + 4 + ABSOLUTE],
+    lanes: [[Lanes<T, S>; P]; MOMENTS + 4 + ABSOLUTE],
 }
 
-impl<S: Simd, T: Real> Sums<S, T> {
+impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
     #[inline(always)]
     pub fn new(simd: S, g: &Record<T>) -> Self {
         Self {
             record: RecordLanes::new(simd, g),
-            lanes: [Lanes::<T, S>::splat(simd, T::ZERO); MOMENTS + 4 + ABSOLUTE],
+            lanes: [[Lanes::<T, S>::splat(simd, T::ZERO); P]; MOMENTS + 4 + ABSOLUTE],
         }
     }
 
@@ -152,27 +152,27 @@ impl<S: Simd, T: Real> Sums<S, T> {
             let y = Lanes::<T, S>::from_slice(simd, &grid.y[at.clone()]);
             let (u, v) = self.record.position(x, y);
             let (wu, wv) = (w * u, w * v);
-            let lanes = &mut self.lanes;
-            lanes[0] += w;
-            lanes[1] += wu;
-            lanes[2] += wv;
-            lanes[3] = wu.mul_add(u, lanes[3]);
-            lanes[4] = wu.mul_add(v, lanes[4]);
-            lanes[5] = wv.mul_add(v, lanes[5]);
-            if D > 0 {
-                for (c, v) in v_colors[..D].iter().enumerate() {
-                    let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
-                    lanes[MOMENTS + c] = weight.mul_add(v, lanes[MOMENTS + c]);
-                }
-            } else {
-                for (c, v) in v_colors.iter().enumerate() {
-                    let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
-                    out[MOMENTS + c] += (weight * v).reduce_sum();
-                }
+            let (lanes, p) = (&mut self.lanes, i / width::<S, T>() % P);
+            lanes[0][p] += w;
+            lanes[1][p] += wu;
+            lanes[2][p] += wv;
+            lanes[3][p] = wu.mul_add(u, lanes[3][p]);
+            lanes[4][p] = wu.mul_add(v, lanes[4][p]);
+            lanes[5][p] = wv.mul_add(v, lanes[5][p]);
+            for (c, v) in v_colors[..D].iter().enumerate() {
+                let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
+                lanes[MOMENTS + c][p] = weight.mul_add(v, lanes[MOMENTS + c][p]);
             }
             if absolute {
-                lanes[MOMENTS + D] += wu.abs();
-                lanes[MOMENTS + D + 1] += self.record.n.mul_add(wu, self.record.t * wv).abs();
+                lanes[MOMENTS + D][p] += wu.abs();
+                let along_y = self.record.n.mul_add(wu, self.record.t * wv);
+                lanes[MOMENTS + D + 1][p] += along_y.abs();
+            }
+        }
+        if D == 0 {
+            let at = block * BLOCK_PIXELS;
+            for (out, v) in out[MOMENTS..].iter_mut().zip(v_colors) {
+                add_products::<S, T, P>(simd, weights, &v[at..at + BLOCK_PIXELS], out);
             }
         }
     }
@@ -191,17 +191,18 @@ impl<S: Simd, T: Real> Sums<S, T> {
     /// number of vectors.
     #[inline(always)]
     fn reduce<const D: usize>(&mut self, count: usize, out: &mut [T]) {
-        let (mut lanes, mut vectors) = (width::<S, T>(), count);
+        let sums = self.lanes.as_flattened_mut();
+        let (mut lanes, mut vectors) = (P * width::<S, T>(), P * count);
         while lanes > 1 {
             for k in 0..vectors.div_ceil(2) {
-                let (a, b) = (self.lanes[2 * k], self.lanes[(2 * k + 1).min(vectors - 1)]);
-                self.lanes[k] = a.unzip_low(b) + a.unzip_high(b);
+                let (a, b) = (sums[2 * k], sums[(2 * k + 1).min(vectors - 1)]);
+                sums[k] = a.unzip_low(b) + a.unzip_high(b);
             }
             vectors = vectors.div_ceil(2);
             lanes /= 2;
         }
         for k in 0..count {
-            let sum = self.lanes[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
+            let sum = sums[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
             // Without compiled channels the colours lie between the moments and the absolute gradients.
             let place = if D == 0 && k >= MOMENTS {
                 out.len() - count + k
@@ -210,5 +211,23 @@ impl<S: Simd, T: Real> Sums<S, T> {
             };
             out[place] = sum;
         }
+    }
+}
+
+/// Add the sum of the products of a block's weights and cotangents.
+#[inline(always)]
+fn add_products<S: Simd, T: Real, const P: usize>(
+    simd: S,
+    weights: &[T],
+    v_colors: &[T],
+    out: &mut T,
+) {
+    for i in (0..BLOCK_PIXELS).step_by(P * width::<S, T>()) {
+        let weights = load::<S, T, P>(simd, &weights[i..]);
+        let mut products = load::<S, T, P>(simd, &v_colors[i..]);
+        for (product, weight) in products.iter_mut().zip(weights) {
+            *product = weight * *product;
+        }
+        *out += fold(&mut products).reduce_sum();
     }
 }
