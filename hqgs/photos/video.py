@@ -14,7 +14,9 @@ from hqgs.photos.pixels import Float32, as_floats, to_uint8
 
 RATE = 30  # frames per second; only the rate control knows it
 _X265 = "pools=none:frame-threads=1:wpp=0:info=0:log-level=none"
-CODECS = {  # encoder, decoder, and options of the encoder for the same bits at any number of cores
+CODECS: dict[
+    str, tuple[str, str, dict[str, str]]
+] = {  # encoder, decoder, and options of the encoder for the same bits at any number of cores
     "video": ("libx264", "h264", {}),
     "video265": (
         "libx265",

@@ -52,8 +52,8 @@ class Densifier:
         self.extent = extent
         self.reach = reach
         self.seed = seed
-        self.grad_sum = torch.zeros(num_gaussians)  # of gradient norms, half images
-        self.count = torch.zeros(num_gaussians)  # views in which the Gaussian was visible
+        self.grad_sum: Tensor = torch.zeros(num_gaussians)  # of gradient norms, half images
+        self.count: Tensor = torch.zeros(num_gaussians)  # views in which the Gaussian was visible
 
     def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""

@@ -42,7 +42,7 @@ from hqgs.training.trials import FOLDED, TOLERANCE, WEIGHTS, FewerBands, fewest_
 TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
 BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
 WINDOW = 50  # steps before and after a decision that tell what it saves
-RULES = {  # what a result depends on beside the configuration
+RULES: dict[str, object] = {  # what a result depends on beside the configuration
     "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
     "tolerance": (TOLERANCE, TRIED, FOLDED),
     "growth": FINEST,
@@ -89,8 +89,9 @@ class Frugality:
             shown: gives the Gaussians that are rasterized now, without a gradient history.
             psnr: of Gaussians to rasterize on training photos of these numbers, as the method compares them.
         """
-        self.schedule, self.views = schedule, views
-        self.memory = Memory()
+        self.schedule: Schedule = schedule
+        self.views: Sequence[View] = views
+        self.memory: Memory = Memory()
         self._shown, self._psnr = shown, psnr
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # of the last steps
         self._open: list[tuple[int, int, float]] = []  # records that wait for what they saved

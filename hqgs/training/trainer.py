@@ -33,7 +33,7 @@ from hqgs.training.densify import Densifier, Growth
 from hqgs.training.frugality import Frugality
 from hqgs.training.guard import LISTED, Event, Fault, Guard, bad_values, gradient_fault, parameter_fault
 from hqgs.training.methods import make_method
-from hqgs.training.methods.base import Target
+from hqgs.training.methods.base import Method, Target
 from hqgs.training.schedule import Plan, Schedule, learning_rates, smaller
 from hqgs.training.state import TrainState
 
@@ -65,18 +65,19 @@ class Trainer:
         if "photos" in config.leave_out:
             scene, self.photos_left_out = choose_photos(scene, inspector)
         self.scene = scene
-        self.extent = scene.extent
-        self.method = make_method(scene, config, inspector)
+        self.extent: float = scene.extent
+        self.method: Method[Any] = make_method(scene, config, inspector)
         with one_torch_thread():
             self._targets = [self.method.prepare(view) for view in scene.train]
             start = self.method.start(scene, self._targets, config)
         self._small: dict[int, tuple[View, Target]] = {}
-        self.config = config = start.config
-        self.method_left_out = start.left_out
-        self.first_points = len(start.gaussians)
-        self.schedule = Schedule.of(config, scene.train, self.method.as_photographed)
-        self.frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
-        self.state = TrainState(
+        self.config: TrainConfig = start.config
+        config = start.config
+        self.method_left_out: list[LeftOut] = start.left_out
+        self.first_points: int = len(start.gaussians)
+        self.schedule: Schedule = Schedule.of(config, scene.train, self.method.as_photographed)
+        self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
+        self.state: TrainState = TrainState(
             start.gaussians,
             self._optimizer(start.gaussians),
             Densifier(config.densify, self.extent, scene.reach, config.seed, self.first_points),

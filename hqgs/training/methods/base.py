@@ -118,9 +118,12 @@ class Plain:
     """
 
     name: str
-    as_photographed = False
-    noise = 0.0
-    rate_left = 1.0
+    as_photographed: bool = False
+    noise: float = 0.0
+
+    @property
+    def rate_left(self) -> float:
+        return 1.0
 
     def prepare(self, view: View) -> Target:
         return Target(*photo_tensors(view))

@@ -54,11 +54,13 @@ class ESFG(nn.Module):
             for name, tokens in zip(("photo", "edge"), _tokens(views, count, config.downscale), strict=True):
                 self.register_buffer(f"{name}_tokens", tokens, persistent=False)
         if config.saf:
-            self.saf = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
+            self.saf: nn.Sequential = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
         if config.eaf:
-            self.eaf = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
+            self.eaf: nn.Sequential = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
         if config.cross_attention:
-            self.query, self.key, self.value = (_linear(XYZ, XYZ, bias=False) for _ in range(3))
+            self.query: nn.Linear = _linear(XYZ, XYZ, bias=False)
+            self.key: nn.Linear = _linear(XYZ, XYZ, bias=False)
+            self.value: nn.Linear = _linear(XYZ, XYZ, bias=False)
         self._initialise(seed)
 
     def forward(self) -> Tensor:

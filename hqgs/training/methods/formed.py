@@ -47,9 +47,9 @@ class Formation:
         """`directions`: of each photo's motion, radians from x towards y (down), where it is known."""
         self.degradation = degradation
         kinds = {step.kind: step.value for step in degradation.steps}
-        self.kinds = frozenset(kinds)
-        self.noise = float(kinds.get("noise") or 0.0) / 255  # standard deviation, where 1 is white
-        self.factor = int(kinds.get("lowres") or 1)  # by which the photos were enlarged
+        self.kinds: frozenset[str] = frozenset(kinds)
+        self.noise: float = float(kinds.get("noise") or 0.0) / 255  # standard deviation, where 1 is white
+        self.factor: int = int(kinds.get("lowres") or 1)  # by which the photos were enlarged
         self._quality = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
         self._directions = directions
         self._operators: dict[tuple[int, int, float | None], Operator | None] = {}

@@ -55,7 +55,7 @@ class Plateau:
     """
 
     def __init__(self, num_photos: int) -> None:
-        self.rate_left = 1.0  # share of the learning rates
+        self.rate_left: float = 1.0  # share of the learning rates
         self._interval = num_photos * math.ceil(STEPS / num_photos)
         self._steps = 0
         self._sums, self._counts = torch.zeros(2, num_photos, dtype=torch.float64)

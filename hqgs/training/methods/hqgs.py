@@ -19,7 +19,7 @@ from hqgs.training.checkpoint import part
 from hqgs.training.config import AUTO, HQGSConfig, TrainConfig
 from hqgs.training.methods.base import Plain, Start
 from hqgs.training.methods.budget import first_points, with_budget
-from hqgs.training.methods.formed import FormedTarget, find_formation
+from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.state import TrainState
@@ -54,10 +54,12 @@ class HQGS(Plain):
     def __init__(self, scene: Scene, config: HQGSConfig, inspector: Inspector | None = None) -> None:
         """`inspector`: what diagnoses the scene's photos where the formation is not given."""
         self.config = config
-        self.formation, self._left_out = find_formation(scene, config.formation, inspector or Inspector())
+        found = find_formation(scene, config.formation, inspector or Inspector())
+        self.formation: Formation = found[0]
+        self._left_out: list[LeftOut] = found[1]
         kinds, jpeg = self.formation.kinds, "jpeg" in self.formation.kinds
-        self.as_photographed = not kinds
-        self.noise = self.formation.noise
+        self.as_photographed: bool = not kinds
+        self.noise: float = self.formation.noise
         self._knee = 0.0 if jpeg else KNEE * self.noise
         self._dssim = 0.0 if "noise" in kinds or jpeg else LAMBDA_DSSIM
         self._views = scene.train

@@ -58,10 +58,10 @@ class PaperHQGS(Plain):
 
     def __init__(self, scene: Scene, seed: int, config: PaperConfig | None = None) -> None:
         """ValueError for photos that are not finite, or where no pixel counts."""
-        self.config = PaperConfig() if config is None else config
+        self.config: PaperConfig = PaperConfig() if config is None else config
         esfg = self.config.esfg
-        self.esfg = None if esfg is None else ESFG(scene.train, seed, esfg)
-        self.rows = torch.zeros(0, dtype=torch.int64)  # of F', the one that each Gaussian reads, [N]
+        self.esfg: ESFG | None = None if esfg is None else ESFG(scene.train, seed, esfg)
+        self.rows: Tensor = torch.zeros(0, dtype=torch.int64)  # of F', the one that each Gaussian reads, [N]
         self._room = CACHE_BYTES
 
     def prepare(self, view: View) -> ScsTarget:
