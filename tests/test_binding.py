@@ -129,7 +129,9 @@ def test_the_environment_forces_vector_instructions() -> None:
     assert with_simd("").stdout.strip() == _rust.simd_level()
 
 
-@pytest.mark.parametrize(("level", "problem"), [("avx9", "there is no level"), ("wasm", "this CPU does not have")])
+@pytest.mark.parametrize(
+    ("level", "problem"), [("avx9", "there is no level"), ("wasm", "this CPU does not have")]
+)
 def test_vector_instructions_that_are_not_there_are_refused(level: str, problem: str) -> None:
     done = with_simd(level)
     assert done.returncode == 1
