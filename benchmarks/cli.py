@@ -10,25 +10,17 @@ from pathlib import Path
 
 import hqgs
 from benchmarks import endurance, export, frugality
-from benchmarks.accuracy import accuracy
-from benchmarks.features import training
+from benchmarks.accuracy import run as accuracy
+from benchmarks.features import run as features
 from benchmarks.output import Benchmark, command_line, write_results
-from benchmarks.quality import quality
-from benchmarks.speed import speed
-from benchmarks.stability import stability
+from benchmarks.quality import run as quality
+from benchmarks.speed import run as speed
+from benchmarks.stability import run as stability
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.training.trainer import TrainingError
 
-BENCHMARKS: dict[str, Benchmark] = {
-    "accuracy": accuracy.BENCHMARK,
-    "endurance": endurance.BENCHMARK,
-    "export": export.BENCHMARK,
-    "frugality": frugality.BENCHMARK,
-    "quality": quality.BENCHMARK,
-    "speed": speed.BENCHMARK,
-    "stability": stability.BENCHMARK,
-    "training": training.BENCHMARK,
-}
+MODULES = (accuracy, endurance, export, features, frugality, quality, speed, stability)
+BENCHMARKS: dict[str, Benchmark] = {m.__name__.split(".")[1]: m.BENCHMARK for m in MODULES}
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,44 +13,22 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from benchmarks.output import Benchmark, Report, kept
-from hqgs.base.files import write_json
+from benchmarks.charts import LEGEND, color, panels
+from benchmarks.data import read_toml
+from benchmarks.measure import Run, record
+from benchmarks.output import Benchmark, Report, table
+from benchmarks.protocol import Protocol, Row, add_options, narrowed, read_protocols
+from benchmarks.scenes import load_scenes
+from benchmarks.study import Cell, grid, open_study
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
-from hqgs.base.text import markdown_table
-from hqgs.scene.builtin import embedded_scene
-from hqgs.scene.builtin.scene import HEIGHT, WIDTH
 from hqgs.scene.scene import Scene
-from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Trainer, TrainingError
 
 RECORDS = 20  # in the course of a run
 NOISE_SHARE = 0.3  # of the training photos
-RATE_FACTOR = 10  # of all learning rates
-RESET_EVERY = 300  # iterations, a tenth of the usual
 LIMIT_MB = 1.0  # growth of the peak memory per 1,000 iterations, once the number of Gaussians is fixed
 SHORTEST = 1_000  # iterations over which such a growth can be told from chance
-
-
-@dataclass(frozen=True)
-class EnduranceConfig:
-    """How long and how large the runs are."""
-
-    iterations: int = 20_000
-    downscale: float = 4.0
-    max_gaussians: int = 30_000
-    seed: int = 0
-
-
-QUICK = EnduranceConfig(iterations=40, downscale=12.0, max_gaussians=4_500)
-
-
-@dataclass(frozen=True)
-class Case:
-    """What is done to the scene and to the configuration."""
-
-    name: str
-    scene: Callable[[Scene], Scene] = lambda scene: scene
-    config: Callable[[TrainConfig], TrainConfig] = lambda config: config
 
 
 def noise_photos(scene: Scene) -> Scene:
@@ -72,60 +49,72 @@ def identical_cameras(scene: Scene) -> Scene:
     return replace(scene, train=[first, replace(first, name=f"again {first.name}")])
 
 
-def fast_rates(config: TrainConfig) -> TrainConfig:
-    """The configuration with all learning rates RATE_FACTOR times as high."""
-    rates = {n: RATE_FACTOR * v for n, v in vars(config).items() if n.startswith("lr_")}
-    return replace(config, **rates)
+PHOTOS: dict[str, Callable[[Scene], Scene]] = {
+    "": lambda scene: scene,
+    "noise": noise_photos,
+    "one": lambda scene: replace(scene, train=scene.train[:1]),
+    "twins": identical_cameras,
+}
 
 
-def frequent_resets(config: TrainConfig) -> TrainConfig:
-    """The configuration with an opacity reset every RESET_EVERY iterations, in short runs sooner."""
-    every = min(RESET_EVERY, max(1, config.densify.stop // 4))
-    return replace(config, densify=replace(config.densify, reset_every=every))
+@dataclass(frozen=True)
+class Case(Row):
+    """What is done to the scene and to the configuration."""
+
+    photos: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.photos not in PHOTOS:
+            raise ValueError(f"photos is {self.photos!r}, wanted one of: {', '.join(filter(None, PHOTOS))}")
+
+    def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
+        """Growth ends after half of the run, so that the memory can be judged in the other half.
+
+        A case that asks for opacity resets has some in a short run, too.
+        """
+        config = super().train_config(seed, iterations, changes)
+        densify = replace(config.densify, stop=iterations // 2)
+        if "densify" in self.config:
+            densify = replace(densify, reset_every=min(densify.reset_every, max(1, densify.stop // 4)))
+        return replace(config, densify=densify)
 
 
-CASES = (
-    Case("as it is"),
-    Case("30 % noise photos", scene=noise_photos),
-    Case("learning rates x10", config=fast_rates),
-    Case("one photo", scene=lambda scene: replace(scene, train=scene.train[:1])),
-    Case("two identical cameras", scene=identical_cameras),
-    Case("opacity resets x10", config=frequent_resets),
-)
+FILE = Path(__file__).with_suffix(".toml")
+PROTOCOLS = read_protocols(FILE, Case)
 
 
-def train_config(config: EnduranceConfig) -> TrainConfig:
-    """Growth ends after half of the run, so that the memory can be judged in the other half."""
-    base = TrainConfig(
-        iterations=config.iterations,
-        seed=config.seed,
-        densify=DensifyConfig(max_gaussians=config.max_gaussians),
-    ).scaled()
-    return replace(base, densify=replace(base.densify, stop=config.iterations // 2))
+def measure(cell: Cell, scene: Scene) -> Run:
+    """Train the case of a cell on what it makes of the scene, which the cases share."""
+    assert isinstance(cell.row, Case)
+    return run_case(PHOTOS[cell.row.photos](scene), cell.config)
 
 
-def run_case(case: Case, scene: Scene, config: EnduranceConfig) -> dict[str, Any]:
+def run_case(scene: Scene, config: TrainConfig) -> Run:
     """Train one case; what it went through, as plain JSON values."""
-    trainer = Trainer(case.scene(scene), case.config(train_config(config)))
-    interval = max(1, config.iterations // RECORDS)
+    trainer = Trainer(scene, config)
+    first_points, interval = len(trainer.gaussians), max(1, config.iterations // RECORDS)
     records: list[dict[str, Any]] = []
     failure = None
-    losses: list[float] = []
+    losses, steps = list[float](), list[float]()
     resets = reset_peak_rss()
     try:
         while trainer.iteration < config.iterations:
+            before = trainer.seconds
             losses.append(trainer.step().loss)
+            steps.append(trainer.seconds - before)
             if trainer.iteration % interval == 0 or trainer.iteration == config.iterations:
-                records.append(_record(trainer, losses, resets))
+                records.append(_so_far(trainer, losses, resets))
                 losses = []
                 resets = reset_peak_rss()
     except TrainingError as error:
         failure = str(error)
-    result = {"case": case.name, "records": records, "failure": failure, "guard": trainer.guard.summary()}
+    result = record(trainer, first_points, steps) | {"records": records, "failure": failure}
+    result["guard"] = trainer.guard.summary()
     return result | verdict(result, config)
 
 
-def _record(trainer: Trainer, losses: Sequence[float], resets: bool) -> dict[str, Any]:
+def _so_far(trainer: Trainer, losses: Sequence[float], resets: bool) -> dict[str, Any]:
     peak = peak_rss_mb() if resets else None  # before the evaluation, which needs memory of its own
     trainer.evaluate()
     tensors = trainer.gaussians.named().values()
@@ -143,7 +132,7 @@ def _record(trainer: Trainer, losses: Sequence[float], resets: bool) -> dict[str
     }
 
 
-def verdict(result: dict[str, Any], config: EnduranceConfig) -> dict[str, Any]:
+def verdict(result: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
     """The three conditions, each True, False or None (not measured), and whether none is False.
 
     `slope_mb`: growth of the peak memory per 1,000 iterations in the second half, by least squares.
@@ -158,118 +147,78 @@ def verdict(result: dict[str, Any], config: EnduranceConfig) -> dict[str, Any]:
         "finite": result["failure"] is None
         and not any(r["values_not_finite"] or r["losses_not_finite"] for r in records),
         "memory_flat": None if slope is None else slope <= LIMIT_MB,
-        "within_budget": all(r["gaussians"] <= config.max_gaussians for r in records),
+        "within_budget": all(r["gaussians"] <= config.densify.max_gaussians for r in records),
     }
     return conditions | {"slope_mb": slope, "passed": False not in conditions.values()}
 
 
-def table(results: Sequence[dict[str, Any]], config: EnduranceConfig) -> str:
-    shown = {True: "yes", False: "NO", None: "-"}
-    body = []
+def cases_table(results: Sequence[dict[str, Any]], protocol: Protocol) -> str:
+    """One line for each case, with the last record's numbers."""
+    shown = {True: "yes", False: "NO", None: "–"}
+    lines = []
     for result in results:
-        records = result["records"]
-        last = records[-1] if records else dict.fromkeys(("loss", "psnr", "peak_rss_mb"))
-        body.append(
-            [
-                result["case"],
-                _number(last["loss"], ".4f"),
-                _number(last["psnr"], ".2f"),
-                _number(max((r["gaussians"] for r in records), default=None), ",d"),
-                _number(last["peak_rss_mb"], ".0f"),
-                _number(result["slope_mb"], "+.2f"),
-                str(result["guard"]["num_events"]),
-                *(shown[result[name]] for name in ("finite", "memory_flat", "within_budget")),
-                "pass" if result["passed"] else "FAIL",
-            ]
+        records = result["records"] or [dict.fromkeys(("loss", "psnr", "peak_rss_mb", "gaussians"))]
+        most = max((r["gaussians"] for r in result["records"]), default=None)
+        lines.append(
+            result
+            | records[-1]
+            | {name: shown[result[name]] for name in ("finite", "memory_flat", "within_budget")}
+            | {"most": most, "events": result["guard"]["num_events"]}
+            | {"verdict": "pass" if result["passed"] else "FAIL"}
         )
-    head = [
-        "case", "last loss", "PSNR (dB)", "most Gaussians", "peak (MB)", "MB per 1,000", "events",
-        "finite", "memory flat", "in budget", "verdict",
-    ]  # fmt: skip
     title = (
-        f"Embedded scene at 1/{config.downscale:g}, {config.iterations:,} iterations, at most "
-        f"{config.max_gaussians:,} Gaussians; memory may grow by {LIMIT_MB:g} MB per 1,000 iterations"
+        f"Photos at 1/{protocol.downscale:g}, {protocol.iterations:,} iterations, at most "
+        f"{protocol.config['densify']['max_gaussians']:,} Gaussians; memory may grow by {LIMIT_MB:g} MB per "
+        "1,000 iterations"
     )
-    return markdown_table(title, head, body)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    return table(title, lines, read_toml(FILE)["columns"]["cases"])
 
 
 def chart(results: Sequence[dict[str, Any]]) -> Figure:
     """Held-out PSNR, Gaussians and peak memory over the iterations, a curve for each case."""
-    figure = Figure(figsize=(8, 8), dpi=150, layout="constrained")
-    panels = figure.subplots(3, 1, sharex=True)
+    figure, grid = panels(8, 8, 3, sharex=True)
     what = {"psnr": "held-out PSNR (dB)", "gaussians": "Gaussians", "peak_rss_mb": "peak memory (MB)"}
-    for axes, (name, label) in zip(panels, what.items(), strict=True):
-        for result in results:
+    for axes, (name, label) in zip(grid, what.items(), strict=True):
+        for k, result in enumerate(results):
             points = [(r["iteration"], r[name]) for r in result["records"] if r[name] is not None]
             if points:
-                axes.plot(*zip(*points, strict=True), label=result["case"], lw=1.4, marker="o", markersize=2)
+                axes.plot(
+                    *zip(*points, strict=True), label=result["case"], color=color(k), lw=1.4, marker="o", ms=2
+                )
         axes.set_ylabel(label)
-        axes.grid(color="#dddddd", linewidth=0.7)
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].legend(frameon=False, fontsize=7)
-    panels[-1].set_xlabel("iterations")
+    if results:
+        grid[0].legend(**LEGEND)
+    grid[-1].set_xlabel("iterations")
     return figure
-
-
-def finished(path: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
-    """The result of a case that is done; ValueError where the file is damaged or another one's."""
-    if (found := kept(path)) is None:
-        return None
-    if found.get("settings") != settings:
-        raise ValueError(f"{path} holds a case with other settings; choose another --out")
-    return found["result"]
 
 
 def run(args: argparse.Namespace) -> Report:
     """Run the cases that are not finished, in their order; each is written as soon as it is done."""
-    config = QUICK if args.quick else EnduranceConfig()
-    changes = {n: v for n in ("iterations", "downscale", "seed") if (v := getattr(args, n)) is not None}
-    config = replace(config, **changes)
-    if not 1 <= config.downscale <= HEIGHT / 8:
-        raise ValueError(f"downscale must be in 1..{HEIGHT / 8:g}, got {config.downscale}")
-    unknown = set(args.cases or ()) - {case.name for case in CASES}
-    if unknown:
-        raise ValueError(
-            f"cases: there is no {min(unknown)!r}; there are: {', '.join(c.name for c in CASES)}"
-        )
-    train_config(config)  # refuses bad settings before the work
-    width, height = (round(side / config.downscale) for side in (WIDTH, HEIGHT))
-    scene = embedded_scene(args.out / "scene", width, height)
-    settings = asdict(config)
-    results = []
-    for case in CASES:
-        if args.cases and case.name not in args.cases:
-            continue
-        words = "".join(c if c.isalnum() else " " for c in case.name).split()
-        path = args.out / "endurance" / f"{'_'.join(words)}.json"
-        result = finished(path, settings)
-        if result is None:
-            print(f"bench endurance: {case.name}", file=sys.stderr, flush=True)
-            result = run_case(case, scene, config)
-            write_json(path, {"settings": settings, "result": result})
-        results.append(result)
-    passed = all(result["passed"] for result in results)
+    protocol = PROTOCOLS["quick" if args.quick else "standard"]
+    protocol = narrowed(protocol, None, args.rows, args.seeds, args.iterations, args.downscale)
+    scenes = load_scenes(args.scenes, protocol.downscale, protocol.embedded, args.out / "scenes", False)
+    more = {row.label: {"photos": row.photos} for row in protocol.rows if isinstance(row, Case)}
+    cells = grid(protocol, scenes, lambda row: (row.label,), lambda row: more[row.label])
+    study = open_study(args, "endurance", cells)
+    if not args.finished:
+        study.train(measure)
+    alone = len(scenes) == len(protocol.seeds) == 1
+    names = {cell: cell.row.label if alone else str(cell) for cell in cells}
+    results = [{"case": name, **study.runs[c]} for c, name in names.items() if c in study.runs]
+    passed = len(results) == len(cells) and all(result["passed"] for result in results)
     return Report(
-        settings=settings | {"limit_mb": LIMIT_MB},
+        settings=asdict(protocol) | {"limit_mb": LIMIT_MB} | study.circumstances(),
         results={"passed": passed, "cases": results},
-        tables=[table(results, config), "All passed." if passed else "NOT all passed."],
+        tables=[cases_table(results, protocol), "All passed." if passed else "NOT all passed."],
         figures={"runs": chart(results)},
+        left_out=study.left_out(),
     )
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--iterations", type=int, metavar="N", help="training steps of each case (20000, with --quick 40)")
-    add("--downscale", type=float, metavar="F", help="divide the photos' sides by F (4, with --quick 12)")
-    add("--seed", type=int, metavar="S", help="of the training (0)")
-    listed = ", ".join(repr(case.name) for case in CASES)
-    add("--cases", nargs="+", metavar="CASE", help=f"only these of: {listed.replace('%', '%%')}")
+def options(parser: argparse.ArgumentParser) -> None:
+    add_options(parser, PROTOCOLS["standard"])
 
 
 BENCHMARK = Benchmark(
-    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size", add_options, run
+    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size", options, run
 )

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -16,6 +15,9 @@ from matplotlib.figure import Figure
 import hqgs
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.machine import machine_facts, version_facts
+from hqgs.base.text import markdown_table
+
+NOTHING = "–"  # in the place of a number that there is not
 
 
 @dataclass
@@ -28,6 +30,11 @@ class Report:
     tables: list[str] = field(default_factory=list)  # Markdown
     figures: dict[str, Figure] = field(default_factory=dict)  # by what they show
     left_out: list[dict[str, str]] = field(default_factory=list)  # {"what", "why"}
+
+    def leave_out(self, what: str, why: str) -> None:
+        entry = {"what": what, "why": why}
+        if entry not in self.left_out:
+            self.left_out.append(entry)
 
 
 @dataclass(frozen=True)
@@ -63,19 +70,6 @@ def write_results(out: Path, name: str, command: str, report: Report) -> list[Pa
     return [out / f"{stem}.json", *pictures]
 
 
-def kept(path: Path) -> dict[str, Any] | None:
-    """What an earlier call kept in this file; None where there is none, ValueError where it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError("it holds no object")
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
-    return found
-
-
 def command_line(args: argparse.Namespace) -> str:
     """The command that gives these results again, every option written out, folders by their name alone."""
     words = ["python", "-m", "benchmarks", args.benchmark]
@@ -85,3 +79,20 @@ def command_line(args: argparse.Namespace) -> str:
         values = value if isinstance(value, list) else [] if value is True else [value]
         words += [f"--{name.replace('_', '-')}", *(v.name if isinstance(v, Path) else str(v) for v in values)]
     return shlex.join(words)
+
+
+def number(value: Any, form: str) -> str:
+    """A value in a format, `ms` for seconds as milliseconds; NOTHING for None and NaN."""
+    if value is None or value != value:
+        return NOTHING
+    if isinstance(value, str):
+        return value
+    if form == "ms":
+        return f"{1000 * value:.3g}" if value < 0.1 else f"{1000 * value:.0f}"
+    return format(value, form)
+
+
+def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]) -> str:
+    """A Markdown table of rows. `columns`: the head and the format of each by its key."""
+    body = [[number(row[key], form) for key, (_, form) in columns.items()] for row in rows]
+    return markdown_table(title, [head for head, _ in columns.values()], body)

@@ -1,8 +1,81 @@
-"""hqgs: clear 3D Gaussian Splatting scenes from bad photos, on the CPU."""
+"""hqgs: clear 3D Gaussian Splatting scenes from bad photos, on the CPU.
 
-from hqgs._rust import get_num_threads, set_num_threads
-from hqgs.model.rasterization import rasterization
+scene = hqgs.load("photos/")
+print(hqgs.diagnose(scene))
+run = hqgs.train(scene, out="run")
+run.model.save("scene.ply")
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hqgs._rust import get_num_threads, set_num_threads
+    from hqgs.base.files import FolderBusyError
+    from hqgs.diagnosis.scene import Diagnosis
+    from hqgs.diagnosis.scene import diagnose_scene as diagnose
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.model.rasterization import RasterizationMeta, rasterization
+    from hqgs.pipeline import Progress, Run, degrade, load, train
+    from hqgs.scene.scene import Camera, Scene, View
+    from hqgs.training.config import TrainConfig
+    from hqgs.training.trainer import TrainingError
 
 __version__ = "0.1.0"
 
-__all__ = ["__version__", "get_num_threads", "rasterization", "set_num_threads"]
+__all__ = [
+    "Camera",
+    "Diagnosis",
+    "FolderBusyError",
+    "Gaussians",
+    "Progress",
+    "RasterizationMeta",
+    "Run",
+    "Scene",
+    "TrainConfig",
+    "TrainingError",
+    "View",
+    "__version__",
+    "degrade",
+    "diagnose",
+    "get_num_threads",
+    "load",
+    "rasterization",
+    "set_num_threads",
+    "train",
+]
+
+# Each name is loaded when it is first used: torch, COLMAP and the rest take seconds.
+_HOMES = {
+    "Camera": "hqgs.scene.scene",
+    "Diagnosis": "hqgs.diagnosis.scene",
+    "FolderBusyError": "hqgs.base.files",
+    "Gaussians": "hqgs.model.gaussians",
+    "Progress": "hqgs.pipeline",
+    "RasterizationMeta": "hqgs.model.rasterization",
+    "Run": "hqgs.pipeline",
+    "Scene": "hqgs.scene.scene",
+    "TrainConfig": "hqgs.training.config",
+    "TrainingError": "hqgs.training.trainer",
+    "View": "hqgs.scene.scene",
+    "degrade": "hqgs.pipeline",
+    "diagnose": "hqgs.diagnosis.scene:diagnose_scene",
+    "get_num_threads": "hqgs._rust",
+    "load": "hqgs.pipeline",
+    "rasterization": "hqgs.model.rasterization",
+    "set_num_threads": "hqgs._rust",
+    "train": "hqgs.pipeline",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, own_name = _HOMES[name].partition(":")
+    value = getattr(import_module(module), own_name or name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -4,6 +4,18 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+# The constants of the rasterizer; rust/constants.rs has each with its reason.
+ALPHA_MIN: float
+ALPHA_MAX: float
+TRANSMITTANCE_MIN: float
+EPS2D: float
+NEAR_PLANE: float
+FAR_PLANE: float
+FOV_MARGIN: float
+QUAT_NORM2_MIN: float
+TILE: int
+BLOCK: int
+
 Array = NDArray[Any]
 Maybe = Array | None
 

@@ -1,55 +1,242 @@
-"""A training run in a folder: progress, checkpoints, Ctrl-C, and the files at the end."""
+"""From a folder of photos to a trained scene: load, degrade, sfm, restore, train, report.
+
+The command line and `import hqgs` both call what is here, so that both have one set of defaults.
+"""
 
 from __future__ import annotations
 
-import math
-import signal
-import sys
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import cast
 
-from tqdm import tqdm
+import numpy as np
+from numpy.typing import NDArray
 
-from hqgs.base.files import CHECKPOINT, PLY, lock_folder, remove_leftovers
+from hqgs.base.files import CHECKPOINT, EMBEDDED, PLY, lock_folder, remove_leftovers
+from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
+from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import psnr
-from hqgs.evaluation.report import RunResult, write_report
-from hqgs.export.ply import write_ply
+from hqgs.evaluation.records import HistoryEntry, Report, SfmRecord
+from hqgs.evaluation.report import RunResult, measure, write_report
+from hqgs.model.gaussians import Gaussians
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.degrade import degrade_scene
+from hqgs.scene.load import load_scene
+from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
-from hqgs.training.config import TrainConfig
+from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
+from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.trainer import Step, Trainer
 
-ENDINGS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C, and what batch systems send
-BAR_EVERY = 10  # steps between updates of the numbers in the progress bar
+EMBEDDED_SIZE = (504, 378)  # pixels
+EMBEDDED_TEST_EVERY = 8
+
+
+def load(
+    path: str | Path,
+    *,
+    downscale: float = 1.0,
+    test_every: int = 8,
+    sfm: bool = False,
+    degrade: str = "none",
+    seed: int = 0,
+    restore: str | Path | None = None,
+    skip_unreadable: bool = True,
+    cache: str | Path | None = None,
+) -> Scene:
+    """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
+
+    Args:
+        path: a COLMAP, LLFF, Deblur-NeRF, nerfstudio, instant-ngp or Blender folder; with `sfm` a folder of
+            photos alone; or "embedded", the room that is built in (504 x 378 px, 24 views).
+        downscale: divide the photos' sides by this, at least 1.
+        test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
+            folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
+        sfm: take cameras and points from the training photos, by COLMAP.
+        degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
+        seed: of the degradation.
+        restore: weights of an image network that the training photos go through at last.
+        skip_unreadable: leave out training photos that cannot be read, as long as at least half of them can;
+            `Scene.notes` names them. False: an error.
+        cache: a folder that keeps what takes long, for the next call: COLMAP's models, the embedded scene.
+
+    Returns:
+        Photos [H, W, 3], sRGB, uint8 (float32 where they were degraded or restored from that); world units
+        and frame are those of the files, cameras are in the OpenCV frame.
+
+    Raises:
+        FileNotFoundError: a folder, photo or file of weights that is not there.
+        ValueError: anything else that is wrong; the message names the file or the photo.
+    """
+    degradation = parse_degradation(degrade)
+    kept = None if cache is None else Path(cache)
+    models = None if kept is None else kept / KEPT
+    if str(path) == EMBEDDED:
+        if not downscale >= 1:
+            raise ValueError(f"downscale must be at least 1, got {downscale}")
+        if test_every != EMBEDDED_TEST_EVERY:
+            raise ValueError(
+                f"test_every is {test_every}, but the embedded scene holds out every {EMBEDDED_TEST_EVERY}th"
+            )
+        width, height = (round(size / downscale) for size in EMBEDDED_SIZE)
+        scene = embedded_scene(cache=None if kept is None else kept / "scene", width=width, height=height)
+    else:
+        scene = load_scene(
+            path,
+            downscale,
+            test_every=test_every,
+            reconstruct=sfm,
+            skip_unreadable=skip_unreadable,
+            keep_sfm=models,
+        )
+    if degradation.steps:
+        scene = degrade_scene(scene, degradation, seed)
+    if sfm and (scene.source != "photos" or degradation.steps):
+        scene = sfm_scene(scene, models)
+    return scene if restore is None else restore_scene(scene, restore)
+
+
+def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
+    """The scene with degraded training photos (float32, 1 is white); held-out ones stay as they are.
+
+    Args:
+        kind: jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH] (white
+            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], chat[:SIDE] (each photo in its
+            own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND (half of the
+            photos only); several joined by + in their order, mixed, or none.
+        seed: of everything random. Each photo has its own numbers, whatever the others are.
+
+    Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.
+    """
+    return degrade_scene(scene, parse_degradation(kind), seed)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run has just done: one step."""
+
+    iteration: int  # steps done, those before a `resume` among them
+    length: int  # steps of the whole run, as far as it is known; it may get less
+    seconds: float  # of training so far
+    gaussians: int
+    loss: float
+    view: str  # the training view of the step
+    render: NDArray[np.float32]  # of that view, [H, W, 3], not clamped; may be smaller than the photo
+    evaluated: HistoryEntry | None  # where the held-out views were measured after this step
+    _step: Step = field(repr=False)
+
+    def psnr(self) -> float | None:
+        """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
+        step = self._step
+        return psnr(self.render, step.view.image, step.view.mask)
+
+
+OnProgress = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A training run that has come to its end, or was stopped by Ctrl-C."""
+
+    model: Gaussians  # as the held-out views and scene.ply show it
+    report: Report  # what report.json holds
+    history: list[HistoryEntry]  # the held-out means while it trained; the last entry is the final one
+    left_out: list[LeftOut]  # what the run did without, and why
+    iterations: int  # steps done
+    length: int  # steps of the whole run
+    seconds: float  # of training, without loading and the report
+    views: list[RenderedView] = field(repr=False)  # the held-out views
+    out: Path | None  # the folder with the files; None: nothing was written
+
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its end; False: Ctrl-C."""
+        return self.iterations == self.length
 
 
 def train(
-    scene: Scene, config: TrainConfig, out: str | Path, resume: bool = False, progress: bool = True
-) -> RunResult:
-    """Train a scene and write checkpoint.safetensors, scene.ply and the files of `write_report` into `out`.
+    scene: Scene,
+    *,
+    out: str | Path | None = None,
+    iterations: int | None = None,
+    method: str = AUTO,
+    leave_out: str = AUTO,
+    seed: int = 0,
+    max_gaussians: int = DensifyConfig.max_gaussians,
+    guidance: str = FORMATION,
+    formation: str = AUTO,
+    eval_every: int | None = None,
+    config: TrainConfig | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: OnProgress | None = None,
+) -> Run:
+    """Train a scene on the CPU. Same seed, same bits, for any number of threads, interrupted or not.
 
-    The first Ctrl-C ends the run after the step it is in: everything is written, and
-    `RunResult.iterations` tells how far it came. See `open_run` for `resume` and the errors.
+    The first Ctrl-C (or SIGTERM) ends the run after the step it is in: everything is written and returned,
+    and `Run.finished` is False. The second raises KeyboardInterrupt at once and leaves the files as they were
+    last written.
+
+    Args:
+        scene: from `hqgs.load`, or made of `hqgs.View` and points.
+        out: a folder for checkpoint.safetensors, scene.ply, report.json, comparison/*.png and
+            error_vs_time.png; None: nothing is written.
+        iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
+        method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
+            "srgs" or "hqgs".
+        leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
+            photos, growth, weight, harmonics, resolution, iterations, with commas.
+        seed: of everything random.
+        max_gaussians: growth stops there; bounds the memory.
+        guidance: of hqgs: "formation", or "paper", its published form.
+        formation: what hqgs takes for the photos' degradation, as `hqgs.degrade` reads it; "auto": it looks.
+        eval_every: iterations between evaluations; None: a tenth of the run.
+        config: the whole configuration, in place of the seven before it.
+        resume: go on from the checkpoint in `out`, if there is one.
+        overwrite: begin anew in a folder that holds a run.
+        progress: is called after each step.
+
+    Raises:
+        ValueError: a scene or a setting that cannot be trained, a damaged checkpoint, or one of another run.
+        FileExistsError: `out` holds a run, and neither `resume` nor `overwrite` is set.
+        FolderBusyError: another run writes into `out`.
+        TrainingError: the training cannot go on; the message says at which iteration and why.
     """
-    with open_run(scene, config, out, resume) as trainer:
-        return run(trainer, out, progress)
+    asked = run_config(
+        iterations=iterations,
+        method=method,
+        leave_out=leave_out,
+        seed=seed,
+        max_gaussians=max_gaussians,
+        guidance=guidance,
+        formation=formation,
+        eval_every=eval_every,
+    )
+    if config is not None and asked != run_config():
+        raise ValueError("config is the whole configuration: nothing of it can be given beside it")
+    if out is not None and (Path(out) / CHECKPOINT).exists() and not (resume or overwrite):
+        raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
+    with open_run(scene, config or asked, out, resume) as trainer:
+        return run_to_end(trainer, out, progress)
 
 
 @contextmanager
-def open_run(scene: Scene, config: TrainConfig, out: str | Path, resume: bool = False) -> Iterator[Trainer]:
+def open_run(
+    scene: Scene, config: TrainConfig, out: str | Path | None = None, resume: bool = False
+) -> Iterator[Trainer]:
     """A trainer that holds the folder `out`: fresh, or with `resume` where the checkpoint there ends.
 
     Without a checkpoint `resume` starts fresh (the run may have been killed before its first one). A fresh
-    run removes an older checkpoint.
-
-    Raises:
-        ValueError: a scene that cannot be trained, a damaged checkpoint, or one of another run.
-        FolderBusyError: another run holds the folder.
+    run removes an older checkpoint. See `train` for the errors.
     """
+    if out is None:
+        yield Trainer(scene, config)
+        return
     checkpoint = Path(out) / CHECKPOINT
     with lock_folder(out):
         for file in (CHECKPOINT, PLY):
@@ -62,120 +249,63 @@ def open_run(scene: Scene, config: TrainConfig, out: str | Path, resume: bool = 
         yield trainer
 
 
-def run(trainer: Trainer, out: str | Path, progress: bool = True) -> RunResult:
-    """Train to the end or to the first Ctrl-C and write everything into `out`, which the caller holds.
-
-    A second Ctrl-C raises KeyboardInterrupt at once and leaves the files as they were last written.
-    """
-    out = Path(out)
+def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProgress | None = None) -> Run:
+    """Train to the end or to the first Ctrl-C and write everything into `out`, which the caller holds."""
+    out = None if out is None else Path(out)
     config = trainer.config
-    bar = tqdm(total=trainer.length, initial=trainer.iteration, disable=None if progress else True)
-    numbers = _BarNumbers()
-    with deferred_interrupt() as interrupted, bar:
+    with deferred_interrupt() as interrupted:
         while trainer.iteration < trainer.length and not interrupted.is_set():
             step = trainer.step()
-            if not bar.disable and trainer.iteration % BAR_EVERY == 0:
-                bar.set_postfix_str(numbers.text(step, len(trainer.gaussians)), refresh=False)
-            bar.total = trainer.length  # which may have become less
-            bar.update()
-            if trainer.iteration % config.eval_every == 0:
+            evaluate = trainer.iteration % config.eval_every == 0
+            if evaluate:
                 trainer.evaluate()
-                if progress:
-                    bar.write(_progress_line(trainer), file=sys.stderr)
-            if trainer.iteration % config.checkpoint_every == 0:
+            if progress is not None:
+                progress(_progress(trainer, step, trainer.history[-1] if evaluate else None))
+            if out is not None and trainer.iteration % config.checkpoint_every == 0:
                 trainer.save(out / CHECKPOINT)
         trainer.evaluate()
-        trainer.save(out / CHECKPOINT)
-        return _write_results(trainer, out)
+        if out is not None:
+            trainer.save(out / CHECKPOINT)
+        return _results(trainer, out)
 
 
-@contextmanager
-def deferred_interrupt() -> Iterator[threading.Event]:
-    """Within this, the first Ctrl-C sets the event that it yields, the second raises KeyboardInterrupt.
-
-    So does SIGTERM.
-    """
-    requested = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield requested  # signals only reach the main thread
-        return
-
-    def on_interrupt(number: int, frame: object) -> None:
-        requested.set()
-        for ending in ENDINGS:
-            signal.signal(ending, signal.default_int_handler)
-
-    before = {ending: signal.signal(ending, on_interrupt) for ending in ENDINGS}
-    try:
-        yield requested
-    finally:
-        for ending, handler in before.items():
-            # None: it was not set from Python. pycolmap's prints a stack trace, which nobody asked for.
-            signal.signal(ending, signal.SIG_DFL if handler is None else handler)
+def _progress(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) -> Progress:
+    return Progress(
+        iteration=trainer.iteration,
+        length=trainer.length,
+        seconds=trainer.seconds,
+        gaussians=len(trainer.gaussians),
+        loss=step.loss,
+        view=step.view.name,
+        render=step.render.numpy(),
+        evaluated=evaluated,
+        _step=step,
+    )
 
 
-class _BarNumbers:
-    """The numbers beside the bar, with a smoothed PSNR of the training views."""
-
-    def __init__(self) -> None:
-        self.psnr: float | None = None
-
-    def text(self, step: Step, gaussians: int) -> str:
-        if math.isfinite(step.loss):
-            now = psnr(step.render.numpy(), step.view.image, step.view.mask)
-            if now is not None:
-                self.psnr = now if self.psnr is None else 0.9 * self.psnr + 0.1 * now
-        shown = "-" if self.psnr is None else f"{self.psnr:.2f} dB"
-        return f"loss {step.loss:.4f}, PSNR {shown}, {gaussians} Gaussians"
-
-
-def _progress_line(trainer: Trainer) -> str:
-    last = trainer.history[-1]
-    values = ["no PSNR" if last["psnr"] is None else f"{last['psnr']:.2f} dB"]
-    values += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
-    where = f"iteration {trainer.iteration}: {len(trainer.gaussians)} Gaussians, {trainer.seconds:.0f} s"
-    return f"{where}, held-out views {', '.join(values)}"
-
-
-def _first_points(trainer: Trainer) -> list[str]:
-    own = len(trainer.scene.points)
-    more = trainer.first_points - own
-    return [f"started from the scene's {own} points and {more} more along the photos' edges"] if more else []
-
-
-def _rates(trainer: Trainer) -> list[str]:
-    left = trainer.method.rate_left
-    why = "pixels held back from the noisy photos showed no gain any more"
-    return [f"the learning rates fell to 1/{1 / left:.0f}: {why}"] if left < 1 else []
-
-
-def _write_results(trainer: Trainer, out: Path) -> RunResult:
-    scene, config = trainer.scene, trainer.config
-    left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
-
-    def leave_out(what: str, why: str) -> None:
-        left_out.append(LeftOut(what, why))
-
-    for what, why in trainer.method.left_out():
-        leave_out(what, why)
-    rows = write_ply(out / PLY, trainer.method.modulate(trainer.gaussians))
-    if rows:
-        leave_out(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf")
-    guard = trainer.guard
+def _results(trainer: Trainer, out: Path | None) -> Run:
+    """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
+    scene, config, guard = trainer.scene, trainer.config, trainer.guard
+    model = trainer.shown()
+    left_out = trainer.left_out()
+    if out is not None and (rows := model.save(out / PLY)):
+        left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
     if guard.skipped:
-        leave_out(f"{guard.skipped} training steps", "the loss or a gradient was not finite")
+        left_out.append(LeftOut(f"{guard.skipped} training steps", "the loss or a gradient was not finite"))
     if guard.culled:
-        leave_out(f"{guard.culled} Gaussians", "a value or a gradient of theirs was not finite")
+        why = "a value or a gradient of theirs was not finite"
+        left_out.append(LeftOut(f"{guard.culled} Gaussians", why))
     if trainer.iteration < trainer.length:
-        leave_out(f"iterations {trainer.iteration + 1} to {trainer.length}", "the run was stopped")
+        what = f"iterations {trainer.iteration + 1} to {trainer.length}"
+        left_out.append(LeftOut(what, "the run was stopped"))
     if not scene.test:
-        leave_out("held-out metrics", "the scene has no held-out view")
+        left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
     views = trainer.render_test_views()
     culled = [view.culled for view in views if view.culled is not None]
     result = RunResult(
         scene=scene.name,
         source=scene.source,
-        notes=[*scene.notes, *_first_points(trainer), *_rates(trainer)],
+        notes=[*scene.notes, *_notes(trainer)],
         method=config.method,
         seed=config.seed,
         iterations=trainer.iteration,
@@ -185,13 +315,32 @@ def _write_results(trainer: Trainer, out: Path) -> RunResult:
         history=trainer.history,
         length=trainer.length,
         left_out=[item.known() for item in left_out],
-        decision_seconds=trainer.frugality.state.decisions,
-        scene_bytes=(out / PLY).stat().st_size,
+        decision_seconds=trainer.frugality.memory.seconds,
+        scene_bytes=None if out is None else (out / PLY).stat().st_size,
         config=asdict(config),
-        sfm=None if scene.sfm is None else asdict(scene.sfm),
+        sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
         guard=guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
         views=views,
     )
-    write_report(out, result)
-    return result
+    return Run(
+        model=model,
+        report=measure(result) if out is None else write_report(out, result),
+        history=trainer.history,
+        left_out=left_out,
+        iterations=trainer.iteration,
+        length=trainer.length,
+        seconds=trainer.seconds,
+        views=views,
+        out=out,
+    )
+
+
+def _notes(trainer: Trainer) -> list[str]:
+    own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
+    if more := trainer.first_points - own:
+        notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+    if left < 1:
+        why = "pixels held back from the noisy photos showed no gain any more"
+        notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
+    return notes

@@ -56,5 +56,8 @@ pub const SUPPORT_SLACK: f64 = 8e-6;
 /// of the camera) are added in the same order for any number of threads.
 pub const PROJECT_CHUNK: usize = 1024;
 
-/// Most (Gaussian, tile) pairs of one view: about 50 bytes each while a gradient is computed, 13 GB in all.
-pub const MAX_PAIRS: u64 = 1 << 28;
+/// Most bytes of the (Gaussian, tile) pairs of one view. How many pairs these are follows from the size of a pair.
+pub const MAX_PAIR_BYTES: u64 = 24 << 30;
+
+/// Most (Gaussian, tile) pairs of one view, however small: all could lie in one tile, whose blocks count in u32.
+pub const MAX_PAIRS: u64 = u32::MAX as u64 / TILE_BLOCKS as u64;

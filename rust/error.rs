@@ -24,10 +24,14 @@ pub enum Error {
     },
     /// The Gaussians reach more tiles than one view may hold.
     TooManyPairs {
-        /// (Gaussian, tile) pairs of the view.
-        pairs: u64,
-        /// The most that are allowed.
+        /// Gaussians of the view.
+        gaussians: u64,
+        /// Tiles of the image.
+        tiles: u64,
+        /// The most (Gaussian, tile) pairs that are allowed.
         limit: u64,
+        /// What so many may take.
+        bytes: u64,
     },
     /// The system does not give the memory that a buffer needs.
     OutOfMemory {
@@ -83,10 +87,15 @@ impl fmt::Display for Error {
             Self::Shape { expected, got, .. } => {
                 write!(f, "expected shape {expected}, got {got}")
             }
-            Self::TooManyPairs { pairs, limit } => write!(
+            Self::TooManyPairs {
+                gaussians,
+                tiles,
+                limit,
+                bytes,
+            } => write!(
                 f,
-                "the Gaussians cover {pairs} (Gaussian, tile) pairs, more than {limit}; \
-                 use fewer or smaller Gaussians, or a smaller image"
+                "{gaussians} Gaussians reach more than {limit} times one of the {tiles} tiles of the image; so many \
+                 pairs take up to {bytes} bytes; use fewer or smaller Gaussians, a smaller image or float32"
             ),
             Self::OutOfMemory { bytes, .. } => write!(f, "cannot allocate {bytes} bytes"),
         }
@@ -124,9 +133,14 @@ mod tests {
                 "scales: expected shape 30 elements, got 29 elements",
             ),
             (
-                Error::TooManyPairs { pairs: 9, limit: 8 },
-                "means: the Gaussians cover 9 (Gaussian, tile) pairs, more than 8; \
-                 use fewer or smaller Gaussians, or a smaller image",
+                Error::TooManyPairs {
+                    gaussians: 9,
+                    tiles: 4,
+                    limit: 8,
+                    bytes: 800,
+                },
+                "means: 9 Gaussians reach more than 8 times one of the 4 tiles of the image; so many pairs take up \
+                 to 800 bytes; use fewer or smaller Gaussians, a smaller image or float32",
             ),
             (
                 Error::OutOfMemory {

@@ -1,11 +1,85 @@
 //! The thread pool of the Python binding: as many threads as `RAYON_NUM_THREADS` or the machine says, until
 //! [`set`] says otherwise. Results never depend on it.
+//!
+//! A process that forks leaves its child a pool without threads: work that it is given would wait for ever. The
+//! child therefore starts a pool of its own with as many threads, the first time that it needs one. All work goes
+//! through [`install`], since rayon's own global pool cannot be replaced.
 
 use crate::error::Error;
 use rayon::{ThreadPool, ThreadPoolBuilder};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::{
+    process, ptr,
+    sync::{
+        Arc, PoisonError, RwLock,
+        atomic::{AtomicPtr, AtomicUsize, Ordering},
+    },
+};
 
-static POOL: RwLock<Option<Arc<ThreadPool>>> = RwLock::new(None);
+/// The pool of one process.
+struct Pool {
+    process: u32,
+    /// Beside the lock, which another thread may have held when the process forked.
+    threads: AtomicUsize,
+    pool: RwLock<Arc<ThreadPool>>,
+}
+
+/// That of this process, or of the one that it was forked from; null before the first work.
+static POOL: AtomicPtr<Pool> = AtomicPtr::new(ptr::null_mut());
+
+impl Pool {
+    /// One with `threads` threads, or with the default number for 0.
+    fn new(threads: usize) -> Result<Self, Error> {
+        let pool = start(threads)?;
+        Ok(Self {
+            process: process::id(),
+            threads: AtomicUsize::new(pool.current_num_threads()),
+            pool: RwLock::new(Arc::new(pool)),
+        })
+    }
+
+    #[allow(unsafe_code)]
+    fn load() -> Option<&'static Self> {
+        // SAFETY: `POOL` is null or comes from `Box::into_raw` in `of_this_process`, and is never freed.
+        unsafe { POOL.load(Ordering::Acquire).as_ref() }
+    }
+
+    /// The pool of this process; if there is none, one with `threads` threads, or with those of the process that
+    /// this one was forked from.
+    fn of_this_process(threads: Option<usize>) -> Result<&'static Self, Error> {
+        loop {
+            let found = Self::load();
+            if let Some(pool) = found.filter(|pool| pool.process == process::id()) {
+                return Ok(pool);
+            }
+            let inherited = found.map_or(0, |pool| pool.threads.load(Ordering::Relaxed));
+            let made = Box::into_raw(Box::new(Self::new(threads.unwrap_or(inherited))?));
+            // The pool of the parent stays as it is: to free it would be to wait for its threads.
+            let found = found.map_or(ptr::null_mut(), |pool| ptr::from_ref(pool).cast_mut());
+            let won = POOL.compare_exchange(found, made, Ordering::AcqRel, Ordering::Acquire);
+            if won.is_err() {
+                drop_unshared(made); // another thread was faster
+            }
+        }
+    }
+}
+
+#[allow(unsafe_code)]
+fn drop_unshared(pool: *mut Pool) {
+    // SAFETY: it comes from `Box::into_raw`, and was not put into `POOL`, so that nobody else knows it.
+    drop(unsafe { Box::from_raw(pool) });
+}
+
+fn start(threads: usize) -> Result<ThreadPool, Error> {
+    ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|e| Error::Threads {
+            message: match threads {
+                0 => format!("cannot start: {e}"),
+                _ => format!("cannot start {threads} threads: {e}"),
+            },
+        })
+}
 
 /// Use `threads` threads from now on.
 ///
@@ -15,26 +89,29 @@ pub fn set(threads: usize) -> Result<(), Error> {
     if threads == 0 {
         return Err(Error::new("threads", "must be at least 1, got 0"));
     }
-    let pool = ThreadPoolBuilder::new()
-        .num_threads(threads)
-        .build()
-        .map_err(|e| Error::Threads {
-            message: format!("cannot start {threads} threads: {e}"),
-        })?;
-    *POOL.write().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(pool));
+    let pool = Pool::of_this_process(Some(threads))?;
+    if pool.threads.load(Ordering::Relaxed) != threads {
+        let other = Arc::new(start(threads)?);
+        *pool.pool.write().unwrap_or_else(PoisonError::into_inner) = other;
+        pool.threads.store(threads, Ordering::Relaxed);
+    }
     Ok(())
 }
 
 /// The number of threads in use.
-pub fn get() -> usize {
+///
+/// # Errors
+/// When the system refuses to start them.
+pub fn get() -> Result<usize, Error> {
     install(rayon::current_num_threads)
 }
 
 /// Run `f` on the pool.
-pub fn install<R: Send>(f: impl FnOnce() -> R + Send) -> R {
-    let pool = POOL.read().unwrap_or_else(PoisonError::into_inner).clone();
-    match pool {
-        Some(pool) => pool.install(f),
-        None => f(),
-    }
+///
+/// # Errors
+/// When the system refuses to start its threads.
+pub fn install<R: Send>(f: impl FnOnce() -> R + Send) -> Result<R, Error> {
+    let pool = Pool::of_this_process(None)?;
+    let pool = Arc::clone(&pool.pool.read().unwrap_or_else(PoisonError::into_inner));
+    Ok(pool.install(f))
 }

@@ -3,7 +3,7 @@
 //! arithmetic on it. What does not stay in cache anyway goes around it where the processor can do that: a cached
 //! store first reads what it overwrites.
 
-use crate::simd::Real;
+use crate::{error::Error, memory, simd::Real};
 use std::{
     mem::MaybeUninit,
     sync::atomic::{AtomicUsize, Ordering},
@@ -34,12 +34,28 @@ pub(crate) struct UninitPiece<'a, T> {
 }
 
 impl<T: Copy> UninitVec<T> {
-    pub fn new(len: usize) -> Self {
-        Self {
-            memory: Vec::with_capacity(len),
+    /// Of what `name` says.
+    ///
+    /// # Errors
+    /// When there is no memory for it.
+    pub fn new(len: usize, name: &str) -> Result<Self, Error> {
+        Ok(Self {
+            memory: memory::with_capacity(len, name)?,
             len,
             set: AtomicUsize::new(0),
-        }
+        })
+    }
+
+    /// Several of these lengths.
+    ///
+    /// # Errors
+    /// As for `new`.
+    pub fn several<const N: usize>(lengths: [usize; N], name: &str) -> Result<[Self; N], Error> {
+        let vectors = lengths.into_iter().map(|len| Self::new(len, name));
+        let vectors: Vec<_> = vectors.collect::<Result<_, _>>()?;
+        Ok(vectors
+            .try_into()
+            .unwrap_or_else(|_| unreachable!("one for each length")))
     }
 
     /// Cut into consecutive pieces, as many as there are lengths and elements.
@@ -163,7 +179,7 @@ mod tests {
     #[test]
     fn pieces_become_one_vector() {
         for lengths in [vec![], vec![0], vec![3, 0, 4], vec![1; 1000]] {
-            let mut vector = UninitVec::new(lengths.iter().sum());
+            let mut vector = UninitVec::new(lengths.iter().sum(), "test").unwrap();
             let pieces = vector.cut(lengths.iter().copied());
             assert_eq!(pieces.len(), lengths.len());
             pieces.into_par_iter().enumerate().for_each(|(k, piece)| {
@@ -188,7 +204,7 @@ mod tests {
         // The second is streamed; its pieces begin at addresses that are aligned to 16 bytes, and not.
         for len in [1000, STREAMED / 4 + 7] {
             let expected: Vec<f32> = (0..len).map(|i| i as f32).collect();
-            let mut vector = UninitVec::new(len);
+            let mut vector = UninitVec::new(len, "test").unwrap();
             let parts: Vec<_> = expected.chunks(len / 5 + 1).collect();
             let pieces = vector.cut(parts.iter().map(|part| part.len()));
             pieces
@@ -210,7 +226,7 @@ mod tests {
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_put_in_part_is_found() {
-        let mut vector = UninitVec::new(4);
+        let mut vector = UninitVec::new(4, "test").unwrap();
         vector.cut([4].into_iter()).pop().unwrap().put(&[1.0f32; 3]);
         vector.finish();
     }
@@ -218,7 +234,7 @@ mod tests {
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_not_set_is_found() {
-        let mut vector = UninitVec::new(5);
+        let mut vector = UninitVec::new(5, "test").unwrap();
         vector.cut([2, 3].into_iter()).pop().unwrap().fill(1u8);
         vector.finish();
     }
@@ -226,7 +242,7 @@ mod tests {
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_set_in_part_is_found() {
-        let mut vector = UninitVec::new(5);
+        let mut vector = UninitVec::new(5, "test").unwrap();
         for mut piece in vector.cut([2, 3].into_iter()) {
             piece.next(2, 1u8);
         }
@@ -236,7 +252,7 @@ mod tests {
     #[test]
     #[should_panic(expected = "a piece was not set")]
     fn setting_one_piece_in_two_cuts_is_not_enough() {
-        let mut vector = UninitVec::new(4);
+        let mut vector = UninitVec::new(4, "test").unwrap();
         for _ in 0..2 {
             vector.cut([2, 2].into_iter()).pop().unwrap().fill(1u8);
         }
@@ -246,6 +262,7 @@ mod tests {
     #[test]
     #[should_panic]
     fn more_than_there_is_cannot_be_cut() {
-        UninitVec::<u8>::new(4).cut([2, 3].into_iter());
+        let mut vector = UninitVec::<u8>::new(4, "test").unwrap();
+        vector.cut([2, 3].into_iter());
     }
 }

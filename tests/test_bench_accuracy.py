@@ -19,9 +19,9 @@ from scenes import random_scene
 
 import hqgs
 from benchmarks import cli
-from benchmarks.accuracy.accuracy import beats
 from benchmarks.accuracy.errors import errors_against, pareto_front
-from benchmarks.accuracy.knobs import CASES, EXACT, Knobs, TunedPass
+from benchmarks.accuracy.knobs import CASES, ORACLES, Knobs, TunedPass
+from benchmarks.accuracy.run import beats
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust
@@ -158,7 +158,7 @@ def test_floor_and_stop_follow_the_definition(
 
 def test_the_exact_oracle_has_no_cutoffs_left() -> None:
     inputs = make_inputs(300, 48, 36, seed=2)
-    exact = TunedPass(inputs, EXACT).outputs()
+    exact = TunedPass(inputs, ORACLES["exact"]).outputs()
     further = Knobs(dtype="float64", alpha_min=1e-15, transmittance_min=0.0)
     errors = errors_against(TunedPass(inputs, further).outputs(), exact)
     assert 0 < errors["image"]["max"] < 1e-10
@@ -168,6 +168,8 @@ def test_the_exact_oracle_has_no_cutoffs_left() -> None:
 def test_default_knobs_are_the_default() -> None:
     inputs = make_inputs(300, 48, 36, seed=2)
     plain, default = RasterPass(inputs), TunedPass(inputs, Knobs())
+    assert CASES[0] == ("default", "", Knobs())
+    assert ORACLES["defined"] == Knobs(dtype="float64")
     assert tuple(asdict(default.knobs).values())[1:] == DEFAULT
     assert torch.equal(plain.run(), default.run())
     for a, b in zip(plain.leaves, default.leaves, strict=True):

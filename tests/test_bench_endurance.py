@@ -12,13 +12,15 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from benchmarks import cli, endurance
-from benchmarks.endurance import CASES, QUICK, Case, EnduranceConfig, run_case, train_config, verdict
-from hqgs.training.config import TrainConfig
+from benchmarks import cli, endurance, scenes
+from benchmarks.endurance import PHOTOS, PROTOCOLS, Case, run_case, verdict
+from benchmarks.study import Store
+from hqgs.scene.scene import Scene
 from hqgs.training.methods.base import ThreeDGS
 
-CONFIG = EnduranceConfig(iterations=20, max_gaussians=80)
-LONG = EnduranceConfig()
+CASES = [row for row in PROTOCOLS["standard"].rows if isinstance(row, Case)]
+LONG = PROTOCOLS["standard"].train_config(CASES[0], 0)
+SHORT = {"densify": {"max_gaussians": 80}}
 
 
 def call(*arguments: str | Path) -> int:
@@ -26,44 +28,53 @@ def call(*arguments: str | Path) -> int:
 
 
 def case(name: str) -> Case:
-    return next(c for c in CASES if c.name == name)
+    return next(c for c in CASES if c.label == name)
+
+
+def hostile(name: str, scene: Scene) -> Scene:
+    return PHOTOS[case(name).photos](scene)
 
 
 def test_what_the_cases_do_to_the_scene() -> None:
     scene = tiny_scene(num_views=11)
-    noisy = case("30 % noise photos").scene(scene)
+    noisy = hostile("30 % noise photos", scene)
     changed = [not np.array_equal(a.image, b.image) for a, b in zip(noisy.train, scene.train, strict=True)]
     assert sum(changed) == 3
     spread = np.concatenate([v.image.ravel() for v, c in zip(noisy.train, changed, strict=True) if c])
     assert abs(spread.mean() - 127.5) < 5
     assert abs(spread.std() - 73.9) < 3
     assert noisy.test == scene.test
-    assert len(case("one photo").scene(scene).train) == 1
-    first, second = case("two identical cameras").scene(scene).train
+    assert len(hostile("one photo", scene).train) == 1
+    first, second = hostile("two identical cameras", scene).train
     assert first.camera == second.camera
     assert np.array_equal(first.image, second.image)
     assert first.name != second.name
 
 
 def test_what_the_cases_do_to_the_configuration() -> None:
-    config = train_config(LONG)
+    config = LONG
+    assert config.densify.max_gaussians == 30_000
     assert (config.iterations, config.densify.stop, config.densify.reset_every) == (20_000, 10_000, 3_000)
-    fast = case("learning rates x10").config(config)
-    assert (fast.lr_means, fast.lr_sh0) == pytest.approx((1.6e-3, 2.5e-2))
-    assert fast.adam_eps == config.adam_eps
-    assert case("opacity resets x10").config(config).densify.reset_every == 300
-    assert case("as it is").config(config) == config
+    fast = PROTOCOLS["standard"].train_config(case("learning rates x10"), 0)
+    rates = {name: 10 * rate for name, rate in vars(config).items() if name.startswith("lr_")}
+    assert {name: vars(fast)[name] for name in rates} == pytest.approx(rates, rel=1e-12)
+    assert replace(fast, **{name: vars(config)[name] for name in rates}) == config
+    resets = PROTOCOLS["standard"].train_config(case("opacity resets x10"), 0)
+    assert resets == replace(config, densify=replace(config.densify, reset_every=300))
+    assert case("opacity resets x10").train_config(0, 40).densify.reset_every == 5  # in a short run, too
+    assert [c.config for c in CASES if c.photos] == [{}, {}, {}]
+    assert [c.label for c in CASES] == [
+        "as it is", "30 % noise photos", "learning rates x10", "one photo", "two identical cameras",
+        "opacity resets x10",
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [c.name for c in CASES])
+@pytest.mark.parametrize("name", [c.label for c in CASES])
 def test_every_case_runs(name: str) -> None:
-    def roomy(config: TrainConfig) -> TrainConfig:
-        """Nothing is pruned as too large: the Gaussians of this scene are."""
-        config = chosen.config(config)
-        return replace(config, densify=replace(config.densify, prune_scale=100.0))
-
-    chosen = case(name)
-    result = run_case(replace(chosen, config=roomy), tiny_scene(), CONFIG)
+    config = case(name).train_config(0, 20, SHORT)
+    # Nothing is pruned as too large: the Gaussians of this scene are.
+    config = replace(config, densify=replace(config.densify, prune_scale=100.0))
+    result = run_case(hostile(name, tiny_scene()), config)
     assert result["passed"], result["failure"]
     assert [r["iteration"] for r in result["records"]] == list(range(1, 21))
     assert all(r["psnr"] > 0 and r["loss"] > 0 for r in result["records"])
@@ -79,7 +90,8 @@ def test_a_nan_that_is_caught_is_counted_and_fails_the_case(monkeypatch: pytest.
         return real(self, render, view) * (torch.nan if len(steps) == 7 else 1.0)
 
     monkeypatch.setattr(ThreeDGS, "loss", spoiled)
-    result = run_case(CASES[0], tiny_scene(), CONFIG)
+    config = CASES[0].train_config(0, 20, SHORT)
+    result = run_case(tiny_scene(), config)
     assert (result["finite"], result["passed"], result["failure"]) == (False, False, None)
     assert [r["losses_not_finite"] for r in result["records"]].count(1) == 1
     assert result["guard"]["num_events"] == 1
@@ -88,10 +100,10 @@ def test_a_nan_that_is_caught_is_counted_and_fails_the_case(monkeypatch: pytest.
 
 def test_a_run_that_breaks_off_is_a_failed_case(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ThreeDGS, "loss", lambda self, render, view: render.sum() * torch.nan)
-    result = run_case(CASES[0], tiny_scene(), replace(CONFIG, iterations=40))
+    result = run_case(tiny_scene(), CASES[0].train_config(0, 40, SHORT))
     assert "20 steps in a row" in result["failure"]
     assert not result["passed"]
-    assert "FAIL" in endurance.table([result], CONFIG)
+    assert "FAIL" in endurance.cases_table([result | {"case": "it"}], PROTOCOLS["quick"])
 
 
 def made_up(peaks: list[float], gaussians: int = 100, bad: int = 0) -> dict[str, Any]:
@@ -118,40 +130,53 @@ def test_verdicts_of_made_up_runs() -> None:
 def test_the_command_keeps_finished_cases(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scenes: list[tuple[int, int]] = []
+    sizes: list[tuple[int, int]] = []
 
-    def embedded(cache: Path, width: int, height: int) -> Any:
-        scenes.append((width, height))
+    def embedded(cache: Path, width: int, height: int, **options: Any) -> Any:
+        sizes.append((width, height))
         return tiny_scene()
 
-    monkeypatch.setattr(endurance, "embedded_scene", embedded)
-    options = ["--quick", "--out", tmp_path, "--cases", "as it is", "one photo"]
+    monkeypatch.setattr(scenes, "embedded_scene", embedded)
+    options = ["--quick", "--out", tmp_path, "--rows", "as it is", "one photo"]
     assert call(*options) == 0
     out, err = capsys.readouterr()
     assert out.count("pass |") == 2
     assert "All passed." in out
-    assert err.count("bench endurance:") == 2
-    assert scenes == [(42, 32)]
+    assert "endurance: 2 runs, 2 left" in err
+    assert "[1/2] embedded, as it is, seed 0: " in err
+    assert "[2/2] embedded, one photo, seed 0: " in err
+    assert sizes == [(42, 32)]
     report = json.loads((tmp_path / "endurance.json").read_text())
     assert [c["case"] for c in report["results"]["cases"]] == ["as it is", "one photo"]
-    assert report["settings"]["iterations"] == QUICK.iterations
+    plain, one = (case["records"][-1]["psnr"] for case in report["results"]["cases"])
+    assert abs(plain - one) > 0.1  # each is trained on photos of its own
+    assert report["settings"]["iterations"] == PROTOCOLS["quick"].iterations
     assert (tmp_path / "endurance_runs.png").stat().st_size > 10_000
-    kept = (tmp_path / "endurance" / "one_photo.json").read_bytes()
-    (tmp_path / "endurance" / "as_it_is.json").unlink()
+    here = Store(tmp_path).here
+    (one,) = here.glob("*one-photo*.json")
+    (plain,) = here.glob("*as-it-is*.json")
+    kept = one.read_bytes()
+    plain.unlink()
+    assert call(*options, "--finished") == 0
+    assert "NOT all passed." in capsys.readouterr().out  # one is missing
     assert call(*options) == 0
-    assert capsys.readouterr().err == "bench endurance: as it is\n"  # the other one is not repeated
-    assert (tmp_path / "endurance" / "one_photo.json").read_bytes() == kept
-    assert call(*options, "--iterations", "41") == 2
-    assert "holds a case with other settings; choose another --out" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "2 runs, 1 left" in err
+    assert "one photo" not in err  # the other one is not repeated
+    assert one.read_bytes() == kept
+    assert call(*options, "--iterations", "41") == 0  # other settings are other runs
+    assert "2 runs, 2 left" in capsys.readouterr().err
+    assert one.read_bytes() == kept
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--iterations", "0"], "iterations is 0, wanted at least 1"),
-        (["--downscale", "0.5"], "downscale must be in 1..47.25, got 0.5"),
-        (["--cases", "none"], "cases: there is no 'none'; there are: as it is, "),
-        (["--seed", "-1"], "seed is -1, wanted at least 0"),
+        (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
+        (["--downscale", "60"], "downscale must be in 1..47.25 for embedded, got 60"),
+        (["--rows", "none"], "rows: there is no 'none'; there are: as it is, "),
+        (["--seeds", "-1"], "seed is -1, wanted at least 0"),
     ],
 )
 def test_bad_options_are_one_line_and_exit_code_2(

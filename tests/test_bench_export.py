@@ -9,10 +9,11 @@ import pytest
 from PIL import Image
 from tiny_scene import tiny_scene
 
-from benchmarks import cli
+from benchmarks import cli, scenes
 from benchmarks import export as bench
+from benchmarks.study import Store
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
-from hqgs.export.export import read_scene_file
+from hqgs.model.gaussians import Gaussians
 
 
 def call(*arguments: str | Path) -> int:
@@ -21,14 +22,15 @@ def call(*arguments: str | Path) -> int:
 
 def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    monkeypatch.setattr(bench, "embedded_scene", lambda *args: asked.append(args) or tiny_scene())
+    monkeypatch.setattr(scenes, "embedded_scene", lambda *args, **_: asked.append(args) or tiny_scene())
     assert call("--quick", "--threads", "1", "--out", tmp_path) == 0
-    assert asked == [(tmp_path / "scene", 42, 32)]
+    assert asked == [(tmp_path / "scenes" / "embedded_42x32_24", 42, 32)]
     report = json.loads((tmp_path / "export.json").read_text(encoding="utf-8"))
     result = report["results"]
     files = {row["name"]: row for row in result["files"]}
-    assert list(files) == list(bench.variants())
-    scene, trained = tiny_scene(), read_scene_file(tmp_path / "export")
+    assert list(files) == list(bench.VARIANTS)
+    (folder,) = (path for path in Store(tmp_path).here.iterdir() if path.is_dir())
+    scene, trained = tiny_scene(), Gaussians.load(folder)
     assert result["psnr"] == pytest.approx(held_out_psnr(scene, held_out_renders(scene, trained)))
     assert result["gaussians"] == len(trained)
     assert report["settings"]["iterations"] == 20
@@ -36,7 +38,7 @@ def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     exact = files["ply, degree 3"]
     assert (exact["cost_db"], exact["largest_change"], exact["psnr_to_original"]) == (0, 0, None)
     assert result["ply_of_3dgs_bytes"] == exact["bytes"] + 12 * len(trained)
-    assert exact["bytes"] == (tmp_path / "export" / "scene.ply").stat().st_size
+    assert exact["bytes"] == (folder / "scene.ply").stat().st_size
     sizes = [files[f"ply, degree {d}"]["bytes"] for d in (3, 2, 1, 0)]
     assert sizes == sorted(sizes, reverse=True)
     fine, coarse = (files[f"spz, {bits} bits, tolerance 0"] for bits in ("8 and 8", "5 and 4"))
@@ -63,7 +65,7 @@ def test_the_front_holds_what_no_other_beats_in_both() -> None:
     ("arguments", "message"),
     [
         (["--downscale", "0.5"], "downscale must be at least 1, got 0.5"),
-        (["--run-folder", "x"], "--run-folder and --scene go together"),
+        (["--scenes", "a", "b"], "one scene and one seed are written"),
         (["--iterations", "0"], "iterations is 0, wanted at least 1"),
     ],
 )
@@ -71,7 +73,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: list[str],
     message: str,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(bench, "embedded_scene", lambda *_: tiny_scene())
+    monkeypatch.setattr(scenes, "embedded_scene", lambda *_, **__: tiny_scene())
     assert call(*arguments, "--out", tmp_path) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line

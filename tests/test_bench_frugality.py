@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pandas import DataFrame
 
 from benchmarks import cli, frugality
-from benchmarks.frugality import FrugalityConfig, against_none, train_config, verdict
+from benchmarks.frugality import PROTOCOLS, against_none, verdict
+from benchmarks.study import Store
+from hqgs.training.config import AUTO, ITEMS, NONE, TrainConfig
 
 
 def call(*arguments: str | Path) -> int:
@@ -22,12 +25,18 @@ def run_of(scene: str, row: str, **changes: Any) -> dict[str, Any]:
 
 
 def test_the_rows() -> None:
-    config = FrugalityConfig()
-    assert train_config("none", config, 0).leave_out == ()
-    assert train_config("iterations", config, 0).leave_out == ("iterations",)
-    assert train_config("auto", config, 3).leave_out == ("photos", "growth", "weight", "harmonics")
-    assert train_config("auto", config, 3).seed == 3
-    assert all(train_config(row, config, 0).iterations == 7_000 for row in config.rows)
+    protocol = PROTOCOLS["standard"]
+    assert protocol.labels == [NONE, *ITEMS, AUTO]
+
+    def config(label: str, seed: int = 0) -> TrainConfig:
+        return protocol.train_config(protocol.rows[protocol.labels.index(label)], seed)
+
+    assert config("none").leave_out == ()
+    assert config("iterations").leave_out == ("iterations",)
+    assert config("auto", 3).leave_out == ("photos", "growth", "weight", "harmonics")
+    assert config("auto", 3).seed == 3
+    assert all(config(label) == TrainConfig(
+        7_000, "3dgs", leave_out=config(label).leave_out).scaled() for label in protocol.labels)  # fmt: skip
 
 
 def test_means_and_the_worst_scene_against_none() -> None:
@@ -38,7 +47,7 @@ def test_means_and_the_worst_scene_against_none() -> None:
         run_of("b", "auto", psnr=24.9, cpu_seconds=60.0, bytes=1200, seconds=60.0, decision_seconds=0.6),
         run_of("c", "auto"),  # has nothing to be compared with
     ]
-    found = against_none(runs, "auto")
+    found = against_none(DataFrame(runs), "auto")
     assert found is not None
     assert found["scenes"] == 2
     assert found["psnr"] == pytest.approx(0.0)
@@ -47,7 +56,7 @@ def test_means_and_the_worst_scene_against_none() -> None:
     assert found["bytes"] == pytest.approx(0.3)
     assert found["decision_share"] == pytest.approx(0.01)
     assert all(verdict(found).values())
-    assert against_none(runs, "growth") is None
+    assert against_none(DataFrame(runs), "growth") is None
     for name, key, value in (
         ("time", "cpu_seconds", 0.51),
         ("bytes", "bytes", 0.34),
@@ -63,7 +72,7 @@ def test_the_worst_scene_is_the_mean_of_its_seeds() -> None:
     runs = [run_of("a", "none", seed=seed) for seed in (0, 1)]
     runs += [run_of("a", "auto", seed=0, psnr=29.6), run_of("a", "auto", seed=1, psnr=30.2)]
     runs += [run_of("b", "none"), run_of("b", "auto", psnr=30.3)]
-    found = against_none(runs, "auto")
+    found = against_none(DataFrame(runs), "auto")
     assert found is not None
     assert (found["scenes"], found["runs"]) == (2, 3)
     assert found["worst_psnr"] == pytest.approx(-0.1)
@@ -82,14 +91,20 @@ def test_a_quick_run_is_written_and_kept(
     assert runs[1]["gaussians"] < runs[0]["gaussians"]
     assert runs[1]["left_out"]
     assert (tmp_path / "frugality_gains.png").stat().st_size > 10_000
+    here = Store(tmp_path).here
+    assert sorted(path.suffix for path in here.iterdir()) == [
+        ".json",
+        ".json",
+    ]  # the PLY file was only weighed
+    assert all(run["bytes"] > 200 * run["gaussians"] * run["sh_degree"] / 3 for run in runs)
 
     def never(*_: Any) -> None:
         raise AssertionError("a finished run was repeated")
 
-    monkeypatch.setattr(frugality, "run_row", never)
+    monkeypatch.setattr(frugality, "run_cell", never)
     assert call("--quick", "--out", tmp_path, "--iterations", "8", "--rows", "none", "auto") == 0
 
-    next((tmp_path / "frugality").glob("*-none-s0-*")).write_text("[", encoding="utf-8")
+    next(here.glob("*-none-*")).write_text("[", encoding="utf-8")
     assert call("--quick", "--out", tmp_path, "--iterations", "8", "--rows", "none", "auto") == 2
     assert "is damaged" in capsys.readouterr().err
 
@@ -97,7 +112,9 @@ def test_a_quick_run_is_written_and_kept(
 def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--rows", "colour", "--out", tmp_path) == 2
     assert "rows: there is no 'colour'; there are: none, photos" in capsys.readouterr().err
-    assert call("--seeds", "0", "--out", tmp_path) == 2
-    assert "seeds must be at least 1, got 0" in capsys.readouterr().err
+    assert call("--seeds", "-1", "--out", tmp_path) == 2
+    assert "seed is -1, wanted at least 0" in capsys.readouterr().err
+    assert call("--seeds", "0", "0", "--out", tmp_path) == 2
+    assert "seeds holds 0 twice" in capsys.readouterr().err
     assert call("--downscale", "0.5", "--out", tmp_path) == 2
     assert "downscale must be at least 1, got 0.5" in capsys.readouterr().err

@@ -3,6 +3,7 @@ numbers that follow from the runs' files."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from dataclasses import replace
@@ -11,26 +12,29 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pandas import DataFrame, Series
 from PIL import Image
 from scipy import ndimage
 
 import hqgs
-from benchmarks import cli
+from benchmarks import cli, study
+from benchmarks import scenes as bench_scenes
+from benchmarks.estimate import GROWTH, Estimate, duration
 from benchmarks.output import Report
-from benchmarks.quality import quality
-from benchmarks.quality import runs as quality_runs
-from benchmarks.quality import scenes as quality_scenes
-from benchmarks.quality.estimate import GROWTH, Estimate, duration
-from benchmarks.quality.protocols import PROTOCOLS, Cell, cells, narrowed
+from benchmarks.protocol import Protocol, narrowed
+from benchmarks.quality import cell as quality_cell
+from benchmarks.quality import run as quality
 from benchmarks.quality.regions import count_regions, edge_robustness
-from benchmarks.quality.runs import RunStore
-from benchmarks.quality.scenes import degraded, degraded_views, load_scenes, validation_split
-from benchmarks.quality.summary import Group, Spread, columns, equal_time_gain, mean_of, psnr_at
-from benchmarks.quality.tables import courses, one_scene
+from benchmarks.quality.run import PROTOCOLS
+from benchmarks.quality.summary import equal_time_gain, means, psnr_at, spread, with_degraded
+from benchmarks.quality.tables import courses, metrics
+from benchmarks.scenes import degraded, degraded_views, load_scenes, validation_split
+from benchmarks.study import Cell, Store, grid, key_of
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.scene import Camera, Scene, SfmReport, View
 from hqgs.training.checkpoint import scene_fingerprint
-from hqgs.training.config import SRGSConfig
+from hqgs.training.config import ESFGConfig, PaperConfig, SRGSConfig, TrainConfig
+from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import TrainingError
 from tests.tiny_scene import tiny_scene
 
@@ -56,7 +60,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def runs(out: Path) -> dict[tuple[str, int, str], dict[str, Any]]:
     """The files' contents by degradation, seed and method."""
-    read = [json.loads(path.read_text(encoding="utf-8")) for path in (out / "runs").iterdir()]
+    read = [json.loads(path.read_text(encoding="utf-8")) for path in files(out)]
     return {(run["degradation"], run["seed"], run["method"]): run for run in read}
 
 
@@ -70,15 +74,31 @@ def table(text: str, title: str) -> dict[str, dict[str, str]]:
     return {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in body}
 
 
+def files(out: Path) -> list[Path]:
+    """Those of the runs that were made here."""
+    return list(Store(out).here.glob("*.json"))
+
+
 def stamps(out: Path) -> dict[str, int]:
-    return {path.name: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
+    return {path.name: path.stat().st_mtime_ns for path in files(out)}
+
+
+def bench_of(
+    out: Path, protocol: Protocol, scenes: list[Scene], sfm: bool = False, pictures: int = 0
+) -> quality.Quality:
+    args = argparse.Namespace(
+        out=out, validate=False, sfm=sfm, pictures=pictures, any_sources=False, known=None
+    )
+    return quality.Quality(args, protocol, scenes, Report(settings={}))
 
 
 def test_each_cell_is_one_file_with_its_numbers(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
     assert set(runs) == {(kind, seed, row) for kind in KINDS for seed in SEEDS for row in ROWS}
     assert len(stamps(out)) == len(runs) == 18
     for run in runs.values():
-        assert (out / "runs" / f"{run['key']}.json").is_file()
+        assert (Store(out).here / f"{run['key']}.json").is_file()
+        assert run["machine"]["cores"] >= 1
+        assert run["versions"]["hqgs"] == hqgs.__version__ or run["versions"]["hqgs"] is None
         assert run["config"]["seed"] == run["seed"]
         assert [h["iteration"] for h in run["history"]] == [1, 2, 3, 4, 5]
         assert run["history"][-1]["psnr"] == pytest.approx(run["metrics"]["psnr"])
@@ -147,7 +167,8 @@ def test_tables_follow_from_the_files(out: Path, runs: dict[Any, dict[str, Any]]
 
 def test_one_file_holds_everything(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
     whole = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))
-    assert {run["key"]: run for run in whole["results"]["runs"]} == {run["key"]: run for run in runs.values()}
+    labelled = [run | {"row": run["method"]} for run in runs.values()]
+    assert {run["key"]: run for run in whole["results"]["runs"]} == {run["key"]: run for run in labelled}
     assert whole["settings"]["protocol"] == "smoke"
     assert whole["settings"]["validation"] is False
     assert {entry["what"] for entry in whole["left_out"]} == {"lpips", "lpips_vgg"}
@@ -168,7 +189,7 @@ def test_sheets_show_the_photo_and_every_render(out: Path, runs: dict[Any, dict[
         photo = np.asarray(image.convert("RGB")).astype(int)
     assert np.array_equal(sheet[line : line + 36, :48], photo)
     for k, row in enumerate(ROWS):
-        with Image.open(out / "renders" / runs["noise:25", 0, row]["key"] / "0.png") as image:
+        with Image.open(Store(out).beside(runs["noise:25", 0, row]["key"], "0.png")) as image:
             render = np.asarray(image).astype(int)
         left = (k + 2) * (48 + gap)
         assert np.array_equal(sheet[line : line + 36, left : left + 48], render)
@@ -183,7 +204,7 @@ def test_finished_cells_are_not_repeated(
 ) -> None:
     before = stamps(out)
     trained: list[str] = []
-    real = quality_runs.run_cell
+    real = quality_cell.run_cell
 
     def counted(cell: Cell, *rest: Any) -> Any:
         trained.append(str(cell))
@@ -195,9 +216,9 @@ def test_finished_cells_are_not_repeated(
 
     gone = runs["lowres:2", 1, "hqgs"]
     name = f"{gone['key']}.json"
-    (out / "runs" / name).unlink()
+    (Store(out).here / name).unlink()
     assert call(out, "--finished", *OPTIONS) == 0
-    assert not (out / "runs" / name).exists()
+    assert not (Store(out).here / name).exists()
     left_out = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))["left_out"]
     assert {"what": "run embedded, lowres:2, hqgs, seed 1", "why": "not finished"} in left_out
 
@@ -205,14 +226,14 @@ def test_finished_cells_are_not_repeated(
     assert trained == ["embedded, lowres:2, hqgs, seed 1"]
     after = stamps(out)
     assert {k: v for k, v in after.items() if k != name} == {k: v for k, v in before.items() if k != name}
-    again = json.loads((out / "runs" / name).read_text(encoding="utf-8"))
+    again = json.loads((Store(out).here / name).read_text(encoding="utf-8"))
     for field in ("metrics", "gaussians", "regions", "config", "views"):
         assert again[field] == gone[field]  # the same bits
 
 
 def test_a_run_serves_other_protocols_and_filters(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
-    assert call(out, "--degradations", "noise:25.0", "--methods", "hqgs", "3dgs", "--iterations", "5") == 0
+    assert call(out, "--degradations", "noise:25.0", "--rows", "hqgs", "3dgs", "--iterations", "5") == 0
     whole = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))
     assert [run["method"] for run in whole["results"]["runs"]] == ["3dgs", "hqgs"]  # the protocol's order
 
@@ -220,7 +241,7 @@ def test_a_run_serves_other_protocols_and_filters(out: Path, monkeypatch: pytest
 def test_known_runs_of_another_machine_are_not_repeated(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real = quality_runs.run_cell
+    real = quality_cell.run_cell
     monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
     known = tmp_path / "known.json"
     assert call(out, *OPTIONS, "--finished") == 0
@@ -242,7 +263,8 @@ def test_known_runs_of_another_machine_are_not_repeated(
     assert call(out, *OPTIONS, "--known", str(known)) == 2
     assert "'../outside'" in capsys.readouterr().err
     assert not (tmp_path / "outside.json").exists()
-    kept = json.loads((out / "runs" / f"{here['runs'][0]['key']}.json").read_text(encoding="utf-8"))
+    assert call(out, *OPTIONS) == 0
+    kept = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))["results"]["runs"][0]
     assert kept == here["runs"][0]
     known.write_text("[]", encoding="utf-8")
     assert call(out, *OPTIONS, "--known", str(known)) == 2
@@ -260,7 +282,7 @@ def test_validation_never_sees_a_test_view(out: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="1 training photos"):
         validation_split(replace(scene, train=scene.train[:1]))
 
-    options = ("--degradations", "noise:25", "--methods", "3dgs", "--iterations", "2", "--validate")
+    options = ("--degradations", "noise:25", "--rows", "3dgs", "--iterations", "2", "--validate")
     assert call(out, *options) == 0
     whole = json.loads((out / "quality_smoke_validation.json").read_text(encoding="utf-8"))
     assert whole["settings"]["validation"] is True
@@ -284,12 +306,13 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
         report = SfmReport(5, ["lost"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, 0.3)
         return replace(scene, sfm=report, points=scene.points + np.float32(0.01))
 
-    monkeypatch.setattr(quality_scenes, "sfm_scene", sfm)
+    monkeypatch.setattr(bench_scenes, "sfm_scene", sfm)
     protocol = narrowed(PROTOCOLS["smoke"], ["noise:25"], ["3dgs", "hqgs"], iterations=2)
-    scene, report = tiny_scene(), Report(settings={})
-    bench = quality.Quality(protocol, [scene], RunStore(tmp_path, validate=False, sfm=True), 0, report)
+    scene = tiny_scene()
+    bench = bench_of(tmp_path, protocol, [scene], sfm=True)
     bench.train()
     bench.tables()
+    report = bench.report
     assert len(seen) == 1
     np.testing.assert_array_equal(seen[0], degraded(scene, "noise:25", 0).train[0].image)
     runs = report.results["runs"]
@@ -305,12 +328,12 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
 
 
 def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, store = tiny_scene(), RunStore(tmp_path, validate=False)
+    scene = tiny_scene()
     protocol = narrowed(PROTOCOLS["smoke"], ["none", "noise:25"], ["3dgs", "srgs"], iterations=2)
-    real = quality_runs.run_cell
+    real = quality_cell.run_cell
 
     def make() -> quality.Quality:
-        return quality.Quality(protocol, [scene], store, 0, Report(settings={}))
+        return bench_of(tmp_path, protocol, [scene])
 
     def raising(error: BaseException, at: str) -> None:
         def run(cell: Cell, *rest: Any) -> Any:
@@ -328,39 +351,83 @@ def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.
     raising(TrainingError("it blew up"), "tiny, noise:25, 3dgs, seed 0")
     bench = make()
     bench.train()
-    assert len(stamps(tmp_path)) == 3
-    bench.tables()
-    assert {"what": "run tiny, noise:25, 3dgs, seed 0", "why": "it blew up"} in bench.report.left_out
-    assert [group.degradation for group in bench.groups()] == ["none"]  # srgs alone is not compared
+    assert [len(bench.study.runs), len(stamps(tmp_path))] == [3, 4]  # and the reason of the other
+    for later in (bench, make()):  # which the next call still knows
+        later.tables()
+        assert {"what": "run tiny, noise:25, 3dgs, seed 0", "why": "it blew up"} in later.report.left_out
+        assert [cells[0].degradation for cells in later.groups()] == ["none"]  # srgs alone is not compared
 
-    first = next(iter((tmp_path / "runs").iterdir()))
+    monkeypatch.setattr(quality, "run_cell", real)
+    bench = make()
+    bench.train()  # it is tried again
+    assert (bench.study.failures, len(bench.study.runs), len(stamps(tmp_path))) == ({}, 4, 4)
+    assert make().study.failures == {}
+
+    first = files(tmp_path)[0]
     first.write_text("{", encoding="utf-8")
     with pytest.raises(ValueError, match=r"is damaged.*remove it"):
         make()
 
 
-def test_the_key_covers_what_a_result_depends_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store, scene = RunStore(tmp_path, validate=False), tiny_scene()
-    base = cells(PROTOCOLS["smoke"], ["tiny"])[0]
-    prints = scene_fingerprint(scene)
-    key = store.key(base, prints)
-    assert key.startswith("tiny-x1-none-3dgs-s0-10-")
-    same = replace(base.row, label="other", srgs=SRGSConfig(texture_weight=0.9))
-    assert store.key(replace(base, row=same), prints) == key  # another method's options
-    srgs = replace(same, method="srgs")
+def test_the_key_covers_what_a_result_depends_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = grid(PROTOCOLS["smoke"], [tiny_scene()])[0]
+
+    def key(cell: Cell, **options: Any) -> str:
+        """With other options of the methods."""
+        return key_of(replace(cell, config=replace(cell.config, **options)), scene_fingerprint(cell.scene))
+
+    first = key(base)
+    assert first.startswith("tiny-x1-none-3dgs-s0-10-")
+    same = replace(base, row=replace(base.row, label="other"))
+    assert key(same, srgs=SRGSConfig(texture_weight=0.9)) == first  # another method's options
+    srgs = replace(base, row=replace(base.row, method="srgs"))
+    moved = replace(base.scene, points=base.scene.points + 1)
     others = [
-        store.key(replace(base, seed=1), prints),
-        store.key(replace(base, iterations=11), prints),
-        store.key(replace(base, degradation="blur"), prints),
-        store.key(base, scene_fingerprint(replace(scene, points=scene.points + 1))),
-        store.key(base, scene_fingerprint(validation_split(scene))),
-        store.key(replace(base, row=srgs), prints),
-        store.key(replace(base, row=replace(srgs, srgs=SRGSConfig(texture_weight=0.8))), prints),
+        key(base, seed=1),
+        key(base, iterations=11),
+        key(replace(base, degradation="blur")),
+        key(replace(base, scene=moved)),
+        key(replace(base, scene=validation_split(base.scene))),
+        key(srgs),
+        key(srgs, srgs=SRGSConfig(texture_weight=0.8)),
+        key(replace(base, more={"sfm": True})),
     ]
-    others.append(replace(store, sfm=True).key(base, prints))
     monkeypatch.setattr(hqgs, "__version__", "999")
-    others.append(store.key(base, prints))
-    assert len({key, *others}) == 10
+    others.append(key(base))
+    assert len({first, *others}) == 10
+
+
+def test_runs_of_other_sources_count_only_when_asked(
+    out: Path, runs: dict[Any, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert {run["sources"] for run in runs.values()} == {Store(out).here.name.split("-")[-1]}
+    run = runs["none", 0, "3dgs"]
+    first = Store(tmp_path)
+    first.write(run)
+    monkeypatch.setattr(study, "sources", lambda: "other")
+    second, both = Store(tmp_path), Store(tmp_path, any_sources=True)
+    assert second.read(run["key"]) is None
+    assert both.read(run["key"]) == run
+    second.write(run | {"seconds": 0.0})
+    for store in (second, both):  # its own come first
+        assert store.read(run["key"]) == run | {"seconds": 0.0}
+    assert first.read(run["key"]) == run
+
+
+def test_the_sources_are_those_that_make_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for changed in ("", "hqgs/cli/main.py", "hqgs/training/loop.py", "rust/lib.rs", "Cargo.lock"):
+        root = tmp_path / f"at {changed}".replace("/", "_")
+        names = ("hqgs/__init__.py", "hqgs/cli/main.py", "hqgs/training/loop.py", "rust/lib.rs")
+        for name in (*names, "Cargo.lock", "Cargo.toml"):
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_text("2" if name == changed else "1", encoding="utf-8")
+        monkeypatch.setattr(hqgs, "__file__", str(root / "hqgs" / "__init__.py"))
+        study.sources.cache_clear()
+        found.append(study.sources())
+    study.sources.cache_clear()
+    assert found[0] == found[1]  # the command line makes no result
+    assert len(set(found)) == 4
 
 
 def test_protocols() -> None:
@@ -371,19 +438,30 @@ def test_protocols() -> None:
         assert protocol.baseline in protocol.labels
         assert len(set(protocol.labels)) == len(protocol.rows)
         assert narrowed(protocol, protocol.degradations) == protocol  # spelled as the parser spells them
-    standard = cells(PROTOCOLS["standard"], ["a", "b"])
+    scene = tiny_scene()
+    standard = grid(PROTOCOLS["standard"], [scene, replace(scene, name="b")])
     assert len(standard) == 2 * 6 * 2 * 3
     assert [cell.row.label for cell in standard[:3]] == list(ROWS)
     assert len({cell.group for cell in standard[:3]}) == 1
     assert {cell.seed for cell in standard[:36]} == {0}
     assert PROTOCOLS["ablation"].labels == [f"V{k}" for k in range(1, 8)]
-    assert all(cell.config.hqgs.guidance == "paper" for cell in cells(PROTOCOLS["ablation"], ["a"]))
-    assert cells(PROTOCOLS["long"], ["a"])[0].config.densify.stop == 15_000
+    for cell in grid(PROTOCOLS["ablation"], [scene]):
+        assert cell.config.hqgs.guidance == "paper"
+        assert cell.config.hqgs.paper == VARIANTS[cell.row.label]
+    losses = [cell.config.hqgs.paper for cell in grid(PROTOCOLS["loss"], [scene])]
+    assert losses == [PaperConfig(loss="l1"), PaperConfig(loss="l1+dssim"), PaperConfig(loss="l1+scs")]
+    sizes = [cell.config.hqgs.paper.esfg for cell in grid(PROTOCOLS["downsampling"], [scene])[1:]]
+    assert sizes == [ESFGConfig(downscale=k) for k in (1, 2, 4)]
+    assert [cell.config.hqgs.first_points for cell in grid(PROTOCOLS["points"], [scene])[:2]] == [0.0, 1.0]
+    assert grid(PROTOCOLS["long"], [scene])[0].config.densify.stop == 15_000
+    for cell in standard:
+        config = TrainConfig(3_000, cell.row.label, cell.seed, leave_out=()).scaled()
+        assert cell.config == config
 
 
 def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for options, message in (
-        (["--methods", "nerf"], "unknown method 'nerf'; there are here: 3dgs, srgs, hqgs"),
+        (["--rows", "nerf"], "rows: there is no 'nerf'; there are: 3dgs, srgs, hqgs"),
         (["--degradations", "fog"], "unknown degradation 'fog'"),
         (["--degradations", "blur", "blur"], "degradations holds blur twice"),
         (["--seeds", "-1"], "seed is -1"),
@@ -470,45 +548,49 @@ def test_gain_at_equal_time() -> None:
 
 
 def test_means_over_groups() -> None:
-    assert Spread.of([1.0, 3.0, 5.0]) == Spread(3.0, 2.0, 1.0, 5.0, 3)
-    assert Spread.of([4.0]).std is None
+    assert spread(Series([1.0, 3.0, 5.0])) == {"mean": 3.0, "std": 2.0, "min": 1.0, "max": 5.0, "count": 3}
+    assert spread(Series([4.0])) == {"mean": 4.0, "std": None, "min": 4.0, "max": 4.0, "count": 1}
+    assert spread(Series([4.0, None])) is None
     values = {("a", "none"): 1.0, ("a", "blur"): 2.0, ("b", "blur"): 6.0, ("b", "jpeg:5"): 7.0}
-    groups = [Group(scene, kind, 0, {"x": fake((0, v))}) for (scene, kind), v in values.items()]
-    parts = columns(groups)
-    assert list(parts) == ["none", "blur", "jpeg:5", "degraded"]
-    means = {kind: mean_of(part, "x", lambda run: run["metrics"]["psnr"]) for kind, part in parts.items()}
-    assert means == {"none": 1.0, "blur": 4.0, "jpeg:5": 7.0, "degraded": 5.0}
-    assert list(columns(groups[:2])) == ["none", "blur"]
-    groups[1].runs["x"]["metrics"]["psnr"] = None
-    assert mean_of(parts["blur"], "x", lambda run: run["metrics"]["psnr"]) is None  # never over fewer runs
+    lines = [{"scene": s, "degradation": kind, "row": "x", "psnr": v} for (s, kind), v in values.items()]
+    frame = DataFrame(lines)
+
+    def found(frame: DataFrame) -> dict[str, float]:
+        return means(with_degraded(frame), ["degradation"], ["psnr"])["psnr"].to_dict()
+
+    assert found(frame) == {"none": 1.0, "blur": 4.0, "jpeg:5": 7.0, "degraded": 5.0}
+    assert list(found(frame)) == ["none", "blur", "jpeg:5", "degraded"]
+    assert list(found(frame.loc[:1])) == ["none", "blur"]
+    frame.loc[1, "psnr"] = None
+    assert math.isnan(found(frame)["blur"])  # never over fewer runs
 
 
 def test_each_scene_has_a_table_of_its_own() -> None:
-    groups = [
-        Group("a", "blur", seed, {"x": {"metrics": {"psnr": 20.0 + seed, "ssim": 0.5}}}) for seed in (0, 3)
-    ]
-    assert table(one_scene(groups, ["x"], "a"), "PSNR/SSIM, a") == {"x": {"blur": "21.50/0.500"}}
+    line = {"scene": "a", "degradation": "blur", "row": "x"}
+    frame = DataFrame([line | {"seed": seed, "psnr": 20.0 + seed, "ssim": 0.5} for seed in (0, 3)])
+    found = table(metrics(frame, "a", ("psnr", "ssim")), "PSNR/SSIM, a")
+    assert found == {"x": {"blur": "21.50/0.500"}}
 
 
 def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
     runs = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
-    groups = [Group("a", "blur", seed, {"x": run, "y": runs[0]}) for seed, run in enumerate(runs)]
-    way = table(
-        courses(groups, ["x", "y"]), "PSNR (dB) and seconds of training on the way, means over all runs"
+    frame = DataFrame(
+        [{"row": label, "run": run} for first in runs for label, run in (("x", first), ("y", runs[0]))]
     )
+    way = table(courses(frame), "PSNR (dB) and seconds of training on the way, means over all runs")
     assert way == {
         "x": {"0": "19.00, 8 s", "1": "25.00, 18 s"},
         "y": {"0": "20.00, 10 s", "1": "24.00, 20 s"},
     }
     runs[1]["history"][0]["psnr"] = None
-    assert courses(groups, ["x"]).count("–, 8 s") == 1
+    assert courses(frame.loc[frame["row"] == "x"]).count("–, 8 s") == 1
 
 
 def test_estimates_learn_from_finished_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second, third = cells(replace(PROTOCOLS["smoke"], iterations=100), ["a"])[:3]
+    scene = replace(tiny_scene(), name="a")
+    first, second, third = grid(replace(PROTOCOLS["smoke"], iterations=100), [scene])[:3]
     estimate = Estimate()
-    scene: Scene = tiny_scene()
-    estimate.probe(replace(first, iterations=2), scene)
+    estimate.probe(replace(first, config=replace(first.config, iterations=2)), scene)
     assert estimate.knows(first)
     assert not estimate.knows(second)
     monkeypatch.setattr(estimate, "_first", {("a", "3dgs"): (0.1, 99.0), ("a", "srgs"): (0.2, 99.0)})

@@ -47,7 +47,7 @@ def test_a_resumed_run_is_the_same_run(uninterrupted: State, tmp_path: Path, sto
 
 
 def test_a_fresh_run_does_not_take_up_an_older_one(tmp_path: Path) -> None:
-    train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    train(tiny_scene(), config=tiny_config(), out=tmp_path)
     with open_run(tiny_scene(), tiny_config(), tmp_path) as trainer:
         assert trainer.iteration == 0
     with open_run(tiny_scene(), tiny_config(), tmp_path, resume=True) as trainer:
@@ -55,9 +55,9 @@ def test_a_fresh_run_does_not_take_up_an_older_one(tmp_path: Path) -> None:
 
 
 def test_resuming_a_finished_run_changes_nothing(tmp_path: Path) -> None:
-    first = train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    first = train(tiny_scene(), config=tiny_config(), out=tmp_path)
     ply = (tmp_path / "scene.ply").read_bytes()
-    again = train(tiny_scene(), tiny_config(), tmp_path, resume=True, progress=False)
+    again = train(tiny_scene(), config=tiny_config(), out=tmp_path, resume=True)
     assert (again.iterations, again.seconds, again.history) == (30, first.seconds, first.history)
     assert (tmp_path / "scene.ply").read_bytes() == ply
 

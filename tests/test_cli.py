@@ -13,9 +13,10 @@ import pytest
 from tiny_scene import tiny_scene
 
 import hqgs
+from hqgs import pipeline
 from hqgs.base.files import CHECKPOINT
 from hqgs.cli import main as cli
-from hqgs.export.ply import read_ply
+from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene, SfmReport
 from hqgs.training.methods.base import ThreeDGS
 
@@ -29,7 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         calls.append(arguments)
         return tiny_scene()
 
-    monkeypatch.setattr(cli, "embedded_scene", embedded)
+    monkeypatch.setattr(pipeline, "embedded_scene", embedded)
     return calls
 
 
@@ -56,7 +57,7 @@ def test_train_the_embedded_scene(
     assert (report["iterations"], report["seed"], report["method"]) == (20, 3, "3dgs")
     assert report["config"]["densify"]["max_gaussians"] == 55
     assert [h["iteration"] for h in report["history"]] == [7, 14, 20]
-    gaussians = len(read_ply(out / "scene.ply"))
+    gaussians = len(Gaussians.load(out / "scene.ply"))
     assert f"{out}: 20 iterations, {gaussians} Gaussians, " in capsys.readouterr().out
 
 
@@ -91,10 +92,11 @@ def test_sfm_replaces_poses_and_points_once(
         seen.append(scene.train[0].image.dtype)
         return replace(scene, sfm=report)
 
-    monkeypatch.setattr(cli, "load_scene", load)
-    monkeypatch.setattr(cli, "sfm_scene", sfm)
+    monkeypatch.setattr(pipeline, "load_scene", load)
+    monkeypatch.setattr(pipeline, "sfm_scene", sfm)
     options = ["--sfm", "--degrade", kind, "--iterations", "2"]
-    assert call("train", "FOLDER", "--out", tmp_path, *options) == 0
+    (tmp_path / "photos").mkdir()
+    assert call("train", tmp_path / "photos", "--out", tmp_path, *options) == 0
     written, printed = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     if (source, kind) == ("photos", "none"):
         assert seen == [True]
@@ -272,11 +274,11 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
     real = ThreeDGS.loss
     steps = []
 
-    def interrupting(self: ThreeDGS, render: Any, view: Any) -> Any:
-        steps.append(view.name)
+    def interrupting(self: ThreeDGS, image: Any, target: Any) -> Any:
+        steps.append(target)
         if len(steps) == 6:
             signal.raise_signal(signal.SIGINT)
-        return real(self, render, view)
+        return real(self, image, target)
 
     monkeypatch.setattr(ThreeDGS, "loss", interrupting)
     assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "20") == 130
@@ -290,5 +292,5 @@ def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
     def interrupting(**arguments: Any) -> Scene:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "embedded_scene", interrupting)
+    monkeypatch.setattr(pipeline, "embedded_scene", interrupting)
     assert call("train", "embedded", "--out", tmp_path) == 130

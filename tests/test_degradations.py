@@ -63,7 +63,11 @@ def test_canonical_text() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "unknown degradation ''; there are: jpeg, noise, lowres, blur, defocus, motion, mixed, none"),
+        (
+            "",
+            "unknown degradation ''; there are: jpeg, noise, lowres, blur, defocus, motion, shake, exposure, "
+            "chat, phone, video, video265, mixed, none, some:KIND, and steps joined by \\+",
+        ),
         ("fog:3", "unknown degradation 'fog'"),
         ("blur:2+", "unknown degradation ''"),
         ("blur:2 + jpeg:20", "unknown degradation ' jpeg'"),

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
-from hqgs.training.adam import Adam
+from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.config import DensifyConfig
 from hqgs.training.densify import Densifier, Growth, quats_to_matrices
 
@@ -220,11 +220,7 @@ def test_reset_cuts_the_opacities_and_forgets_their_moments_alone() -> None:
     g, optimizer = make([KEPT] * 3)
     with torch.no_grad():
         g.opacities[1] = math.log(0.007 / 0.993)
-    d = densifier(g)
-    assert d.update(35, g, optimizer) == Growth()
-    assert not d.reset(34, g, optimizer)
-    assert g.activated_opacities().detach().amax() > 0.01
-    assert d.reset(35, g, optimizer)
+    reset_opacities(g, optimizer, CONFIG.reset_opacity)
     np.testing.assert_allclose(g.activated_opacities().detach().numpy(), [0.01, 0.007, 0.01], rtol=1e-5)
     assert not optimizer.state[g.opacities]["exp_avg"].any()
     assert not optimizer.state[g.opacities]["exp_avg_sq"].any()
@@ -252,20 +248,6 @@ def test_all_gaussians_can_go() -> None:
     g, optimizer = make([KEPT] * 3, opacity=0.001)
     assert densifier(g).update(10, g, optimizer).pruned == 3
     assert len(g) == 0
-
-
-def test_the_schedule() -> None:
-    config = DensifyConfig(start=20, stop=61, every=10, reset_every=25)
-    g, optimizer = make([CLONED])
-    d = densifier(g, config)
-    grown, resets = [], []
-    for iteration in range(1, 100):
-        see(d, [1.0] * len(g))
-        growth = d.update(iteration, g, optimizer)
-        grown += [iteration] if growth.cloned else []
-        resets += [iteration] if d.reset(iteration, g, optimizer) else []
-    assert grown == [30, 40, 50, 60]
-    assert resets == [25, 50]
 
 
 def test_schedules_of_other_lengths() -> None:

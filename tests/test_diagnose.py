@@ -8,21 +8,26 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter1d
 
-from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene, format_diagnosis
+import hqgs.diagnosis.scene as module
+from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
+from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.methods.formed import find_formation
 
 WIDTH, HEIGHT, PHOTOS = 272, 208, 3  # px; multiples of 8 and 16
 
@@ -209,7 +214,7 @@ def test_report_is_json_and_names_every_part() -> None:
         ("noise", False),
         ("jpeg", False),
     ]
-    text = format_diagnosis(found)
+    text = str(found)
     assert all(view.name in text for view in scene.train)
     assert all(reason in text for _, _, reason in found.needs())
     assert diagnose_scene(scene) == found
@@ -218,6 +223,32 @@ def test_report_is_json_and_names_every_part() -> None:
 def test_photos_are_spread_over_the_scene() -> None:
     scene = degraded_scene("none", photos=5)
     assert [photo.name for photo in diagnose_scene(scene, max_photos=3).photos] == ["0.png", "2.png", "4.png"]
+
+
+def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The choice of photos, the formation and the motion's directions share what was seen."""
+    seen: list[str] = []
+    real = module.inspect_photo
+
+    def spy(name: str, *arguments: Any, **options: Any) -> Any:
+        seen.append(name)
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(module, "inspect_photo", spy)
+    scene = degraded_scene("motion:9", photos=4)
+    inspector = Inspector()
+    find_formation(scene, "auto", inspector)
+    assert sorted(seen) == [view.name for view in scene.train]
+    again, _ = find_formation(scene, "motion:9", inspector)
+    assert inspector.inspect(scene.train[2]).diagnosis.name == "2.png"
+    assert len(seen) == 4
+    twin = replace(scene.train[2])  # another photo that is equal
+    assert inspector.inspect(twin) is not inspector.inspect(scene.train[2])
+    assert len(seen) == 5
+    alone, _ = find_formation(scene, "motion:9", Inspector())
+    targets = [formation.target(scene.train[0]).operator for formation in (again, alone)]
+    image = torch.rand(208, 272, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(*(operator(image) for operator in targets if operator is not None))
 
 
 def test_bad_input_is_named() -> None:

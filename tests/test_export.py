@@ -13,19 +13,18 @@ from reference import sh_basis
 from test_ply import random_gaussians
 from tiny_scene import tiny_scene
 
+from hqgs import pipeline
 from hqgs.cli import main as cli
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.export.export import (
-    ExportOptions,
     along_a_curve,
     export,
     file_degree,
     needed_degrees,
-    read_scene_file,
     reduce_gaussians,
 )
-from hqgs.export.ply import read_ply, write_ply
-from hqgs.export.spz import encode_spz, read_spz
+from hqgs.export.options import ExportOptions
+from hqgs.model.formats.spz import encode_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene.scene import Camera
@@ -131,14 +130,14 @@ def test_a_band_that_next_to_none_needs_is_left_out_for_all() -> None:
 def test_ply_holds_the_bands_that_are_asked_for_exactly(tmp_path: Path, sh_degree: int) -> None:
     g = some_gaussians()
     written = export(g, tmp_path / "a.ply", ExportOptions("ply", sh_degree, band_tolerance=0.0))
-    back = read_ply(tmp_path / "a.ply")
+    back = Gaussians.load(tmp_path / "a.ply")
     assert (back.sh_degree, written.sh_degree, written.gaussians) == (sh_degree, sh_degree, 300)
     assert torch.equal(back.shN, g.shN[:, : (sh_degree + 1) ** 2 - 1])
     assert torch.equal(back.means, g.means)
     assert g.sh_degree == 3  # what was given stays as it is
     coefficients = 3 * (16 - (sh_degree + 1) ** 2)
     assert [e.bytes for e in written.left_out] == ([] if sh_degree == 3 else [300 * 4 * coefficients])
-    write_ply(tmp_path / "all.ply", g)
+    g.save(tmp_path / "all.ply")
     header = (tmp_path / "a.ply").read_bytes().index(b"end_header\n")
     rest = (tmp_path / "all.ply").stat().st_size - (tmp_path / "all.ply").read_bytes().index(b"end_header\n")
     assert rest - (written.bytes - header) == sum(e.bytes or 0 for e in written.left_out)
@@ -150,13 +149,13 @@ def test_spz_zeroes_the_bands_of_each_gaussian(tmp_path: Path, sh_degree: int) -
     g.opacities[:4] = -9.0
     options = ExportOptions("spz", sh_degree, sh_bits=(8, 8))
     written = export(g, tmp_path / "a.spz", options)
-    back = read_spz(tmp_path / "a.spz")
+    back = Gaussians.load(tmp_path / "a.spz")
     assert (len(back), back.sh_degree) == (296, sh_degree)
     assert written.left_out[0].what == "4 Gaussians"
     assert len(written.left_out) == (3 if 0 < sh_degree < 3 else 2)
     assert (
         sum(e.bytes or 0 for e in written.left_out)
-        == len(encode_spz(along_a_curve(g), (8, 8)).data) - written.bytes
+        == len(encode_spz(along_a_curve(g).arrays(), (8, 8)).data) - written.bytes
     )
     degrees = needed_degrees(along_a_curve(steps_last(g, ExportOptions("ply", band_tolerance=0.0))), 0.004)
     above = torch.arange(back.shN.shape[1]) >= ((degrees + 1).square() - 1)[:, None]
@@ -185,7 +184,7 @@ def test_the_curve_only_changes_the_order() -> None:
 def test_no_gaussian_at_all(tmp_path: Path, name: str) -> None:
     written = export(random_gaussians(0), tmp_path / name, ExportOptions(name[2:]))
     assert (written.gaussians, written.left_out[0].what) == (0, "harmonics of degrees 1 to 3")
-    assert len(read_scene_file(tmp_path / name)) == 0
+    assert len(Gaussians.load(tmp_path / name)) == 0
 
 
 def test_options_are_checked() -> None:
@@ -213,13 +212,13 @@ def test_the_command_on_a_run_folder(
     g.opacities[:] = 2.0
     g.opacities[0] = -8.0
     run = tmp_path / "run"
-    write_ply(run / "scene.ply", g)
-    monkeypatch.setattr(cli, "embedded_scene", lambda **_: scene)
+    g.save(run / "scene.ply")
+    monkeypatch.setattr(pipeline, "embedded_scene", lambda **_: scene)
     out = tmp_path / "new" / "a.spz"
     assert call(run, "--out", out, "--scene", "embedded", "--downscale", "2") == 0
     text = capsys.readouterr().out
     before = held_out_psnr(scene, held_out_renders(scene, g))
-    after = held_out_psnr(scene, held_out_renders(scene, read_spz(out)))
+    after = held_out_psnr(scene, held_out_renders(scene, Gaussians.load(out)))
     table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if "|" in line]
     size = (run / "scene.ply").stat().st_size
     share = f"{100 * out.stat().st_size / size:.1f} %"
@@ -232,17 +231,17 @@ def test_the_command_on_a_run_folder(
 
 
 def test_the_format_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_ply(tmp_path / "a.ply", some_gaussians())
+    some_gaussians().save(tmp_path / "a.ply")
     assert call(tmp_path / "a.ply", "--out", tmp_path / "b", "--format", "spz", "--sh-bits", "6", "3") == 0
     assert "PSNR" not in capsys.readouterr().out
-    assert len(read_spz(tmp_path / "b")) == 300
+    assert len(Gaussians.load(tmp_path / "b", "spz")) == 300
 
 
 def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_ply(tmp_path / "a.ply", some_gaussians())
+    some_gaussians().save(tmp_path / "a.ply")
     far = some_gaussians()
     far.means[:] += 1e6
-    write_ply(tmp_path / "far.ply", far)
+    far.save(tmp_path / "far.ply")
     (tmp_path / "empty").mkdir()
     before = sorted(tmp_path.iterdir())
     for source, out, message, *more in (

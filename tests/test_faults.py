@@ -32,12 +32,11 @@ from PIL import Image
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
-from benchmarks.cli import BENCHMARKS
-from benchmarks.cli import main as benchmark
+from benchmarks import cli as benchmarks
 from benchmarks.output import Benchmark, Report
 from hqgs.base.files import CHECKPOINT, PLY, FolderBusyError, write_json
 from hqgs.cli import main as cli
-from hqgs.export.ply import read_ply, write_ply
+from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import train
 from hqgs.scene.formats.colmap import write_colmap as write_model
 from hqgs.scene.load import load_scene
@@ -75,7 +74,7 @@ def hidden(path: Path) -> list[str]:
 
 
 def _train_in_child(out: Path, config: TrainConfig) -> None:
-    train(tiny_scene(), config, out, resume=True, progress=False)
+    train(tiny_scene(), config=config, out=out, resume=True)
 
 
 def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> None:
@@ -83,7 +82,7 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
         if user is not None:
             os.setuid(user)
         command, *rest = arguments
-        code = benchmark(rest) if command == "benchmarks" else cli.main(arguments)
+        code = benchmarks.main(rest) if command == "benchmarks" else cli.main(arguments)
         sys.stderr.flush()
     os._exit(code)
 
@@ -92,7 +91,7 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
 def processes() -> ForkServerContext:
     """Children that start from a process in which everything is imported already."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hqgs.cli.main", "tiny_scene", "piq"])
+    context.set_forkserver_preload(["hqgs.cli.main", "hqgs.pipeline", "tiny_scene", "piq"])
     return context
 
 
@@ -115,7 +114,7 @@ def check_files(out: Path) -> None:
     if (out / CHECKPOINT).exists():
         load_checkpoint(out / CHECKPOINT)
     if (out / PLY).exists():
-        assert len(read_ply(out / PLY)) > 0
+        assert len(Gaussians.load(out / PLY)) > 0
     if (out / "report.json").exists():
         report = json.loads((out / "report.json").read_text())
         for name in ("error_vs_time.png", *(v["picture"] for v in report["metrics"]["views"])):
@@ -165,7 +164,7 @@ def test_runs_killed_at_random_moments_can_be_resumed(
         kills += child.exitcode == -signal.SIGKILL
         assert (out / CHECKPOINT).exists() or writes == 0
         check_files(out)
-        result = train(tiny_scene(), config, out, resume=True, progress=False)
+        result = train(tiny_scene(), config=config, out=out, resume=True)
         assert result.iterations == 30
         assert_same(read_state(out / CHECKPOINT), state)
         assert (out / PLY).read_bytes() == ply
@@ -176,12 +175,12 @@ def test_runs_killed_at_random_moments_can_be_resumed(
 
 def test_what_a_killed_writer_leaves_is_removed(tmp_path: Path) -> None:
     """Also the file that safetensors itself makes: a kill at that moment is too rare to wait for."""
-    train(tiny_scene(), tiny_config(3), tmp_path, progress=False)
+    train(tiny_scene(), config=tiny_config(3), out=tmp_path)
     names = [".tmpAb3dE9", f".{Path(PLY).stem}.x{Path(PLY).suffix}"]
     for name in names:
         (tmp_path / name).write_bytes(b"half")
     assert set(hidden(tmp_path)) >= set(names)
-    train(tiny_scene(), tiny_config(3), tmp_path, resume=True, progress=False)
+    train(tiny_scene(), config=tiny_config(3), out=tmp_path, resume=True)
     assert hidden(tmp_path) == []
 
 
@@ -209,11 +208,11 @@ def test_a_second_run_in_the_folder_is_refused_until_the_first_ends(
     child = start(processes, tmp_path, tiny_config(100_000, densify=DensifyConfig(stop=0)))
     wait_for(tmp_path / CHECKPOINT, child)
     with pytest.raises(FolderBusyError, match=f"another run is writing into {tmp_path}"):
-        train(tiny_scene(), tiny_config(), tmp_path)
+        train(tiny_scene(), config=tiny_config(), out=tmp_path, resume=True)
     child.kill()
     child.join()
     assert (tmp_path / ".lock").exists()  # which holds nobody up
-    assert train(tiny_scene(), tiny_config(), tmp_path, progress=False).iterations == 30
+    assert train(tiny_scene(), config=tiny_config(), out=tmp_path, overwrite=True).iterations == 30
 
 
 # --- a full disk
@@ -307,7 +306,7 @@ def test_every_writer_leaves_the_old_file_on_a_full_disk(disk: Path) -> None:
     trainer = Trainer(tiny_scene(), tiny_config())
     writers = {
         "a.json": lambda path: write_json(path, {"a": "x" * 9_000}),
-        "a.ply": lambda path: write_ply(path, trainer.gaussians),
+        "a.ply": lambda path: trainer.gaussians.save(path),
         "a.safetensors": trainer.save,
     }
     for name in writers:
@@ -363,9 +362,9 @@ def test_a_benchmark_on_a_full_disk_is_one_line(
         write_json(args.out / "run.json", "x" * 9_000)
         return Report({})
 
-    monkeypatch.setitem(BENCHMARKS, "stability", Benchmark("full", lambda parser: None, full))
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "stability", Benchmark("full", lambda parser: None, full))
     with small_files(4_000):
-        assert benchmark(["stability", "--quick", "--out", str(tmp_path)]) == 1
+        assert benchmarks.main(["stability", "--quick", "--out", str(tmp_path)]) == 1
     assert last_line(capsys) == f"hqgs: {tmp_path}: [Errno 27] File too large"
     assert list(tmp_path.iterdir()) == []
 
@@ -447,7 +446,7 @@ def test_a_clock_that_goes_backwards_gives_no_negative_time(
 
     monkeypatch.setattr(time, "time", backwards)
     monkeypatch.setattr(time, "time_ns", lambda: int(backwards() * 1e9))
-    train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    train(tiny_scene(), config=tiny_config(), out=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     seconds = [0.0, *(entry["seconds"] for entry in report["history"]), report["seconds"]]
     assert seconds == sorted(seconds)

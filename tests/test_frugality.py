@@ -12,6 +12,7 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 import hqgs.training.frugality as module
+import hqgs.training.schedule as schedule
 from hqgs.base.left_out import LeftOut, format_left_out
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
@@ -27,7 +28,7 @@ STILL = DensifyConfig(start=10_000, reset_every=10_000)
 @pytest.fixture(autouse=True)
 def early(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of a few steps decide on the harmonics too."""
-    monkeypatch.setattr(module, "EARLIEST", 1)
+    monkeypatch.setattr(schedule, "EARLIEST", 1)
 
 
 def run(scene: Scene, iterations: int, *items: str, **changes: object) -> Trainer:
@@ -63,8 +64,8 @@ def test_with_nothing_to_leave_out_all_photos_are_trained_at_full_size() -> None
 def test_some_photos_are_held_back_until_the_bands_are_tried() -> None:
     trainer = Trainer(tiny_scene(VIEWS), tiny_config(60, leave_out=("harmonics",)))
     names = [trainer.step().view.name for _ in range(60)]
-    held = {view.name for view in trainer.frugality.held}
-    back = trainer.frugality.state.released
+    held = {trainer.scene.train[k].name for k in trainer.schedule.held}
+    back = trainer.state.decisions.released
     assert 0 < back < trainer.config.densify.stop  # so that growth sees them
     assert len(held) == 1
     assert not held & set(names[:back])
@@ -73,22 +74,22 @@ def test_some_photos_are_held_back_until_the_bands_are_tried() -> None:
 
 def test_few_photos_are_never_held_back() -> None:
     trainer = run(tiny_scene(9), 30, "harmonics")
-    assert trainer.frugality.held == []
+    assert trainer.schedule.held == ()
     assert trainer.frugality.left_out() == []
 
 
 def test_degraded_photos_have_a_budget_of_their_own() -> None:
     scene, items = tiny_scene(VIEWS), ("photos", "growth", "weight", "harmonics", "resolution", "iterations")
     noisy = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:20"), leave_out=items)
-    assert Trainer(scene, noisy).frugality.items == {"photos", "iterations"}
+    assert Trainer(scene, noisy).schedule.items == {"photos", "iterations"}
     clean = replace(noisy, hqgs=HQGSConfig(formation="none"))
-    assert Trainer(scene, clean).frugality.items == set(items) - {"resolution"}  # too small for that
+    assert Trainer(scene, clean).schedule.items == set(items) - {"resolution"}  # too small for that
 
 
 def test_fine_gaussians_do_not_grow() -> None:
     everything, coarse = run(tiny_scene(), 30), run(tiny_scene(), 30, "growth")
     assert len(coarse.gaussians) < len(everything.gaussians)
-    refused = coarse.frugality.state.refused
+    refused = coarse.frugality.memory.refused
     assert refused > 0
     assert coarse.frugality.left_out()[0].what == f"finer Gaussians, {refused} times"
 
@@ -115,13 +116,15 @@ def test_bands_go_where_the_held_back_photos_do_not_ask_for_them() -> None:
 
 
 def test_a_short_run_keeps_its_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "EARLIEST", 2_000)
+    monkeypatch.setattr(schedule, "EARLIEST", 2_000)
     for iterations in (200, 2_900):
-        trainer = Trainer(tiny_scene(VIEWS), TrainConfig(iterations, leave_out=("harmonics",)).scaled())
-        assert trainer.frugality.items == set()
-        assert trainer.frugality.held == []
-    config = TrainConfig(3_100, leave_out=("harmonics",)).scaled()
-    assert Trainer(tiny_scene(VIEWS), config).frugality.items == {"harmonics"}
+        trainer = Trainer(
+            tiny_scene(VIEWS), TrainConfig(iterations, "3dgs", leave_out=("harmonics",)).scaled()
+        )
+        assert trainer.schedule.items == set()
+        assert trainer.schedule.held == ()
+    config = TrainConfig(3_100, "3dgs", leave_out=("harmonics",)).scaled()
+    assert Trainer(tiny_scene(VIEWS), config).schedule.items == {"harmonics"}
 
 
 def test_bands_stay_where_the_view_matters() -> None:
@@ -147,7 +150,7 @@ def test_what_no_photo_shows_goes_when_growth_ends() -> None:
 
 
 def test_the_first_part_is_trained_at_half_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "SMALLEST_SIDE", 8)
+    monkeypatch.setattr(schedule, "SMALLEST_SIDE", 8)
     trainer = Trainer(tiny_scene(), tiny_config(20, leave_out=("resolution",)))
     shapes = [tuple(trainer.step().render.shape) for _ in range(20)]
     end = round(COARSE_PART * 20)
@@ -175,11 +178,11 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
     rates = []
     while trainer.iteration < trainer.length:
         trainer.step()
-        rates.append(next(g["lr"] for g in trainer.optimizer.param_groups if g["name"] == "means"))
-    state = trainer.frugality.state
+        rates.append(next(g["lr"] for g in trainer.state.optimizer.param_groups if g["name"] == "means"))
+    state = trainer.state.decisions
     assert trainer.iteration == state.length < 2_000
     assert state.released == pytest.approx(state.length / 1.5, abs=1)
-    assert trainer.densifier.config.stop == pytest.approx(1.25 * state.released, abs=1)
+    assert trainer.schedule.growth_end(state) == pytest.approx(1.25 * state.released, abs=1)
     assert rates[-1] == pytest.approx(trainer.extent * 1e-9)
     assert all(b <= a for a, b in pairwise(rates))
     item = trainer.frugality.left_out()[0]
@@ -189,7 +192,7 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "SMALLEST_SIDE", 8)
+    monkeypatch.setattr(schedule, "SMALLEST_SIDE", 8)
     items = ("growth", "weight", "harmonics", "resolution")
     scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
     whole = Trainer(scene, config)
@@ -208,10 +211,10 @@ def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
-    result = train(tiny_scene(VIEWS), tiny_config(leave_out=("growth",)), tmp_path, progress=False)
-    assert result.left_out[0]["what"].startswith("finer Gaussians")
-    assert 0 <= result.decision_seconds < result.seconds
-    assert result.scene_bytes == (tmp_path / "scene.ply").stat().st_size
+    result = train(tiny_scene(VIEWS), config=tiny_config(leave_out=("growth",)), out=tmp_path)
+    assert result.left_out[0].what.startswith("finer Gaussians")
+    assert 0 <= result.report["decision_seconds"] < result.seconds
+    assert result.report["scene_bytes"] == (tmp_path / "scene.ply").stat().st_size
 
 
 def test_the_table() -> None:

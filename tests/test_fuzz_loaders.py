@@ -29,7 +29,6 @@ from safetensors.torch import save_file
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.report import read_report
-from hqgs.export.ply import read_ply, write_ply
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
 from hqgs.scene.load import load_scene
@@ -54,7 +53,7 @@ def load_folder(root: Path) -> None:
 
 
 def load_gaussians(root: Path) -> None:
-    gaussians = read_ply(root / "scene.ply")
+    gaussians = Gaussians.load(root / "scene.ply")
     assert all(bool(torch.isfinite(t).all()) for t in gaussians.named().values())
 
 
@@ -116,7 +115,7 @@ def some_gaussians() -> Gaussians:
 
 
 def as_ply(root: Path, text: bool = False) -> None:
-    write_ply(root / "scene.ply", some_gaussians())
+    some_gaussians().save(root / "scene.ply")
     if text:
         ply = plyfile.PlyData.read(io.BytesIO((root / "scene.ply").read_bytes()))
         ply.text = True
@@ -346,6 +345,8 @@ def test_a_link_to_a_device_or_a_loop_is_refused(tmp_path: Path) -> None:
         {"meta": {"config": None, "scene": []}},
         {"drop": "iteration"},
         {"drop": "guard"},
+        {"drop": "decisions"},
+        {"set": {"decisions": {"length": 30}}},
         {"set": {"guard": {"rude": 1}}},
         {"set": {"guard": []}},
         {"tensor": ("gaussians.means", None)},

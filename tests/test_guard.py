@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from example_method import install
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
@@ -17,9 +18,8 @@ from hqgs.base.files import CHECKPOINT
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import train
 from hqgs.training.adam import select_rows
-from hqgs.training.config import METHODS, DensifyConfig
+from hqgs.training.config import DensifyConfig
 from hqgs.training.guard import KEPT, LISTED, bad_rows, is_sound
-from hqgs.training.methods import MAKERS
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.trainer import Trainer
 
@@ -70,8 +70,7 @@ class Faulty(ThreeDGS):
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> Faulty:
     method = Faulty()
-    monkeypatch.setitem(METHODS, "faulty", "")
-    monkeypatch.setitem(MAKERS, "faulty", lambda scene, config: method)
+    install(monkeypatch, "faulty", method)
     return method
 
 
@@ -89,12 +88,12 @@ def test_gaussians_with_a_bad_gradient_are_named_and_culled(
     for _ in range(3):
         trainer.step()
     before = values(trainer)
-    moments = trainer.optimizer.state[trainer.gaussians.means]["exp_avg"].clone()
+    moments = trainer.state.optimizer.state[trainer.gaussians.means]["exp_avg"].clone()
     step = trainer.step()
     rest = [i for i in range(40) if i not in (3, 17)]
     for name, tensor_before in before.items():  # the step changed nothing else: Adam has not seen it
         assert torch.equal(trainer.gaussians.named()[name], tensor_before[rest]), name
-    assert torch.equal(trainer.optimizer.state[trainer.gaussians.means]["exp_avg"], moments[rest])
+    assert torch.equal(trainer.state.optimizer.state[trainer.gaussians.means]["exp_avg"], moments[rest])
     assert trainer.guard.events == [
         {
             "iteration": 4,
@@ -125,8 +124,8 @@ def test_a_bad_parameter_is_culled_and_the_others_train_as_if_it_had_not_been(
     with torch.no_grad():
         trainer.gaussians.named()[tensor][11] = value
     rest = torch.tensor([i for i in range(40) if i != 11])
-    select_rows(expected.gaussians, expected.optimizer, rest, old=39)
-    expected.densifier.grad_sum, expected.densifier.count = torch.zeros(39), torch.zeros(39)
+    select_rows(expected.gaussians, expected.state.optimizer, rest, old=39)
+    expected.state.densifier.grad_sum, expected.state.densifier.count = torch.zeros(39), torch.zeros(39)
     step = trainer.step()
     expected.step()
     assert [(e["what"], e["tensors"], e["gaussians"]) for e in trainer.guard.events] == [
@@ -167,14 +166,14 @@ def test_children_that_would_lie_nowhere_are_culled() -> None:
     with torch.no_grad():
         trainer.gaussians.scales[4] = 88.7
         trainer.gaussians.shN[9, 2, 1] = torch.nan  # this tensor is looked at where rows change
-        trainer.densifier.grad_sum[4] = 1e6
+        trainer.state.densifier.grad_sum[4] = 1e6
     trainer.step()  # the round at 8
     assert all(bool(torch.isfinite(t).all()) for t in values(trainer).values())
     (event,) = trainer.guard.events
     assert (event["what"], event["iteration"]) == ("parameter", 8)
     assert set(event["tensors"]) == {"means", "shN"}
     assert trainer.guard.culled == event["count"] >= 3
-    assert len(trainer.gaussians) == len(trainer.densifier.count) > 0
+    assert len(trainer.gaussians) == len(trainer.state.densifier.count) > 0
     trainer.step()
 
 
@@ -194,7 +193,7 @@ def test_a_photo_that_is_not_finite_is_named_and_the_others_are_trained_on(tmp_p
     image[3, 4:7, 1] = np.nan
     bad = replace(scene.train[2], image=image)
     scene = replace(scene, train=[*scene.train[:2], bad, *scene.train[3:]])
-    train(scene, tiny_config(densify=ONLY_TRAIN), tmp_path, progress=False)
+    train(scene, config=tiny_config(densify=ONLY_TRAIN), out=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     guard = report["guard"]
     assert guard["skipped_steps"] == guard["num_events"] == 6  # 30 steps, five views
@@ -251,10 +250,10 @@ def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Pa
 
 
 def test_the_report_of_a_healthy_run(tmp_path: Path) -> None:
-    result = train(tiny_scene(), tiny_config(), tmp_path, progress=False)
+    result = train(tiny_scene(), config=tiny_config(), out=tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["guard"] == {"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []}
-    assert report["culled_in_a_view"] == result.culled_in_a_view
+    assert report["culled_in_a_view"] == result.report["culled_in_a_view"]
     assert 0 <= report["culled_in_a_view"] < report["gaussians"]
 
 

@@ -14,23 +14,43 @@ from test_hqgs import fixed
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
+from hqgs.evaluation.held_out import held_out_renders
 from hqgs.photos.formula import parse_degradation
-from hqgs.pipeline import run
+from hqgs.pipeline import run_to_end
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import View
-from hqgs.training.methods.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels
+from hqgs.training.methods.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels, Plateau
 from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.trainer import Trainer
 
 SIZE = (20, 30)
+Photos = dict[str, tuple[Tensor, Tensor | None]]
 
 
-def photos(count: int = 3) -> dict[str, tuple[Tensor, Tensor | None]]:
+def photos(count: int = 3) -> Photos:
     rng = np.random.default_rng(5)
     return {f"{k}.png": (torch.from_numpy(rng.random((*SIZE, 3), np.float32)), None) for k in range(count)}
 
 
-def look(held: HeldPixels, given: dict[str, tuple[Tensor, Tensor | None]], offset: float) -> None:
+class Held:
+    """The held pixels of photos, and what is decided on them."""
+
+    def __init__(self, given: Photos) -> None:
+        drawn = {name: HeldPixels.draw(k, *photo) for k, (name, photo) in enumerate(given.items())}
+        self.masks = {name: mask for name, (_, mask) in drawn.items()}
+        self.pixels = {name: held for name, (held, _) in drawn.items()}
+        self.plateau = Plateau(len(given))
+
+    def see(self, name: str, image: Tensor) -> None:
+        held = self.pixels[name]
+        self.plateau.see(held.photo, held.error(image))
+
+    @property
+    def rate_left(self) -> float:
+        return self.plateau.rate_left
+
+
+def look(held: Held, given: Photos, offset: float) -> None:
     """As many steps as lie between two looks, with renders that are `offset` off."""
     names = list(given)
     for k in range(len(names) * -(-STEPS // len(names))):
@@ -42,7 +62,7 @@ def test_a_fiftieth_of_the_pixels_that_count_is_held_back() -> None:
     mask = torch.zeros(SIZE, dtype=torch.bool)
     mask[:, :10] = True
     given = photos(2) | {"mask.png": (photos()["0.png"][0], mask)}
-    masks = HeldPixels(given).masks
+    masks = Held(given).masks
     assert {name: int((~m).sum()) for name, m in masks.items() if name != "mask.png"} == {
         "0.png": SHARE * 600,
         "1.png": SHARE * 600,
@@ -51,13 +71,13 @@ def test_a_fiftieth_of_the_pixels_that_count_is_held_back() -> None:
     assert not masks["mask.png"][~mask].any()
     assert int(mask.sum()) == 200  # the given one is as it was
     assert not torch.equal(masks["0.png"], masks["1.png"])
-    again = HeldPixels(given).masks
+    again = Held(given).masks
     assert all(torch.equal(masks[name], again[name]) for name in masks)
 
 
 def test_only_held_pixels_are_looked_at() -> None:
     given = photos()
-    held = HeldPixels(given)
+    held = Held(given)
     look(held, given, 0.3)
     for name, (photo, _) in given.items():
         worse = torch.where(held.masks[name][..., None], photo + 9.0, photo + 0.2)
@@ -68,7 +88,7 @@ def test_only_held_pixels_are_looked_at() -> None:
 
 def test_rates_are_halved_at_each_look_without_a_gain() -> None:
     given = photos()
-    held = HeldPixels(given)
+    held = Held(given)
     rates = []
     for offset in (0.5, 0.4, 0.4, 0.41, 0.39, 0.395, 0.3):
         look(held, given, offset)
@@ -83,7 +103,7 @@ def test_photos_are_compared_with_themselves() -> None:
     """A photo that comes in later, or is left out for a while, is no gain and no loss."""
     given = photos()
     first = {name: given[name] for name in ("0.png", "1.png")}
-    held = HeldPixels(given)
+    held = Held(given)
     for offset in (0.5, 0.4):
         for k in range(201):
             held.see(f"{k % 2}.png", first[f"{k % 2}.png"][0] + offset)
@@ -98,7 +118,7 @@ def test_photos_are_compared_with_themselves() -> None:
 
 def test_what_is_not_finite_is_passed_over() -> None:
     given = photos() | {"masked.png": (photos()["0.png"][0], torch.zeros(SIZE, dtype=torch.bool))}
-    held = HeldPixels(given)
+    held = Held(given)
     look(held, given, 0.5)
     held.see("0.png", torch.full((*SIZE, 3), torch.nan))
     look(held, given, 0.4)
@@ -110,22 +130,22 @@ def test_what_is_not_finite_is_passed_over() -> None:
 
 def test_its_state_goes_on_where_it_was() -> None:
     given = photos()
-    one, other = HeldPixels(given), HeldPixels(given)
+    one, other = Held(given), Held(given)
     for offset in (0.5, 0.6):
         look(one, given, offset)
     for k in range(100):
         one.see(f"{k % 3}.png", given[f"{k % 3}.png"][0] + 0.7)
-    other.load_state_dict(one.state_dict())
+    other.plateau.load_state_dict(one.plateau.state_dict())
     for held in (one, other):
         for k in range(100, 201):
             held.see(f"{k % 3}.png", given[f"{k % 3}.png"][0] + 0.4)
     assert one.rate_left == other.rate_left == FACTOR**2
-    ends = one.state_dict(), other.state_dict()
+    ends = one.plateau.state_dict(), other.plateau.state_dict()
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
     with pytest.raises(ValueError, match=r"sums is \[3\], wanted \[2\]"):
-        HeldPixels(photos(2)).load_state_dict(one.state_dict())
+        Plateau(2).load_state_dict(one.plateau.state_dict())
     with pytest.raises(KeyError, match="counts"):
-        other.load_state_dict({k: v for k, v in one.state_dict().items() if k != "counts"})
+        other.plateau.load_state_dict({k: v for k, v in one.plateau.state_dict().items() if k != "counts"})
 
 
 def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
@@ -147,7 +167,7 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
     assert trainer.method.rate_left <= FACTOR**2
     errors = [error_of_grey(t, scene.train) for t in (trainer, constant)]
     assert errors[0] < 0.97 * errors[1]
-    run(trainer, tmp_path / "out", progress=False)  # which only writes
+    run_to_end(trainer, tmp_path / "out")  # which only writes
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert any(note.startswith("the learning rates fell to 1/") for note in report["notes"])
     assert any(entry["what"] == "1/50 of each photo's pixels in the loss" for entry in report["left_out"])
@@ -160,6 +180,5 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
 
 
 def error_of_grey(trainer: Trainer, views: list[View]) -> float:
-    with torch.no_grad():
-        renders = [trainer._render(view.camera)[0] for view in views]
-    return float(torch.stack(renders).sub(128 / 255).square().mean())
+    renders = held_out_renders(replace(trainer.scene, test=views), trainer.shown())
+    return float(np.mean([np.square(view.render - 128 / 255) for view in renders]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -9,10 +10,13 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
+from example_method import loss_of
 from scipy.fft import dctn
 from test_srgs import fine_scene
 from tiny_scene import tiny_config, tiny_scene
 
+from hqgs.base.left_out import LeftOut
+from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import tables_of_quality
@@ -23,9 +27,11 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig, HQGSConfig
-from hqgs.training.methods.hqgs import HQGS, make_hqgs
+from hqgs.training.methods import make_method
+from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.methods.paper import PaperHQGS
 from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.state import TrainState
 from hqgs.training.trainer import Trainer
 
 
@@ -51,13 +57,11 @@ def test_clean_photos_train_as_3dgs_bit_for_bit() -> None:
 def test_auto_is_named_after_what_it_comes_to(formation: str, name: str, tmp_path: Path) -> None:
     """And it is that, bit for bit; a run goes on under the name that it was started with."""
     auto, same = (tiny_config(6, method=m, hqgs=fixed(formation)) for m in ("auto", name))
-    results = [
-        train(tiny_scene(), config, tmp_path / config.method, progress=False) for config in (auto, same)
-    ]
-    assert [result.method for result in results] == [name, name]
+    results = [train(tiny_scene(), config=config, out=tmp_path / config.method) for config in (auto, same)]
+    assert [result.report["method"] for result in results] == [name, name]
     first, second = (view.render for result in results for view in result.views)
     assert np.array_equal(first, second)
-    train(tiny_scene(), auto, tmp_path / "auto", resume=True, progress=False)
+    train(tiny_scene(), config=auto, out=tmp_path / "auto", resume=True)
     paper = Trainer(tiny_scene(), tiny_config(method="auto", hqgs=HQGSConfig(guidance="paper")))
     assert paper.config.method == "hqgs"
 
@@ -75,16 +79,21 @@ def test_motion_has_the_direction_of_each_photo() -> None:
     clean_scene = replace(scene, train=views)
     moved = degrade_scene(clean_scene, parse_degradation("motion:9"), 0)
     method = HQGS(moved, fixed("motion:9"))
-    assert method.left_out() == []
+    assert motion_left_out(method, moved) == []
     for clean, photo in zip(views, moved.train, strict=True):
         image = torch.from_numpy(clean.image)
         plain = float(photometric_loss(image, torch.from_numpy(photo.image)))
-        assert float(method.loss(image, photo)) < 0.15 * plain
+        assert float(loss_of(method, image, photo)) < 0.15 * plain
     flat = replace(moved.train[0], image=np.full_like(moved.train[0].image, 0.5))
-    method = HQGS(replace(moved, train=[flat, *moved.train[1:]]), fixed("motion:9"))
-    assert method.left_out() == [
-        ("motion in the loss of 1 of 3 photos", f"no direction is told from {flat.name}")
+    one_flat = replace(moved, train=[flat, *moved.train[1:]])
+    assert motion_left_out(HQGS(one_flat, fixed("motion:9")), one_flat) == [
+        LeftOut("motion in the loss of 1 of 3 photos", f"no direction is told from {flat.name}")
     ]
+
+
+def motion_left_out(method: HQGS, scene: Scene) -> list[LeftOut]:
+    start = method.start(scene, [method.prepare(view) for view in scene.train], tiny_config())
+    return [item for item in start.left_out if "motion" in item.what]
 
 
 def test_low_resolution_compares_shrunk_renders() -> None:
@@ -93,11 +102,11 @@ def test_low_resolution_compares_shrunk_renders() -> None:
     assert view.low is not None
     render = render_like(view.image)
     small = torch.nn.functional.avg_pool2d(render.permute(2, 0, 1)[None], 4)[0].permute(1, 2, 0)
-    loss = float(method.loss(render, view))
+    loss = float(loss_of(method, render, view))
     near = float(photometric_loss(small.contiguous(), torch.from_numpy(view.low)))
     assert loss == pytest.approx(near, rel=0.1)  # bicubic is no average of 4 x 4 pixels, but close to it
     without = replace(scene, train=[replace(v, low=None) for v in scene.train])
-    again = HQGS(without, fixed("lowres:4")).loss(render, without.train[1])
+    again = loss_of(HQGS(without, fixed("lowres:4")), render, without.train[1])
     assert float(again) == pytest.approx(loss, rel=0.02)  # the enlarged photo still holds the small one
 
 
@@ -109,12 +118,12 @@ def test_noise_counts_by_its_square_without_dssim() -> None:
     assert (difference.abs() < knee).any()
     assert (difference.abs() > knee).any()
     method = HQGS(scene, fixed("noise:25"))
-    mask = method.compared(render, view)[2]
+    mask = method.prepare(view).mask
     assert mask is not None
     assert int((~mask).sum()) == 8  # a fiftieth of 24 x 16 pixels is held back
     expected = 2 / knee * torch.nn.functional.huber_loss(difference[mask], torch.zeros(()), delta=knee)
-    assert float(method.loss(render, view)) == pytest.approx(float(expected), rel=1e-6)
-    assert HQGS(scene, fixed("jpeg:10+noise:25")).compared(render, view)[2] is None
+    assert float(loss_of(method, render, view)) == pytest.approx(float(expected), rel=1e-6)
+    assert HQGS(scene, fixed("jpeg:10+noise:25")).prepare(view).mask is None
 
 
 def test_jpeg_forgives_what_the_file_leaves_open() -> None:
@@ -122,8 +131,8 @@ def test_jpeg_forgives_what_the_file_leaves_open() -> None:
     scene = degrade_scene(clean, parse_degradation("jpeg:10"), 0)
     method = HQGS(scene, fixed("jpeg:10", jpeg_pixels=0.0))
     photos = [torch.from_numpy(v.image.astype(np.float32) / 255) for v in clean.train]
-    inside = max(float(method.loss(p, v)) for p, v in zip(photos, scene.train, strict=True))
-    wrong = float(method.loss(1 - photos[0], scene.train[0]))
+    inside = max(float(loss_of(method, p, v)) for p, v in zip(photos, scene.train, strict=True))
+    wrong = float(loss_of(method, 1 - photos[0], scene.train[0]))
     assert inside < 0.03 * wrong  # the codec clips colours and rounds to 8 bits
 
 
@@ -135,7 +144,7 @@ def test_masked_pixels_have_no_gradient(formation: str) -> None:
     scene = replace(scene, train=[replace(v, mask=mask) for v in scene.train])
     method = HQGS(scene, fixed(formation))
     render = render_like(scene.train[0].image).requires_grad_()
-    method.loss(render, scene.train[0]).backward()
+    loss_of(method, render, scene.train[0]).backward()
     assert render.grad is not None
     far = 12 if formation in ("noise:10", "jpeg:20") else 4  # px that an operator may carry over the border
     if (
@@ -165,8 +174,8 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
 def test_degraded_photos_are_trained_without_resets() -> None:
     scene, config = tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("noise:6"))
     trainer = Trainer(scene, config)
-    resets = ("resets of the opacities", "a budget of Gaussians bears none")
-    assert resets in trainer.method.left_out()
+    resets = LeftOut("resets of the opacities", "a budget of Gaussians bears none")
+    assert resets in trainer.left_out()
     while trainer.iteration < config.densify.stop + 1:
         trainer.step()
     assert trainer.gaussians.activated_opacities().median() > 2 * config.densify.reset_opacity
@@ -209,9 +218,9 @@ def test_under_jpeg_the_budget_and_the_growth_follow_what_the_codec_kept() -> No
 
 def test_it_looks_by_itself_and_says_what_it_leaves_out(tmp_path: Path) -> None:
     scene = degrade_scene(tiny_scene(), parse_degradation("noise:40"), 0)
-    result = train(scene, tiny_config(method="hqgs"), tmp_path, progress=False)
-    assert result.config["hqgs"]["formation"] != "auto"
-    assert any("in the loss" in entry["what"] for entry in result.left_out)
+    result = train(scene, config=tiny_config(method="hqgs"), out=tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text())["config"]["hqgs"]["formation"] != "auto"
+    assert any("in the loss" in item.what for item in result.left_out)
 
 
 @pytest.mark.parametrize(
@@ -226,12 +235,13 @@ def test_a_bad_setting_is_refused(changes: dict[str, object]) -> None:
 def test_a_photo_that_does_not_fit_is_named() -> None:
     scene, _ = fine_scene(views=2)
     with pytest.raises(ValueError, match=r"view '0'.*lowres:2"):
-        HQGS(scene, fixed("lowres:2"))
+        HQGS(scene, fixed("lowres:2")).prepare(scene.train[0])
 
 
 def test_the_papers_guidance_is_another_method() -> None:
-    assert isinstance(make_hqgs(tiny_scene(), HQGSConfig(guidance="paper"), 0), PaperHQGS)
-    assert isinstance(make_hqgs(tiny_scene(), fixed("none"), 0), HQGS)
+    for config, method in ((HQGSConfig(guidance="paper"), PaperHQGS), (fixed("none"), HQGS)):
+        made = make_method(tiny_scene(), tiny_config(method="hqgs", hqgs=config), Inspector())
+        assert type(made) is method
 
 
 def test_blurred_photos_give_a_sharper_scene_than_3dgs() -> None:
@@ -290,7 +300,8 @@ def test_photo_pixels_are_those_of_the_nearest_view_that_sees_the_mean() -> None
 def test_no_gaussian_is_smaller_than_its_floor() -> None:
     scene = tiny_scene()
     method = HQGS(scene, fixed("lowres:2", smallest=0.5))
-    gaussians = Trainer(scene, tiny_config()).gaussians
+    start = method.start(scene, [method.prepare(view) for view in scene.train], tiny_config())
+    gaussians = start.gaussians
     with torch.no_grad():
         gaussians.scales[0] = -20.0
         gaussians.scales[1] = 3.0
@@ -308,13 +319,13 @@ def test_sizes_follow_a_change_of_rows_that_keeps_their_number() -> None:
     before = method.state_dict()["smallest"]
     n = len(trainer.gaussians)
     turned = torch.arange(n - 1, -1, -1)
-    select_rows(trainer.gaussians, trainer.optimizer, turned, old=n)
-    method.rows_changed()
-    assert not {"smallest", "age"} & set(method.state_dict())
-    method.modulate(trainer.gaussians)
+    select_rows(trainer.gaussians, trainer.state.optimizer, turned, old=n)
+    trainer.state.iteration = 7
+    method.rows_changed(trainer.state, turned)
     expected = method.config.smallest * photo_pixels(trainer.gaussians.means, trainer.scene.train)
     assert torch.equal(method.state_dict()["smallest"], expected.float())
     assert not torch.equal(method.state_dict()["smallest"], before)
+    assert int(method.state_dict()["since"]) == 7
 
 
 def test_the_trainer_tells_the_method_of_growth_and_culling() -> None:
@@ -322,9 +333,10 @@ def test_the_trainer_tells_the_method_of_growth_and_culling() -> None:
     told: list[int] = []
     real = trainer.method.rows_changed
 
-    def rows_changed() -> None:
+    def rows_changed(state: TrainState, parents: torch.Tensor) -> None:
         told.append(len(trainer.gaussians))
-        real()
+        assert len(parents) == len(state.gaussians)
+        real(state, parents)
 
     with patch.object(trainer.method, "rows_changed", rows_changed):
         before = len(trainer.gaussians)

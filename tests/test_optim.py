@@ -167,7 +167,7 @@ def test_bad_input_is_named() -> None:
         "visible: must be bool": lambda: step(ones.clone(), torch.ones(4)),
         "visible: expected shape": lambda: step(ones.clone(), torch.ones(3, dtype=torch.bool)),
         "param: must be a contiguous": lambda: step(torch.ones(3, 4).t()),
-        "param: expected an array of float64": lambda: step(ones.half()),
+        "param: expected an array of float32 or float64, got float16": lambda: step(ones.half()),
         "weight_decay": lambda: Adam([{"params": [ones.clone()], "weight_decay": 0.1}]).step(),
     }.items():
         with pytest.raises(ValueError, match=name):

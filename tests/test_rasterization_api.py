@@ -82,6 +82,49 @@ def test_unsupported_arguments_may_be_passed_as_absent() -> None:
     assert torch.equal(render, hqgs.rasterization(**scene.arguments())[0])
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        (
+            "backgrounds",
+            (0, 0, 0),
+            "backgrounds: expected a torch tensor such as torch.zeros(C, D), got (0, 0, 0)",
+        ),
+        ("backgrounds", torch.zeros(1, 3).long(), "backgrounds: must be float32 or float64, got torch.int64"),
+        ("backgrounds", torch.zeros(3), "backgrounds: expected shape [1, 3], got [3]"),
+        (
+            "covars",
+            torch.eye(3).expand(8, 3, 3),
+            "covars: hqgs takes the shape of a Gaussian as quats and scales, got a tensor [8, 3, 3]",
+        ),
+        (
+            "rolling_shutter",
+            torch.zeros(500),
+            "rolling_shutter: hqgs renders one image of a pinhole camera at a time, got a tensor [500]",
+        ),
+        (
+            "means",
+            torch.zeros(2, 8, 3),
+            "means: expected shape [N, 3], got [2, 8, 3]; hqgs takes no leading batch dimensions, "
+            "call it for each scene",
+        ),
+        (
+            "viewmats",
+            torch.zeros(2, 1, 4, 4),
+            "viewmats: expected shape [C, 4, 4], got [2, 1, 4, 4]; hqgs takes no leading batch dimensions, "
+            "call it for each scene",
+        ),
+        ("means", torch.zeros(8, 4), "means: expected shape [N, 3], got [8, 4]"),
+        ("means", torch.zeros(()), "means: expected shape [N, 3], got []"),
+    ],
+)  # fmt: skip
+def test_messages_are_short_and_right(name: str, value: object, message: str) -> None:
+    scene = random_scene(8, 10, 7, seed=0, dtype=F32)
+    with pytest.raises((ValueError, NotImplementedError)) as error:
+        hqgs.rasterization(**scene.arguments(**{name: value}))
+    assert str(error.value) == message
+
+
 def numbers(shape: tuple[int, ...]) -> str:
     """A pattern for a shape in any brackets."""
     return ",? ?".join(str(size) for size in shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ F32, F64 = torch.float32, torch.float64
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 TOLERANCE = {F64: 1e-9, F32: 1e-4}  # relative L2
 both_dtypes = pytest.mark.parametrize("dtype", [F64, F32], ids=["f64", "f32"])
-Renderer = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+Renderer = Callable[..., tuple[Tensor, Tensor, Mapping[str, Any]]]
 
 
 def smooth_scene(options: dict[str, Any], **scene_options: Any) -> GaussianScene:
@@ -65,7 +65,7 @@ def test_gradcheck(case: str, name: str) -> None:
 
 def run(
     renderer: Renderer, scene: GaussianScene, cotangents: tuple[Tensor, Tensor], **options: Any
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
+) -> tuple[dict[str, Tensor], Mapping[str, Any]]:
     """Gradients of <render, cotangents[0]> + <alphas, cotangents[1]> for the scene's leaves, and meta."""
     render, alphas, meta = renderer(**scene.arguments(**options))
     if meta["means2d"].requires_grad:

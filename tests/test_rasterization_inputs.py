@@ -14,6 +14,7 @@ from scenes import GaussianScene, random_scene
 from torch import Tensor
 
 import hqgs
+from hqgs.model.rasterization import RasterizationMeta
 
 F32, F64 = torch.float32, torch.float64
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
@@ -24,7 +25,7 @@ both_dtypes = pytest.mark.parametrize("dtype", [F64, F32], ids=["f64", "f32"])
 
 def backward(
     scene: GaussianScene, **options: Any
-) -> tuple[Tensor, Tensor, dict[str, Any], dict[str, Tensor]]:
+) -> tuple[Tensor, Tensor, RasterizationMeta, dict[str, Tensor]]:
     """Render, alphas, meta and the gradients of a fixed random loss for every input."""
     leaves = scene.with_grad(*INPUTS)
     render, alphas, meta = hqgs.rasterization(**leaves.arguments(**options))

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from example_method import install
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
 from hqgs.scene.scene import Scene
 from hqgs.training.adam import Adam
-from hqgs.training.config import METHODS, DensifyConfig, TrainConfig
-from hqgs.training.methods import MAKERS
-from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.methods.base import Target, ThreeDGS
 from hqgs.training.trainer import Trainer
 
 SELECTIVE = tiny_config(selective_adam=True)
@@ -39,7 +39,7 @@ def state(trainer: Trainer) -> dict[str, bytes]:
     """All that is trained, and its moments."""
     tensors: dict[str, Tensor] = dict(trainer.gaussians.named())
     for name, tensor in trainer.gaussians.named().items():
-        tensors |= {f"{name}.{key}": value for key, value in trainer.optimizer.state[tensor].items()}
+        tensors |= {f"{name}.{key}": value for key, value in trainer.state.optimizer.state[tensor].items()}
     return {name: tensor.detach().numpy().tobytes() for name, tensor in tensors.items()}
 
 
@@ -52,10 +52,10 @@ def test_off_every_row_is_updated_and_on_only_the_visible_ones() -> None:
     moved = {}
     for selective in (False, True):
         trainer = Trainer(with_points_behind(), replace(config, selective_adam=selective))
-        for group in trainer.optimizer.param_groups:  # moments that go on moving without a gradient
+        for group in trainer.state.optimizer.param_groups:  # moments that go on moving without a gradient
             for param in group["params"]:
                 moments = {"exp_avg": torch.ones_like(param), "exp_avg_sq": torch.ones_like(param)}
-                trainer.optimizer.state[param] = {"step": torch.tensor(1.0), **moments}
+                trainer.state.optimizer.state[param] = {"step": torch.tensor(1.0), **moments}
         before = trainer.gaussians.opacities.detach().clone()
         trainer.step()
         moved[selective] = trainer.gaussians.opacities.detach() != before
@@ -95,12 +95,11 @@ def test_the_tensors_of_a_method_are_always_updated(monkeypatch: pytest.MonkeyPa
         def param_groups(self) -> list[dict[str, Any]]:
             return [{"name": "offset", "params": [self.offset], "lr": 0.01}]
 
-        def loss(self, render: Tensor, view: Any) -> Tensor:
-            return super().loss(render, view) + self.offset.sum()
+        def loss(self, image: Tensor, target: Target) -> Tensor:
+            return super().loss(image, target) + self.offset.sum()
 
     method = Offset()
-    monkeypatch.setitem(METHODS, "offset", "")
-    monkeypatch.setitem(MAKERS, "offset", lambda scene, config: method)
+    install(monkeypatch, "offset", method)
     trainer = Trainer(tiny_scene(), replace(SELECTIVE, method="offset"))
     trainer.step()
     assert torch.allclose(method.offset.detach(), torch.full((7,), -0.01))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from example_method import install, loss_of
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 from tiny_scene import tiny_config, tiny_scene
@@ -16,8 +17,7 @@ from hqgs.evaluation.metrics import psnr
 from hqgs.photos.operators import Separable
 from hqgs.photos.resize import resize, resize_matrix
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.config import METHODS, DensifyConfig, SRGSConfig
-from hqgs.training.methods import MAKERS
+from hqgs.training.config import DensifyConfig, SRGSConfig
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.methods.srgs import SRGS
 from hqgs.training.trainer import Trainer
@@ -51,10 +51,6 @@ def fine_scene(views: int = 12, points: int = 800) -> tuple[Scene, list[NDArray[
     xyz = np.concatenate([xy, np.full((points, 1), depth)], axis=1).astype(np.float32)
     colors = np.full((points, 3), 128, np.uint8)
     return Scene("fine", photos, [], xyz, colors, "test"), clean
-
-
-def one_view(view: View) -> Scene:
-    return replace(tiny_scene(), train=[view], test=[])
 
 
 def photometric_numpy(x: NDArray[Any], y: NDArray[Any]) -> float:
@@ -101,17 +97,18 @@ def test_loss_against_numpy() -> None:
     tie, texture = photometric_numpy(small, low), photometric_numpy(render.astype(float), image)
     assert abs(tie - texture) > 0.01
     for weight in (0.0, 0.4, 1.0):
-        method = SRGS(one_view(view), SRGSConfig(texture_weight=weight))
-        loss = method.loss(torch.from_numpy(render), view)
+        loss = loss_of(SRGS(SRGSConfig(texture_weight=weight)), torch.from_numpy(render), view)
         assert loss.item() == pytest.approx((1 - weight) * tie + weight * texture, abs=2e-6)
     assert SRGSConfig().texture_weight == 0.4
 
 
 def test_gradient_of_the_loss() -> None:
     view = replace(tiny_scene().train[0], low=np.full((4, 6, 3), 0.3, np.float32))
-    method = SRGS(one_view(view), SRGSConfig())
+    method = SRGS(SRGSConfig())
     render = torch.rand(16, 24, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda x: method.loss(x, view), render.requires_grad_(), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda x: loss_of(method, x, view), render.requires_grad_(), fast_mode=True
+    )
 
 
 def test_a_photo_without_low_is_tied_at_half_its_size() -> None:
@@ -121,13 +118,12 @@ def test_a_photo_without_low_is_tied_at_half_its_size() -> None:
     half = resize_matrix(16, 8), resize_matrix(24, 12)
     small = [np.einsum("hH,HWc,wW->hwc", half[0], x, half[1]) for x in (render.astype(float), photo)]
     expected = 0.6 * photometric_numpy(*small) + 0.4 * photometric_numpy(render.astype(float), photo)
-    loss = SRGS(one_view(view), SRGSConfig()).loss(torch.from_numpy(render), view)
+    loss = loss_of(SRGS(SRGSConfig()), torch.from_numpy(render), view)
     assert loss.item() == pytest.approx(expected, abs=2e-6)
 
 
 def test_without_low_and_with_factor_1_it_is_3dgs_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(METHODS, "srgs", "")
-    monkeypatch.setitem(MAKERS, "srgs", lambda scene, config: SRGS(scene, SRGSConfig(own_factor=1)))
+    install(monkeypatch, "srgs", SRGS(SRGSConfig(own_factor=1)))
     trainers = [Trainer(tiny_scene(), tiny_config(12, method=name)) for name in ("srgs", "3dgs")]
     for _ in range(12):
         losses = [trainer.step().loss for trainer in trainers]
@@ -146,7 +142,7 @@ def test_pixels_that_do_not_count_have_no_influence() -> None:
     losses, gradients = [], []
     for value in (0.0, 50.0):
         x = torch.from_numpy(np.where(mask[..., None], render, np.float32(value))).requires_grad_()
-        loss = SRGS(one_view(view), SRGSConfig()).loss(x, view)
+        loss = loss_of(SRGS(SRGSConfig()), x, view)
         loss.backward()
         losses.append(loss.item())
         assert x.grad is not None
@@ -167,8 +163,8 @@ def test_low_pixels_count_where_all_that_they_are_made_from_counts() -> None:
 
     def subpixel(low: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> float:
         view = replace(tiny_scene().train[0], low=low, mask=mask)
-        method = SRGS(one_view(view), SRGSConfig(texture_weight=0))
-        return method.loss(torch.from_numpy(render), view).item()
+        method = SRGS(SRGSConfig(texture_weight=0))
+        return loss_of(method, torch.from_numpy(render), view).item()
 
     assert subpixel(low, mask) < 1e-6
     assert subpixel(low, None) > 0.1
@@ -182,13 +178,12 @@ def test_a_mask_that_leaves_no_low_pixel_is_no_error() -> None:
     mask[::2] = True
     view = replace(tiny_scene().train[0], low=np.zeros((4, 6, 3), np.float32), mask=mask)
     render = torch.full((16, 24, 3), 0.5)
-    expected = 0.4 * ThreeDGS().loss(render, view).item()
-    assert SRGS(one_view(view), SRGSConfig()).loss(render, view).item() == pytest.approx(expected, rel=1e-6)
+    expected = 0.4 * loss_of(ThreeDGS(), render, view).item()
+    assert loss_of(SRGS(SRGSConfig()), render, view).item() == pytest.approx(expected, rel=1e-6)
 
 
 def test_photos_come_out_sharper_than_those_of_3dgs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(METHODS, "srgs", "")
-    monkeypatch.setitem(MAKERS, "srgs", lambda scene, config: SRGS(scene, SRGSConfig()))
+    install(monkeypatch, "srgs", SRGS(SRGSConfig()))
     scene, clean = fine_scene()
     values = {}
     for method in ("3dgs", "srgs"):
@@ -213,18 +208,25 @@ def test_photos_come_out_sharper_than_those_of_3dgs(monkeypatch: pytest.MonkeyPa
 def test_a_wrong_low_photo_is_named(low: NDArray[np.float32], message: str) -> None:
     view = replace(tiny_scene().train[0], low=low)
     with pytest.raises(ValueError, match=rf"view 'view1\.png': .*{message}"):
-        SRGS(one_view(view), SRGSConfig())
+        SRGS(SRGSConfig()).prepare(view)
+
+
+def test_two_photos_of_one_name_are_each_their_own_tie() -> None:
+    scene = tiny_scene()
+    white = replace(scene.train[0], image=np.full_like(scene.train[0].image, 255))
+    trainer = Trainer(replace(scene, train=[scene.train[0], white]), tiny_config(method="srgs"))
+    for _ in range(4):
+        step = trainer.step()
+        expected = loss_of(SRGS(SRGSConfig()), step.render, step.view)
+        assert step.loss == expected.item()
 
 
 def test_wrong_values_are_named() -> None:
-    scene = tiny_scene()
     with pytest.raises(ValueError, match=r"texture_weight is 1\.5"):
         SRGSConfig(texture_weight=1.5)
     with pytest.raises(ValueError, match="own_factor is 0"):
         SRGSConfig(own_factor=0)
-    with pytest.raises(ValueError, match=r"two training views are called 'view1\.png'"):
-        SRGS(replace(scene, train=[scene.train[0]] * 2), SRGSConfig())
-    method = SRGS(scene, SRGSConfig())
+    method = SRGS(SRGSConfig())
     assert method.param_groups() == []
     method.load_state_dict(method.state_dict())
     with pytest.raises(ValueError, match=r"no state of its own.*\['offset'\]"):

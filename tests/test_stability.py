@@ -14,8 +14,9 @@ import torch
 from reference import reference_rasterization
 
 from benchmarks import cli
-from benchmarks.stability.oracle import GROUPS, Oracle
-from benchmarks.stability.stability import (
+from benchmarks.stability import measure, run
+from benchmarks.stability.cases import PIXELS, cases, scene
+from benchmarks.stability.measure import (
     COSINE,
     GRADIENT_F64,
     VALUE_F64,
@@ -24,7 +25,7 @@ from benchmarks.stability.stability import (
     input_rounding,
     misses,
 )
-from benchmarks.stability.stability_cases import PIXELS, cases, scene
+from benchmarks.stability.oracle import GROUPS, Oracle
 
 CASES = {case.name: case for case in cases()}
 
@@ -125,9 +126,7 @@ def test_oracle_agrees_with_autograd(antialiased: bool, degree: int | None) -> N
 
 def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The measure itself: a change of 1e-6 in one value, or of 1 % in one gradient, misses the targets."""
-    from benchmarks.stability import stability
-
-    right = stability.render
+    right = measure.render
 
     def wrong_image(*args):
         image, radii, gradients = right(*args)
@@ -141,7 +140,7 @@ def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     case = CASES["ordinary"]
     for wrong, word in ((wrong_image, "values"), (wrong_gradient, "gradient of quats")):
-        monkeypatch.setattr(stability, "render", wrong)
+        monkeypatch.setattr(measure, "render", wrong)
         assert any(word in miss for miss in misses(case, evaluate(case, "f64")))
 
 
@@ -154,10 +153,8 @@ def test_rounding_of_geo_referenced_inputs_is_what_spoils_them() -> None:
 def test_command_writes_tables_and_chart(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from benchmarks.stability import stability
-
     few = [CASES[name] for name in ("ordinary", "behind the camera", "NaN in means[0]", "world offset 1e6")]
-    monkeypatch.setattr(stability, "cases", lambda long: few)
+    monkeypatch.setattr(run, "cases", lambda long: few)
     assert cli.main(["stability", "--quick", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "| ordinary" in printed
@@ -167,3 +164,18 @@ def test_command_writes_tables_and_chart(
     assert results["cases"][0]["outcomes"][1]["value_relative"] < VALUE_F64
     assert (tmp_path / "stability_errors.png").stat().st_size > 10_000
     assert cli.main(["stability", "--quick", "--long", "--out", str(tmp_path)]) == 2
+
+
+def test_a_mistake_in_the_catalogue_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from benchmarks.stability import cases as module
+
+    monkeypatch.setattr(module, "FILE", tmp_path / "cases.toml")
+    for text, message in (
+        ('a = [{ name = "b", why = "c", firts = { means = [0.0, 0.0, 1.0] } }]', "'b': there is no 'firts'"),
+        ('a = [{ name = "b" }]', "'b': why is missing"),
+        ('a = [{ name = "b", why = "c", culled = [0.5] }]', r"'b', culled\[0\]: 0.5 is not of the type int"),
+        ("a = [", "cases.toml: "),
+    ):
+        (tmp_path / "cases.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match=message):
+            cases()

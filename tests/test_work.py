@@ -294,4 +294,4 @@ def test_training_leaves_out_the_harmonics_above_its_degree() -> None:
         assert counts.harmonics == counts.gaussians * (degree + 1) ** 2
         grad = trainer.gaussians.shN.grad
         assert (grad is None) == (degree == 0)
-        assert trainer.optimizer.state[trainer.gaussians.shN]["step"] == trainer.iteration
+        assert trainer.state.optimizer.state[trainer.gaussians.shN]["step"] == trainer.iteration

@@ -42,6 +42,8 @@ def tiny_config(iterations: int = 30, **changes: object) -> TrainConfig:
     )
     settings: dict[str, object] = {
         "iterations": iterations,
+        "method": "3dgs",
+        "leave_out": (),
         "sh_interval": 6,
         "eval_every": 10,
         "checkpoint_every": 5,

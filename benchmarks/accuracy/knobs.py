@@ -6,16 +6,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from unittest.mock import patch
 
 import torch
 
+from benchmarks import places
+from benchmarks.data import build, read_toml
 from benchmarks.speed.ewa import ALPHA_MIN, TRANSMITTANCE_MIN
 from benchmarks.speed.inputs import RasterInputs
 from benchmarks.speed.rasterizer import RasterPass
-from hqgs import _rust
 
-NO_FLOOR = 1e-12  # alpha: what lies below it in all layers together is less than a rounding of the image
+FILE = Path(__file__).with_name("accuracy.toml")
 
 
 @dataclass(frozen=True)
@@ -30,36 +32,23 @@ class Knobs:
     exp2_degree: int = 6  # of the polynomial in float32
 
 
-DEFINED = Knobs(dtype="float64")  # the definition of docs/conventions.md, without float32's roundings
-EXACT = Knobs(dtype="float64", alpha_min=NO_FLOOR, transmittance_min=0.0)  # and without its cutoffs
-
 # (knob, value, settings); the first is what is measured against.
-CASES: tuple[tuple[str, str, Knobs], ...] = (
-    ("default", "", Knobs()),
-    ("dtype", "float64", DEFINED),
-    ("cutoffs", "none", Knobs(alpha_min=NO_FLOOR, transmittance_min=0.0)),
-    ("cutoffs", "none, float64", EXACT),
-    ("alpha floor", "1/1024", Knobs(alpha_min=1 / 1024)),
-    ("alpha floor", "1/128", Knobs(alpha_min=1 / 128)),
-    ("alpha floor", "1/64", Knobs(alpha_min=1 / 64)),
-    ("transmittance stop", "1e-5", Knobs(transmittance_min=1e-5)),
-    ("transmittance stop", "1e-3", Knobs(transmittance_min=1e-3)),
-    ("transmittance stop", "1e-2", Knobs(transmittance_min=1e-2)),
-    ("degree of 2^x", "5", Knobs(exp2_degree=5)),
-    ("degree of 2^x", "4", Knobs(exp2_degree=4)),
-    ("degree of 2^x", "3", Knobs(exp2_degree=3)),
-    ("tiles", "bounding box", Knobs(spans="box")),
-    ("tiles", "3-sigma square", Knobs(spans="square")),
-    ("block skipping", "off", Knobs(skip_blocks=False)),
-    ("tiles, skipping", "square, off", Knobs(spans="square", skip_blocks=False)),
-)
+CASES = [
+    (knob, value, build(Knobs, settings, f"{FILE.name}, {knob} {value}"))
+    for knob, values in read_toml(FILE)["cases"].items()
+    for value, settings in values.items()
+]
+ORACLES = {  # the definition of docs/conventions.md without float32's roundings, and without its cutoffs
+    "exact": next(knobs for knob, value, knobs in CASES if (knob, value) == ("cutoffs", "none, float64")),
+    "defined": next(knobs for knob, value, knobs in CASES if (knob, value) == ("dtype", "float64")),
+}
 
 
 @contextmanager
 def tuned(knobs: Knobs) -> Iterator[None]:
     """Inside it the rasterizer has these knobs, the dtype aside."""
     values = (knobs.alpha_min, knobs.transmittance_min, knobs.spans, knobs.skip_blocks, knobs.exp2_degree)
-    with patch.object(_rust, "project_forward", partial(_rust.project_forward, knobs=values)):
+    with patch.object(*places.PROJECT, partial(getattr(*places.PROJECT), knobs=values)):
         yield
 
 

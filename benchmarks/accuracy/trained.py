@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.protocol import Row
 from benchmarks.speed.inputs import RasterInputs
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.render import render_view
 from hqgs.scene.builtin import embedded_scene
-from hqgs.training.config import DensifyConfig, TrainConfig
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
@@ -23,8 +22,9 @@ def trained_inputs(
 ) -> RasterInputs:
     """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
     scene = embedded_scene(cache, *size, num_views=views)
-    config = TrainConfig(iterations=steps, seed=seed, densify=DensifyConfig(max_gaussians=most)).scaled()
-    trainer = Trainer(scene, replace(config, sh_interval=1))
+    changes = {"densify": {"max_gaussians": most}, "sh_interval": 1}
+    config = Row("3dgs").train_config(seed, steps, changes)
+    trainer = Trainer(scene, config)
     for _ in range(steps):
         trainer.step()
     g, view = trainer.gaussians.detached(), scene.train[0]

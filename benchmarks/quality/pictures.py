@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from benchmarks.quality.runs import RunStore
-from benchmarks.quality.scenes import degraded_views
+from benchmarks.quality.cell import render_path
+from benchmarks.scenes import degraded_views
+from benchmarks.study import Store
 from hqgs.base.files import atomic_path
 from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.report import AMPLIFICATION, MASKED
@@ -23,14 +24,14 @@ Uint8 = NDArray[np.uint8]
 
 
 def write_sheet(
-    path: Path, store: RunStore, clean: Scene, runs: Mapping[str, dict[str, Any]], number: int
+    path: Path, store: Store, clean: Scene, runs: Mapping[str, dict[str, Any]], number: int
 ) -> bool:
     """Write the sheet of one held-out view; False where a render was not kept.
 
     Above: photo, degraded photo, the render of each run. Below each of those after the first: its difference
     from the photo. No run has seen the degraded photo; it shows what happened to the training photos.
     """
-    files = {label: store.render_path(run["key"], number) for label, run in runs.items()}
+    files = {label: render_path(store, run["key"], number) for label, run in runs.items()}
     if not all(file.is_file() for file in files.values()):
         return False
     first = next(iter(runs.values()))

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.quality.scenes import degraded_views
+from benchmarks.scenes import degraded_views
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.edges import edge_magnitude

@@ -1,61 +1,78 @@
-"""The numbers of a quality benchmark's tables, from its runs."""
+"""The numbers of the quality benchmark's tables, from its runs: a frame with one line for each run.
+
+A mean is that of all runs of its group: where one of them lacks the number, there is none.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from pandas import DataFrame, Series, concat
 
+from benchmarks.measure import Run
+from benchmarks.study import Cell
 from hqgs.evaluation.metrics import METRICS
 from hqgs.photos.formula import NONE
 
 DEGRADED = "degraded"  # in the place of a degradation: all of them, without the clean photos
-
-Run = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Group:
-    """The runs that see the same photos, by the label of their row."""
-
-    scene: str
-    degradation: str
-    seed: int
-    runs: dict[str, Run]
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Values over groups."""
-
-    mean: float
-    std: float | None  # sample standard deviation; None for one value
-    min: float
-    max: float
-    count: int
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
-        std = float(np.std(values, ddof=1)) if len(values) > 1 else None
-        return cls(float(np.mean(values)), std, min(values), max(values), len(values))
+GROUP = ["scene", "degradation", "seed"]  # the runs that see the same photos
+GAINS = ("gain", "equal_time_gain")  # over the baseline, dB
+COSTS: dict[str, Callable[[Run], float | None]] = {
+    "seconds": lambda run: run["seconds"],
+    "cpu_seconds": lambda run: run["cpu_seconds"],
+    "setup_seconds": lambda run: run["setup_seconds"],
+    "ms_per_step": lambda run: 1_000 * run["seconds"] / run["iterations"],
+    "render_ms": lambda run: run["render_ms"],
+    "initial_points": lambda run: run["initial_points"],
+    "gaussians": lambda run: run["gaussians"],
+    "peak_rss_mb": lambda run: run["peak_rss_mb"],
+    "edge_density": lambda run: run["regions"]["edge"]["density"],
+    "flat_density": lambda run: run["regions"]["flat"]["density"],
+}
 
 
-def columns(groups: Sequence[Group]) -> dict[str, list[Group]]:
-    """The groups of each degradation, in their order, and `DEGRADED` where there are several of them."""
-    kinds = list(dict.fromkeys(group.degradation for group in groups))
-    parts = {kind: [g for g in groups if g.degradation == kind] for kind in kinds}
-    if len(kinds) - (NONE in kinds) > 1:
-        parts[DEGRADED] = [g for g in groups if g.degradation != NONE]
-    return parts
+def frame_of(runs: Iterable[tuple[Cell, Run]], baseline: str | None = None) -> DataFrame:
+    """A line for each run with all numbers of the tables, NaN where there is none; the runs are in `run`.
+
+    Gains are over the run of the `baseline` in the same group; without one there are none.
+    """
+    pairs = list(runs)
+    base = {cell.group: run for cell, run in pairs if cell.row.label == baseline}
+    lines = []
+    for cell, run in pairs:
+        line = dict(zip(GROUP, cell.group, strict=True)) | {"row": cell.row.label, "run": run}
+        line |= {name: run["metrics"][name] for name in METRICS}
+        line |= {name: cost(run) for name, cost in COSTS.items()}
+        if baseline is not None:
+            line["gain"] = psnr_gain(run, base[cell.group])
+            line["equal_time_gain"] = equal_time_gain(run, base[cell.group])
+        lines.append(line)
+    frame = DataFrame(lines)
+    return frame.astype({name: float for name in frame.columns if name not in ("row", "run", *GROUP)})
 
 
-def mean_of(groups: Iterable[Group], label: str, value: Callable[[Run], float | None]) -> float | None:
-    """Mean of a number of a row's runs; None where one of them lacks it."""
-    values = [value(group.runs[label]) for group in groups]
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known and len(known) == len(values) else None
+def with_degraded(frame: DataFrame) -> DataFrame:
+    """The runs of each degradation, in their order, and as `DEGRADED` all of them where there are several."""
+    bad = frame.loc[frame["degradation"] != NONE]
+    if len(set(bad["degradation"])) < 2:
+        return frame
+    return concat([frame, bad.assign(degradation=DEGRADED)], ignore_index=True)
+
+
+def means(frame: DataFrame, by: Sequence[str], values: Sequence[str]) -> DataFrame:
+    """Means over the runs that share `by`, in their order; NaN where one of them lacks the number."""
+    parts = frame.groupby(list(by), sort=False)[list(values)]
+    return DataFrame(parts.agg(lambda v: v.mean(skipna=False)))
+
+
+def spread(values: Series) -> dict[str, float | None] | None:
+    """Mean, sample standard deviation (None for one value), range and number; None where a value lacks."""
+    if values.isna().any():
+        return None
+    found = values.agg(["mean", "std", "min", "max"]).to_dict()
+    return found | {"std": found["std"] if len(values) > 1 else None, "count": len(values)}
 
 
 def psnr_gain(run: Run, base: Run) -> float | None:
@@ -89,47 +106,15 @@ def equal_time_gain(run: Run, base: Run) -> float | None:
     return None if mine is None or other is None else mine - other
 
 
-def spread(
-    groups: Sequence[Group], label: str, baseline: str, gain: Callable[[Run, Run], float | None]
-) -> Spread | None:
-    """A gain over the baseline in the same group, over groups; None where one has none."""
-    values = [gain(group.runs[label], group.runs[baseline]) for group in groups]
-    known = [v for v in values if v is not None]
-    return Spread.of(known) if known and len(known) == len(values) else None
-
-
-def density(run: Run, region: str) -> float | None:
-    """Gaussians per 1,000 pixels of a region."""
-    return run["regions"][region]["density"]
-
-
-COSTS: dict[str, Callable[[Run], float | None]] = {
-    "seconds": lambda run: run["seconds"],
-    "cpu_seconds": lambda run: run["cpu_seconds"],
-    "setup_seconds": lambda run: run["setup_seconds"],
-    "ms_per_step": lambda run: 1_000 * run["seconds"] / run["iterations"],
-    "render_ms": lambda run: run["render_ms"],
-    "initial_points": lambda run: run["initial_points"],
-    "gaussians": lambda run: run["gaussians"],
-    "peak_rss_mb": lambda run: run["peak_rss_mb"],
-}
-
-
-def summary(groups: Sequence[Group], labels: Sequence[str], baseline: str | None) -> dict[str, Any]:
+def summary(frame: DataFrame, baseline: str | None) -> dict[str, Any]:
     """All means and gains by row and degradation, as JSON values. `baseline` None: no gains."""
-    gains = {"gain": psnr_gain, "equal_time_gain": equal_time_gain}
+    numbers = means(with_degraded(frame), ["row", "degradation"], [*METRICS, *COSTS])
     rows: dict[str, Any] = {}
-    for label in labels:
-        rows[label] = {}
-        for kind, part in columns(groups).items():
-            entry: dict[str, Any] = {"runs": len(part)}
-            entry |= {m: mean_of(part, label, lambda run, m=m: run["metrics"][m]) for m in METRICS}
-            entry |= {name: mean_of(part, label, cost) for name, cost in COSTS.items()}
-            for region in ("edge", "flat"):
-                entry[f"{region}_density"] = mean_of(part, label, lambda run, r=region: density(run, r))
+    for label, of_row in with_degraded(frame).groupby("row", sort=False):
+        kinds = rows[str(label)] = {}
+        for kind, part in of_row.groupby("degradation", sort=False):
+            line = numbers.loc[(label, kind)].items()
+            kinds[str(kind)] = {"runs": len(part)} | {n: None if v != v else float(v) for n, v in line}
             if baseline is not None and label != baseline:
-                for name, gain in gains.items():
-                    over = spread(part, label, baseline, gain)
-                    entry[name] = None if over is None else asdict(over)
-            rows[label][kind] = entry
+                kinds[str(kind)] |= {name: spread(part[name]) for name in GAINS}
     return rows

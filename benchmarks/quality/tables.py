@@ -2,235 +2,142 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from benchmarks.quality.summary import COSTS, Group, Run, columns, density, mean_of
+from pandas import DataFrame, Series
+
+from benchmarks.data import read_toml
+from benchmarks.output import NOTHING, number, table
+from benchmarks.quality.summary import means, spread, with_degraded
 from hqgs.base.text import markdown_table
 
-METRICS = {
-    "psnr": ("PSNR", ".2f"),
-    "ssim": ("SSIM", ".3f"),
-    "haarpsi": ("HaarPSI", ".3f"),
-    "lpips": ("LPIPS", ".3f"),
-}
-NOTHING = "–"
-
-Summary = dict[str, Any]  # of `quality_summary.summary`
+COLUMNS = read_toml(Path(__file__).with_name("protocols.toml"))["columns"]
+METRICS, COSTS, REGIONS, SFM = (COLUMNS[name] for name in ("metrics", "costs", "regions", "sfm"))
+LABEL = {"row": ("", "")}
 
 
-def quality(numbers: Summary, what: str) -> str:
-    """Rows are methods, columns degradations: the metrics that all runs have. `what`: which runs they are."""
-    shown = {
-        metric: form
-        for metric, form in METRICS.items()
-        if all(entry[metric] is not None for row in numbers.values() for entry in row.values())
-    }
-    names = "/".join(name for name, _ in shown.values())
-    body = [
-        [
-            label,
-            *("/".join(_number(entry[m], form) for m, (_, form) in shown.items()) for entry in row.values()),
-        ]
-        for label, row in numbers.items()
-    ]
-    return markdown_table(f"{names}, {what}", ["", *_kinds(numbers)], body)
+def by_degradation(title: str, frame: DataFrame, text: Callable[[DataFrame], str]) -> str:
+    """A table with a row for each method and a column for each degradation."""
+    parts = with_degraded(frame).groupby(["row", "degradation"], sort=False)
+    cells: dict[Any, str] = {key: text(part) for key, part in parts}
+    labels, kinds = (list(dict.fromkeys(key[k] for key in cells)) for k in (0, 1))
+    body = [[label, *(cells[label, kind] for kind in kinds)] for label in labels]
+    return markdown_table(title, ["", *kinds], body)
 
 
-def gains(numbers: Summary, name: str, title: str) -> str:
+def metrics(frame: DataFrame, what: str, names: Sequence[str] = ("psnr", "ssim", "haarpsi", "lpips")) -> str:
+    """Those of the metrics that all runs have. `what`: which runs they are."""
+    shown = [name for name in names if frame[name].notna().all()]
+    title = "/".join(METRICS[name][0] for name in shown)
+
+    def text(part: DataFrame) -> str:
+        return "/".join(number(part[name].mean(), METRICS[name][1]) for name in shown)
+
+    return by_degradation(f"{title}, {what}", frame, text)
+
+
+def gains(frame: DataFrame, name: str, title: str, baseline: str) -> str:
     """Gains of the rows that have them: mean ± standard deviation over groups, and the worst group."""
-    body = [
-        [label, *(_gain(entry[name]) for entry in row.values())]
-        for label, row in numbers.items()
-        if all(name in entry for entry in row.values())
-    ]
-    return markdown_table(
-        f"{title} (dB): mean ± std over scenes and seeds (worst)", ["", *_kinds(numbers)], body
-    )
+
+    def text(part: DataFrame) -> str:
+        over = spread(part[name])
+        if over is None or over["std"] is None:
+            return number(None if over is None else over["mean"], "+.2f")
+        return f"{over['mean']:+.2f} ± {over['std']:.2f} ({over['min']:+.2f})"
+
+    title = f"{title} (dB): mean ± std over scenes and seeds (worst)"
+    return by_degradation(title, frame.loc[frame["row"] != baseline], text)
 
 
-def one_scene(groups: Sequence[Group], labels: Sequence[str], what: str) -> str:
-    """PSNR and SSIM of the groups of one scene, means over seeds."""
-    parts = columns(groups)
-    body = [
-        [
-            label,
-            *(
-                "/".join(
-                    _number(mean_of(part, label, lambda run, m=m: run["metrics"][m]), METRICS[m][1])
-                    for m in ("psnr", "ssim")
-                )
-                for part in parts.values()
-            ),
-        ]
-        for label in labels
-    ]
-    return markdown_table(f"PSNR/SSIM, {what}", ["", *parts], body)
-
-
-def costs(groups: Sequence[Group], labels: Sequence[str], facts: str) -> str:
+def costs(frame: DataFrame, facts: str) -> str:
     """Time, size and memory: means over all runs."""
-    heads = {
-        "seconds": ("training (s)", ".1f"), "cpu_seconds": ("CPU (s)", ".1f"),
-        "setup_seconds": ("set-up (s)", ".2f"),
-        "ms_per_step": ("step (ms)", ".1f"), "render_ms": ("render (ms)", ".2f"),
-        "initial_points": ("first points", ",.0f"), "gaussians": ("Gaussians", ",.0f"),
-        "peak_rss_mb": ("peak memory (MB)", ",.0f"),
-    }  # fmt: skip
-    body = [
-        [label, *(_number(mean_of(groups, label, COSTS[name]), form) for name, (_, form) in heads.items())]
-        for label in labels
-    ]
-    runs = [group.runs[label] for group in groups for label in labels]
-    hours = sum(run["wall_seconds"] for run in runs) / 3600
-    title = f"Cost, means over all {len(runs)} runs, which took {hours:.1f} h; {facts}"
-    return markdown_table(title, ["", *(head for head, _ in heads.values())], body)
+    hours = sum(run["wall_seconds"] for run in frame["run"]) / 3600
+    title = f"Cost, means over all {len(frame)} runs, which took {hours:.1f} h; {facts}"
+    return table(title, _records(means(frame, ["row"], list(COSTS))), LABEL | COSTS)
 
 
-def training_times(numbers: Summary) -> str:
+def training_times(frame: DataFrame) -> str:
     """Seconds of training and number of Gaussians by degradation."""
-    body = [
-        [label, *(f"{entry['seconds']:.0f} s, {entry['gaussians']:,.0f}" for entry in row.values())]
-        for label, row in numbers.items()
-    ]
-    return markdown_table("Training time, Gaussians", ["", *_kinds(numbers)], body)
+
+    def text(part: DataFrame) -> str:
+        return f"{part['seconds'].mean():.0f} s, {part['gaussians'].mean():,.0f}"
+
+    return by_degradation("Training time, Gaussians", frame, text)
 
 
-def courses(groups: Sequence[Group], labels: Sequence[str]) -> str:
+def courses(frame: DataFrame) -> str:
     """Held-out PSNR and seconds of training at the evaluations that all runs have, means over the runs."""
-    runs = [group.runs[label] for group in groups for label in labels]
-    shared = sorted(set.intersection(*({h["iteration"] for h in run["history"]} for run in runs)))
-
-    def mean(label: str, iteration: int, name: str) -> float | None:
-        def value(run: Run) -> float | None:
-            return next(h[name] for h in run["history"] if h["iteration"] == iteration)
-
-        return mean_of(groups, label, value)
-
-    body = [
-        [
-            label,
-            *(
-                f"{_number(mean(label, k, 'psnr'), '.2f')}, {_number(mean(label, k, 'seconds'), '.0f')} s"
-                for k in shared
-            ),
-        ]
-        for label in labels
-    ]
-    return markdown_table(
-        "PSNR (dB) and seconds of training on the way, means over all runs",
-        ["iterations", *(f"{k:,}" for k in shared)],
-        body,
-    )
+    histories = [{h["iteration"]: h for h in run["history"]} for run in frame["run"]]
+    shared = sorted(set.intersection(*map(set, histories)))
+    body = []
+    for label, part in frame.assign(history=histories).groupby("row", sort=False)["history"]:
+        cells = []
+        for k in shared:
+            psnr, seconds = (Series([h[k][n] for h in part], dtype=float) for n in ("psnr", "seconds"))
+            cells.append(f"{number(psnr.mean(skipna=False), '.2f')}, {seconds.mean():.0f} s")
+        body.append([str(label), *cells])
+    title = "PSNR (dB) and seconds of training on the way, means over all runs"
+    return markdown_table(title, ["iterations", *(f"{k:,}" for k in shared)], body)
 
 
-def regions(groups: Sequence[Group], labels: Sequence[str]) -> str:
+def regions(frame: DataFrame) -> str:
     """Gaussians per 1,000 pixels on edges and in flat parts of the clean photos, means over all runs."""
-
-    def ratio(run: Run) -> float | None:
-        edge, flat = density(run, "edge"), density(run, "flat")
-        return edge / flat if edge is not None and flat else None
-
-    body = [
-        [
-            label,
-            _number(mean_of(groups, label, lambda run: density(run, "edge")), ".1f"),
-            _number(mean_of(groups, label, lambda run: density(run, "flat")), ".1f"),
-            _number(mean_of(groups, label, ratio), ".2f"),
-        ]
-        for label in labels
-    ]
-    return markdown_table(
-        "Gaussians per 1,000 pixels of a training view", ["", "edges", "flat", "edges / flat"], body
-    )
+    edge, flat = frame["edge_density"], frame["flat_density"]
+    frame = frame.assign(edge=edge, flat=flat, ratio=edge / flat.where(flat > 0))
+    rows = _records(means(frame, ["row"], list(REGIONS)))
+    return table("Gaussians per 1,000 pixels of a training view", rows, LABEL | REGIONS)
 
 
 def edge_maps(rows: Sequence[dict[str, Any]]) -> str:
     """PSNR of degraded photos and of their edge maps against those of the clean photos."""
     kinds = list(dict.fromkeys(kind for row in rows for kind in row["degradations"]))
-    body = []
+    lines = []
     for row in rows:
         for name, text in (("photo", "photos"), ("edge", "edge maps")):
-            values = [row["degradations"][kind][f"{name}_psnr"] for kind in kinds]
-            body.append(
-                [
-                    f"{row['scene']}, {text}",
-                    *(f"{v:.2f}" for v in values),
-                    _number(row[f"{name}_variance"], ".2f"),
-                ]
-            )
-    return markdown_table(
-        "PSNR (dB) of what a degradation leaves, against the clean photo; variance over degradations (dB²)",
-        ["", *kinds, "variance"],
-        body,
-    )
+            line = {kind: found[f"{name}_psnr"] for kind, found in row["degradations"].items()}
+            lines.append(line | {"row": f"{row['scene']}, {text}", "variance": row[f"{name}_variance"]})
+    title = "PSNR (dB) of what a degradation leaves, against the clean photo; variance over them (dB²)"
+    heads = {kind: (kind, ".2f") for kind in kinds} | {"variance": ("variance", ".2f")}
+    return table(title, lines, LABEL | heads)
 
 
-def formations(groups: Sequence[Group], label: str) -> str:
+def formations(frame: DataFrame, label: str) -> str:
     """What a method took for the photos' degradation, by scene; several where the seeds differ."""
-    kinds = list(dict.fromkeys(group.degradation for group in groups))
-    body = []
-    for scene in dict.fromkeys(group.scene for group in groups):
-        found = {
-            kind: dict.fromkeys(
-                group.runs[label]["formation"] or NOTHING
-                for group in groups
-                if (group.scene, group.degradation) == (scene, kind)
-            )
-            for kind in kinds
-        }
-        body.append([scene, *(", ".join(texts) or NOTHING for texts in found.values())])
-    return markdown_table(f"What {label} took for the degradation", ["", *kinds], body)
+    mine = frame.loc[frame["row"] == label]
+    found = mine.assign(text=[run["formation"] or NOTHING for run in mine["run"]])
+    kinds = list(dict.fromkeys(mine["degradation"]))
+    lines = []
+    for scene, part in found.groupby("scene", sort=False):
+        texts = part.groupby("degradation", sort=False)["text"].agg(lambda t: ", ".join(dict.fromkeys(t)))
+        lines.append({"row": scene} | {kind: texts.get(kind, NOTHING) for kind in kinds})
+    columns = LABEL | {kind: (kind, "") for kind in kinds}
+    return table(f"What {label} took for the degradation", lines, columns)
 
 
-def reconstructions(groups: Sequence[Group]) -> str:
+def reconstructions(frame: DataFrame) -> str:
     """Poses and points from the degraded photos against the scenes' own; all rows of a group share them."""
-    body = []
-    for group in groups:
-        found = next(iter(group.runs.values()))["sfm"]
-        rotation, translation = found["rotation_error_deg"], found["translation_error"]
-        own_error = _number(found["own_reprojection_error_px"], ".2f")
-        body.append(
-            [
-                f"{group.scene}, {group.degradation}, seed {group.seed}",
-                f"{found['photos'] - len(found['not_registered'])} / {found['photos']}",
-                f"{rotation['median']:.3f} / {rotation['max']:.3f}",
-                f"{translation['median']:.2%} / {translation['max']:.2%}",
-                f"{found['own_cameras_px']:.2f}",
-                f"{found['points']:,} ({found['own_points']:,})",
-                f"{found['point_distance']:.2%}",
-                f"{found['track_length']:.1f} ({_number(found['own_track_length'], '.1f')})",
-                f"{found['reprojection_error_px']:.2f} ({own_error})",
-            ]
+    lines = []
+    for line in frame.drop_duplicates(["scene", "degradation", "seed"]).to_dict("records"):
+        s = line["run"]["sfm"]
+        rotation, translation = s["rotation_error_deg"], s["translation_error"]
+        lines.append(
+            s
+            | {
+                "row": f"{line['scene']}, {line['degradation']}, seed {line['seed']}",
+                "registered": f"{s['photos'] - len(s['not_registered'])} / {s['photos']}",
+                "rotation": f"{rotation['median']:.3f} / {rotation['max']:.3f}",
+                "translation": f"{translation['median']:.2%} / {translation['max']:.2%}",
+                "points": f"{s['points']:,} ({s['own_points']:,})",
+                "track_length": f"{s['track_length']:.1f} ({number(s['own_track_length'], '.1f')})",
+                "reprojection": f"{s['reprojection_error_px']:.2f} "
+                f"({number(s['own_reprojection_error_px'], '.2f')})",
+            }
         )
-    return markdown_table(
-        "Poses and points from the degraded photos, in brackets the scene's own; distances in scene extents",
-        [
-            "",
-            "registered",
-            "rotation error (deg), median / max",
-            "centre error, median / max",
-            "own cameras off (px)",
-            "points",
-            "to the nearest own point",
-            "photos a point",
-            "reprojection error (px)",
-        ],
-        body,
-    )
+    title = "Poses and points from the degraded photos (the scene's own); distances in scene extents"
+    return table(title, lines, LABEL | SFM)
 
 
-def _kinds(numbers: Summary) -> list[str]:
-    return list(next(iter(numbers.values())))
-
-
-def _number(value: float | None, form: str) -> str:
-    return NOTHING if value is None else format(value, form)
-
-
-def _gain(over: dict[str, Any] | None) -> str:
-    if over is None:
-        return NOTHING
-    if over["std"] is None:
-        return f"{over['mean']:+.2f}"
-    return f"{over['mean']:+.2f} ± {over['std']:.2f} ({over['min']:+.2f})"
+def _records(frame: DataFrame) -> list[dict[str, Any]]:
+    return frame.reset_index().to_dict("records")

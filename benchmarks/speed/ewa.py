@@ -1,4 +1,4 @@
-"""TODO"""
+"""EWA projection in float64 numpy, by the formulas of docs/conventions.md; no code of the crate."""
 
 from __future__ import annotations
 

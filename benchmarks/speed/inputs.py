@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import root_scalar
 from scipy.spatial.transform import Rotation
 
-from benchmarks.speed.ewa import ALPHA_MIN, EPS2D, project
-from hqgs.model.gaussians import SH_C0
+from benchmarks.speed.ewa import project
+from hqgs._rust import ALPHA_MIN, EPS2D
+from hqgs.model.constants import SH_C0
 
 Array32 = NDArray[np.float32]
 Array64 = NDArray[np.float64]
@@ -111,25 +112,18 @@ def load_inputs(folder: Path, n: int) -> RasterInputs:
     path = folder / f"inputs_{n}.npz"
     if not path.is_file():
         raise FileNotFoundError(f"there is no {path}")
-    names = {"v_output": "v_image"}
-    with np.load(path, allow_pickle=False) as data:
-        wanted = ("means", "quats", "scales", "opacities", "sh", "v_output", "viewmat", "K", "background")
-        if missing := [name for name in wanted if name not in data]:
-            raise ValueError(f"{path} lacks {', '.join(missing)}")
-        arrays: dict[str, Any] = {names.get(name, name): data[name] for name in wanted}
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, 16, 3)}
-    shapes |= {"viewmat": (4, 4), "K": (3, 3), "background": (3,)}
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"{path}: {name} has shape {list(arrays[name].shape)}, wanted {list(shape)}")
-    if arrays["v_image"].ndim != 3 or arrays["v_image"].shape[2] != 3:
-        raise ValueError(f"{path}: v_output has shape {list(arrays['v_image'].shape)}, wanted [H, W, 3]")
-    return RasterInputs(
-        **{
-            name: a.astype(np.float64 if name in ("viewmat", "K") else np.float32)
-            for name, a in arrays.items()
-        }
-    )
+    shapes |= {"v_output": ("H", "W", 3), "viewmat": (4, 4), "K": (3, 3), "background": (3,)}
+    arrays: dict[str, Any] = {}
+    with np.load(path, allow_pickle=False) as data:
+        if missing := [name for name in shapes if name not in data]:
+            raise ValueError(f"{path} lacks {', '.join(missing)}")
+        for name, wanted in shapes.items():
+            array = data[name].astype(np.float64 if name in ("viewmat", "K") else np.float32)
+            if array.shape != ((*array.shape[:2], 3) if name == "v_output" else wanted):
+                raise ValueError(f"{path}: {name} has shape {list(array.shape)}, wanted {list(wanted)}")
+            arrays[name] = array
+    return RasterInputs(v_image=arrays.pop("v_output"), **arrays)
 
 
 def _size(inputs: RasterInputs) -> float:

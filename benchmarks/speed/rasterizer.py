@@ -11,21 +11,14 @@ import numpy as np
 import torch
 
 import hqgs
+from benchmarks.places import COMPOSITE, CRATE
 from benchmarks.speed.inputs import RasterInputs
-from benchmarks.speed.replay import blended_counts, random_pixels
 from benchmarks.speed.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
 from benchmarks.speed.work import count_work
-from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
 
-STAGES = {
-    "project_forward": "project",
-    "composite_forward": "bin and composite",
-    "composite_backward": "composite backward",
-    "project_backward": "project backward",
-}
+STAGES = list(CRATE.values())
 BIN = "bin"  # the part of "bin and composite" before the first pixel
-CRATE = [(_rust, name, stage) for name, stage in STAGES.items()]
 
 
 class RasterPass:
@@ -48,6 +41,7 @@ class RasterPass:
         self.v_image = torch.from_numpy(inputs.v_image[None]).to(device, dtype)
         self.rasterize = rasterize
         self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change
+        self.blended = 0  # (Gaussian, pixel) pairs of the last pass that was timed
 
     def run(self) -> torch.Tensor:
         """One pass; returns the image [1, H, W, 3], the gradients are in the leaves."""
@@ -57,11 +51,12 @@ class RasterPass:
         return image.detach()
 
     def __call__(self) -> Seconds:
-        clock, bins = StageClock(), list[float]()
-        with one_torch_thread(), clock.watching(CRATE), _binning(bins):
-            seconds = clock.seconds(self.run, STAGES.values())
+        clock, composites = StageClock(), list[Any]()
+        with one_torch_thread(), clock.watching(CRATE), _keeping(composites):
+            seconds = clock.seconds(self.run, STAGES)
         self.clear()
-        return seconds | {BIN: sum(bins)}
+        self.blended = sum(composite.blended for composite in composites)
+        return seconds | {BIN: sum(composite.bin_seconds for composite in composites)}
 
     def clear(self) -> None:
         """Free the gradients, so that the many cases of a benchmark fit into memory together."""
@@ -70,16 +65,16 @@ class RasterPass:
 
 
 @contextmanager
-def _binning(bins: list[float]) -> Iterator[None]:
-    """Add to `bins` the seconds of the tile lists, which the crate itself takes."""
-    forward = _rust.composite_forward
+def _keeping(composites: list[Any]) -> Iterator[None]:
+    """Add to the list what the crate counts and times itself in each composite."""
+    forward = getattr(*COMPOSITE)
 
     def call(*args: Any) -> Any:
         out = forward(*args)
-        bins.append(out[0].bin_seconds)
+        composites.append(out[0])
         return out
 
-    with patch.object(_rust, "composite_forward", call):
+    with patch.object(*COMPOSITE, call):
         yield
 
 
@@ -93,15 +88,14 @@ def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
     return call
 
 
-def measure(inputs: Sequence[RasterInputs], repeats: int, samples: int) -> list[dict[str, Any]]:
-    """Time and work of each of the inputs. `samples`: pixels in which the blended Gaussians are counted."""
+def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
+    """Time and work of each of the inputs."""
     passes = {str(len(x)): RasterPass(x) for x in inputs}
     measured = interleaved({name: warmed(case) for name, case in passes.items()}, repeats)
     rows = []
     for x, (name, rounds) in zip(inputs, measured.items(), strict=True):
-        counts = blended_counts(x, random_pixels(x, samples, seed=0))
-        stages = {stage: median(rounds, stage) for stage in [*STAGES.values(), "rest"]}
-        work = count_work(counts, x.width * x.height, *passes[name].work)
+        stages = {stage: median(rounds, stage) for stage in [*STAGES, "rest"]}
+        work = count_work(passes[name].blended, x.width * x.height, *passes[name].work)
         limit = work["limit_core_seconds"] / hqgs.get_num_threads()
         compositing = [r["bin and composite"] - r[BIN] + r["composite backward"] for r in rounds]
         rows.append(

@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks import charts
+from benchmarks.charts import BLUE, LEGEND, ORANGE, panels
 from benchmarks.speed.inputs import fitted, make_inputs
 from benchmarks.speed.rasterizer import RasterPass, warmed
 from benchmarks.speed.timing import exponent, interleaved, median, quartiles
@@ -58,13 +60,12 @@ def _curve(x: Sequence[int], passes: Sequence[RasterPass], repeats: int) -> dict
 
 def scaling_chart(scaling: dict[str, Any]) -> Figure:
     """Two panels: time against Gaussians and against megapixels, with the fitted power."""
-    figure = Figure(figsize=(9, 4), dpi=150, layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    figure, (left, right) = panels(9, 4, 1, 2, sharey=True)
     curve = scaling["gaussians"]
-    _panel(left, curve, 1, "Gaussians", f"{curve['width']} x {curve['height']} pixels", "#1f6fb2")
+    _panel(left, curve, 1, "Gaussians", f"{curve['width']} x {curve['height']} pixels", BLUE)
     left.set_ylabel("forward and backward (s)")
     curve = scaling["pixels"]
-    _panel(right, curve, 1e6, "megapixels", f"{curve['gaussians']} Gaussians", "#c2571a")
+    _panel(right, curve, 1e6, "megapixels", f"{curve['gaussians']} Gaussians", ORANGE)
     return figure
 
 
@@ -75,7 +76,5 @@ def _panel(axes: Axes, curve: dict[str, Any], unit: float, label: str, title: st
     center = np.exp(np.log(seconds).mean()) * (x / np.exp(np.log(x).mean())) ** curve["exponent"]
     axes.plot(x, center, color="#888888", linestyle="--", linewidth=1, label=f"power {curve['exponent']:.2f}")
     axes.set(xscale="log", yscale="log", xlabel=label)
-    axes.set_title(title, fontsize=10, loc="left")
-    axes.grid(color="#dddddd", linewidth=0.7)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False)
+    charts.title(axes, title)
+    axes.legend(**LEGEND)

@@ -25,13 +25,7 @@ def still_config(config: TrainConfig, n: int) -> TrainConfig:
         config,
         iterations=iterations,
         sh_interval=1,
-        lr_means=TINY,
-        lr_means_final=TINY,
-        lr_scales=TINY,
-        lr_quats=TINY,
-        lr_opacities=TINY,
-        lr_sh0=TINY,
-        lr_shN=TINY,
+        **{name: TINY for name in vars(config) if name.startswith("lr_")},
         densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
     )
 
@@ -52,8 +46,8 @@ def make_trainer(
     ]
     colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
     scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
-    config = still_config(TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig()), n)
-    trainer = Trainer(scene, config)
+    config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
+    trainer = Trainer(scene, still_config(config, n))
     gaussians = trainer.gaussians
     with torch.no_grad():
         gaussians.scales.copy_(torch.from_numpy(inputs.scales).log())

@@ -5,42 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
-
-from benchmarks.speed.rasterizer import CRATE, STAGES
+from benchmarks.places import parts_of_step
 from benchmarks.speed.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
-from hqgs.training import trainer as trainer_module
 from hqgs.training.trainer import Trainer
 
 # In the order of a step. Each is without the others that run inside it.
 PARTS = (
     "activations",  # of the Gaussians, and the checks of hqgs.rasterization
     "method",  # what it makes of the Gaussians before they are rasterized
-    *list(STAGES.values())[:2],
+    "project",
+    "bin and composite",
     "loss",
     "autograd",  # the backward pass of the activations, and torch's own work
-    *list(STAGES.values())[2:],
+    "composite backward",
+    "project backward",
     "density statistics",
     "Adam",
 )
-
-# Milliseconds of a step at 504 x 378, by method and number of Gaussians.
-TARGETS = {("3dgs", 100_000): 80, ("3dgs", 200_000): 140, ("hqgs", 100_000): 90}
-TARGET_SIZE = (504, 378)
-
-
-def places(trainer: Trainer) -> list[tuple[Any, str, str]]:
-    """Where the parts of a step are called."""
-    return [
-        *CRATE,
-        (trainer_module, "render_view", "activations"),
-        (type(trainer.method), "modulate", "method"),
-        (type(trainer.method), "loss", "loss"),
-        (torch.Tensor, "backward", "autograd"),
-        (type(trainer.densifier), "observe", "density statistics"),
-        (type(trainer.densifier), "update", "density statistics"),
-        (type(trainer.optimizer), "step", "Adam"),
-    ]
 
 
 def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
@@ -54,14 +35,19 @@ def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
     clock = StageClock()
 
     def call() -> Seconds:
-        with clock.watching(places(trainer)):
+        with clock.watching(parts_of_step(trainer)):
             return clock.seconds(trainer.step, PARTS)
 
     return call
 
 
-def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[str, Any]]:
-    """Seconds of a step, and the share of each part of it, for each trainer; `case` is its key."""
+def measure_steps(
+    trainers: Mapping[str, Trainer], repeats: int, targets: Mapping[str, int]
+) -> list[dict[str, Any]]:
+    """Seconds of a step, and the share of each part of it, for each trainer; `case` is its key.
+
+    `targets`: milliseconds by method and number of Gaussians.
+    """
     cases: dict[str, Callable[[], Seconds]] = {}
     for name, trainer in trainers.items():
         cases |= {f"{name}/whole": whole_step(trainer), f"{name}/parts": step_by_parts(trainer)}
@@ -70,7 +56,7 @@ def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[st
     first = measured[f"{next(iter(trainers))}/whole"]
     for name, trainer in trainers.items():
         camera = trainer.scene.train[0].camera
-        method, n, size = trainer.config.method, len(trainer.gaussians), (camera.width, camera.height)
+        method, n = trainer.config.method, len(trainer.gaussians)
         whole, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
         stages = {part: median(parts, part) for part in (*PARTS, "rest")}
         total = sum(stages.values())
@@ -84,7 +70,7 @@ def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[st
                 "seconds": median(whole),
                 "seconds_quartiles": quartiles(whole),
                 "over_first": median_ratio(whole, first),
-                "target_ms": TARGETS.get((method, n)) if size == TARGET_SIZE else None,
+                "target_ms": targets.get(f"{method}, {n}"),
                 "clocked": median_ratio(parts, whole),  # how much the clocks slow the step down
                 "stages": stages,
                 "percent": {stage: 100 * seconds / total for stage, seconds in stages.items()},

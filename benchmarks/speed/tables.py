@@ -3,70 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from benchmarks.data import read_toml
+from benchmarks.output import number, table
 from hqgs.base.text import markdown_table
 
 Rows = Sequence[dict[str, Any]]
+COLUMNS = read_toml(Path(__file__).with_name("speed.toml"))["columns"]
 
 
 def rasterizer(rows: Rows) -> list[str]:
     """Times of the stages, and the work behind them."""
-    first = rows[0]
-    stages = list(first["stages"])
-    size = f"{first['width']} x {first['height']}"
-    times = markdown_table(
-        f"Rasterizer, {size}, harmonics of degree 3, forward and backward (ms, medians)",
-        [
-            "Gaussians", *stages, "whole", "quartiles", "limit", "whole / limit",
-            "of it bin", "compositing alone", "compositing / limit",
-        ],
-        [
-            [
-                f"{r['gaussians']:,}",
-                *(_ms(r["stages"][stage]) for stage in stages),
-                _ms(r["seconds"]),
-                " to ".join(map(_ms, r["seconds_quartiles"])),
-                _ms(r["limit_seconds"]),
-                f"{r['times_limit']:.2f}",
-                _ms(r["bin_seconds"]),
-                _ms(r["compositing_seconds"]),
-                f"{r['compositing_times_limit']:.2f}",
-            ]
-            for r in rows
-        ],
-    )  # fmt: skip
-    work = markdown_table(
-        "Work of one pass",
-        [
-            "Gaussians", "blended per pixel", "tile pairs", "blocks", "of them changed", "lane use",
-            "operations per blended pair", "bytes per tile pair", "operations per byte",
-        ],
-        [
-            [
-                f"{r['gaussians']:,}",
-                f"{w['blended_per_pixel']:.1f} ± {w['blended_standard_error']:.1f}",
-                f"{w['tile_pairs']:,}",
-                f"{w['blocks']:,}",
-                f"{100 * w['changed_blocks'] / w['blocks']:.1f} %",
-                f"{100 * w['lane_use']:.0f} %",
-                f"{w['operations_per_blended_pair']:.0f}",
-                f"{w['bytes_per_tile_pair']:.0f}",
-                f"{w['operations_per_byte']:.1f}",
-            ]
-            for r in rows
-            for w in [r["work"]]
-        ],
-    )  # fmt: skip
-    return [times, work]
+    size = f"{rows[0]['width']} x {rows[0]['height']}"
+    title = f"Rasterizer, {size}, harmonics of degree 3, forward and backward (ms, medians)"
+    times = [row | row["stages"] | {"quartiles": _quartiles(row)} for row in rows]
+    work = [row | row["work"] for row in rows]
+    work = [row | {"changed": row["changed_blocks"] / row["blocks"]} for row in work]
+    return [table(title, times, COLUMNS["rasterizer"]), table("Work of one pass", work, COLUMNS["work"])]
 
 
 def steps(rows: Rows) -> str:
     """One column for each case."""
     first = rows[0]
     body = [
-        ["whole step (ms)", *(_ms(r["seconds"]) for r in rows)],
-        ["quartiles (ms)", *(" to ".join(map(_ms, r["seconds_quartiles"])) for r in rows)],
+        ["whole step (ms)", *(number(r["seconds"], "ms") for r in rows)],
+        ["quartiles (ms)", *map(_quartiles, rows)],
         [f"over {first['case']}", *(f"{r['over_first']:.2f}" for r in rows)],
         ["target (ms)", *(str(r["target_ms"] or "") for r in rows)],
         *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
@@ -77,64 +40,37 @@ def steps(rows: Rows) -> str:
 
 
 def threads(rows: Rows) -> str:
-    return markdown_table(
-        "Threads",
-        ["", "threads", "ms", "speed-up", "per thread"],
-        [
-            [
-                r["case"],
-                str(r["threads"]),
-                _ms(r["seconds"]),
-                f"{r['speedup']:.2f}",
-                f"{100 * r['speedup'] / r['threads']:.0f} %",
-            ]
-            for r in rows
-        ],
-    )
+    lines = [row | {"share": row["speedup"] / row["threads"]} for row in rows]
+    return table("Threads", lines, COLUMNS["threads"])
 
 
 def scaling(result: dict[str, Any]) -> list[str]:
     """The powers, and the points that they were fitted to."""
-    by_size, by_pixels = result["gaussians"], result["pixels"]
-    powers = markdown_table(
-        "Power with which the time of forward and backward grows",
-        ["against", "fitted", "steepest between two points", "target"],
-        [
-            [name, f"{curve['exponent']:.2f}", f"{curve['steepest']:.2f}", f"<= {result['target_exponent']}"]
-            for name, curve in (("Gaussians", by_size), ("pixels", by_pixels))
-        ],
-    )
-    pixels = by_size["width"] * by_size["height"]
-    points = [(n, pixels, seconds) for n, seconds in zip(by_size["x"], by_size["seconds"], strict=True)]
-    points += [
-        (by_pixels["gaussians"], pixels, seconds)
-        for pixels, seconds in zip(by_pixels["x"], by_pixels["seconds"], strict=True)
-    ]
-    body = [[f"{n:,}", f"{pixels / 1e6:.3g}", _ms(seconds)] for n, pixels, seconds in points]
-    return [powers, markdown_table("The points", ["Gaussians", "megapixels", "ms"], body)]
+    size, pixels = result["gaussians"], result["pixels"]
+    title = "Power with which the time of forward and backward grows"
+    names = {"against": "Gaussians"}, {"against": "pixels"}
+    powers = [curve | name for curve, name in zip((size, pixels), names, strict=True)]
+    powers = [curve | {"target": result["target_exponent"]} for curve in powers]
+    area = size["width"] * size["height"]
+    points = [(n, area, s) for n, s in zip(size["x"], size["seconds"], strict=True)]
+    points += [(pixels["gaussians"], a, s) for a, s in zip(pixels["x"], pixels["seconds"], strict=True)]
+    lines = [{"gaussians": n, "megapixels": a / 1e6, "seconds": s} for n, a, s in points]
+    return [table(title, powers, COLUMNS["powers"]), table("The points", lines, COLUMNS["points"])]
 
 
 def memory(result: dict[str, Any]) -> str:
     megapixels = result["width"] * result["height"] / 1e6
     title = (
-        f"Peak memory, {result['method']}, {result['gaussians']:,} Gaussians, {result['photos']} photos of "
-        f"{megapixels:.2f} MP, {result['steps']} steps (GB = 10^9 bytes)"
+        f"Peak memory (MB = 10^6 bytes), {result['method']}, {result['gaussians']:,} Gaussians, "
+        f"{result['photos']} photos of {megapixels:.2f} MP, {result['steps']} steps"
     )
-    head = ["after the imports", "with the scene", "in training", "target"]
-    names = ("imports_mb", "scene_mb", "peak_mb", "target_mb")
-    return markdown_table(title, head, [[f"{result[name] / 1000:.2f}" for name in names]])
+    return table(title, [result], COLUMNS["memory"])
 
 
 def gsplat(rows: Rows) -> str:
-    return markdown_table(
-        f"gsplat on {rows[0]['device']}, the same inputs, forward and backward (ms, medians)",
-        ["Gaussians", "gsplat", "hqgs", "hqgs / gsplat"],
-        [
-            [f"{r['gaussians']:,}", _ms(r["seconds"]), _ms(r["hqgs_seconds"]), f"{r['ratio']:.1f}"]
-            for r in rows
-        ],
-    )
+    title = f"gsplat on {rows[0]['device']}, the same inputs, forward and backward (ms, medians)"
+    return table(title, rows, COLUMNS["gsplat"])
 
 
-def _ms(seconds: float) -> str:
-    return f"{1000 * seconds:.3g}" if seconds < 0.1 else f"{1000 * seconds:.0f}"
+def _quartiles(row: dict[str, Any]) -> str:
+    return " to ".join(number(seconds, "ms") for seconds in row["seconds_quartiles"])

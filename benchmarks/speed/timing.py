@@ -79,11 +79,11 @@ class StageClock:
         return call
 
     @contextmanager
-    def watching(self, places: Iterable[tuple[Any, str, str]]) -> Iterator[None]:
-        """Time functions in the place where their callers find them: (class or module, name, stage)."""
+    def watching(self, stages: Mapping[tuple[Any, str], str]) -> Iterator[None]:
+        """Time functions in the place where their callers find them: class or module, and name."""
         with ExitStack() as stack:
-            for owner, name, stage in places:
-                stack.enter_context(patch.object(owner, name, self.timed(stage, getattr(owner, name))))
+            for place, stage in stages.items():
+                stack.enter_context(patch.object(*place, self.timed(stage, getattr(*place))))
             yield
 
     def seconds(self, function: Callable[[], Any], stages: Iterable[str]) -> Seconds:

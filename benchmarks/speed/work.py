@@ -1,20 +1,17 @@
 """How much work an image is: counted, not timed.
 
-Operations are read off rust/kernel.rs and rust/tiles.rs for three channels in float32: one for each addition,
-product, division, root, minimum, comparison, logical operation, selection and shift, two for a fused product
-and sum. Moves, shuffles and counts of bits are left out, and so is what is done once for each Gaussian, row
-of tiles or pixel. Bytes are those of the lists that hold a row for each (Gaussian, tile) pair or for each
-Gaussian in a block, once for each stage that writes the row and once for each that reads it. What belongs to
-one tile (its pixels, the layers of the backward pass) stays in cache and is not counted. Whoever changes a
-kernel counts again.
+Operations are read off rust/composite/kernel/ and rust/tiles/ for three channels in float32: one for each
+addition, product, division, root, minimum, comparison, logical operation, selection and shift, two for a
+fused product and sum. Moves, shuffles and counts of bits are left out, and so is what is done once for each
+Gaussian, row of tiles or pixel. Bytes are those of the lists that hold a row for each (Gaussian, tile) pair
+or for each Gaussian in a block, once for each stage that writes the row and once for each that reads it.
+What belongs to one tile (its pixels, the layers of the backward pass) stays in cache and is not counted.
+Whoever changes a kernel counts again.
 """
 
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 BLOCK_PIXELS = 16  # lanes of a block of 4 x 4 pixels
 
@@ -45,23 +42,21 @@ BLOCK_BYTES = 3 * 4  # an index in a block's list: written, read by both passes
 
 
 def count_work(
-    counts: NDArray[np.int64], pixels: int, tile_pairs: int, blocks: int, changed_blocks: int
+    blended: int, pixels: int, tile_pairs: int, blocks: int, changed_blocks: int
 ) -> dict[str, Any]:
-    """The work of one forward and backward pass.
+    """The work of one forward and backward pass, from the crate's counters.
 
     Args:
-        counts: blended Gaussians of some random pixels.
+        blended: (Gaussian, pixel) pairs that changed a pixel.
         pixels: of the image.
-        tile_pairs, blocks, changed_blocks: the crate's counters, `meta["work"]`: (Gaussian, tile) pairs,
-            (Gaussian, block) pairs that each pass evaluates, those of them that changed a pixel.
+        tile_pairs, blocks, changed_blocks: (Gaussian, tile) pairs, (Gaussian, block) pairs that each pass
+            evaluates, those of them that changed a pixel.
     """
-    blended = float(counts.mean()) * pixels
     lanes = BLOCK_PIXELS * blocks
     operations = LANE * lanes + PAIR * tile_pairs
     size = PAIR_BYTES * tile_pairs + BLOCK_BYTES * blocks
     return {
-        "blended_per_pixel": float(counts.mean()),
-        "blended_standard_error": float(counts.std() / np.sqrt(len(counts))),
+        "blended_per_pixel": blended / pixels,
         "blended_pairs": blended,
         "tile_pairs": tile_pairs,
         "blocks": blocks,

@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
+EMBEDDED = "embedded"  # in the place of a scene folder: the scene that is built in
 CHECKPOINT, PLY = "checkpoint.safetensors", "scene.ply"
 
 
@@ -39,6 +40,22 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         tmp.replace(path)
     finally:
         tmp.unlink(missing_ok=True)
+
+
+def existing_folder(path: str | Path) -> Path:
+    """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file."""
+    folder = Path(path).resolve()
+    if not folder.exists():
+        raise FileNotFoundError(f"there is no scene folder {folder}")
+    if not folder.is_dir():
+        raise ValueError(f"{folder} is a file, a scene is a folder")
+    return folder
+
+
+def check_new_folder(out: Path) -> None:
+    """FileExistsError unless `out` is missing or an empty folder."""
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise FileExistsError(f"{out} exists and is not an empty folder")
 
 
 def keep_folder(source: Path, target: Path) -> None:

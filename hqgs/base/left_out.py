@@ -4,7 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TypedDict, cast
+
+
+class _Named(TypedDict):
+    what: str
+    why: str
+
+
+class LeftOutRecord(_Named, total=False):
+    """`LeftOut` as JSON: what is not known is not there."""
+
+    evidence: str
+    seconds: float
+    memory_mb: float
+    bytes: int
+    cost_db: float
 
 
 @dataclass(frozen=True)
@@ -19,9 +34,10 @@ class LeftOut:
     bytes: int | None = None  # of the scene file saved
     cost_db: float | None = None  # lost in PSNR on training photos that were held back; below 0: gained
 
-    def known(self) -> dict[str, Any]:
+    def known(self) -> LeftOutRecord:
         """The fields that are known, as plain JSON values."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        known = {name: value for name, value in asdict(self).items() if value is not None}
+        return cast(LeftOutRecord, known)
 
 
 def format_left_out(items: Sequence[LeftOut]) -> str:

@@ -8,15 +8,24 @@ import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import TypedDict
 
 PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
-def machine_facts() -> dict[str, str | int | float | None]:
-    """CPU model, vector instructions in use, cores this process may use, memory in GiB, system, architecture.
+class MachineFacts(TypedDict):
+    """What the numbers of a run depend on. None: not known."""
 
-    Memory is None where unknown.
-    """
+    cpu: str  # model
+    simd: str  # vector instructions in use
+    cores: int | None  # that this process may use
+    memory_gib: float | None
+    system: str
+    architecture: str
+
+
+def machine_facts() -> MachineFacts:
+    """Facts about this machine."""
     from hqgs._rust import simd_level  # here, since the rest of this file loads nothing
 
     return {

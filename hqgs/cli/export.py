@@ -5,14 +5,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
-from hqgs.export.export import READERS, Export, ExportOptions, export, format_of, read_scene_file, scene_file
-from hqgs.model.gaussians import Gaussians
-from hqgs.scene.scene import Scene
+from hqgs.export.options import ExportOptions
+from hqgs.model.formats.files import READERS, format_of, scene_file
+
+if TYPE_CHECKING:
+    from hqgs.export.export import Export
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.scene.scene import Scene
 
 DEFAULTS = ExportOptions("ply")
 
@@ -49,7 +52,7 @@ def run_export(args: argparse.Namespace, load_scene: Callable[[], Scene | None])
     """Export what `args` say and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
     try:
         options = ExportOptions(
-            format=args.format or format_of(args.out),
+            format=format_of(args.out, args.format),
             sh_degree=args.sh_degree,
             band_tolerance=args.band_tolerance,
             sh_bits=tuple(args.sh_bits),
@@ -57,13 +60,17 @@ def run_export(args: argparse.Namespace, load_scene: Callable[[], Scene | None])
         source = scene_file(args.source)
         if args.out.exists() and args.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is left out would be lost")
-        gaussians = read_scene_file(source)
+        from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
+        from hqgs.export.export import export
+        from hqgs.model.gaussians import Gaussians
+
+        gaussians = Gaussians.load(source)
         scene = load_scene()
         before = None if scene is None else held_out_psnr(scene, held_out_renders(scene, gaussians))
         written = export(gaussians, args.out, options)
         after = None
         if scene is not None:
-            back = READERS[options.format](args.out)
+            back = Gaussians.load(args.out, options.format)
             after = held_out_psnr(scene, held_out_renders(scene, back))
     except BAD_INPUT as error:
         return fail(2, str(error))

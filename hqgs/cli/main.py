@@ -1,4 +1,4 @@
-"""The command line: `hqgs train SCENE --out DIR` and `hqgs degrade SCENE --kind KIND --out DIR`.
+"""The command line: arguments in, text and exit codes out; the work is that of `hqgs.load`, `hqgs.train`, ...
 
 Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C or
 SIGTERM. Then a training run has written everything, unless Ctrl-C was pressed twice, and degrading nothing.
@@ -10,53 +10,35 @@ import argparse
 import signal
 import threading
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hqgs
-from hqgs.base.files import CHECKPOINT, write_json
-from hqgs.base.left_out import LeftOut, format_left_out
+from hqgs.base.files import CHECKPOINT, EMBEDDED, check_new_folder, existing_folder, write_json
+from hqgs.base.left_out import format_left_out
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.export import add_parser as add_export_parser
 from hqgs.cli.export import run_export
-from hqgs.diagnosis import diagnose_scene, format_diagnosis
-from hqgs.evaluation.report import RunResult
+from hqgs.cli.progress import ProgressBar
 from hqgs.photos.formula import parse_degradation
-from hqgs.pipeline import open_run, run
-from hqgs.scene.builtin import embedded_scene
-from hqgs.scene.degrade import check_new_folder, degrade_scene, write_degraded_scene
-from hqgs.scene.load import load_scene
-from hqgs.scene.restore import restore_scene
-from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
-from hqgs.training.config import (
-    AUTO,
-    GUIDANCES,
-    ITEMS,
-    METHODS,
-    NONE,
-    DensifyConfig,
-    HQGSConfig,
-    TrainConfig,
-    parse_leave_out,
-)
-from hqgs.training.config import AUTO as LEAVE_OUT
-from hqgs.training.trainer import TrainingError
+from hqgs.training.config import AUTO, GUIDANCES, ITEMS, METHODS, NONE, TrainConfig, run_config
 
-EMBEDDED = "embedded"
-EMBEDDED_SIZE = (504, 378)  # pixels
+if TYPE_CHECKING:
+    from hqgs.pipeline import Run
+    from hqgs.scene.scene import Scene
+
 KINDS_HELP = (
-    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], "
-    "several joined by + in their order, mixed, or none"
+    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
+    "exposure[:EV], phone[:EV], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), several "
+    "joined by + in their order, mixed, or none"
 )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code. SIGTERM counts as Ctrl-C."""
     args = _parser().parse_args(argv)
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # instead of pycolmap's, with a stack trace
     try:
         return args.run(args)
     except KeyboardInterrupt:
@@ -83,9 +65,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--leave-out",
-        default=LEAVE_OUT,
+        default=AUTO,
         metavar="LIST",
-        help=f"what the run may do without where the scene does not need it: {LEAVE_OUT}, {NONE}, or some of "
+        help=f"what the run may do without where the scene does not need it: {AUTO}, {NONE}, or some of "
         f"{','.join(ITEMS)} (%(default)s)",
     )
     add(
@@ -150,44 +132,56 @@ def _add_photos(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(args: argparse.Namespace) -> int:
-    with ExitStack() as stack:
-        try:
-            config = _config(args)
-            degradation = parse_degradation(args.degrade)
-            if (args.out / CHECKPOINT).exists() and not args.resume:
-                raise FileExistsError(
-                    f"{args.out} holds a run; continue it with --resume or choose another --out"
-                )
-            if args.threads is not None:
-                hqgs.set_num_threads(args.threads)
-            scene = _scene(args, args.out, args.sfm, skip_unreadable="photos" in config.leave_out)
-            if degradation.steps:
-                scene = degrade_scene(scene, degradation, config.seed)
-            if args.sfm and (scene.source != "photos" or degradation.steps):
-                scene = sfm_scene(scene, args.out / KEPT)
-                print(scene.sfm)
-            if args.restore is not None:
-                scene = restore_scene(scene, args.restore)
-            trainer = stack.enter_context(open_run(scene, config, args.out, args.resume))
-        except BAD_INPUT as error:
-            return fail(2, str(error))
-        except OSError as error:
-            return fail(1, f"{args.out}: {error}")
-        try:
-            result = run(trainer, args.out)
-        except TrainingError as error:
-            return fail(1, str(error))
-        except OSError as error:
-            return fail(1, f"{args.out}: {error}")
-    _print_summary(args.out, result)
-    return 0 if result.iterations == result.length else 130
+    try:
+        config = run_config(
+            iterations=args.iterations,
+            method=args.method,
+            leave_out=args.leave_out,
+            seed=args.seed,
+            max_gaussians=args.max_gaussians,
+            guidance=args.guidance,
+            formation=args.formation,
+            eval_every=args.eval_every,
+        )
+        parse_degradation(args.degrade)
+        if (args.out / CHECKPOINT).exists() and not args.resume:
+            raise FileExistsError(
+                f"{args.out} holds a run; continue it with --resume or choose another --out"
+            )
+        if args.threads is not None:
+            hqgs.set_num_threads(args.threads)
+        _ready(args.scene)
+        scene = hqgs.load(
+            args.scene,
+            downscale=args.downscale,
+            sfm=args.sfm,
+            degrade=args.degrade,
+            seed=args.seed,
+            restore=args.restore,
+            skip_unreadable="photos" in config.leave_out,
+            cache=args.out,
+        )
+        if scene.sfm is not None:
+            print(scene.sfm)
+        with ProgressBar() as bar:
+            done = hqgs.train(scene, out=args.out, config=config, resume=args.resume, progress=bar)
+    except BAD_INPUT as error:
+        return fail(2, str(error))
+    except OSError as error:
+        return fail(1, f"{args.out}: {error}")
+    except hqgs.TrainingError as error:
+        return fail(1, str(error))
+    _print_summary(args.out, done)
+    return 0 if done.finished else 130
 
 
 def _degrade(args: argparse.Namespace) -> int:
     try:
         degradation = parse_degradation(args.kind)
         check_new_folder(args.out)
-        scene = _scene(args, out=None)
+        scene = _load(args)
+        from hqgs.scene.degrade import write_degraded_scene  # here: it loads torch
+
         write_degraded_scene(scene, args.out, degradation, args.seed)
     except BAD_INPUT as error:
         return fail(2, str(error))
@@ -199,57 +193,41 @@ def _degrade(args: argparse.Namespace) -> int:
 
 def _diagnose(args: argparse.Namespace) -> int:
     try:
-        diagnosis = diagnose_scene(_scene(args, out=None))
+        scene = _load(args)
+        diagnosis = hqgs.diagnose(scene)
         if args.out is not None:
             write_json(args.out, asdict(diagnosis))
     except BAD_INPUT as error:
         return fail(2, str(error))
     except OSError as error:
         return fail(1, f"{args.out}: {error}")
-    print(format_diagnosis(diagnosis))
+    print(diagnosis)
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
-    return run_export(args, lambda: None if args.scene is None else _scene(args, out=None))
+    return run_export(args, lambda: None if args.scene is None else _load(args))
 
 
-def _config(args: argparse.Namespace) -> TrainConfig:
-    leave_out = parse_leave_out(args.leave_out)
-    if args.iterations is None and args.leave_out == LEAVE_OUT:
-        leave_out = (*leave_out, "iterations")
-    config = TrainConfig(
-        iterations=TrainConfig.iterations if args.iterations is None else args.iterations,
-        leave_out=leave_out,
-        method=args.method,
-        seed=args.seed,
-        densify=DensifyConfig(max_gaussians=args.max_gaussians),
-        hqgs=HQGSConfig(guidance=args.guidance, formation=args.formation),
-    ).scaled()
-    return config if args.eval_every is None else replace(config, eval_every=args.eval_every)
+def _load(args: argparse.Namespace) -> Scene:
+    _ready(args.scene)
+    return hqgs.load(args.scene, downscale=args.downscale, skip_unreadable=False)
 
 
-def _scene(
-    args: argparse.Namespace, out: Path | None, sfm: bool = False, skip_unreadable: bool = False
-) -> Scene:
-    """`out`: the folder of the run, which keeps what is made of a scene; None keeps nothing."""
-    if args.scene != EMBEDDED:
-        keep = None if out is None else out / KEPT
-        return load_scene(
-            args.scene, args.downscale, reconstruct=sfm, skip_unreadable=skip_unreadable, keep_sfm=keep
-        )
-    if not args.downscale >= 1:
-        raise ValueError(f"downscale must be at least 1, got {args.downscale}")
-    width, height = (round(size / args.downscale) for size in EMBEDDED_SIZE)
-    cache = None if out is None else out / "scene"
-    return embedded_scene(cache=cache, width=width, height=height)
+def _ready(scene: str) -> None:
+    """Tell a wrong path at once; then load what takes seconds, after which SIGTERM counts as Ctrl-C."""
+    if scene != EMBEDDED:
+        existing_folder(scene)
+    import_module("hqgs.pipeline")
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # instead of pycolmap's, with a stack trace
 
 
-def _print_summary(out: Path, result: RunResult) -> None:
-    last = result.history[-1]
-    numbers = [f"{result.iterations} iterations", f"{result.gaussians} Gaussians", f"{result.seconds:.0f} s"]
+def _print_summary(out: Path, done: Run) -> None:
+    last = done.history[-1]
+    numbers = [f"{done.iterations} iterations", f"{len(done.model)} Gaussians", f"{done.seconds:.0f} s"]
     numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
     numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
     print(f"{out}: {', '.join(numbers)}")
-    if table := format_left_out([LeftOut(**item) for item in result.left_out]):
+    if table := format_left_out(done.left_out):
         print(table)

@@ -12,6 +12,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.text import some
 from hqgs.diagnosis.copies import find_copies, note_of_unlike
 from hqgs.diagnosis.coverage import Sight
+from hqgs.diagnosis.scene import Inspector
 from hqgs.diagnosis.sharpness import Look, Sharpness, look_at_photos
 from hqgs.scene.scene import Scene, View
 
@@ -33,7 +34,7 @@ class _Drop:
     evidence: str
 
 
-def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
+def choose_photos(scene: Scene, inspector: Inspector | None = None) -> tuple[Scene, list[LeftOut]]:
     """The scene without training photos that teach nothing or do harm, and what was left out.
 
     - Broken: with values that are not finite.
@@ -46,7 +47,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
       each of them averages some of it away.
 
     At least three photos and half of them stay. `Scene.notes` says which photos nearly went and why they
-    stay. Held-out views are neither looked at nor changed.
+    stay. Held-out views are neither looked at nor changed. `inspector`: the one of the run.
     """
     most = len(scene.train) - max(LEAST_KEPT, (len(scene.train) + 1) // 2)
     if most <= 0:
@@ -60,7 +61,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     notes: list[str] = []
     sound = [view for view, count in zip(scene.train, bad, strict=True) if not count]
     if sound:
-        drops += _needless(sound, scene.points, notes)
+        drops += _needless(sound, scene.points, notes, inspector or Inspector())
     if len(drops) > most:
         names = some([drop.view.name for drop in drops[most:]])
         notes.append(f"training photos kept so that at least half of them stay: {names}")
@@ -80,7 +81,9 @@ def _bad_values(view: View) -> int:
     return sum(int((~np.isfinite(p)).sum()) for p in photos if p is not None and p.dtype != np.uint8)
 
 
-def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[_Drop]:
+def _needless(
+    views: list[View], points: NDArray[np.float32], notes: list[str], inspector: Inspector
+) -> list[_Drop]:
     """The worst first. What was nearly left out is told in `notes`."""
     looks = look_at_photos(views)
     sight = Sight(views, points)
@@ -90,7 +93,7 @@ def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) 
     spectra = [look.rings for look in looks if look.rings is not None]
     sharpness = Sharpness(spectra) if spectra else None
     rank = np.zeros(len(views)) if sharpness is None else sharpness.fine()
-    copies, unlike, averaged = find_copies(views, looks, sight, rank, gone)
+    copies, unlike, averaged = find_copies(views, looks, sight, rank, gone, inspector)
     gone |= {twin.index for twin in copies}
     gone |= {k for k, look in enumerate(looks) if look.colour is not None}  # there is nothing to be sharp
     blurred = {} if sharpness is None else _blurred(views, sharpness, sight, peers, gone, notes)

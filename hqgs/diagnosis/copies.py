@@ -9,8 +9,7 @@ import numpy as np
 
 from hqgs.base.text import some
 from hqgs.diagnosis.coverage import Sight
-from hqgs.diagnosis.photo import inspect_photo
-from hqgs.diagnosis.scene import VISIBLE_QUALITY
+from hqgs.diagnosis.scene import VISIBLE_QUALITY, Inspector
 from hqgs.diagnosis.sharpness import Look
 from hqgs.photos.pixels import Floats
 from hqgs.scene.scene import View
@@ -31,7 +30,12 @@ class Twin:
 
 
 def find_copies(
-    views: Sequence[View], looks: Sequence[Look], sight: Sight, rank: Floats, gone: set[int]
+    views: Sequence[View],
+    looks: Sequence[Look],
+    sight: Sight,
+    rank: Floats,
+    gone: set[int],
+    inspector: Inspector,
 ) -> tuple[list[Twin], list[Twin], str | None]:
     """Copies; photos from the same place with another picture; and what the photos average away.
 
@@ -48,7 +52,7 @@ def find_copies(
             near[k] = list(zip(others.tolist(), parallax.tolist(), strict=True))
     if not near:
         return [], [], None
-    averaged = _averaged(views)
+    averaged = _averaged(views, inspector)
     copies: dict[int, Twin] = {}
     unlike: dict[int, Twin] = {}
     for k, others in near.items():
@@ -84,10 +88,10 @@ def _same_mask(a: View, b: View) -> bool:
     return bool(np.array_equal(a.mask, b.mask))
 
 
-def _averaged(views: Sequence[View]) -> str | None:
+def _averaged(views: Sequence[View], inspector: Inspector) -> str | None:
     """What several photos of the same picture average away, by the diagnosis of a few of them."""
     chosen = np.unique(np.linspace(0, len(views) - 1, PROBES).round().astype(np.int64))
-    found = [inspect_photo(v.name, v.image, v.low).diagnosis for v in (views[k] for k in chosen)]
+    found = [inspector.inspect(views[k]).diagnosis for k in chosen]
     noises = [photo.noise for photo in found if photo.noise is not None and photo.noise >= photo.noise_limit]
     if 2 * len(noises) > len(found):
         return f"noise of {np.median(noises):.0f} levels"

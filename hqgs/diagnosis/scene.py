@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
+from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import NONE, parse_degradation
-from hqgs.scene.scene import Scene
+from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
 PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
@@ -42,6 +43,64 @@ class Diagnosis:
         """Per part: its name, whether the method needs it, and why, in one sentence."""
         return [(part.name, part.needed, part.reason) for part in self.parts]
 
+    def __str__(self) -> str:
+        """One row per photo, the formation, and per part whether it is needed and why."""
+        rows = [_HEAD, *(_row(photo) for photo in self.photos)]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
+        lines = [
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
+        lines += ["", f"{self.scene}: {self.formation}"]
+        for name, needed, reason in self.needs():
+            lines.append(f"  {name:8}{'needed   ' if needed else 'left out '} {reason}")
+        return "\n".join(lines)
+
+
+class Inspector:
+    """Looks at photos, at each once however often it is asked for.
+
+    It holds what it has seen of their pixels: keep it no longer than a run needs to start.
+    """
+
+    def __init__(self) -> None:
+        # By identity, with the views, so that no other can come to have it.
+        self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
+        self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
+
+    def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
+        """`inspect_photo` of a view; `enlargement` where it is known."""
+        key = id(view), enlargement
+        if key not in self._inspected:
+            found = inspect_photo(view.name, view.image, view.low, enlargement=enlargement)
+            self._inspected[key] = view, found
+        return self._inspected[key][1]
+
+    def diagnose(self, scene: Scene, max_photos: int = 16) -> Diagnosis:
+        """As `diagnose_scene`."""
+        if max_photos < 1:
+            raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
+        chosen = np.unique(np.linspace(0, len(scene.train) - 1, max_photos).round().astype(np.int64))
+        found: list[Inspected] = []
+        for view in (scene.train[k] for k in chosen):
+            probes = [f.diagnosis for f in found[:PROBES] if f.diagnosis.enlargement.evidence is not None]
+            known = None
+            if (
+                len(probes) == PROBES
+                and len({(p.enlargement.factor, p.height, p.width) for p in probes}) == 1
+            ):
+                first = probes[0]
+                if view.image.shape[:2] == (first.height, first.width):
+                    known = first.enlargement
+            found.append(self.inspect(view, known))
+        key = tuple(map(id, found))
+        if key not in self._concluded:
+            self._concluded[key] = tuple(conclude(found))
+        photos = self._concluded[key]
+        parts = (_blur(photos), _lowres(photos), _noise(photos), _jpeg(photos))
+        text = "+".join(part.step for part in parts if part.step is not None) or NONE
+        return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+
 
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     """Diagnose up to `max_photos` training photos, spread over the scene, and sum them up by medians.
@@ -50,25 +109,7 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     formation: when in doubt, "none". Under JPEG of visible quality noise and blur come from the coefficients
     of all photos together. ValueError for `max_photos` below 1, or a bad photo, which is named.
     """
-    if max_photos < 1:
-        raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
-    views = scene.train
-    chosen = [
-        views[k] for k in np.unique(np.linspace(0, len(views) - 1, max_photos).round().astype(np.int64))
-    ]
-    found: list[Inspected] = []
-    for view in chosen:
-        probes = [f.diagnosis for f in found[:PROBES] if f.diagnosis.enlargement.evidence is not None]
-        known = None
-        if len(probes) == PROBES and len({(p.enlargement.factor, p.height, p.width) for p in probes}) == 1:
-            first = probes[0]
-            if view.image.shape[:2] == (first.height, first.width):
-                known = first.enlargement
-        found.append(inspect_photo(view.name, view.image, view.low, enlargement=known))
-    photos = tuple(conclude(found))
-    parts = (_blur(photos), _lowres(photos), _noise(photos), _jpeg(photos))
-    text = "+".join(part.step for part in parts if part.step is not None) or NONE
-    return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+    return Inspector().diagnose(scene, max_photos)
 
 
 def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:
@@ -156,19 +197,6 @@ def _pooled(photos: Sequence[PhotoDiagnosis]) -> bool:
 def _spread_of(values: Sequence[float]) -> float:
     """1.4826 times the median distance from the median: a normal distribution's standard deviation."""
     return float(1.4826 * np.median(np.abs(np.asarray(values) - np.median(values))))
-
-
-def format_diagnosis(diagnosis: Diagnosis) -> str:
-    """One row per photo, the formation, and per part whether it is needed and why."""
-    rows = [_HEAD, *(_row(photo) for photo in diagnosis.photos)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
-    lines = [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
-    lines += ["", f"{diagnosis.scene}: {diagnosis.formation}"]
-    for name, needed, reason in diagnosis.needs():
-        lines.append(f"  {name:8}{'needed   ' if needed else 'left out '} {reason}")
-    return "\n".join(lines)
 
 
 def _row(photo: PhotoDiagnosis) -> tuple[str, ...]:

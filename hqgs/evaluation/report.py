@@ -8,17 +8,31 @@ import shutil
 import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from hqgs.base.files import atomic_path, write_json
+from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, evaluate_view, mean_metrics
+from hqgs.evaluation.records import (
+    GuardRecord,
+    HistoryEntry,
+    Json,
+    MetricsRecord,
+    MetricValues,
+    Report,
+    RunRecord,
+    SfmRecord,
+)
+from hqgs.photos.files import PHOTO_SUFFIXES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 REPORT, CHART, PICTURES = "report.json", "error_vs_time.png", "comparison"
 AMPLIFICATION = 4  # of the difference in the pictures
@@ -28,12 +42,11 @@ MASKED = (
     158,
     170,
 )  # difference panel where the mask leaves the photo out: no grey that a difference has
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a training run hands to `write_report`. `config` and the lists hold plain JSON values."""
+    """What a training run hands to `write_report`; see `RunRecord`."""
 
     scene: str
     source: str  # format the scene was read from
@@ -44,19 +57,27 @@ class RunResult:
     seconds: float  # training time, without loading and without this report
     gaussians: int
     peak_rss_mb: float | None
-    history: list[dict[str, Any]]  # {"iteration", "seconds", "psnr", "ssim"}: held-out means while training
+    history: list[HistoryEntry]
     length: int  # iterations of the whole run; fewer were done where it was stopped
-    left_out: list[dict[str, Any]]  # `LeftOut.known`
+    left_out: list[LeftOutRecord]
     decision_seconds: float  # of `seconds`: to find out what may be left out
-    scene_bytes: int  # of scene.ply
-    config: dict[str, Any]
-    guard: dict[str, Any]  # what was not finite: `Guard.summary`
+    scene_bytes: int | None  # of scene.ply; None: nothing was written
+    config: dict[str, Json]
+    guard: GuardRecord
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
     views: list[RenderedView] = field(repr=False)
-    sfm: dict[str, Any] | None = None  # `SfmReport`; None: poses and points are the scene's own
+    sfm: SfmRecord | None = None
 
 
-def write_report(out_dir: str | Path, result: RunResult) -> dict[str, Any]:
+def measure(result: RunResult) -> Report:
+    """The report, with the held-out views measured; it names no pictures yet.
+
+    Raises ValueError where a field is no JSON value, or a view's render, photo and mask do not fit.
+    """
+    return _report(result, [_evaluate(view) for view in result.views], None)
+
+
+def write_report(out_dir: str | Path, result: RunResult) -> Report:
     """Measure the held-out views and write the report into `out_dir`; return what report.json holds.
 
     Files: `comparison/<view>.png` (photo | render | amplified difference), `error_vs_time.png` and
@@ -64,24 +85,12 @@ def write_report(out_dir: str | Path, result: RunResult) -> dict[str, Any]:
     report.json is moved last, so where it exists everything else does. A run that fails before the move
     leaves an older report as it was. Pictures of other view names are not removed.
 
-    Raises ValueError where a field is no JSON value, or a view's render, photo and mask do not fit.
+    Raises ValueError as `measure` does, OSError where a file cannot be written.
     """
     out_dir = Path(out_dir)
-    head = _head(result)
     metrics = [_evaluate(view) for view in result.views]
-    mean = mean_metrics(metrics)
     files = _file_names([view.name for view in result.views])
-    measured = {
-        "metrics": {
-            "mean": _values(mean),
-            "views": [
-                {"name": view.name, **_values(m), "picture": f"{PICTURES}/{file}"}
-                for view, m, file in zip(result.views, metrics, files, strict=True)
-            ],
-            "reasons": mean.reasons,
-        }
-    }
-    report = measured | head | {"machine": machine_facts(), "versions": version_facts()}
+    report = _report(result, metrics, files)
 
     out_dir.mkdir(parents=True, exist_ok=True)
     for leftover in out_dir.glob(".report.*"):  # of a run that was killed
@@ -102,7 +111,7 @@ def write_report(out_dir: str | Path, result: RunResult) -> dict[str, Any]:
     return report
 
 
-def read_report(path: str | Path) -> dict[str, Any]:
+def read_report(path: str | Path) -> Report:
     """Read a report.json. Raises FileNotFoundError, or ValueError where the file is no report."""
     path = Path(path)
     try:
@@ -114,7 +123,7 @@ def read_report(path: str | Path) -> dict[str, Any]:
     missing = {"mean", "views", "reasons"} - report["metrics"].keys()
     if missing:
         raise ValueError(f"{path} is no hqgs report: its metrics lack {', '.join(sorted(missing))}")
-    return report
+    return cast(Report, report)
 
 
 def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
@@ -147,6 +156,8 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
 
 def error_chart(result: RunResult) -> Figure:
     """Held-out PSNR and SSIM against training time, one panel each."""
+    from matplotlib.figure import Figure  # here: only what draws a chart waits for it
+
     figure = Figure(figsize=(7, 5.2), dpi=150, layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     title = f"{result.scene}, {result.method}, seed {result.seed}: held-out views while training"
@@ -158,8 +169,10 @@ def error_chart(result: RunResult) -> Figure:
     return figure
 
 
-def _curve(axes: Axes, history: list[dict[str, Any]], key: str, label: str, last: str, color: str) -> None:
-    points = [(h["seconds"], h[key]) for h in history if h[key] is not None]
+def _curve(
+    axes: Axes, history: list[HistoryEntry], key: Literal["psnr", "ssim"], label: str, last: str, color: str
+) -> None:
+    points = [(h["seconds"], value) for h in history if (value := h[key]) is not None]
     axes.set_ylabel(label)
     axes.grid(color="#dddddd", linewidth=0.7)
     axes.spines[["top", "right"]].set_visible(False)
@@ -182,7 +195,22 @@ def _curve(axes: Axes, history: list[dict[str, Any]], key: str, label: str, last
     )
 
 
-def _head(result: RunResult) -> dict[str, Any]:
+def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | None) -> Report:
+    """The report of measured views; `files`: the names of their pictures."""
+    mean = mean_metrics(metrics)
+    pictures = [None] * len(metrics) if files is None else [f"{PICTURES}/{file}" for file in files]
+    measured: MetricsRecord = {
+        "mean": _values(mean),
+        "views": [
+            {"name": view.name, **_values(m), "picture": picture}
+            for view, m, picture in zip(result.views, metrics, pictures, strict=True)
+        ],
+        "reasons": mean.reasons,
+    }
+    return {"metrics": measured, **_head(result), "machine": machine_facts(), "versions": version_facts()}
+
+
+def _head(result: RunResult) -> RunRecord:
     """The fields that go into the report as they are; all but the pictures."""
     head = {name: value for name, value in vars(result).items() if name != "views"}
     for name, value in head.items():
@@ -190,7 +218,7 @@ def _head(result: RunResult) -> dict[str, Any]:
             json.dumps(value, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ValueError(f"RunResult.{name} cannot be written as JSON: {error}") from error
-    return head
+    return cast(RunRecord, head)
 
 
 def _evaluate(view: RenderedView) -> ViewMetrics:
@@ -200,9 +228,9 @@ def _evaluate(view: RenderedView) -> ViewMetrics:
         raise ValueError(f"view {view.name!r}: {error}") from error
 
 
-def _values(metrics: ViewMetrics) -> dict[str, float | None]:
+def _values(metrics: ViewMetrics) -> MetricValues:
     values = asdict(metrics)
-    return {metric: values[metric] for metric in METRICS}
+    return cast(MetricValues, {metric: values[metric] for metric in METRICS})
 
 
 def _file_names(views: list[str]) -> list[str]:
@@ -226,7 +254,9 @@ def _printable(text: str, longest: int = 60) -> str:
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
-def _caption_font(captions: list[str], width: int, height: int) -> tuple[Any, int]:
+def _caption_font(
+    captions: list[str], width: int, height: int
+) -> tuple[ImageFont.FreeTypeFont | ImageFont.ImageFont, int]:
     """The largest font, in proportion to the picture, in which all captions fit; and the line's height."""
     size = min(max(height // 26, 14), 40)
     font = ImageFont.load_default(size)

@@ -1,1 +1,1 @@
-"""Scene files: PLY, SPZ, fewer bands of the harmonics."""
+"""Smaller scene files: fewer Gaussians, fewer bands of the harmonics, fewer bits."""

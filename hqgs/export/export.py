@@ -10,7 +10,6 @@ Gaussian's opacity bounds its weight in a pixel.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,37 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hqgs.base.files import PLY
+from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
-from hqgs.export.ply import read_ply, write_ply
-from hqgs.export.spz import SH_BITS, encode_spz, read_spz, write_spz
-from hqgs.model.gaussians import MAX_SH_DEGREE, Gaussians
+from hqgs.export.options import ExportOptions
+from hqgs.model.formats.spz import encode_spz, write_spz
+from hqgs.model.gaussians import Gaussians
 
-READERS: dict[str, Callable[[Path], Gaussians]] = {"ply": read_ply, "spz": read_spz}
-ALPHA_MIN = 1 / 255  # docs/conventions.md: no pixel shows less
-QUAT_NORM2_MIN = 1e-12  # docs/conventions.md: such a rotation is culled
 BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
 CURVE_BITS = 10  # of a cell along each axis
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """What is written of a scene."""
-
-    format: str  # "ply" or "spz"
-    sh_degree: int = MAX_SH_DEGREE  # at most
-    band_tolerance: float = 0.004  # of a colour, white at 1: a level of an 8-bit picture; 0: every band stays
-    sh_bits: tuple[int, int] = SH_BITS  # SPZ: of the coefficients of degree 1, and of degrees 2 and 3
-
-    def __post_init__(self) -> None:
-        if self.format not in READERS:
-            raise ValueError(f"format is {self.format!r}, wanted one of: {', '.join(READERS)}")
-        if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
-            raise ValueError(f"sh_degree is {self.sh_degree}, wanted 0..{MAX_SH_DEGREE}")
-        if not 0 <= self.band_tolerance < math.inf:
-            raise ValueError(f"band_tolerance is {self.band_tolerance}, wanted a number that is not negative")
-        if not all(1 <= bits <= 8 for bits in self.sh_bits):
-            raise ValueError(f"sh_bits is {self.sh_bits}, wanted two numbers in 1..8")
 
 
 @dataclass(frozen=True)
@@ -64,47 +40,21 @@ class Export:
     clipped: dict[str, int]  # SPZ: values outside its ranges, by name
 
 
-def read_scene_file(path: str | Path) -> Gaussians:
-    """The Gaussians of a PLY or SPZ file, or of scene.ply in the folder of a run.
-
-    Raises FileNotFoundError, or ValueError where it is no such file; the message names it.
-    """
-    path = scene_file(path)
-    return READERS[format_of(path)](path)
-
-
-def scene_file(path: str | Path) -> Path:
-    """The file itself, or scene.ply of a run's folder. FileNotFoundError where there is none."""
-    path = Path(path)
-    file = path / PLY if path.is_dir() else path
-    if not file.is_file():
-        raise FileNotFoundError(f"there is no {file}")
-    return file
-
-
-def format_of(path: Path) -> str:
-    """The format that a file's suffix names. ValueError for another suffix."""
-    name = path.suffix[1:].lower()
-    if name not in READERS:
-        raise ValueError(f"{path}: the suffix says no format; wanted .{' or .'.join(READERS)}")
-    return name
-
-
 def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Export:
     """Write what the options leave of the Gaussians, atomically.
 
     The Gaussians of a PLY file keep their order, those of an SPZ file get one that packs well.
 
-    Raises ValueError where SPZ cannot hold the scene (see `hqgs.spz.encode_spz`).
+    Raises ValueError where SPZ cannot hold the scene (see `hqgs.model.formats.spz.encode_spz`).
     """
     path = Path(path)
     steps = reduce_gaussians(gaussians, options)
     reduced = steps[-1].gaussians if steps else gaussians
     clipped: dict[str, int] = {}
     if options.format == "ply":
-        write_ply(path, reduced)
+        reduced.save(path, options.format)
     else:
-        clipped = write_spz(path, along_a_curve(reduced), options.sh_bits).clipped
+        clipped = write_spz(path, along_a_curve(reduced).arrays(), options.sh_bits).clipped
     written = path.stat().st_size
     sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
     sizes.append(_size(reduced, options) if options.format == "ply" else written)
@@ -223,6 +173,6 @@ def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
     if options.format == "ply":
         return 4 * len(gaussians) * (3 + 3 + gaussians.shN.shape[1] * 3 + 1 + 3 + 4)
     try:
-        return len(encode_spz(along_a_curve(gaussians), options.sh_bits).data)
+        return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits).data)
     except ValueError:
         return None

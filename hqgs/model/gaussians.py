@@ -1,24 +1,30 @@
-"""The Gaussians as trainable tensors, their activations, and how they start from a point cloud."""
+"""The Gaussians as trainable tensors: how they start, how they look from a camera, and their files."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from torch import Tensor
 
-SH_C0 = 0.28209479177387814  # the constant basis function: 1 / (2 sqrt(pi))
-MAX_SH_DEGREE = 3
+from hqgs.base.threads import one_torch_thread
+from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE, SH_C0
+from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.files import READERS, WRITERS, format_of, scene_file
+from hqgs.model.render import render_view
+from hqgs.scene.scene import Camera
+
 MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
 INITIAL_OPACITY = 0.1
 NEIGHBORS = 3  # a point's first scale comes from its 3 nearest neighbours
 
 
-@dataclass
+@dataclass(repr=False)
 class Gaussians:
     """N Gaussians before their activations: exp for the scales, the sigmoid for the opacities.
 
@@ -43,6 +49,9 @@ class Gaussians:
         if self.shN.ndim != 3 or self.shN.shape[::2] != (n, 3) or self.shN.shape[1] not in sizes:
             raise ValueError(f"shN has shape {list(self.shN.shape)}, wanted [{n}, one of {sizes}, 3]")
 
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self)}, sh_degree={self.sh_degree})"
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
@@ -59,6 +68,17 @@ class Gaussians:
         """The same values (shared memory) without a gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.named().items()})
 
+    def arrays(self) -> Arrays:
+        """The same values (shared memory) as numpy arrays, by the names of the fields."""
+        return {
+            "means": self.means.detach().numpy(),
+            "scales": self.scales.detach().numpy(),
+            "quats": self.quats.detach().numpy(),
+            "opacities": self.opacities.detach().numpy(),
+            "sh0": self.sh0.detach().numpy(),
+            "shN": self.shN.detach().numpy(),
+        }
+
     def activated_scales(self) -> Tensor:
         """Standard deviations [N, 3] in world units."""
         return torch.exp(self.scales)
@@ -66,6 +86,69 @@ class Gaussians:
     def activated_opacities(self) -> Tensor:
         """Opacities [N] in (0, 1)."""
         return torch.sigmoid(self.opacities)
+
+    def render(
+        self, camera: Camera, *, background: Sequence[float] = BACKGROUND, sh_degree: int | None = None
+    ) -> Tensor:
+        """The view of a camera: an image [H, W, 3], a tensor in the Gaussians' dtype that is not clamped.
+
+        Gradients flow to the tensors that ask for one; wrap the call in `torch.no_grad()` to only look.
+        `hqgs.rasterization` gives depth, alpha and several cameras at once. Same bits for any number of
+        threads.
+
+        Args:
+            camera: size and pinhole intrinsics in pixels, world to camera.
+            background: R, G, B behind everything.
+            sh_degree: of the harmonics in use, 0..3; None: all that there are.
+
+        Raises:
+            ValueError: a degree that the Gaussians do not have, or a background that is no three numbers.
+        """
+        degree = self.sh_degree if sh_degree is None else sh_degree
+        if not 0 <= degree <= self.sh_degree:
+            raise ValueError(f"sh_degree is {degree}, wanted 0..{self.sh_degree}")
+        if len(background) != 3:
+            raise ValueError(f"background is {background}, wanted three numbers: R, G, B")
+        with one_torch_thread():
+            return render_view(self, camera, degree, background)[0]
+
+    def save(self, path: str | Path, format: str | None = None) -> int:
+        """Write a scene file atomically; return how many Gaussians were left out as NaN or Inf.
+
+        Args:
+            path: ends in .ply (the layout of 3DGS, exact) or .spz (a tenth as large, with the errors that
+                docs/export.md states).
+            format: "ply" or "spz" for a file with another suffix.
+
+        Raises:
+            ValueError: another suffix or format, or a scene that does not fit the ranges of SPZ.
+            OSError: the file cannot be written; what was there before stays.
+        """
+        path = Path(path)
+        return WRITERS[format_of(path, format)](path, self.arrays())
+
+    @classmethod
+    def load(cls, path: str | Path, format: str | None = None) -> Gaussians:
+        """Read a scene file, float32: ours, or a PLY file of 3DGS, gsplat or Brush.
+
+        Args:
+            path: a .ply or .spz file, or the folder of a run.
+            format: "ply" or "spz" for a file with another suffix.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is no such file, or it is damaged; the message names the file and the property.
+        """
+        file = scene_file(path)
+        arrays = READERS[format_of(file, format)](file)
+        return cls(
+            means=torch.from_numpy(arrays["means"]),
+            scales=torch.from_numpy(arrays["scales"]),
+            quats=torch.from_numpy(arrays["quats"]),
+            opacities=torch.from_numpy(np.ascontiguousarray(arrays["opacities"])),
+            sh0=torch.from_numpy(arrays["sh0"]),
+            shN=torch.from_numpy(arrays["shN"]),
+        )
 
     @classmethod
     def from_points(
@@ -110,6 +193,8 @@ class Gaussians:
 
 def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
     """Mean squared distance of each point [P, 3] to its 3 nearest other points, [P]."""
+    from scipy.spatial import KDTree  # here: to render or to read a file needs no scipy
+
     xyz = points.astype(np.float64)
     distances, _ = KDTree(xyz).query(xyz, k=NEIGHBORS + 1)  # the first is the point itself
     return np.square(distances[:, 1:]).mean(axis=1)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hqgs.model.gaussians import SH_C0, Gaussians
+from hqgs.model.constants import SH_C0
+from hqgs.model.gaussians import Gaussians
 from hqgs.scene.geometry import in_picture
 from hqgs.scene.scene import View
 

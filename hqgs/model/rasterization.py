@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hqgs._rust import get_num_threads, set_num_threads
+from hqgs._rust import EPS2D, FAR_PLANE, NEAR_PLANE, TILE
 from hqgs.model.autograd import _Composite, _Project
 
-__all__ = ["get_num_threads", "rasterization", "set_num_threads"]
+__all__ = ["RasterizationMeta", "rasterization"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
+
+
+class RasterizationMeta(TypedDict):
+    """What `rasterization` knows beside its images, of N Gaussians in C cameras."""
+
+    means2d: Tensor  # [C, N, 2], pixels; call `.retain_grad()` on it to get its gradient
+    radii: Tensor  # [C, N, 2], int32, pixels; 0 where culled
+    depths: Tensor  # [C, N], world units along the viewing axis
+    conics: Tensor  # [C, N, 3], 1/px^2: the inverse 2D covariance's xx, xy, yy
+    opacities: Tensor  # [C, N], after the compensation of "antialiased"
+    width: int
+    height: int
+    tile_size: int
+    n_cameras: int
+    camera_ids: None  # gsplat has them where it packs its arrays; nothing is packed here
+    gaussian_ids: None
+    work: tuple[int, int, int]  # pairs of Gaussian and tile, blocks evaluated, blocks with a change
 
 
 def rasterization(
@@ -26,13 +43,13 @@ def rasterization(
     Ks: Tensor,
     width: int,
     height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
+    near_plane: float = NEAR_PLANE,
+    far_plane: float = FAR_PLANE,
     radius_clip: float = 0.0,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int = TILE,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
@@ -41,8 +58,8 @@ def rasterization(
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
-    **unsupported: Any,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    **unsupported: object,
+) -> tuple[Tensor, Tensor, RasterizationMeta]:
     """Render N Gaussians into C pinhole cameras; code written for `gsplat.rasterization` runs unchanged.
 
     Gradients flow to every tensor argument but `Ks`; what does not require one is not computed. Frames,
@@ -66,15 +83,13 @@ def rasterization(
         backgrounds: colour behind everything, [C, D]; None is 0.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), "RGB+D" or "RGB+ED"; depth is
             the last channel.
-        absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
+        absgrad: also leave the sum over pixels of |d loss / d means2d| in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
 
     Returns:
-        render_colors [C, height, width, X], render_alphas [C, height, width, 1], and a dict with means2d
-        [C, N, 2] (call `.retain_grad()` on it to get its gradient), radii [C, N, 2] int32 (0 where
-        culled), depths [C, N], conics [C, N, 3], opacities [C, N], width, height, n_cameras, tile_size
-        and work (pairs, blocks evaluated, blocks with a change; `hqgs.model.work_counts` counts more).
+        render_colors [C, height, width, X], not clamped; render_alphas [C, height, width, 1]; and
+        `RasterizationMeta`, the positions, radii and depths of the Gaussians in each camera among it.
 
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
@@ -96,10 +111,10 @@ def rasterization(
         raise ValueError(f"rasterize_mode: must be one of {RASTERIZE_MODES}, got {rasterize_mode!r}")
     for name, value, low in (("width", width, 1), ("height", height, 1)):
         if int(value) != value or value < low:
-            raise ValueError(f"{name}: must be an integer of at least {low}, got {value!r}")
+            raise ValueError(f"{name}: must be an integer of at least {low}, got {_short(value)}")
     for name, value in (("eps2d", eps2d), ("near_plane", near_plane), ("radius_clip", radius_clip)):
         if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name}: must be finite and not negative, got {value!r}")
+            raise ValueError(f"{name}: must be finite and not negative, got {_short(value)}")
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
     _check_colors(colors, rest, n, c, sh_degree)
@@ -119,9 +134,7 @@ def rasterization(
     )
     channels: Tensor = sh_colors if sh_degree is not None else colors
     if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
-        raise ValueError(
-            f"backgrounds: expected shape {(c, channels.shape[-1])}, got {tuple(backgrounds.shape)}"
-        )
+        raise ValueError(f"backgrounds: expected shape {[c, channels.shape[-1]]}, got {_shape(backgrounds)}")
     if render_mode in ("D", "ED"):
         channels, backgrounds = depths[..., None], None
     elif render_mode != "RGB":
@@ -133,7 +146,7 @@ def rasterization(
     image, alphas, work = _Composite.apply(frame, means2d, link, alphas_in, channels, backgrounds, absgrad)
     if render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    meta = {
+    meta: RasterizationMeta = {
         "means2d": means2d,
         "radii": radii,
         "depths": depths,
@@ -159,9 +172,14 @@ _NEUTRAL = {
     "with_eval3d": (False,),
     "rolling_shutter": (None, 0),
 }
+_REASONS = {
+    "covars": "hqgs takes the shape of a Gaussian as quats and scales",
+    "distributed": "hqgs renders in one process",
+    "extra_signals": "hqgs renders what is in colors; append the signals to them",
+}
 
 
-def _refuse(unsupported: dict[str, Any]) -> None:
+def _refuse(unsupported: dict[str, object]) -> None:
     known = {
         *_NEUTRAL, "covars", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
         "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs", "extra_signals", "rays",
@@ -169,15 +187,29 @@ def _refuse(unsupported: dict[str, Any]) -> None:
     for name, value in unsupported.items():
         if name not in known:
             raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
-        neutral = getattr(value, "name", None) == "GLOBAL" or value in _NEUTRAL.get(name, (None,))
-        if not neutral:
-            raise NotImplementedError(f"{name}: hqgs renders pinhole cameras only, got {value!r}")
+        neutral = _NEUTRAL.get(name, (None,))
+        absent = not isinstance(value, Tensor) and (
+            value in neutral or getattr(value, "name", "") == "GLOBAL"
+        )
+        if not absent:
+            why = _REASONS.get(name, "hqgs renders one image of a pinhole camera at a time")
+            raise NotImplementedError(f"{name}: {why}, got {_short(value)}")
+
+
+def _short(value: object) -> str:
+    """A value for a message of one line: of a tensor its shape alone."""
+    return f"a tensor {_shape(value)}" if isinstance(value, Tensor) else repr(value)[:60]
+
+
+def _shape(tensor: Tensor) -> str:
+    return str(list(tensor.shape))
 
 
 def _check_tensors(tensors: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> None:
     for name, value in {**tensors, "viewmats": viewmats, "Ks": Ks}.items():
         if not isinstance(value, Tensor):
-            raise ValueError(f"{name}: expected a torch tensor, got {type(value).__name__}")
+            like = " such as torch.zeros(C, D)" if name == "backgrounds" else ""
+            raise ValueError(f"{name}: expected a torch tensor{like}, got {_short(value)}")
         if value.device.type != "cpu":
             raise ValueError(f"{name}: must be on the CPU, got a tensor on {value.device}")
         if value.dtype not in (torch.float32, torch.float64):
@@ -186,16 +218,28 @@ def _check_tensors(tensors: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> 
     for name, value in tensors.items():
         if value.dtype != means.dtype:
             raise ValueError(f"{name}: must have the dtype of means, {means.dtype}, got {value.dtype}")
-    n = means.shape[0] if means.dim() else 0
-    for name, shape in (("means", (n, 3)), ("quats", (n, 4)), ("scales", (n, 3)), ("opacities", (n,))):
-        if tensors[name].shape != shape:
-            raise ValueError(f"{name}: expected shape {shape}, got {tuple(tensors[name].shape)}")
-    c = viewmats.shape[0] if viewmats.dim() else 0
-    for name, value, shape in (("viewmats", viewmats, (c, 4, 4)), ("Ks", Ks, (c, 3, 3))):
-        if value.shape != shape or c == 0:
-            raise ValueError(f"{name}: expected shape {('C >= 1', *shape[1:])}, got {tuple(value.shape)}")
+    _check_shape("means", means, "N", 3)
+    n = len(means)
+    for name, shape in (("quats", [n, 4]), ("scales", [n, 3]), ("opacities", [n])):
+        if list(tensors[name].shape) != shape:
+            raise ValueError(f"{name}: expected shape {shape}, got {_shape(tensors[name])}")
+    _check_shape("viewmats", viewmats, "C", 4, 4)
+    c = len(viewmats)
+    if c == 0:
+        raise ValueError(f"viewmats: expected shape [C >= 1, 4, 4], got {_shape(viewmats)}")
+    if list(Ks.shape) != [c, 3, 3]:
+        raise ValueError(f"Ks: expected shape {[c, 3, 3]}, got {_shape(Ks)}")
     if Ks.requires_grad:
         raise NotImplementedError("Ks: no gradient with respect to the intrinsics; pass Ks.detach()")
+
+
+def _check_shape(name: str, value: Tensor, size: str, *fixed: int) -> None:
+    """Check that `value` is [any, *fixed]; its first `size` is what the other shapes are held against."""
+    if value.shape[1:] != fixed or value.dim() == 0:
+        batched = value.dim() > len(fixed) + 1 and value.shape[-len(fixed) :] == fixed
+        hint = "; hqgs takes no leading batch dimensions, call it for each scene" if batched else ""
+        expected = f"[{', '.join(map(str, (size, *fixed)))}]"
+        raise ValueError(f"{name}: expected shape {expected}, got {_shape(value)}{hint}")
 
 
 def _check_colors(colors: Tensor, rest: Tensor | None, n: int, c: int, sh_degree: int | None) -> None:

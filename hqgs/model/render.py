@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,24 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs import _rust
-from hqgs.model.gaussians import Gaussians
-from hqgs.model.rasterization import rasterization
+from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.scene.scene import Camera, View
 
-BACKGROUND = (0.0, 0.0, 0.0)  # RGB
-OPTIONS = (
-    0.01,
-    1e10,
-    0.0,
-    0.3,
-    False,
-    False,
-)  # near, far, radius_clip, eps2d, antialiased, as `render_view` renders; differentiable
+if TYPE_CHECKING:
+    from hqgs.model.gaussians import Gaussians  # which has this file's `render_view` as its method
+
+# As `render_view` renders: near, far, radius_clip, eps2d, antialiased; and not to be differentiated.
+OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D, False, False)
 
 
 def render_view(
-    gaussians: Gaussians, camera: Camera, sh_degree: int, background: tuple[float, float, float]
-) -> tuple[Tensor, dict[str, Any]]:
+    gaussians: Gaussians, camera: Camera, sh_degree: int, background: Sequence[float]
+) -> tuple[Tensor, RasterizationMeta]:
     """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
     # At degree 0 the higher harmonics are left out, so that they get no gradient full of zeros either.
     colors = (gaussians.sh0, gaussians.shN) if sh_degree else gaussians.sh0
@@ -43,7 +38,7 @@ def render_view(
         camera.width,
         camera.height,
         sh_degree=sh_degree,
-        backgrounds=torch.tensor([background]),
+        backgrounds=torch.tensor([[*background]], dtype=gaussians.means.dtype),
     )
     return images[0], meta
 

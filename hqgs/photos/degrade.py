@@ -1,24 +1,36 @@
-"""How photos get bad: JPEG, noise, low resolution and blur, as pure functions of a photo and a generator.
+"""How photos get bad, as pure functions of photos and generators.
 
-Photos are sRGB as stored, scaled to [0, 1]; nothing is linearised, as in the field's benchmarks.
+Photos are sRGB as stored, scaled to [0, 1]. JPEG, noise, low resolution, blur, defocus and motion happen to
+these values and nothing is linearised, as in the field's benchmarks; what a hand or a camera does happens in
+linear light (shake, exposure, phone).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 from hqgs.base.threads import one_torch_thread
-from hqgs.photos.formula import Degradation, small_side
+from hqgs.photos.camera import draw_gains, expose
+from hqgs.photos.formula import VIDEOS, Degradation, Step, small_side
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.kernels import REACH, disc_kernel, motion_kernel
+from hqgs.photos.light import to_linear, to_srgb
+from hqgs.photos.phone import FULL_WELL, phone_jpeg
 from hqgs.photos.pixels import Float32, as_floats
 from hqgs.photos.resize import resize
+from hqgs.photos.shake import draw_path, draw_strength, path_length, shake_kernel
+from hqgs.photos.video import film
+
+CHAT_QUALITIES = (40, 70)  # of a messenger's JPEG: the lowest and highest, all equally likely
+JPEG_FILES = ("jpeg", "phone")  # these kinds end in a JPEG file
+
+Record = dict[str, Any]  # what one step did to one photo: "kind", "value" and the kind's own values, for JSON
 
 
 @dataclass(frozen=True)
@@ -27,36 +39,105 @@ class Degraded:
 
     image: Float32  # [H, W, 3], the size of the clean photo; may leave [0, 1]
     low: Float32 | None  # [h, w, 3]: with a low-res step, the small photo that `image` was enlarged from
-    jpeg: bytes | None  # where JPEG is the last step: the file whose pixels `low`, or else `image`, holds
+    jpeg: (
+        bytes | None
+    )  # where JPEG or a phone is the last step: the file whose pixels `low`, or else `image`, holds
+    records: list[Record] = field(default_factory=list)  # one for each step that happened to this photo
 
 
 def degrade_image(
-    image: NDArray[np.uint8] | Float32, degradation: Degradation, rng: np.random.Generator
+    image: NDArray[np.uint8] | Float32,
+    degradation: Degradation,
+    rng: np.random.Generator,
+    factor: float | None = None,
 ) -> Degraded:
     """Apply the steps to a clean photo [H, W, 3], uint8 or float32 with white at 1.
 
     Low-res makes the photo small; later steps then happen to the small photo, and at the end bicubic
-    resizing brings it back to H x W. Noise and the motion's direction come from `rng`, in the order of the
-    steps. ValueError for a photo of another type or shape, one that is not finite, or a blur too wide for it.
+    resizing brings it back to H x W. What is random comes from `rng`, in the order of the steps. A `some`
+    step happens with `factor` times its value, and not at all without one. A video is a film of this one
+    photo; `degrade_sequence` is for more. ValueError for a photo of another type or shape, one that is not
+    finite, or a blur too wide for it.
+
+    What the records hold beside "kind" and "value" (the step's, with its factor):
+    motion: "direction" (radians from x towards y, which points down);
+    shake: "extent" and "length" of the path in px, and "path", its four knots [[x, y], ...] in px
+    (`hqgs.photos.shake`); the extent is uniform in [0.2, 1] times the value;
+    exposure: "gains" of red, green and blue in linear light (`hqgs.photos.camera`);
+    chat: "size" of the small photo [width, height] and "quality";
+    phone: "electrons" of white;
+    video, video265: "frame" (its type: I, P or B) and "bytes" of the compressed frame.
     """
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype not in (np.uint8, np.float32):
-        raise ValueError(f"image must be [H, W, 3] uint8 or float32, got {image.shape} {image.dtype}")
-    if not np.isfinite(image).all():
-        raise ValueError("image holds NaN or Inf")
-    now = as_floats(image)
-    small, jpeg = False, None
-    for step in degradation.for_width(image.shape[1]).steps:
-        amount, jpeg = step.value or 0.0, None
+    return degrade_sequence([image], degradation, [rng], [factor])[0]
+
+
+def degrade_sequence(
+    images: Sequence[NDArray[np.uint8] | Float32],
+    degradation: Degradation,
+    rngs: Sequence[np.random.Generator],
+    factors: Sequence[float | None],
+) -> list[Degraded]:
+    """Apply the steps to photos in the order of a film: only `video` lets one photo depend on another.
+
+    Each photo has its generator and its factor as in `degrade_image`. ValueError as there, or for photos of
+    several sizes before a video.
+    """
+    photos = [_Photo(image, rng) for image, rng in zip(images, rngs, strict=True)]
+    all_steps = [degradation.for_width(*photo.size).steps for photo in photos]
+    for k, step in enumerate(degradation.steps):
+        if step.kind in VIDEOS:
+            crf = int(all_steps[0][k].value or 0)
+            frames = film([photo.now for photo in photos], crf, step.kind)
+            for photo, frame in zip(photos, frames, strict=True):
+                photo.now, photo.jpeg = frame.image, None
+                photo.records.append(
+                    {"kind": step.kind, "value": crf, "frame": frame.kind, "bytes": frame.bytes}
+                )
+            continue
+        for photo, steps, factor in zip(photos, all_steps, factors, strict=True):
+            if not step.some:
+                photo.apply(steps[k])
+            elif factor is not None:
+                photo.apply(steps[k].scaled(factor))
+    return [photo.degraded() for photo in photos]
+
+
+class _Photo:
+    """A photo on its way through the steps."""
+
+    def __init__(self, image: NDArray[np.uint8] | Float32, rng: np.random.Generator) -> None:
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype not in (np.uint8, np.float32):
+            raise ValueError(f"image must be [H, W, 3] uint8 or float32, got {image.shape} {image.dtype}")
+        if not np.isfinite(image).all():
+            raise ValueError("image holds NaN or Inf")
+        self.size = (image.shape[1], image.shape[0])
+        self.now, self.small, self.jpeg = as_floats(image), False, None
+        self.records: list[Record] = []
+        self._rng = rng
+
+    def apply(self, step: Step) -> None:
+        """One step that has a value and concerns this photo alone."""
+        value, self.jpeg = step.value or 0.0, None
+        own: Record = {}
         if step.kind == "jpeg":
-            jpeg = encode_jpeg(now, int(amount))
-            now = decode_jpeg(jpeg)
+            self._store(encode_jpeg(self.now, int(value)))
+        elif step.kind == "phone":
+            self._store(phone_jpeg(self.now, value, self._rng))
+            own = {"electrons": FULL_WELL / 2**value}
         elif step.kind == "lowres":
-            now, small = shrink(now, int(amount)), True
+            self.now, self.small = shrink(self.now, int(value)), True
         else:
-            now = _OPERATORS[step.kind](now, amount, rng)
-    if small:
-        return Degraded(resize(now, image.shape[0], image.shape[1]), now, jpeg)
-    return Degraded(now, None, jpeg)
+            self.now, own = _OPERATORS[step.kind](self.now, value, self._rng)
+        self.records.append({"kind": step.kind, "value": step.value, **own})
+
+    def degraded(self) -> Degraded:
+        if self.small:
+            width, height = self.size
+            return Degraded(resize(self.now, height, width), self.now, self.jpeg, self.records)
+        return Degraded(self.now, None, self.jpeg, self.records)
+
+    def _store(self, jpeg: bytes) -> None:
+        self.now, self.jpeg = decode_jpeg(jpeg), jpeg
 
 
 def add_noise(image: Float32, sigma: float, rng: np.random.Generator) -> Float32:
@@ -100,18 +181,73 @@ def convolve(image: Float32, kernel: NDArray[np.float64]) -> Float32:
     rows, columns = kernel.shape[0] // 2, kernel.shape[1] // 2
     _check_fits(image, max(rows, columns), f"kernel of {kernel.shape[1]} x {kernel.shape[0]} px")
     padded = np.pad(image.astype(np.float64), ((rows, rows), (columns, columns), (0, 0)), mode="reflect")
+    from scipy.signal import fftconvolve  # takes seconds to import
+
     return fftconvolve(padded, kernel[..., None], mode="valid", axes=(0, 1)).astype(np.float32)
 
 
-def _motion(image: Float32, length: float, rng: np.random.Generator) -> Float32:
-    return convolve(image, motion_kernel(length, rng.uniform(0, math.pi)))
+def shake(image: Float32, knots: NDArray[np.float64]) -> Float32:
+    """The mean over the exposure, in linear light, of the photo [H, W, 3] moved along a path in px.
+
+    `knots` [4, 2] (x right, y down) are those of `shake_kernel`: a point of light draws its path into the
+    photo. ValueError if the photo is smaller than the path reaches.
+    """
+    return to_srgb(convolve(to_linear(image), shake_kernel(knots)))
 
 
-_OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], Float32]] = {
-    "noise": add_noise,
-    "blur": lambda image, sigma, rng: gaussian_blur(image, sigma),
-    "defocus": lambda image, radius, rng: convolve(image, disc_kernel(radius)),
+def chat(image: Float32, side: int, quality: int) -> Float32:
+    """What a messenger makes of a photo [H, W, 3], at its size.
+
+    Antialiased bicubic shrinking until the longest side has `side` px (a photo that is no larger keeps its
+    size), the other side rounded; a JPEG of this quality with 4:2:0 chroma; bicubic enlarging.
+    """
+    height, width = image.shape[:2]
+    small = resize(image, *_chat_size(height, width, side))
+    return resize(decode_jpeg(encode_jpeg(small, quality)), height, width)
+
+
+def _chat_size(height: int, width: int, side: int) -> tuple[int, int]:
+    share = min(side / max(height, width), 1)
+    return max(round(height * share), 1), max(round(width * share), 1)
+
+
+_Own = tuple[Float32, Record]  # the photo, and what its record gets
+
+
+def _plain(operator: Callable[[Float32, float, np.random.Generator], Float32]) -> Callable[..., _Own]:
+    return lambda image, value, rng: (operator(image, value, rng), {})
+
+
+def _motion(image: Float32, length: float, rng: np.random.Generator) -> _Own:
+    direction = rng.uniform(0, math.pi)
+    return convolve(image, motion_kernel(length, direction)), {"direction": direction}
+
+
+def _shake(image: Float32, longest: float, rng: np.random.Generator) -> _Own:
+    extent = longest * draw_strength(rng)
+    knots = draw_path(rng, extent)
+    return shake(image, knots), {"extent": extent, "length": path_length(knots), "path": knots.tolist()}
+
+
+def _exposure(image: Float32, stops: float, rng: np.random.Generator) -> _Own:
+    gains = draw_gains(rng, stops)
+    return expose(image, gains), {"gains": gains.tolist()}
+
+
+def _chat(image: Float32, side: float, rng: np.random.Generator) -> _Own:
+    quality = int(rng.integers(CHAT_QUALITIES[0], CHAT_QUALITIES[1] + 1))
+    height, width = _chat_size(image.shape[0], image.shape[1], int(side))
+    return chat(image, int(side), quality), {"size": [width, height], "quality": quality}
+
+
+_OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], _Own]] = {
+    "noise": _plain(add_noise),
+    "blur": _plain(lambda image, sigma, rng: gaussian_blur(image, sigma)),
+    "defocus": _plain(lambda image, radius, rng: convolve(image, disc_kernel(radius))),
     "motion": _motion,
+    "shake": _shake,
+    "exposure": _exposure,
+    "chat": _chat,
 }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.photos.formula import Degradation, small_side
+from hqgs.photos.formula import Degradation, check_formation, small_side
 from hqgs.photos.kernels import REACH, disc_kernel, motion_kernel
 from hqgs.photos.operators import Kernel, Separable
 from hqgs.photos.resize import resize_matrix
@@ -64,7 +64,8 @@ def formation(
     """The linear steps of a degradation, for renders of `height` x `width` px.
 
     `direction` of the motion in radians from x towards y (down); without it motion is passed over, as are
-    noise and JPEG. None where no step is left. ValueError where a kernel is too large for the render.
+    noise and JPEG. None where no step is left. ValueError where a kernel is too large for the render, or for
+    a step that has no operator (`check_formation`).
     """
     operators: list[Operator] = []
     matrices: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # of the separable steps in a row
@@ -76,7 +77,7 @@ def formation(
             operators.append(Separable.of(*matrices))
             matrices = None
 
-    for step in degradation.for_width(width).steps:
+    for step in check_formation(degradation).for_width(width, height).steps:
         value = step.value or 0.0
         if step.kind in ("blur", "lowres"):
             if step.kind == "blur":

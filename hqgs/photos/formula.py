@@ -8,24 +8,35 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Kind:
-    """The values that one kind of step takes."""
+    """The values that one kind of step takes, and where it may stand."""
 
     lowest: float
     highest: float
     unit: str
     integer: bool = False
     at_504: float | None = None  # the value where none is written, in px of a photo 504 px wide
+    default: float | None = None  # the same, for a value that does not depend on the photo's size
+    formation: bool = True  # whether a method can be told of it: the same in all photos, or known from them
+    some: bool = True  # whether it may happen to some of the photos only
 
 
 KINDS = {
     "jpeg": Kind(1, 95, "a quality", integer=True),
     "noise": Kind(0.01, 255, "a standard deviation, where white is 255"),
-    "lowres": Kind(2, 16, "a factor", integer=True),
+    "lowres": Kind(2, 16, "a factor", integer=True, some=False),
     "blur": Kind(0.1, 50, "sigma in px", at_504=2.5),
     "defocus": Kind(0.5, 50, "a radius in px", at_504=5.0),
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
+    "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0, formation=False),
+    "exposure": Kind(0.01, 4, "the most stops to either side", default=1, formation=False),
+    "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
+    "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
+    "video": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
+    "video265": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
 }
-NONE, MIXED = "none", "mixed"
+NONE, MIXED, SOME = "none", "mixed", "some"
+LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
+VIDEOS = ("video", "video265")
 
 
 @dataclass(frozen=True)
@@ -33,24 +44,35 @@ class Step:
     """One step. ValueError for an unknown kind, or a value outside the kind's range."""
 
     kind: str
-    value: float | None = None  # None: the default, which scales with the photo's width
+    value: float | None = None  # None: the default, which may scale with the photo's size
+    some: bool = False  # whether it happens to half of the photos only, at mixed strengths
 
     def __post_init__(self) -> None:
+        if self.some and not (self.kind in KINDS and KINDS[self.kind].some):
+            wanted = ", ".join(name for name, kind in KINDS.items() if kind.some)
+            raise ValueError(f"{SOME} takes one of {wanted}; got {SOME}:{self.kind}")
         if self.kind not in KINDS:
             raise ValueError(
-                f"unknown degradation {self.kind!r}; there are: {', '.join([*KINDS, MIXED, NONE])}, and "
-                "steps joined by +"
+                f"unknown degradation {self.kind!r}; there are: {', '.join([*KINDS, MIXED, NONE])}, "
+                f"{SOME}:KIND, and steps joined by +"
             )
         kind = KINDS[self.kind]
         wanted = f"{kind.unit}, {'an integer in ' if kind.integer else ''}{kind.lowest:g}..{kind.highest:g}"
         if self.value is None:
-            if kind.at_504 is None:
+            if kind.at_504 is None and kind.default is None:
                 raise ValueError(f"{self.kind} needs a value: {self.kind}:VALUE with {wanted}")
         elif not kind.lowest <= self.value <= kind.highest or (kind.integer and self.value % 1):
             raise ValueError(f"{self.kind} is {self.value:g}, wanted {wanted}")
 
+    def scaled(self, factor: float) -> Step:
+        """The step with `factor` times its value, which it has, within the kind's range; for all photos."""
+        if self.value is None:
+            raise ValueError(f"{self} has no value that could be scaled")
+        return Step(self.kind, _within(KINDS[self.kind], self.value * factor))
+
     def __str__(self) -> str:
-        return self.kind if self.value is None else f"{self.kind}:{_shortest(self.value)}"
+        name = f"{SOME}:{self.kind}" if self.some else self.kind
+        return name if self.value is None else f"{name}:{_shortest(self.value)}"
 
 
 @dataclass(frozen=True)
@@ -59,21 +81,30 @@ class Degradation:
 
     steps: tuple[Step, ...]
 
-    def for_width(self, width: int) -> Degradation:
-        """The same with a value in every step, for photos `width` px wide.
+    def for_width(self, width: int, height: int | None = None) -> Degradation:
+        """The same with a value in every step, for photos `width` px wide and `height` px high.
 
-        A default scales with the width of the picture that its step meets, within the kind's range.
+        A default in px scales with the width of the picture that its step meets, within the kind's range;
+        that of `chat` scales with the longest side, which is the width where no height is given.
         """
+        longest = width if height is None else max(width, height)
         steps = []
         for step in self.steps:
             if step.value is None:
                 kind = KINDS[step.kind]
-                value = (kind.at_504 or 0.0) * width / 504
-                step = replace(step, value=min(max(value, kind.lowest), kind.highest))
+                value = kind.default
+                if value is None:
+                    value = (kind.at_504 or 0.0) * (longest if step.kind in LONGEST else width) / 504
+                step = replace(step, value=_within(kind, value))
             elif step.kind == "lowres":
-                width = small_side(width, int(step.value))
+                width, longest = (small_side(side, int(step.value)) for side in (width, longest))
             steps.append(step)
         return Degradation(tuple(steps))
+
+    @property
+    def partial(self) -> bool:
+        """Whether a step happens to some of the photos only."""
+        return any(step.some for step in self.steps)
 
     def __str__(self) -> str:
         if self.steps == MIXED_STEPS:
@@ -85,11 +116,23 @@ MIXED_STEPS = (Step("blur"), Step("lowres", 2), Step("noise", 10), Step("jpeg", 
 
 
 def parse_degradation(text: str) -> Degradation:
-    """Read `jpeg:Q`, `noise:S`, `lowres:N`, `blur[:SIGMA]`, `defocus[:R]`, `motion[:LENGTH]` or `none`.
+    """Read what happened to photos: `none`, or steps joined by `+`, which happen in the written order.
 
-    Steps joined by `+` happen in the written order: `blur:2+jpeg:20`. `mixed` stands for
-    `blur+lowres:2+noise:10+jpeg:20`. Without a value, blur, defocus and motion take 2.5, 5 and 15 px for a
-    width of 504 px and scale with the photo's width. ValueError names what is wrong and the values there are.
+    | step | what happens | where |
+    |---|---|---|
+    | `jpeg:Q`, `noise:S`, `lowres:N` | a quality, sigma in levels, a factor | `degrade_image` |
+    | `blur[:SIGMA]`, `defocus[:R]`, `motion[:LENGTH]` | one kernel, in px, on the values as stored | same |
+    | `shake[:PX]` | a curved path of its own in each photo, in linear light | `hqgs.photos.shake` |
+    | `exposure[:EV]` | gain and white balance of its own in each photo | `hqgs.photos.camera` |
+    | `chat[:SIDE]` | a messenger: shrunk, JPEG, enlarged | `hqgs.photos.degrade` |
+    | `phone[:EV]` | a phone in low light: mosaic, noise, its processing, JPEG | `hqgs.photos.phone` |
+    | `video[:CRF]`, `video265[:CRF]` | H.264 or H.265 over all photos, sorted by name | `hqgs.photos.video` |
+    | `mixed` | `blur+lowres:2+noise:10+jpeg:20` | |
+    | `some:STEP` | the step in half of the training photos only, at mixed strengths | `hqgs.scene.degrade` |
+
+    Without a value, blur, defocus, motion and shake take 2.5, 5, 15 and 12 px for a width of 504 px and scale
+    with the photo's width; chat takes half of the longest side, exposure 1, phone 4 and both videos 36.
+    ValueError names what is wrong and the values there are.
     """
     if text == NONE:
         return Degradation(())
@@ -100,14 +143,37 @@ def parse_degradation(text: str) -> Degradation:
         elif part == NONE:
             raise ValueError(f"{NONE!r} stands alone, got the degradation {text!r}")
         else:
-            kind, colon, value = part.partition(":")
-            steps.append(Step(kind, _number(value, part) if colon else None))
+            some = part.partition(":")[0] == SOME
+            kind, colon, value = (part.partition(":")[2] if some else part).partition(":")
+            steps.append(Step(kind, _number(value, part) if colon else None, some))
     return Degradation(tuple(steps))
+
+
+def parse_formation(text: str) -> Degradation:
+    """Read what a method is told of the photos: as `parse_degradation`, and ValueError for other kinds."""
+    return check_formation(parse_degradation(text))
+
+
+def check_formation(degradation: Degradation) -> Degradation:
+    """The same; ValueError unless every step is one that a method can be told of."""
+    for step in degradation.steps:
+        if step.some or not KINDS[step.kind].formation:
+            known = ", ".join(name for name, kind in KINDS.items() if kind.formation)
+            raise ValueError(
+                f"{step} differs from photo to photo and has no operator in the loss; a formation is made of "
+                f"{known}"
+            )
+    return degradation
 
 
 def small_side(side: int, factor: int) -> int:
     """The side of a photo that was shrunk by `factor`, px."""
     return math.ceil(side / factor)
+
+
+def _within(kind: Kind, value: float) -> float:
+    """The value in the kind's range, whole where the kind asks for it."""
+    return min(max(float(round(value)) if kind.integer else value, kind.lowest), kind.highest)
 
 
 def _number(text: str, part: str) -> float:

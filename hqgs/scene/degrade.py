@@ -13,28 +13,38 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path
+from hqgs.base.files import atomic_path, check_new_folder
 from hqgs.base.text import some
-from hqgs.photos.degrade import Degraded, degrade_image
+from hqgs.photos.degrade import JPEG_FILES, Degraded, Record, degrade_image, degrade_sequence
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.photos.formula import Degradation
+from hqgs.photos.formula import VIDEOS, Degradation
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.capture import inside
 from hqgs.scene.formats.colmap import write_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
 from hqgs.scene.scene import Scene, View
 
+SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
+_CHOICE = 1  # third word of the choice's seed; a photo's own generator has two
+
 
 def degrade_scene(scene: Scene, degradation: Degradation, seed: int) -> Scene:
     """The scene with degraded training photos (float32, `View.low` with low-res); held-out ones as they are.
 
     Each photo has a generator of its own, from the seed and the photo's place among all names, so that no
-    photo depends on another. `Scene.notes` gets a line with the kind, the seed and the photos. ValueError for
-    a negative seed, or a photo that is too small for a blur; it names the photo.
+    photo depends on another, unless there is a video: all photos, sorted by name and held-out ones included,
+    are its frames, and the held-out ones in it are degraded like the others, but not kept.
+
+    A `some` step happens to half of the training photos, rounded up. Each photo draws a number and a factor
+    uniform in [0.5, 1.5]; the half with the smallest numbers get the step with the factor times its value,
+    within the kind's range. All `some` steps of a degradation share both.
+
+    `Scene.notes` gets a line with the kind, the seed and the photos. ValueError for a negative seed, a photo
+    that is too small for a blur, or photos of several sizes before a video; the last two name the photo.
     """
     train = [
         replace(view, image=result.image, low=result.low)
-        for view, result in _degraded_views(scene, degradation, seed)
+        for view, result in degraded_views(scene, degradation, seed)
     ]
     note = _note(scene, degradation, seed, "kept as 32-bit floats")
     return replace(scene, train=train, notes=[*scene.notes, note])
@@ -44,26 +54,29 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
     """Degrade as `degrade_scene` does and write a scene folder with the same cameras, points and split.
 
     It holds a COLMAP model (pinhole cameras), `images` and, where the scene has masks, `masks`. Held-out
-    photos are PNGs of the clean pixels. Where JPEG is the last step, the training photos are the JPEG files
-    themselves, otherwise PNGs, clipped and rounded to 8 bits. With low-res, the small photos are stored in
-    this way in `low`, and `images` holds PNGs of the enlarged ones. The suffixes of names follow the files.
-    `degradation.json` tells kind, seed and photos.
+    photos are PNGs of the clean pixels. Where JPEG is the last step of all photos, or a phone, the training
+    photos are the JPEG files themselves, otherwise PNGs, clipped and rounded to 8 bits. With low-res, the
+    small photos are stored in this way in `low`, and `images` holds PNGs of the enlarged ones. The suffixes
+    of names follow the files. `degradation.json` tells kind, seed, photos and what happened to each of them.
 
     All is written beside `out` and then moved there: after an error or Ctrl-C `out` is as it was. Raises
     FileExistsError unless `out` is missing or an empty folder; ValueError as `degrade_scene` does, or where
     the new suffixes would mix up the photos' names.
     """
-    kinds = [step.kind for step in degradation.steps]
-    jpeg_last, enlarged = kinds[-1:] == ["jpeg"], "lowres" in kinds
+    last_step = degradation.steps[-1] if degradation.steps else None
+    jpeg_last = last_step is not None and last_step.kind in JPEG_FILES and not last_step.some
+    enlarged = any(step.kind == "lowres" for step in degradation.steps)
     suffix = ".jpg" if jpeg_last else ".png"
     names = {view.name: _with_suffix(view.name, ".png" if enlarged else suffix) for view in scene.train}
     names |= {view.name: _with_suffix(view.name, ".png") for view in scene.test}
     _check_names(names)
     with _new_folder(Path(out).resolve()) as root:
         train: dict[str, str | None] = {}
-        for view, result in _degraded_views(scene, degradation, seed):
+        steps: dict[str, list[Record]] = {}
+        for view, result in degraded_views(scene, degradation, seed):
             name, last = names[view.name], result.image if result.low is None else result.low
-            content = last if result.jpeg is None else result.jpeg
+            content = result.jpeg if jpeg_last and result.jpeg is not None else last
+            steps[name] = result.records
             if enlarged:
                 small = _with_suffix(name, suffix)
                 train[name] = f"low/{small}"
@@ -95,39 +108,82 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
                 train=train,
                 held_out=[names[view.name] for view in scene.test],
                 notes=[*scene.notes, _note(scene, degradation, seed, stored)],
+                steps=steps,
             ),
         )
 
 
-def check_new_folder(out: Path) -> None:
-    """FileExistsError unless `out` is missing or an empty folder."""
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not an empty folder")
-
-
-def _degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterator[tuple[View, Degraded]]:
-    """The training views with what becomes of their photos."""
+def degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterator[tuple[View, Degraded]]:
+    """The training views with what becomes of their photos, as `degrade_scene` says."""
     if seed < 0:
         raise ValueError(f"seed is {seed}, wanted at least 0")
-    names = sorted(view.name for view in (*scene.train, *scene.test))
+    if any(step.kind in VIDEOS for step in degradation.steps):
+        yield from _filmed(scene, degradation, seed)
+        return
+    factors = _factors(scene, seed) if degradation.partial else {}
+    rngs = _generators(scene, seed)
     for view in scene.train:
-        rng = np.random.default_rng([seed, names.index(view.name)])
         try:
-            result = degrade_image(view.image, degradation, rng)
+            result = degrade_image(view.image, degradation, rngs[view.name], factors.get(view.name))
         except ValueError as error:
             raise ValueError(f"photo {view.name!r}: {error}") from error
         yield view, result
 
 
+def _filmed(scene: Scene, degradation: Degradation, seed: int) -> Iterator[tuple[View, Degraded]]:
+    """The same for a degradation with a video: all photos at once, in the order of their names."""
+    views = sorted((*scene.train, *scene.test), key=lambda view: view.name)
+    shape = views[0].image.shape
+    for view in views:
+        if view.image.shape != shape:
+            sizes = " and ".join(f"{s[1]} x {s[0]}" for s in (shape, view.image.shape))
+            raise ValueError(
+                f"photo {view.name!r}: a film has one size, but {views[0].name!r} and it have {sizes} px"
+            )
+    factors, rngs = _factors(scene, seed), _generators(scene, seed)
+    results = degrade_sequence(
+        [view.image for view in views],
+        degradation,
+        [rngs[view.name] for view in views],
+        [factors.get(view.name) for view in views],
+    )
+    by_name = {view.name: result for view, result in zip(views, results, strict=True)}
+    for view in scene.train:
+        yield view, by_name[view.name]
+
+
+def _generators(scene: Scene, seed: int) -> dict[str, np.random.Generator]:
+    names = sorted(view.name for view in (*scene.train, *scene.test))
+    return {name: np.random.default_rng([seed, k]) for k, name in enumerate(names)}
+
+
+def _factors(scene: Scene, seed: int) -> dict[str, float]:
+    """The half of the training photos that `some` steps hit, each with its factor."""
+    names = sorted(view.name for view in (*scene.train, *scene.test))
+    rng = np.random.default_rng([seed, 0, _CHOICE])
+    places = dict(zip(names, rng.random(len(names)), strict=True))
+    factors = dict(zip(names, rng.uniform(*SOME_FACTORS, len(names)).tolist(), strict=True))
+    train = sorted((view.name for view in scene.train), key=lambda name: places[name])
+    return {name: factors[name] for name in train[: _half(len(train))]}
+
+
+def _half(count: int) -> int:
+    return (count + 1) // 2
+
+
 def _note(scene: Scene, degradation: Degradation, seed: int, stored: str) -> str:
-    widths = sorted({view.camera.width for view in scene.train})
-    exact = {str(degradation.for_width(width)): width for width in widths}
+    sizes = sorted({(view.camera.width, view.camera.height) for view in scene.train})
+    exact = {str(degradation.for_width(*size)): size[0] for size in sizes}
     kind = str(degradation)
     if set(exact) != {kind}:
         kind += f" ({', '.join(f'{steps} at a width of {width} px' for steps, width in exact.items())})"
+    photos = f"all training photos ({len(scene.train)})"
+    if degradation.partial:
+        hit = f"{_half(len(scene.train))} of {len(scene.train)}"
+        whole = all(step.some for step in degradation.steps)
+        photos = f"{hit} training photos" if whole else f"{photos}, the steps of some: {hit}"
     return (
-        f"degradation {kind}, seed {seed}: all training photos ({len(scene.train)}), {stored}; "
-        f"held-out photos ({len(scene.test)}) are clean"
+        f"degradation {kind}, seed {seed}: {photos}, {stored}; held-out photos ({len(scene.test)}) are clean"
     )
 
 

@@ -7,10 +7,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hqgs._rust import NEAR_PLANE
 from hqgs.scene.scene import Camera, View
 
 MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
-NEAREST = 0.01  # view-space depth, as the rasterizer's near plane
 
 
 def unproject(
@@ -55,7 +55,7 @@ def in_picture(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     viewmat, K = torch.from_numpy(camera.viewmat), camera.K
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
     seen = (
-        (z > NEAREST)
+        (z > NEAR_PLANE)
         & (x.abs() * K[0, 0] < MARGIN * camera.width / 2 * z)
         & (y.abs() * K[1, 1] < MARGIN * camera.height / 2 * z)
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hqgs.base.files import existing_folder
 from hqgs.photos.files import UnreadableError
 from hqgs.scene.capture import Capture, list_photos, photo_folder
 from hqgs.scene.formats.colmap import find_models, read_colmap
@@ -18,8 +19,6 @@ from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
 from hqgs.scene.sfm.bare_photos import bare_photos, read_photos
 from hqgs.scene.views import load_views
-
-__all__ = ["load_scene"]
 
 
 def load_scene(
@@ -54,11 +53,7 @@ def load_scene(
 
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
-    root = Path(path).resolve()
-    if not root.exists():
-        raise FileNotFoundError(f"there is no scene folder {root}")
-    if not root.is_dir():
-        raise ValueError(f"{root} is a file, a scene is a folder")
+    root = existing_folder(path)
     if not (math.isfinite(downscale) and downscale >= 1):
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:

@@ -32,7 +32,7 @@ from hqgs.scene.scene import Scene, View
 if TYPE_CHECKING:
     from spandrel import ImageModelDescriptor
 
-    Network = ImageModelDescriptor[torch.nn.Module]
+    _Network = ImageModelDescriptor[torch.nn.Module]
 
 RANDOM = ("AuraSR",)  # these networks draw other detail in every view and every run
 PICKLED = (".pth", ".pt", ".ckpt")
@@ -113,7 +113,7 @@ def restore_scene(scene: Scene, weights: str | Path, config: RestoreConfig = DEF
     return replace(scene, train=train, notes=[*scene.notes, note])
 
 
-def _load(weights: Path) -> tuple[Network, str]:
+def _load(weights: Path) -> tuple[_Network, str]:
     """The network of a file and the file's SHA-256."""
     if importlib.util.find_spec("spandrel") is None:
         raise ValueError(
@@ -174,7 +174,7 @@ def _as_taken(view: View) -> NDArray[np.uint8] | NDArray[np.float32]:
 
 
 def _restored_image(
-    network: Network, view: View, config: RestoreConfig
+    network: _Network, view: View, config: RestoreConfig
 ) -> NDArray[np.uint8] | NDArray[np.float32]:
     photo = _as_taken(view)
     values = as_floats(photo).clip(0, 1)
@@ -192,7 +192,7 @@ def _restored_image(
     return np.ascontiguousarray(out)
 
 
-def _in_tiles(network: Network, image: Tensor, config: RestoreConfig) -> Tensor:
+def _in_tiles(network: _Network, image: Tensor, config: RestoreConfig) -> Tensor:
     """[1, C, h, w] to [1, C, h scale, w scale], tile by tile."""
     scale, multiple = network.scale, network.size_requirements.multiple_of
     height, width = image.shape[2:]
@@ -216,7 +216,7 @@ def _in_tiles(network: Network, image: Tensor, config: RestoreConfig) -> Tensor:
     return out
 
 
-def _longest_side(network: Network, config: RestoreConfig) -> int | None:
+def _longest_side(network: _Network, config: RestoreConfig) -> int | None:
     """Of a tile, in px; None: the whole photo at once."""
     from spandrel import ModelTiling
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from torch import Tensor
 from hqgs.base.files import atomic_path
 from hqgs.scene.scene import Scene
 
-FORMAT = 3  # raised when a newer reader could not use an older file
+FORMAT = 4  # raised when a newer reader could not use an older file
+FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
 
 
 def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -64,6 +65,26 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]
     if not isinstance(meta, dict):
         raise ValueError(f"the checkpoint {path} is damaged: its values are no JSON object")
     return tensors, meta
+
+
+def part(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors whose names start with `prefix`, without it."""
+    return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+
+
+def check_same(path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any]) -> None:
+    """ValueError for the first field that differs; nested fields are named with dots."""
+    if not isinstance(saved, dict):
+        raise ValueError(f"{path} is damaged: {prefix or 'config'} is {saved!r:.80}")
+    for name in here | saved:
+        old, new = saved.get(name), here.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            check_same(path, f"{prefix}{name}.", old, new)
+        elif old != new and name not in FREE_FIELDS:
+            raise ValueError(
+                f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
+                "use the same one, or another folder"
+            )
 
 
 def scene_fingerprint(scene: Scene) -> dict[str, str]:

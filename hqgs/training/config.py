@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from hqgs.model.gaussians import MAX_SH_DEGREE
-from hqgs.model.render import BACKGROUND
-from hqgs.photos.formula import parse_degradation
+from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE
+from hqgs.photos.formula import parse_formation
 
 AUTO, NONE = "auto", "none"
 METHODS = {
@@ -26,6 +25,7 @@ ITEMS = {
     "iterations": "the rest of a run that has stopped improving",
 }
 ASKED_FOR = ("resolution", "iterations")  # not automatic: the first costs, a number of iterations means it
+AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 Loss = Literal["l1", "l1+dssim", "l1+scs"]
 
@@ -33,7 +33,7 @@ Loss = Literal["l1", "l1+dssim", "l1+scs"]
 def parse_leave_out(text: str) -> tuple[str, ...]:
     """The items of "auto" (all but ASKED_FOR), "none" or a list with commas, in the order of ITEMS."""
     if text == AUTO:
-        return tuple(item for item in ITEMS if item not in ASKED_FOR)
+        return AUTOMATIC
     names = set() if text == NONE else {name.strip() for name in text.split(",")}
     check_items(names)
     return tuple(item for item in ITEMS if item in names)
@@ -177,7 +177,7 @@ class HQGSConfig:
 
     guidance: str = FORMATION  # or "paper": `PaperHQGS` instead of everything below
     paper: PaperConfig = field(default_factory=PaperConfig)
-    formation: str = AUTO  # what happened to the photos, as `parse_degradation` reads it; "auto": diagnosed
+    formation: str = AUTO  # what happened to the photos, as `parse_formation` reads it; "auto": diagnosed
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
     smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
     gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
@@ -187,7 +187,7 @@ class HQGSConfig:
         if self.guidance not in GUIDANCES:
             raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
         if self.formation != AUTO:
-            parse_degradation(self.formation)
+            parse_formation(self.formation)
         for name in ("jpeg_pixels", "smallest", "gaussians_per_pixel"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
@@ -197,13 +197,14 @@ class HQGSConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything but the photos that a result depends on. The defaults are those of 3DGS.
+    """Everything but the photos that a result depends on.
 
-    `scaled()` fits the schedule to a run of another length than 30,000 iterations.
+    `scaled()` fits the schedule to a run of another length than 30,000 iterations. `run_config` makes the
+    configuration of a run as a user asks for it.
     """
 
     iterations: int = 30_000
-    method: str = "3dgs"
+    method: str = AUTO
     seed: int = 0
     sh_degree: int = MAX_SH_DEGREE
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
@@ -216,7 +217,7 @@ class TrainConfig:
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
     adam_eps: float = 1e-15
     selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
-    leave_out: tuple[str, ...] = ()  # of `hqgs.left_out.ITEMS`: what the run may do without, where it pays
+    leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays
     background: tuple[float, float, float] = BACKGROUND  # RGB
     eval_every: int = 3_000  # iterations between evaluations on the held-out views
     checkpoint_every: int = 1_000  # iterations; does not change the result
@@ -252,3 +253,42 @@ class TrainConfig:
             checkpoint_every=min(self.checkpoint_every, tenth),
             densify=self.densify.scaled(self.iterations),
         )
+
+
+def run_config(
+    *,
+    iterations: int | None = None,
+    method: str = AUTO,
+    leave_out: str = AUTO,
+    seed: int = 0,
+    max_gaussians: int = DensifyConfig.max_gaussians,
+    guidance: str = FORMATION,
+    formation: str = AUTO,
+    eval_every: int | None = None,
+) -> TrainConfig:
+    """The configuration of a run as users ask for it, its schedule fitted to its length.
+
+    Args:
+        iterations: None: at most 30,000, with `leave_out` "auto" fewer where the scene has stopped improving.
+        method: one of METHODS.
+        leave_out: "auto", "none" or some of ITEMS with commas.
+        seed: of everything random.
+        max_gaussians: bounds the memory.
+        guidance: of the method hqgs, one of GUIDANCES.
+        formation: what happened to the photos, as `parse_formation` reads it; "auto": hqgs looks.
+        eval_every: iterations between evaluations; None: a tenth of the run.
+
+    Raises ValueError for a name that there is not, or a number out of range.
+    """
+    items = parse_leave_out(leave_out)
+    if iterations is None and leave_out == AUTO:
+        items = (*items, "iterations")
+    config = TrainConfig(
+        iterations=TrainConfig.iterations if iterations is None else iterations,
+        leave_out=items,
+        method=method,
+        seed=seed,
+        densify=DensifyConfig(max_gaussians=max_gaussians),
+        hqgs=HQGSConfig(guidance=guidance, formation=formation),
+    ).scaled()
+    return config if eval_every is None else replace(config, eval_every=eval_every)

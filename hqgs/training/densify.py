@@ -7,8 +7,7 @@ Kerbl et al. 2023, section 5.2. Every change of the number of Gaussians is a sel
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from hqgs.model.gaussians import Gaussians
-from hqgs.training.adam import reset_opacities, select_rows
+from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
 
 SPLIT_CHILDREN = 2
@@ -31,10 +30,12 @@ class Growth:
     split: int = 0
     pruned: int = 0
     refused: int = 0  # Gaussians that would have grown but are too fine
+    # [M]: the former rows that those of now stem from; None: no row has changed.
+    parents: Tensor | None = field(default=None, compare=False)
 
 
 class Densifier:
-    """Gathers image gradients and changes the set of Gaussians on schedule.
+    """Gathers image gradients and changes the set of Gaussians, when the schedule asks for it.
 
     The random numbers of a round follow from (seed, iteration) alone, so there is no generator to save.
     """
@@ -63,44 +64,28 @@ class Densifier:
         self.count += visible
 
     def update(
-        self,
-        iteration: int,
-        gaussians: Gaussians,
-        optimizer: Optimizer,
-        finest: Callable[[Tensor], Tensor] | None = None,
+        self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, finest: Tensor | None = None
     ) -> Growth:
-        """Grow and prune, as far as the schedule asks for it after this iteration (1, 2, ...).
+        """One round of growth and pruning after this iteration (1, 2, ...).
 
-        `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` gives for means [N, 3]
-        the largest scales [N], world units, of Gaussians that are too fine to be cloned or split.
+        `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` [N], world units:
+        Gaussians whose largest scale is at most that are too fine to be cloned or split.
         """
-        c = self.config
-        if iteration >= c.stop:
-            return Growth()
-        cloned = split = pruned = refused = 0
-        if iteration > c.start and iteration % c.every == 0:
-            cloned, split, refused = self._grow(iteration, gaussians, optimizer, finest)
-            pruned = self._prune(iteration, gaussians, optimizer)
-            self.grad_sum = torch.zeros(len(gaussians))
-            self.count = torch.zeros(len(gaussians))
-        return Growth(cloned, split, pruned, refused)
+        growth = self._grow(iteration, gaussians, optimizer, finest)
+        growth = self._prune(iteration, gaussians, optimizer, growth)
+        self.grad_sum = torch.zeros(len(gaussians))
+        self.count = torch.zeros(len(gaussians))
+        return growth
 
-    def reset(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> bool:
-        """Cut the opacities where the schedule asks for it; whether it did.
+    def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> Tensor:
+        """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay.
 
-        To be called before the next step, not after the one that it is due at: what is looked at or written
-        in between is the scene before its opacities are cut, and a run that ends there keeps it.
+        Returns the rows that are left, [M].
         """
-        due = 0 < iteration < self.config.stop and iteration % self.config.reset_every == 0
-        if due:
-            reset_opacities(gaussians, optimizer, self.config.reset_opacity)
-        return due
-
-    def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> None:
-        """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay."""
         kept = torch.nonzero(~bad)[:, 0]
         select_rows(gaussians, optimizer, kept, old=len(kept))
         self.grad_sum, self.count = self.grad_sum[kept], self.count[kept]
+        return kept
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"grad_sum": self.grad_sum, "count": self.count}
@@ -109,19 +94,14 @@ class Densifier:
         self.grad_sum, self.count = state["grad_sum"], state["count"]
 
     def _grow(
-        self,
-        iteration: int,
-        gaussians: Gaussians,
-        optimizer: Optimizer,
-        finest: Callable[[Tensor], Tensor] | None,
-    ) -> tuple[int, int, int]:
-        """Clone the small and split the large among those with a high mean gradient; how many each, and how
-        many were too fine for it."""
+        self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, finest: Tensor | None
+    ) -> Growth:
+        """Clone the small and split the large among those with a high mean gradient."""
         n = len(gaussians)
         grad = self.grad_sum / self.count.clamp(min=1)
         refused = 0
         if finest is not None:
-            fine = _largest_scale(gaussians) <= finest(gaussians.means.detach())
+            fine = _largest_scale(gaussians) <= finest
             refused = int((fine & (grad >= self.config.grad_threshold)).sum())
             grad = torch.where(fine, -1.0, grad)
         # Either way a candidate adds one Gaussian to the total.
@@ -133,7 +113,8 @@ class Densifier:
         cloned = torch.nonzero(grow & ~large)[:, 0]
         split = torch.nonzero(grow & large)[:, 0]
 
-        select_rows(gaussians, optimizer, torch.cat([kept, cloned, *[split] * SPLIT_CHILDREN]), old=len(kept))
+        parents = torch.cat([kept, cloned, *[split] * SPLIT_CHILDREN])
+        select_rows(gaussians, optimizer, parents, old=len(kept))
         children = slice(len(kept) + len(cloned), len(gaussians))
         rng = np.random.default_rng([self.seed, iteration])
         with torch.no_grad():
@@ -142,18 +123,21 @@ class Densifier:
             rotation = quats_to_matrices(gaussians.quats[children])
             gaussians.means[children] += (rotation @ (scales * normal)[:, :, None])[:, :, 0]
             gaussians.scales[children] -= math.log(SPLIT_SHRINK)
-        return len(cloned), len(split), refused
+        grown = len(cloned) or len(split)
+        return Growth(len(cloned), len(split), 0, refused, parents if grown else None)
 
-    def _prune(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer) -> int:
+    def _prune(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, growth: Growth) -> Growth:
         with torch.no_grad():
             bad = gaussians.activated_opacities() < self.config.prune_opacity
             if iteration > self.config.reset_every:
                 bad |= _largest_scale(gaussians) > self.config.prune_scale * self.reach
         pruned = int(bad.sum())
-        if pruned:
-            kept = torch.nonzero(~bad)[:, 0]
-            select_rows(gaussians, optimizer, kept, old=len(kept))
-        return pruned
+        if not pruned:
+            return growth
+        kept = torch.nonzero(~bad)[:, 0]
+        select_rows(gaussians, optimizer, kept, old=len(kept))
+        parents = kept if growth.parents is None else growth.parents[kept]
+        return replace(growth, pruned=pruned, parents=parents)
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:

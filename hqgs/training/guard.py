@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import cast
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
 
+from hqgs.evaluation.records import GuardEvent, GuardRecord
+from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
 
 LIMIT = 1e18  # larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits
@@ -37,14 +40,14 @@ class Guard:
     skipped_in_a_row: int = 0
     culled: int = 0  # Gaussians that were removed
     num_events: int = 0
-    events: list[dict[str, Any]] = field(default_factory=list)  # the first ones, as `Event`
+    events: list[GuardEvent] = field(default_factory=list)  # the first ones
 
     def add(self, event: Event) -> None:
         self.num_events += 1
         if len(self.events) < KEPT:
-            self.events.append(asdict(event))
+            self.events.append(cast(GuardEvent, asdict(event)))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> GuardRecord:
         """For report.json."""
         return {
             "skipped_steps": self.skipped,
@@ -52,6 +55,53 @@ class Guard:
             "num_events": self.num_events,
             "events": self.events,
         }
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What was not finite in one look."""
+
+    what: str  # "gradient" or "parameter"
+    tensors: list[str]
+    rows: Tensor  # bool [N], the Gaussians at fault
+
+
+def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -> Fault | None:
+    """Where a gradient is not finite.
+
+    The Gaussians are not at fault where the gradient of the loss with respect to the render is not finite
+    already: that comes from the view.
+    """
+    # shN, three quarters of the numbers, is left out: its gradient is sh0's times a bounded basis.
+    # A method may leave a tensor without a gradient.
+    named = {n: t.grad for n, t in gaussians.named().items() if n != "shN" and t.grad is not None}
+    others = [
+        (group["name"], param.grad)
+        for group in optimizer.param_groups
+        if group.get("every_row")
+        for param in group["params"]
+        if param.grad is not None
+    ]
+    if all(map(is_sound, (*named.values(), *(grad for _, grad in others)))):
+        return None
+    if render.grad is not None and not torch.isfinite(render.grad).all():
+        return Fault("gradient", ["render"], torch.zeros(len(gaussians), dtype=torch.bool))
+    names, rows = bad_rows(gaussians.named())
+    if names:  # which is why: the activations pass NaN on
+        return Fault("parameter", names, rows)
+    names, rows = bad_rows(named)
+    names += [name for name, grad in others if not torch.isfinite(grad).all()]
+    return Fault("gradient", names, rows) if names else None
+
+
+def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
+    """Where a Gaussian is not finite. shN is looked at after a change of rows: its gradients are finite, so
+    nothing else can spoil it."""
+    named = {n: t for n, t in gaussians.named().items() if n != "shN" or rows_changed}
+    if all(map(is_sound, named.values())):
+        return None
+    names, rows = bad_rows(gaussians.named())
+    return Fault("parameter", names, rows) if names else None
 
 
 def is_sound(tensor: Tensor) -> bool:

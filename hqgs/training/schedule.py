@@ -1,13 +1,160 @@
-"""What a step does, as a pure function of the configuration and the iteration."""
+"""What a step does: a pure function of the configuration, of the decisions so far, and of the iteration."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from hqgs.photos.resize import area_downscale
 from hqgs.scene.scene import Camera, View
+from hqgs.training.config import TrainConfig
+
+T = TypeVar("T")
 
 COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
+HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
+FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
+BAND_CHECK = 0.3  # of the run: when the harmonics are tried
+EARLIEST = 2_000  # iterations before which they cannot tell yet
+BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
+REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """What a run has decided so far, as far as its steps depend on it."""
+
+    length: int  # iterations of the run as far as it is known: those of the configuration, or fewer
+    degree: int  # of the harmonics, at most
+    released: int = 0  # the iteration after which the held-back photos came back; 0: not yet
+
+    @property
+    def num_higher(self) -> int:
+        """Coefficients above degree 0 of each Gaussian."""
+        return (self.degree + 1) ** 2 - 1
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one step does, in its order."""
+
+    iteration: int  # 1, 2, ...
+    resets: bool  # the opacities are cut before it
+    view: int  # number of the training view
+    coarse: bool  # photo and camera at 1 / COARSE_FACTOR of the sides
+    part: float  # of the run that is done with it, 0..1: what the learning rates follow
+    degree: int  # of the harmonics that are trained
+    observes: bool  # its gradients count for growth
+    grows: bool  # Gaussians are added and removed after it
+    finest: float | None  # px of the photo that sees a Gaussian best: finer ones do not grow; None: any may
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The plan of every step of a run."""
+
+    config: TrainConfig
+    items: frozenset[str]  # of `config.leave_out`: what this run may do without
+    num_views: int  # for training
+    held: tuple[int, ...]  # numbers of those that are held back at first
+
+    @classmethod
+    def of(cls, config: TrainConfig, views: Sequence[View], as_photographed: bool) -> Schedule:
+        """`views`: those for training; `as_photographed`: whether the method takes them as they are."""
+        items = set(config.leave_out)
+        if not as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
+            items &= {"photos", "iterations"}
+        if min(min(v.camera.width, v.camera.height) for v in views) < COARSE_FACTOR * SMALLEST_SIDE:
+            items -= {"resolution"}
+        if _band_check(config) >= config.densify.stop:  # a run that is too short to tell
+            items -= {"harmonics"}
+        count = 0
+        if items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
+            count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
+        return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)))
+
+    def start(self) -> Decisions:
+        """Before the first step."""
+        return Decisions(self.config.iterations, self.config.sh_degree)
+
+    def plan(self, iteration: int, decisions: Decisions) -> Plan:
+        """What step number `iteration` (1, 2, ...) does."""
+        densify, stop = self.config.densify, self.growth_end(decisions)
+        before = iteration - 1
+        coarse = self.is_coarse(iteration)
+        return Plan(
+            iteration=iteration,
+            # Not after the step that it is due at: what is looked at or written in between is the scene
+            # before its opacities are cut, and a run that ends there keeps it.
+            resets=0 < before < stop and before % densify.reset_every == 0,
+            view=self.view(iteration, decisions),
+            coarse=coarse,
+            part=self.part(iteration, decisions),
+            degree=self.degree(iteration, decisions),
+            observes=iteration < stop,
+            grows=densify.start < iteration < stop and iteration % densify.every == 0,
+            finest=FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in self.items else None,
+        )
+
+    def holds(self, decisions: Decisions) -> bool:
+        """Whether photos are held back."""
+        return bool(self.held) and not decisions.released
+
+    def view(self, iteration: int, decisions: Decisions) -> int:
+        """Each epoch visits all views once, in an order of its own."""
+        views = list(range(self.num_views))
+        if self.holds(decisions):
+            views = [k for k in views if k not in self.held]
+        epoch, index = divmod(iteration - 1, len(views))
+        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(views))
+        return views[order[index]]
+
+    def part(self, iteration: int, decisions: Decisions) -> float:
+        """Of the run that is done with this step, 0..1."""
+        total = self.config.iterations
+        if decisions.length == total:
+            return iteration / total
+        released, length = decisions.released, decisions.length
+        start = released / total  # what follows is squeezed into the shortened rest
+        return start + (1 - start) * (iteration - released) / (length - released)
+
+    def degree(self, iteration: int, decisions: Decisions) -> int:
+        """Of the harmonics that are trained: it rises with the iterations."""
+        interval = self.config.sh_interval
+        if "harmonics" in self.items:
+            interval = min(interval, max(1, int(BAND_INTERVAL * self.config.iterations)))
+        return min(decisions.degree, iteration // interval)
+
+    def growth_end(self, decisions: Decisions) -> int:
+        """The iteration from which on nothing grows; a shortened run ends growth sooner."""
+        stop = self.config.densify.stop
+        if decisions.length == self.config.iterations:
+            return stop
+        return min(stop, math.ceil((1 + REST / 2) * decisions.released))
+
+    @property
+    def band_check(self) -> int:
+        """The iteration after which the harmonics are tried."""
+        return _band_check(self.config)
+
+    @property
+    def coarse_end(self) -> int:
+        """The last iteration at the smaller size; 0: there is none."""
+        return round(COARSE_PART * self.config.iterations) if "resolution" in self.items else 0
+
+    def is_coarse(self, iteration: int) -> bool:
+        return iteration <= self.coarse_end
+
+
+def learning_rates(config: TrainConfig, extent: float, part: float) -> dict[str, float]:
+    """Of each tensor of the Gaussians. The means' is in units of the extent and falls exponentially."""
+    means = extent * config.lr_means ** (1 - part) * config.lr_means_final**part
+    others = {name: getattr(config, f"lr_{name}") for name in ("scales", "quats", "opacities", "sh0", "shN")}
+    return {"means": means, **others}
 
 
 def smaller(view: View) -> View:
@@ -17,3 +164,13 @@ def smaller(view: View) -> View:
     image, mask = area_downscale(view.image, view.mask, width, height)
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     return View(view.name, Camera(width, height, K, camera.viewmat), image, mask)
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """`count` of the items at most, evenly spread."""
+    count = min(count, len(items))
+    return [items[k] for k in np.linspace(0, len(items), 2 * count + 1)[1::2].astype(int)]
+
+
+def _band_check(config: TrainConfig) -> int:
+    return max(EARLIEST, round(BAND_CHECK * config.iterations), 1)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
-import numpy as np
 from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.harmonics import folded
 from hqgs.model.render import largest_weights
 from hqgs.scene.scene import View
-
-T = TypeVar("T")
+from hqgs.training.schedule import spread
 
 TOLERANCE = 0.02  # dB that leaving one thing out may cost
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
@@ -78,9 +75,3 @@ def fewest_gaussians(
         if cost <= TOLERANCE:
             return FewerGaussians(whole, cost, limit, faint)
     return None
-
-
-def spread(items: Sequence[T], count: int) -> list[T]:
-    """`count` of the items at most, evenly spread."""
-    count = min(count, len(items))
-    return [items[k] for k in np.linspace(0, len(items), 2 * count + 1)[1::2].astype(int)]

@@ -2,7 +2,7 @@
 //! cloud and for a room as a trained scene looks like; and Adam on as many Gaussians.
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use hqgs::{
+use hqgs::internals::{
     composite::{self, CompositeCotangents, CompositeInput},
     project::{self, ProjectCotangents, ProjectOptions, Projected},
     scene::{Colors, Harmonics, synthetic::Synthetic},
@@ -68,7 +68,7 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         camera: &s.camera,
         background: None,
     };
-    let pixels = s.camera.width * s.camera.height;
+    let pixels = s.camera.width() * s.camera.height();
     group.bench_function(BenchmarkId::new("composite", n), |b| {
         b.iter(|| composite::forward(&input).expect("right lengths"));
     });

@@ -10,10 +10,14 @@ use crate::{
     constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::{Error, check_len},
+    memory,
     simd::Real,
 };
 use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
+
+/// What an error calls the buffers of this file.
+const NAME: &str = "gradients";
 
 /// Cotangents of the compositor's outputs.
 #[derive(Debug, Clone, Copy)]
@@ -92,24 +96,29 @@ pub fn backward<T: Real>(
     let grid = Grid::new();
     let level = input.projection.level.token;
     let degree = input.projection.knobs.exp2_degree;
-    let (pair_grads, counts): (Vec<_>, Vec<_>) = (0..tiles.lists.len())
-        .into_par_iter()
-        .map_init(
+    let count = tiles.lists.len();
+    let mut pair_grads = memory::filled(Vec::new(), count, NAME)?;
+    let mut counts = memory::filled(Counts::default(), count, NAME)?;
+    pair_grads
+        .par_iter_mut()
+        .zip(&mut counts)
+        .enumerate()
+        .try_for_each_init(
             || Scratch {
                 adjoint: Adjoint::new(channels),
                 layers: Vec::new(),
             },
-            |scratch, tile| {
-                dispatch!(level, simd => for_alpha!(
+            |scratch, (tile, (grads, counts))| -> Result<(), Error> {
+                (*grads, *counts) = dispatch!(level, simd => for_alpha!(
                     channels, degree, backward_tile, simd, T, (input, composited, v, &grid, tile, layout, scratch)
-                ))
+                ))?;
+                Ok(())
             },
-        )
-        .unzip();
+        )?;
     Ok(CompositeGrads {
         background,
         counts: counts.into_iter().fold(Counts::default(), Counts::plus),
-        ..gather(input, &pair_grads, layout, wanted)
+        ..gather(input, &pair_grads, layout, wanted)?
     })
 }
 
@@ -131,11 +140,11 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     tile: usize,
     layout: PairLayout,
     scratch: &mut Scratch<T>,
-) -> (Vec<T>, Counts) {
+) -> Result<(Vec<T>, Counts), Error> {
     let mut counts = Counts::default();
     let list = &input.tiles.lists[tile];
     if list.records.is_empty() {
-        return (Vec::new(), counts);
+        return Ok((Vec::new(), counts));
     }
     let Scratch { adjoint, layers } = scratch;
     let wanted = read_cotangents::<T, D>(input, v, tile, adjoint, &mut counts);
@@ -149,13 +158,13 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     counts.backward_blocks = depths.iter().copied().map(u64::from).sum();
     if wanted == 0 {
         counts.skipped_tiles = 1;
-        return (Vec::new(), counts);
+        return Ok((Vec::new(), counts));
     }
     counts.backward_tiles = 1;
     list.fetch();
-    let begins = unblend_blocks::<S, T, D, E>(simd, input, grid, tile, &depths, adjoint, layers);
-    let out = for_parts!(S, T, P => sum_layers::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers));
-    (out, counts)
+    let begins = unblend_blocks::<S, T, D, E>(simd, input, grid, tile, &depths, adjoint, layers)?;
+    let out = for_parts!(S, T, P => sum_layers::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
+    Ok((out, counts))
 }
 
 /// Fill `adjoint` with the cotangents of a tile. Returns the blocks with one that is not 0: bit b for block b.
@@ -209,9 +218,10 @@ fn unblend_blocks<S: Simd, T: Real, const D: usize, const E: usize>(
     depths: &[u32; TILE_BLOCKS],
     adjoint: &Adjoint<T>,
     layers: &mut Vec<T>,
-) -> [usize; TILE_BLOCKS + 1] {
+) -> Result<[usize; TILE_BLOCKS + 1], Error> {
     let total = depths.iter().sum::<u32>() as usize;
     if layers.len() < total * LAYER {
+        memory::reserve(layers, total * LAYER - layers.len(), NAME)?;
         layers.resize(total * LAYER, T::ZERO);
     }
     let mut begins = [0; TILE_BLOCKS + 1];
@@ -224,7 +234,7 @@ fn unblend_blocks<S: Simd, T: Real, const D: usize, const E: usize>(
         for_vectors!(S, T, V => kernel::unblend::<S, T, D, E, V>(simd, grid, block, seen, adjoint, out));
         begins[block + 1] = end;
     }
-    begins
+    Ok(begins)
 }
 
 /// Gaussian by Gaussian the sums over its blocks.
@@ -238,12 +248,12 @@ fn sum_layers<S: Simd, T: Real, const D: usize, const P: usize>(
     layout: PairLayout,
     adjoint: &Adjoint<T>,
     layers: &[T],
-) -> Vec<T> {
+) -> Result<Vec<T>, Error> {
     let list = &input.tiles.lists[tile];
     let mut next = [0; TILE_BLOCKS];
     next.copy_from_slice(&begins[..TILE_BLOCKS]);
     let row = layout.row();
-    let mut out = vec![T::ZERO; list.records.len() * row];
+    let mut out = memory::filled(T::ZERO, list.records.len() * row, NAME)?;
     for ((record, &mask), &place) in list.records.iter().zip(&list.masks).zip(&list.places) {
         let mut sums = Sums::<S, T, P>::new(simd, record);
         let out = &mut out[place as usize * row..(place as usize + 1) * row];
@@ -261,7 +271,7 @@ fn sum_layers<S: Simd, T: Real, const D: usize, const P: usize>(
         }
         sums.finish::<D>(layout.absolute, out);
     }
-    out
+    Ok(out)
 }
 
 /// Gradient of the background: the sum of transmittance times cotangent, tile by tile in order.

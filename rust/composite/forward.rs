@@ -9,6 +9,7 @@ use crate::{
     constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::Error,
+    memory,
     simd::Real,
     uninit::UninitVec,
 };
@@ -37,9 +38,9 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
     input.check()?;
     let (tiles, channels) = (input.tiles, input.channels());
     let count = tiles.tiles_x * tiles.tiles_y;
-    let mut depths = vec![[0; TILE_BLOCKS]; count];
-    let mut transmittance = UninitVec::new(count * TILE_PIXELS);
-    let mut colors = UninitVec::new(count * channels);
+    let mut depths = memory::filled([0; TILE_BLOCKS], count, "image")?;
+    let mut transmittance = UninitVec::new(count * TILE_PIXELS, "image")?;
+    let mut colors = UninitVec::new(count * channels, "image")?;
     let grid = Grid::new();
     let level = input.projection.level.token;
     let degree = input.projection.knobs.exp2_degree;
@@ -57,7 +58,7 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
         })
         .reduce(Counts::default, Counts::plus);
     let (transmittance, colors) = (transmittance.finish(), colors.finish());
-    let (image, alphas) = image_from_tiles(input, &transmittance, &colors);
+    let (image, alphas) = image_from_tiles(input, &transmittance, &colors)?;
     Ok(Image {
         image,
         alphas,
@@ -77,13 +78,11 @@ fn image_from_tiles<T: Real>(
     input: &CompositeInput<T>,
     transmittance: &[T],
     colors: &[Pixels<T>],
-) -> (Vec<T>, Vec<T>) {
+) -> Result<(Vec<T>, Vec<T>), Error> {
     let (tiles, channels) = (input.tiles, input.channels());
     let (width, height) = (input.camera.width, input.camera.height);
-    let (mut image, mut alphas) = (
-        UninitVec::new(width * height * channels),
-        UninitVec::new(width * height),
-    );
+    let pixels = width * height;
+    let [mut image, mut alphas] = UninitVec::several([pixels * channels, pixels], "image")?;
     let pixels = (0..tiles.tiles_y).map(|row| TILE.min(height - row * TILE) * width);
     image
         .cut(pixels.clone().map(|n| n * channels))
@@ -110,7 +109,7 @@ fn image_from_tiles<T: Real>(
                 }
             }
         });
-    (image.finish(), alphas.finish())
+    Ok((image.finish(), alphas.finish()))
 }
 
 /// Composite one tile.

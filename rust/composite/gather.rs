@@ -5,6 +5,7 @@ use super::{
     kernel::{ABSOLUTE, MOMENTS},
 };
 use crate::{
+    error::Error,
     project::Splat,
     simd::Real,
     tiles::{Chunk, UNIT},
@@ -45,7 +46,7 @@ pub(super) fn gather<T: Real>(
     pair_grads: &[Vec<T>],
     layout: PairLayout,
     wanted: Wanted,
-) -> CompositeGrads<T> {
+) -> Result<CompositeGrads<T>, Error> {
     let chunks = &input.tiles.chunks;
     let channels = layout.channels;
     let rows = [
@@ -57,7 +58,7 @@ pub(super) fn gather<T: Real>(
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
     let n = input.projection.splats.len();
-    let mut arrays = rows.map(|row| UninitVec::new(row * n));
+    let mut arrays = UninitVec::several(rows.map(|row| row * n), "gradients")?;
     let cut = |array, row| UninitVec::cut(array, chunks.iter().map(|c| (c.end - c.begin) * row));
     let [means2d, whitened, opacities, absolute, colors] = &mut arrays;
     let jobs: Vec<_> = chunks
@@ -85,14 +86,14 @@ pub(super) fn gather<T: Real>(
         },
     );
     let [means2d, whitened, opacities, absolute, colors] = arrays.map(UninitVec::finish);
-    CompositeGrads {
+    Ok(CompositeGrads {
         means2d,
         whitened,
         opacities,
         absolute,
         colors,
         ..CompositeGrads::default()
-    }
+    })
 }
 
 /// The outputs of one chunk: empty where not wanted, zeros before.

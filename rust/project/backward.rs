@@ -267,7 +267,7 @@ pub fn backward<T: Real>(
         (wanted.harmonics_rest, rest_row),
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
-    let mut arrays = rows.map(|row| UninitVec::<T>::new(row * n));
+    let mut arrays = UninitVec::<T>::several(rows.map(|row| row * n), "gradients")?;
     let [means, quats, scales, opacities, sh, rest] = &mut arrays;
     let jobs: Vec<_> = chunks(means, n, rows[0])
         .into_iter()

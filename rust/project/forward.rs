@@ -128,14 +128,13 @@ pub fn forward<T: Real>(
     let clamped = usize::from(shaded.is_some());
     let sloped = usize::from(shaded.is_some_and(|h| h.degree > 0));
     let groups = n.div_ceil(GROUP);
-    let (mut splats, mut keys) = (UninitVec::new(n), UninitVec::new(n));
-    let (mut means2d, mut depths) = (UninitVec::new(2 * n), UninitVec::new(n));
-    let (mut conics, mut radii) = (UninitVec::new(3 * n), UninitVec::new(2 * n));
-    let (mut opacities, mut rgb) = (UninitVec::new(n), UninitVec::new(channels * n));
-    let (mut slopes, mut clamps) = (
-        UninitVec::new(sloped * groups),
-        UninitVec::new(clamped * groups),
-    );
+    let name = "splats";
+    let (mut splats, mut keys) = (UninitVec::new(n, name)?, UninitVec::new(n, name)?);
+    let [mut means2d, mut depths, mut conics, mut opacities, mut rgb] =
+        UninitVec::several([2 * n, n, 3 * n, n, channels * n], name)?;
+    let mut radii = UninitVec::new(2 * n, name)?;
+    let mut slopes = UninitVec::new(sloped * groups, name)?;
+    let mut clamps = UninitVec::new(clamped * groups, name)?;
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))

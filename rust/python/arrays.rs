@@ -1,7 +1,7 @@
 //! Arrays in and out.
 
 use crate::error::BindingResult;
-use hqgs::{Error, simd::Real};
+use hqgs::internals::{Error, simd::Real};
 use numpy::{Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::{exceptions::PyValueError, prelude::*};
 use std::{any::Any, collections::HashMap, fmt::Display, ops::Range};
@@ -21,7 +21,7 @@ impl<'py, T: Element> Array<'py, T> {
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
         let array = value
             .cast::<PyArrayDyn<T>>()
-            .map_err(|_| wrong_type(name, &T::get_dtype(value.py()), value))?;
+            .map_err(|_| wrong_type(name, T::get_dtype(value.py()), value))?;
         if !array.is_c_contiguous() {
             return Err(PyValueError::new_err(format!(
                 "{name}: must be C-contiguous, got shape {:?} with strides {:?}",
@@ -132,16 +132,43 @@ pub(crate) fn is_f32(name: &str, value: &Bound<'_, PyAny>) -> BindingResult<bool
     }
 }
 
+/// Room for `len` elements of what `name` says.
+fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> {
+    let mut vector = Vec::new();
+    match vector.try_reserve_exact(len) {
+        Ok(()) => Ok(vector),
+        Err(_) => Err(Error::OutOfMemory {
+            name: name.into(),
+            bytes: (len as u64).saturating_mul(size_of::<T>() as u64),
+        }),
+    }
+}
+
+/// A gradient to be filled, with no elements if it is not `wanted`.
+pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> Result<Vec<T>, Error> {
+    let len = if wanted { len } else { 0 };
+    let mut gradient = with_capacity(len, "gradient")?;
+    gradient.resize(len, T::ZERO);
+    Ok(gradient)
+}
+
 /// One array of every camera's outputs, one after the other, [C, ...].
-pub(crate) fn join<O, T: Copy>(outs: &mut [O], array: impl Fn(&mut O) -> &mut Vec<T>) -> Vec<T> {
+pub(crate) fn join<O, T: Copy>(
+    outs: &mut [O],
+    array: impl Fn(&mut O) -> &mut Vec<T>,
+) -> Result<Vec<T>, Error> {
     let mut parts: Vec<_> = outs
         .iter_mut()
         .map(|out| std::mem::take(array(out)))
         .collect();
-    match parts.len() {
-        1 => parts.remove(0),
-        _ => parts.concat(),
+    if parts.len() == 1 {
+        return Ok(parts.remove(0));
     }
+    let mut joined = with_capacity(parts.iter().map(Vec::len).sum(), "views")?;
+    for part in parts {
+        joined.extend_from_slice(&part);
+    }
+    Ok(joined)
 }
 
 /// Something for one of the scalar types.

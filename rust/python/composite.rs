@@ -7,7 +7,7 @@ use crate::{
     error::BindingResult,
     project::{Frame, Projections, channels_of, of_camera},
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
     counts::Counts,
@@ -100,10 +100,12 @@ fn composite_as<'py, T: Scalar>(
     let frame = &frame.get().0;
     let c = frame.cameras.len();
     let colors = Array::<T>::new("colors", colors)?;
+    let shape = colors.shape();
     let (colors, given) = channels_of(&colors, frame.n, c)?;
     if given != channels {
-        let message = format!("the colors have {given}, got {channels}");
-        return Err(Error::new("channels", message).into());
+        let n = frame.n;
+        let expected = format!("[{n}, {channels}] or [{c}, {n}, {channels}]");
+        return Err(Error::shape("colors", expected, format!("{shape:?}")).into());
     }
     let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
     let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
@@ -143,11 +145,11 @@ fn composite_as<'py, T: Scalar>(
                     counts: total,
                     bin_seconds,
                 },
-                join(&mut images, |image| image),
-                join(&mut alphas, |alphas| alphas),
+                join(&mut images, |image| image)?,
+                join(&mut alphas, |alphas| alphas)?,
             ))
         })
-    })?;
+    })??;
     let out = (state, image.into_pyarray(py), alphas.into_pyarray(py));
     Ok(out.into_bound_py_any(py)?)
 }
@@ -184,7 +186,7 @@ fn composite_backward_as<'py, T: Scalar>(
     let [width, height] = frame
         .cameras
         .first()
-        .map_or([0; 2], |c| [c.width, c.height]);
+        .map_or([0; 2], |c| [c.width(), c.height()]);
     let pixels = width * height;
     let backgrounds = optional_of_shape::<T>("backgrounds", backgrounds, &[c, channels])?;
     let v_image = Array::<T>::new("v_image", v_image)?.of_shape(&[c, height, width, channels])?;
@@ -217,16 +219,16 @@ fn composite_backward_as<'py, T: Scalar>(
             let cameras = frame.cameras.iter().enumerate();
             cameras.map(backward).collect::<Result<_, Error>>()
         })
-    })?;
+    })??;
     let counts = outs
         .iter()
         .fold(Counts::default(), |sum, out| sum.plus(out.counts));
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let whitened = join(&mut outs, |out| &mut out.whitened);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let absolutes = join(&mut outs, |out| &mut out.absolute);
-    let v_colors = join(&mut outs, |out| &mut out.colors);
-    let v_background = join(&mut outs, |out| &mut out.background);
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let whitened = join(&mut outs, |out| &mut out.whitened)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let absolutes = join(&mut outs, |out| &mut out.absolute)?;
+    let v_colors = join(&mut outs, |out| &mut out.colors)?;
+    let v_background = join(&mut outs, |out| &mut out.background)?;
     let out = (
         geometry.then(|| means2d.into_pyarray(py)),
         geometry.then(|| whitened.into_pyarray(py)),

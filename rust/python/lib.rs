@@ -11,7 +11,7 @@ mod training;
 
 use arrays::{Array, by_dtype};
 use error::{BindingError, BindingResult};
-use hqgs::{simd, threads};
+use hqgs::internals::{constants, simd, threads};
 use numpy::Element;
 use pyo3::prelude::*;
 use std::ffi::{c_int, c_long};
@@ -44,8 +44,8 @@ fn set_num_threads(threads: usize) -> BindingResult<()> {
 
 /// Number of threads in use.
 #[pyfunction]
-fn get_num_threads() -> usize {
-    threads::get()
+fn get_num_threads() -> BindingResult<usize> {
+    Ok(threads::get()?)
 }
 
 /// The vector instructions in use: the best of this CPU, or those that HQGS_SIMD names.
@@ -64,6 +64,24 @@ fn pointer_to<T: Element>(array: &Bound<'_, PyAny>) -> BindingResult<usize> {
     Ok(Array::<T>::new("array", array)?.slice()?.as_ptr() as usize)
 }
 
+/// The constants that define an image, for Python to use the same ones.
+fn add_constants(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    for (name, value) in [
+        ("ALPHA_MIN", constants::ALPHA_MIN),
+        ("ALPHA_MAX", constants::ALPHA_MAX),
+        ("TRANSMITTANCE_MIN", constants::TRANSMITTANCE_MIN),
+        ("EPS2D", constants::EPS2D),
+        ("NEAR_PLANE", constants::NEAR_PLANE),
+        ("FAR_PLANE", constants::FAR_PLANE),
+        ("FOV_MARGIN", constants::FOV_MARGIN),
+        ("QUAT_NORM2_MIN", constants::QUAT_NORM2_MIN),
+    ] {
+        m.add(name, value)?;
+    }
+    m.add("TILE", constants::TILE)?;
+    m.add("BLOCK", constants::BLOCK)
+}
+
 /// The extension module `hqgs._rust`.
 #[pymodule]
 fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -73,6 +91,7 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(simd_level, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
+    add_constants(m)?;
     project::register(m)?;
     composite::register(m)?;
     training::register(m)?;

@@ -5,7 +5,7 @@ use crate::{
     error::BindingResult,
     project::Frame,
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     composite::{self, CompositeInput},
     simd::Real,
@@ -41,7 +41,7 @@ fn blending_weights_as<'py, T: Real + Element>(
     let py = frame.py();
     let frame = &frame.get().0;
     let (cameras, projections) = (&frame.cameras, &frame.projections);
-    let size = cameras.first().map_or([0; 2], |c| [c.height, c.width]);
+    let size = cameras.first().map_or([0; 2], |c| [c.height(), c.width()]);
     // Not bool: its bytes are 0 or 1 to Rust, and an array that is a view of another type may hold others.
     let mask = optional_of_shape::<u8>("mask", mask, &[cameras.len(), size[0], size[1]])?;
     let mask = mask.as_ref().map(Array::slice).transpose()?;
@@ -61,6 +61,6 @@ fn blending_weights_as<'py, T: Real + Element>(
             }
             Ok(out)
         })
-    })?;
+    })??;
     Ok(out.into_pyarray(py).into_any())
 }

@@ -1,8 +1,8 @@
 //! The binding of the operators on pictures.
 
-use crate::arrays::{Array, by_dtype};
+use crate::arrays::{Array, by_dtype, gradient};
 use crate::error::BindingResult;
-use hqgs::{
+use hqgs::internals::{
     Error,
     simd::Real,
     threads,
@@ -117,7 +117,7 @@ fn apply<'py, T: Real + Element>(
     let py = image.py();
     let image = Array::<T>::new("image", image)?;
     let (data, shape) = (image.slice()?, image.shape());
-    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))?;
+    let out = py.detach(|| threads::install(|| operator.apply(data, shape)))??;
     Ok(out.into_pyarray(py).into_any())
 }
 
@@ -151,9 +151,9 @@ fn cell_distance_as<'py, T: Real + Element>(
     let centres = Array::<T>::new("centres", centres)?.of_shape(x.shape())?;
     let widths = Array::<T>::new("widths", widths)?.of_shape(x.shape())?;
     let (x, centres, widths) = (x.slice()?, centres.slice()?, widths.slice()?);
-    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let mut grad = gradient::<T>(x.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value =
-        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))?;
+        py.detach(|| threads::install(|| jpeg_cells::distance(x, centres, widths, scale, out)))??;
     Ok((value, want_grad.then(|| grad.into_pyarray(py).into_any())))
 }

@@ -1,8 +1,8 @@
 //! The binding of the loss and of the optimizer.
 
-use crate::arrays::{Array, check_apart, is_f32, optional_of_shape, place};
+use crate::arrays::{Array, check_apart, gradient, is_f32, optional_of_shape, place};
 use crate::error::BindingResult;
-use hqgs::{
+use hqgs::internals::{
     Error,
     simd::Real,
     threads,
@@ -115,7 +115,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
         unreachable!("checked above")
     };
     let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
-    let mut grad = vec![T::ZERO; if want_grad { x.len() } else { 0 }];
+    let mut grad = gradient::<T>(x.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value = py.detach(|| {
         T::with_scratch(|scratch| {
@@ -123,7 +123,7 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
                 loss::photometric(x, y, mask, h, w, c, lambda_dssim, knee, out, scratch)
             })
         })
-    })?;
+    })??;
     let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
     Ok((value.loss, value.l1, value.ssim, grad))
 }
@@ -152,7 +152,7 @@ fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
     let value = a.py().detach(|| {
         T::with_scratch(|scratch| threads::install(|| loss::ssim(x, y, mask, h, w, c, scratch)))
     });
-    Ok(value?)
+    Ok(value??)
 }
 
 /// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
@@ -227,7 +227,7 @@ fn adam_step_as<T: Real + Element>(
         exp_avg: exp_avg.as_slice_mut()?,
         exp_avg_sq: exp_avg_sq.as_slice_mut()?,
     };
-    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))?)
+    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
 
 /// Borrow a C-contiguous array of `shape` to write to it.

@@ -1,31 +1,84 @@
-//! The whole path for one camera, from Gaussians to pixels and back, for callers without Python.
+//! The whole path for one camera, from Gaussians to pixels and back.
+
+pub use crate::{
+    accuracy_knobs::{AccuracyKnobs, Spans},
+    composite::CompositeCotangents as Cotangents,
+    project::ProjectOptions,
+};
 
 use crate::{
     Error,
-    composite::{self, CompositeCotangents, CompositeInput, Composited, Image},
-    project::{self, ProjectCotangents, ProjectOptions, Projected, Projection, Shading},
-    scene::{Camera, Colors, Gaussians, Harmonics},
+    composite::{self, CompositeInput, Composited, Image},
+    error::check_len,
+    project::{self, ProjectCotangents, Projected, Projection, Shading},
+    scene::{Camera, Colors, Gaussians},
     simd::Real,
     tiles::{self, Tiles},
 };
 
-/// An image and what its backward pass replays.
+/// An image, and what its backward pass replays: the inputs stay borrowed, so that no others can stand in.
 #[derive(Debug)]
-pub struct Rendered<T> {
-    /// [H, W, 3]
+pub struct Rendered<'a, T> {
+    /// [H, W, channels]
     pub image: Vec<T>,
-    /// [H, W]
+    /// How much of each pixel the Gaussians cover, 0 to 1, [H, W].
     pub alphas: Vec<T>,
-    /// Radii in pixels, [N, 2]; 0 where culled.
+    /// Radii of the Gaussians' supports in pixels, rounded up, [N, 2]; 0 where culled.
     pub radii: Vec<i32>,
+    gaussians: Gaussians<'a, T>,
+    background: Option<&'a [T]>,
+    camera: Camera,
+    options: ProjectOptions,
     projection: Projection,
+    /// Whether the colours are harmonics, and how they change.
+    harmonics: bool,
     shading: Option<Shading<T>>,
     tiles: Tiles<T>,
     composited: Composited<T>,
 }
 
-/// Gradients of all inputs.
-#[derive(Debug, Clone, PartialEq)]
+/// Which gradients [`backward`] is to compute: what is left out costs less, or nothing.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Wanted {
+    /// Of the means.
+    pub means: bool,
+    /// Of the quaternions.
+    pub quats: bool,
+    /// Of the scales.
+    pub scales: bool,
+    /// Of the opacities.
+    pub opacities: bool,
+    /// Of the colours: the channels, or the harmonics.
+    pub colors: bool,
+    /// Of the background.
+    pub background: bool,
+    /// Of the camera's pose.
+    pub viewmat: bool,
+    /// Of the projected means, and the sums of its absolute values, by which densification decides.
+    pub means2d: bool,
+}
+
+impl Wanted {
+    /// Everything.
+    pub const ALL: Self = Self {
+        means: true,
+        quats: true,
+        scales: true,
+        opacities: true,
+        colors: true,
+        background: true,
+        viewmat: true,
+        means2d: true,
+    };
+
+    /// Whether any of them goes through the geometry of the splats.
+    fn geometry(self) -> bool {
+        self.means || self.quats || self.scales || self.opacities || self.viewmat || self.means2d
+    }
+}
+
+/// Gradients of the inputs; empty where not wanted or not given, 0 for a Gaussian that is culled.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Gradients<T> {
     /// [N, 3]
     pub means: Vec<T>,
@@ -35,35 +88,53 @@ pub struct Gradients<T> {
     pub scales: Vec<T>,
     /// `[N]`
     pub opacities: Vec<T>,
-    /// [N, K, 3]
-    pub harmonics: Vec<T>,
-    /// Row-major [4, 4]
-    pub viewmat: [f64; 16],
+    /// Of the channels, [N, channels], or of `Harmonics::coefficients`, [N, K, 3].
+    pub colors: Vec<T>,
+    /// Of `Harmonics::rest`, [N, K - 1, 3].
+    pub colors_rest: Vec<T>,
+    /// `[channels]`
+    pub background: Vec<T>,
+    /// Of the world-to-camera matrix, row-major [4, 4]; its last row is 0.
+    pub viewmat: Option<[f64; 16]>,
+    /// Of the projected means in pixels, [N, 2].
+    pub means2d: Vec<T>,
+    /// Sums over the pixels of the absolute values of these, [N, 2].
+    pub means2d_absolute: Vec<T>,
 }
 
-/// Render Gaussians with spherical harmonics.
+/// Render Gaussians in front of `background`, `[channels]` (None: 0).
 ///
 /// # Errors
-/// When the arrays do not describe the same number of Gaussians, or cover too many tiles.
-pub fn forward<T: Real>(
-    gaussians: &Gaussians<T>,
-    harmonics: &Harmonics<T>,
+/// When the arrays do not describe the same number of Gaussians or channels, an option is out of its range, or
+/// the Gaussians cover too many tiles.
+pub fn forward<'a, T: Real>(
+    gaussians: Gaussians<'a, T>,
+    colors: Colors<'_, T>,
+    background: Option<&'a [T]>,
     camera: &Camera,
     options: &ProjectOptions,
-) -> Result<Rendered<T>, Error> {
+) -> Result<Rendered<'a, T>, Error> {
+    let channels = colors.channels();
+    if let Some(background) = background {
+        check_len("background", background, channels)?;
+    }
     let Projected {
         projection,
         radii,
-        colors,
+        colors: shaded,
         shading,
         ..
-    } = project::forward(gaussians, Colors::Harmonics(harmonics), camera, options)?;
-    let tiles = tiles::bin(&projection, &colors, 3, camera)?;
+    } = project::forward(&gaussians, colors, camera, options)?;
+    let (harmonics, given) = match colors {
+        Colors::Harmonics(_) => (true, &shaded[..]),
+        Colors::Channels(data, _) => (false, data),
+    };
+    let tiles = tiles::bin(&projection, given, channels, camera)?;
     let input = CompositeInput {
         projection: &projection,
         tiles: &tiles,
         camera,
-        background: None,
+        background,
     };
     let Image {
         image,
@@ -75,74 +146,105 @@ pub fn forward<T: Real>(
         image,
         alphas,
         radii,
+        gaussians,
+        background,
+        camera: *camera,
+        options: *options,
         projection,
+        harmonics,
         shading,
         tiles,
         composited,
     })
 }
 
-/// Gradients of a loss whose gradient with respect to the image is `v_image` [H, W, 3].
+/// Gradients of a loss, from its gradients `v` with respect to the image and the alphas.
 ///
 /// # Errors
-/// When `v_image` has the wrong length.
+/// When an array of `v` has the wrong length, or harmonics were rendered with `differentiable` off.
 pub fn backward<T: Real>(
-    gaussians: &Gaussians<T>,
-    camera: &Camera,
-    options: &ProjectOptions,
-    rendered: &Rendered<T>,
-    v_image: &[T],
+    rendered: &Rendered<'_, T>,
+    v: &Cotangents<T>,
+    wanted: Wanted,
 ) -> Result<Gradients<T>, Error> {
-    let input = CompositeInput {
-        projection: &rendered.projection,
-        tiles: &rendered.tiles,
+    let Rendered {
+        image,
+        alphas,
+        gaussians,
+        background,
         camera,
-        background: None,
+        options,
+        projection,
+        harmonics,
+        shading,
+        tiles,
+        composited,
+        ..
+    } = rendered;
+    check_len("v.image", v.image, image.len())?;
+    check_len("v.alphas", v.alphas.unwrap_or(alphas), alphas.len())?;
+    let input = CompositeInput {
+        projection,
+        tiles,
+        camera,
+        background: *background,
     };
-    let v = CompositeCotangents {
-        image: v_image,
-        alphas: None,
+    // The colours of harmonics change with the direction in which a Gaussian is seen.
+    let directed = *harmonics && (wanted.means || wanted.viewmat);
+    let composite_wanted = composite::Wanted {
+        geometry: wanted.geometry(),
+        absolute: wanted.means2d,
+        colors: wanted.colors || directed,
+        background: wanted.background && background.is_some(),
     };
-    let wanted = composite::Wanted {
-        geometry: true,
-        colors: true,
-        ..composite::Wanted::default()
-    };
-    let composited = composite::backward(&input, &rendered.composited, &v, wanted)?;
+    let splats = composite::backward(&input, composited, v, composite_wanted)?;
+    let geometry = composite_wanted.geometry;
     let cotangents = ProjectCotangents {
-        means2d: Some(&composited.means2d),
-        whitened: Some(&composited.whitened),
-        opacities: Some(&composited.opacities),
+        means2d: geometry.then_some(&splats.means2d[..]),
+        whitened: geometry.then_some(&splats.whitened[..]),
+        opacities: geometry.then_some(&splats.opacities[..]),
         depths: None,
         conics: None,
-        colors: Some(&composited.colors),
+        colors: (*harmonics && composite_wanted.colors).then_some(&splats.colors[..]),
     };
-    let wanted = project::Wanted {
-        means: true,
-        quats: true,
-        scales: true,
-        opacities: true,
-        harmonics: true,
-        harmonics_rest: false,
-        camera: true,
+    let project_wanted = project::Wanted {
+        means: wanted.means,
+        quats: wanted.quats,
+        scales: wanted.scales,
+        opacities: wanted.opacities,
+        harmonics: *harmonics && wanted.colors,
+        harmonics_rest: *harmonics && wanted.colors,
+        camera: wanted.viewmat,
     };
-    let projection = &rendered.projection;
     let grads = project::backward(
         gaussians,
-        rendered.shading.as_ref(),
+        shading.as_ref(),
         camera,
         options,
         projection,
         &cotangents,
-        wanted,
+        project_wanted,
     )?;
+    let channels_wanted = wanted.colors && !harmonics;
     Ok(Gradients {
-        viewmat: grads.camera.viewmat(camera),
+        viewmat: wanted.viewmat.then(|| grads.camera.viewmat(camera)),
         means: grads.means,
         quats: grads.quats,
         scales: grads.scales,
         opacities: grads.opacities,
-        harmonics: grads.harmonics,
+        colors: if channels_wanted {
+            splats.colors
+        } else {
+            grads.harmonics
+        },
+        colors_rest: grads.harmonics_rest,
+        background: splats.background,
+        means2d: if wanted.means2d {
+            splats.means2d
+        } else {
+            Vec::new()
+        },
+        means2d_absolute: splats.absolute,
     })
 }
 

@@ -4,7 +4,7 @@ use super::*;
 use crate::{
     accuracy_knobs::{AccuracyKnobs, Spans},
     constants::ALPHA_MIN,
-    scene::synthetic::Synthetic,
+    scene::{Harmonics, synthetic::Synthetic},
     simd::{Level, at_each_level, levels},
 };
 use rayon::ThreadPoolBuilder;
@@ -25,8 +25,14 @@ fn options(level: Level) -> ProjectOptions {
     }
 }
 
-fn render<T: Real>(level: Level, s: &Synthetic<T>) -> Rendered<T> {
-    forward(&s.gaussians(), &harmonics(s), &s.camera, &options(level)).unwrap()
+fn render_with<'a, T: Real>(s: &'a Synthetic<T>, options: &ProjectOptions) -> Rendered<'a, T> {
+    let harmonics = harmonics(s);
+    let colors = Colors::Harmonics(&harmonics);
+    forward(s.gaussians(), colors, None, &s.camera, options).unwrap()
+}
+
+fn render<T: Real>(level: Level, s: &Synthetic<T>) -> Rendered<'_, T> {
+    render_with(s, &options(level))
 }
 
 fn cotangent<T: Real>(s: &Synthetic<T>) -> Vec<T> {
@@ -37,8 +43,11 @@ fn cotangent<T: Real>(s: &Synthetic<T>) -> Vec<T> {
 }
 
 fn gradients<T: Real>(s: &Synthetic<T>, r: &Rendered<T>) -> Gradients<T> {
-    let options = options(r.projection.level);
-    backward(&s.gaussians(), &s.camera, &options, r, &cotangent(s)).unwrap()
+    let v = Cotangents {
+        image: &cotangent(s),
+        alphas: None,
+    };
+    backward(r, &v, Wanted::ALL).unwrap()
 }
 
 #[test]
@@ -123,14 +132,13 @@ fn tuned(
     level: Level,
     s: &Synthetic<f32>,
     knobs: AccuracyKnobs,
-) -> (Rendered<f32>, Gradients<f32>) {
+) -> (Rendered<'_, f32>, Gradients<f32>) {
     let options = ProjectOptions {
         knobs,
         ..options(level)
     };
-    let (g, h) = (s.gaussians(), harmonics(s));
-    let r = forward(&g, &h, &s.camera, &options).unwrap();
-    let v = backward(&g, &s.camera, &options, &r, &cotangent(s)).unwrap();
+    let r = render_with(s, &options);
+    let v = gradients(s, &r);
     (r, v)
 }
 
@@ -281,7 +289,7 @@ fn check_single(level: Level) {
         ("quats", error(&g32.quats, &g64.quats)),
         ("scales", error(&g32.scales, &g64.scales)),
         ("opacities", error(&g32.opacities, &g64.opacities)),
-        ("harmonics", error(&g32.harmonics, &g64.harmonics)),
+        ("harmonics", error(&g32.colors, &g64.colors)),
     ] {
         assert!(e < 1e-5, "{name}: relative error {e}");
     }
@@ -315,8 +323,210 @@ fn the_wrong_length_is_named() {
         scales: &s.scales[..29],
         ..s.gaussians()
     };
-    let error = forward(&g, &harmonics(&s), &s.camera, &ProjectOptions::default()).unwrap_err();
+    let given = harmonics(&s);
+    let colors = Colors::Harmonics(&given);
+    let options = ProjectOptions::default();
+    let error = forward(g, colors, None, &s.camera, &options).unwrap_err();
     assert_eq!(error.name(), "scales");
+    let error = forward(s.gaussians(), colors, Some(&[0.0]), &s.camera, &options).unwrap_err();
+    assert_eq!(error.name(), "background");
+    let channels = Colors::Channels(&s.harmonics, 47);
+    let error = forward(s.gaussians(), channels, None, &s.camera, &options).unwrap_err();
+    assert_eq!(error.name(), "colors");
+    let narrow = ProjectOptions {
+        far_plane: options.near_plane,
+        ..options
+    };
+    let error = forward(s.gaussians(), colors, None, &s.camera, &narrow).unwrap_err();
+    assert_eq!(error.name(), "far_plane");
+    let r = render_with(&s, &options);
+    for (image, alphas, name) in [(1199, 400, "v.image"), (1200, 399, "v.alphas")] {
+        let v = Cotangents {
+            image: &vec![0.0; image],
+            alphas: Some(&vec![0.0; alphas]),
+        };
+        let error = backward(&r, &v, Wanted::ALL).unwrap_err();
+        assert_eq!(error.name(), name);
+    }
+}
+
+/// All inputs as one list of numbers, and the gradient in the same order.
+struct Inputs {
+    scene: Synthetic<f64>,
+    colors: Vec<f64>,
+    background: Vec<f64>,
+    viewmat: [f64; 16],
+    harmonics: bool,
+}
+
+impl Inputs {
+    fn new(harmonics: bool) -> Self {
+        let scene = Synthetic::<f64>::new(12, 23, 18, 4).unwrap();
+        let wave = |n: usize| (0..n).map(|i| 0.5 + 0.4 * (i as f64 * 1.7).sin()).collect();
+        let (colors, background) = if harmonics {
+            (scene.harmonics.clone(), wave(3))
+        } else {
+            (wave(12 * 5), wave(5))
+        };
+        let viewmat = scene.camera.viewmat();
+        Self {
+            scene,
+            colors,
+            background,
+            viewmat,
+            harmonics,
+        }
+    }
+
+    /// The loss is a sum of all pixels and alphas with different weights.
+    fn loss(&self, wanted: Option<Wanted>) -> (f64, Gradients<f64>) {
+        let s = &self.scene;
+        let camera = Camera::new(&self.viewmat, &s.camera.k(), 23, 18).unwrap();
+        let harmonics = Harmonics {
+            coefficients: &self.colors,
+            rest: None,
+            stored: 16,
+            degree: 3,
+        };
+        let colors = if self.harmonics {
+            Colors::Harmonics(&harmonics)
+        } else {
+            Colors::Channels(&self.colors, 5)
+        };
+        // No jumps: nothing is left out.
+        let options = ProjectOptions {
+            knobs: AccuracyKnobs {
+                alpha_min: 1e-15,
+                transmittance_min: 0.0,
+                ..AccuracyKnobs::default()
+            },
+            ..ProjectOptions::default()
+        };
+        let background = Some(&self.background[..]);
+        let r = forward(s.gaussians(), colors, background, &camera, &options).unwrap();
+        let weights = |n: usize| -> Vec<f64> { (0..n).map(|i| (i as f64 * 0.73).cos()).collect() };
+        let (image, alphas) = (weights(r.image.len()), weights(r.alphas.len()));
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+        let loss = dot(&image, &r.image) + dot(&alphas, &r.alphas);
+        let v = Cotangents {
+            image: &image,
+            alphas: Some(&alphas),
+        };
+        let gradients = wanted.map(|wanted| backward(&r, &v, wanted).unwrap());
+        (loss, gradients.unwrap_or_default())
+    }
+
+    fn array(&mut self, k: usize) -> &mut [f64] {
+        let s = &mut self.scene;
+        match k {
+            0 => &mut s.means,
+            1 => &mut s.quats,
+            2 => &mut s.scales,
+            3 => &mut s.opacities,
+            4 => &mut self.colors,
+            5 => &mut self.background,
+            _ => &mut self.viewmat[..12],
+        }
+    }
+}
+
+#[test]
+fn gradients_are_those_of_finite_differences() {
+    for harmonics in [false, true] {
+        let mut inputs = Inputs::new(harmonics);
+        let (_, g) = inputs.loss(Some(Wanted::ALL));
+        let viewmat = g.viewmat.unwrap();
+        assert_eq!(viewmat[12..], [0.0; 4]);
+        let arrays: [&[f64]; 7] = [
+            &g.means,
+            &g.quats,
+            &g.scales,
+            &g.opacities,
+            &g.colors,
+            &g.background,
+            &viewmat[..12],
+        ];
+        for (k, gradient) in arrays.into_iter().enumerate() {
+            assert_eq!(gradient.len(), inputs.array(k).len());
+            for (i, exact) in gradient.iter().enumerate() {
+                let (h, value) = (1e-5, inputs.array(k)[i]);
+                let mut at = |x| {
+                    inputs.array(k)[i] = x;
+                    inputs.loss(None).0
+                };
+                let difference = (at(value + h) - at(value - h)) / (2.0 * h);
+                inputs.array(k)[i] = value;
+                assert!(
+                    (exact - difference).abs() < 1e-5 * (1.0 + difference.abs()),
+                    "harmonics {harmonics}, array {k}, number {i}: {exact}, not {difference}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_not_wanted_is_empty_and_changes_no_bit_of_the_rest() {
+    for harmonics in [false, true] {
+        let inputs = Inputs::new(harmonics);
+        let (_, all) = inputs.loss(Some(Wanted::ALL));
+        let none = Wanted::default();
+        for (k, wanted) in [
+            Wanted {
+                means: true,
+                ..none
+            },
+            Wanted {
+                quats: true,
+                ..none
+            },
+            Wanted {
+                scales: true,
+                ..none
+            },
+            Wanted {
+                opacities: true,
+                ..none
+            },
+            Wanted {
+                colors: true,
+                ..none
+            },
+            Wanted {
+                background: true,
+                ..none
+            },
+            Wanted {
+                viewmat: true,
+                ..none
+            },
+            Wanted {
+                means2d: true,
+                ..none
+            },
+        ]
+        .into_iter()
+        .enumerate()
+        {
+            let (_, one) = inputs.loss(Some(wanted));
+            let mut expected = Gradients::default();
+            match k {
+                0 => expected.means = all.means.clone(),
+                1 => expected.quats = all.quats.clone(),
+                2 => expected.scales = all.scales.clone(),
+                3 => expected.opacities = all.opacities.clone(),
+                4 => expected.colors = all.colors.clone(),
+                5 => expected.background = all.background.clone(),
+                6 => expected.viewmat = all.viewmat,
+                _ => {
+                    expected.means2d = all.means2d.clone();
+                    expected.means2d_absolute = all.means2d_absolute.clone();
+                }
+            }
+            assert_eq!(one, expected);
+        }
+        assert_eq!(inputs.loss(Some(none)).1, Gradients::default());
+    }
 }
 
 /// All outputs and gradients by name: with harmonics, and of five channels before a background.
@@ -329,33 +539,21 @@ fn outputs<T: Real>(level: Level, s: &Synthetic<T>) -> Vec<(&'static str, Vec<f6
         values.map(T::from_f64).collect()
     };
     let (colors, background) = (wave(5 * n), wave(5));
-    let projected = project::forward(
-        &gaussians,
-        Colors::Channels(&colors, 5),
+    let channels = Colors::Channels(&colors, 5);
+    let view = forward(
+        gaussians,
+        channels,
+        Some(&background),
         &s.camera,
         &options(level),
     )
     .unwrap();
-    let tiles = tiles::bin(&projected.projection, &colors, 5, &s.camera).unwrap();
-    let input = CompositeInput {
-        projection: &projected.projection,
-        tiles: &tiles,
-        camera: &s.camera,
-        background: Some(&background),
-    };
-    let view = composite::forward(&input).unwrap();
     let (v_image, v_alphas) = (wave(view.image.len()), wave(view.alphas.len()));
-    let v = CompositeCotangents {
+    let v = Cotangents {
         image: &v_image,
         alphas: Some(&v_alphas),
     };
-    let wanted = composite::Wanted {
-        geometry: true,
-        absolute: true,
-        colors: true,
-        background: true,
-    };
-    let five = composite::backward(&input, &view.composited, &v, wanted).unwrap();
+    let five = backward(&view, &v, Wanted::ALL).unwrap();
     let numbers = |v: &[T]| v.iter().map(|x| x.to_f64()).collect::<Vec<f64>>();
     vec![
         ("image", numbers(&r.image)),
@@ -364,11 +562,11 @@ fn outputs<T: Real>(level: Level, s: &Synthetic<T>) -> Vec<(&'static str, Vec<f6
         ("quats", numbers(&g.quats)),
         ("scales", numbers(&g.scales)),
         ("opacities", numbers(&g.opacities)),
-        ("harmonics", numbers(&g.harmonics)),
-        ("viewmat", g.viewmat.to_vec()),
+        ("harmonics", numbers(&g.colors)),
+        ("viewmat", g.viewmat.unwrap().to_vec()),
         ("5 channels", numbers(&view.image)),
         ("their means2d", numbers(&five.means2d)),
-        ("their absolute", numbers(&five.absolute)),
+        ("their absolute", numbers(&five.means2d_absolute)),
         ("their colors", numbers(&five.colors)),
         ("their background", numbers(&five.background)),
     ]

@@ -7,27 +7,27 @@ use glam::{DMat3, DVec2, DVec3};
 #[derive(Debug, Clone, Copy)]
 pub struct Camera {
     /// World to camera, linear part.
-    pub rotation: DMat3,
+    pub(crate) rotation: DMat3,
     /// World to camera, translation.
-    pub translation: DVec3,
+    pub(crate) translation: DVec3,
     /// Camera centre in the world, `-rotation^-1 translation`.
-    pub center: DVec3,
+    pub(crate) center: DVec3,
     /// Focal lengths, pixels.
-    pub focal: DVec2,
+    pub(crate) focal: DVec2,
     /// Principal point, pixels.
-    pub principal: DVec2,
+    pub(crate) principal: DVec2,
     /// Image width, pixels.
-    pub width: usize,
+    pub(crate) width: usize,
     /// Image height, pixels.
-    pub height: usize,
+    pub(crate) height: usize,
     /// Smallest `(x/z, y/z)` at which the Jacobian is evaluated.
-    pub ratio_min: DVec2,
+    pub(crate) ratio_min: DVec2,
     /// Largest `(x/z, y/z)` at which the Jacobian is evaluated.
-    pub ratio_max: DVec2,
+    pub(crate) ratio_max: DVec2,
 }
 
 impl Camera {
-    /// A camera from a row-major 4 x 4 world-to-camera matrix and a row-major 3 x 3 intrinsic matrix.
+    /// A camera from a row-major 4 x 4 world-to-camera matrix and a row-major 3 x 3 intrinsic matrix in pixels.
     ///
     /// # Errors
     /// When a number is not finite, a focal length is not positive, the skew is not 0, the last row of
@@ -100,6 +100,39 @@ impl Camera {
             ratio_max: (size - principal) / focal + margin,
         })
     }
+
+    /// Image width, pixels.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Image height, pixels.
+    pub fn height(&self) -> usize {
+        self.height
+    }
+
+    /// The camera's centre in the world.
+    pub fn center(&self) -> [f64; 3] {
+        self.center.to_array()
+    }
+
+    /// Row-major 4 x 4 world-to-camera matrix.
+    pub fn viewmat(&self) -> [f64; 16] {
+        let mut m = [0.0; 16];
+        for i in 0..3 {
+            let row = self.rotation.row(i).to_array();
+            m[4 * i..4 * i + 3].copy_from_slice(&row);
+            m[4 * i + 3] = self.translation[i];
+        }
+        m[15] = 1.0;
+        m
+    }
+
+    /// Row-major 3 x 3 intrinsic matrix, pixels.
+    pub fn k(&self) -> [f64; 9] {
+        let (f, c) = (self.focal, self.principal);
+        [f.x, 0.0, c.x, 0.0, f.y, c.y, 0.0, 0.0, 1.0]
+    }
 }
 
 /// Gradient of a loss with respect to a camera's pose; sums over Gaussians in a fixed order.
@@ -141,5 +174,28 @@ impl CameraGrad {
             m[4 * i..4 * i + 4].copy_from_slice(&row(i));
         }
         m
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_matrices_come_back_and_the_centre_is_where_they_put_it() {
+        // A turn by 90 degrees about z, and away from the origin.
+        let viewmat = [
+            0.0, -1.0, 0.0, 3.0, 1.0, 0.0, 0.0, -2.0, 0.0, 0.0, 1.0, 5.0, 0.0, 0.0, 0.0, 1.0,
+        ];
+        let k = [50.0, 0.0, 20.5, 0.0, 60.0, 15.5, 0.0, 0.0, 1.0];
+        let camera = Camera::new(&viewmat, &k, 40, 30).unwrap();
+        assert_eq!(camera.viewmat(), viewmat);
+        assert_eq!(camera.k(), k);
+        assert_eq!((camera.width(), camera.height()), (40, 30));
+        let c = camera.center();
+        for row in viewmat[..12].chunks_exact(4) {
+            let seen: f64 = row[..3].iter().zip(&c).map(|(r, c)| r * c).sum();
+            assert!((seen + row[3]).abs() < 1e-15);
+        }
     }
 }

@@ -2,7 +2,7 @@
 
 mod camera;
 mod gaussians;
-pub mod synthetic;
+pub(crate) mod synthetic;
 
 pub use camera::{Camera, CameraGrad};
 pub use gaussians::{Colors, Gaussians, Harmonics};

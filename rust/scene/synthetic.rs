@@ -266,7 +266,8 @@ mod tests {
             degree: 3,
         };
         let options = crate::project::ProjectOptions::default();
-        let r = crate::render::forward(&s.gaussians(), &harmonics, &s.camera, &options).unwrap();
+        let colors = crate::scene::Colors::Harmonics(&harmonics);
+        let r = crate::render::forward(s.gaussians(), colors, None, &s.camera, &options).unwrap();
         let open = r.alphas.iter().filter(|a| **a < 0.9).count();
         assert!(
             open < r.alphas.len() / 20,

@@ -6,13 +6,20 @@ use fearless_simd::{Simd, SimdFloatElement};
 /// A vector of `T` of the machine's own width.
 pub type Lanes<T, S> = <T as SimdFloatElement>::Native<S>;
 
-/// f32 or f64.
-pub trait Real: SimdFloatElement + Send + Sync + 'static {
+mod sealed {
+    pub trait Sealed {}
+    impl Sealed for f32 {}
+    impl Sealed for f64 {}
+}
+
+/// f32 or f64, and no other type.
+pub trait Real: sealed::Sealed + SimdFloatElement + Send + Sync + 'static {
     /// Zero.
     const ZERO: Self;
     /// One.
     const ONE: Self;
     /// Whether this is f32.
+    #[doc(hidden)]
     const SINGLE: bool;
     /// Nearest value of this type.
     fn from_f64(x: f64) -> Self;
@@ -23,6 +30,7 @@ pub trait Real: SimdFloatElement + Send + Sync + 'static {
     /// `2^x` for `x <= 0`, lane by lane. Relative error at most 1.2e-7 (f32), 3e-16 (f64) down to the
     /// smallest normal number; below it the result is that number, which every caller cuts off. `DEGREE` is
     /// that of the polynomial; all but 3, 4 and 5, which f32 alone has, mean the one of this accuracy.
+    #[doc(hidden)]
     fn exp2<S: Simd, const DEGREE: usize>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S>;
 }
 

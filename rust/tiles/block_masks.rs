@@ -1,8 +1,10 @@
 //! Which blocks of its tile a Gaussian reaches.
 
-use super::pairs::Record;
+use super::{NAME, pairs::Record};
 use crate::{
     constants::{BLOCK, BLOCKS_PER_SIDE, TILE, TILE_BLOCKS},
+    error::Error,
+    memory,
     simd::{Real, groups::GROUP},
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
@@ -14,8 +16,12 @@ pub(super) struct Shapes(Vec<[[f32; GROUP]; 6]>);
 
 impl Shapes {
     /// Make room for `n` Gaussians.
-    pub fn resize(&mut self, n: usize) {
-        self.0.resize(n.div_ceil(GROUP), [[0.0; GROUP]; 6]);
+    pub fn resize(&mut self, n: usize) -> Result<(), Error> {
+        let groups = n.div_ceil(GROUP);
+        let more = groups.saturating_sub(self.0.len());
+        memory::reserve(&mut self.0, more, NAME)?;
+        self.0.resize(groups, [[0.0; GROUP]; 6]);
+        Ok(())
     }
 
     #[inline(always)]
@@ -25,6 +31,20 @@ impl Shapes {
             row[k % GROUP] = value.to_f64() as f32;
         }
     }
+}
+
+/// Make room for what the functions below write for `count` Gaussians: whole vectors, in the lists one more.
+pub(super) fn make_room(
+    count: usize,
+    masks: &mut Vec<u16>,
+    lists: &mut [Vec<u32>; TILE_BLOCKS],
+) -> Result<(), Error> {
+    *masks = memory::with_capacity(count.next_multiple_of(GROUP), NAME)?;
+    for list in lists {
+        let more = (count.next_multiple_of(GROUP) + GROUP).saturating_sub(list.len());
+        memory::reserve(list, more, NAME)?;
+    }
+    Ok(())
 }
 
 /// For each of `count` Gaussians the blocks of which a pixel centre can lie in the support (bit b for block

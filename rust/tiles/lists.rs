@@ -1,10 +1,11 @@
 //! The list of one tile: its pairs, front to back.
 
 use super::{
-    block_masks::{Shapes, all_blocks, reached_blocks},
+    NAME,
+    block_masks::{Shapes, all_blocks, make_room, reached_blocks},
     pairs::{Pairs, Record, copy_color},
 };
-use crate::{constants::TILE_BLOCKS, project::Projection, simd::Real};
+use crate::{constants::TILE_BLOCKS, error::Error, memory, project::Projection, simd::Real};
 use fearless_simd::Simd;
 use std::hint::black_box;
 
@@ -74,7 +75,7 @@ pub(super) fn list<S: Simd, T: Real>(
     channels: usize,
     tile: usize,
     scratch: &mut Scratch<T>,
-) -> List<T> {
+) -> Result<List<T>, Error> {
     let Scratch {
         keys,
         records,
@@ -85,6 +86,10 @@ pub(super) fn list<S: Simd, T: Real>(
     keys.clear();
     records.clear();
     colors.clear();
+    let n = chunks.iter().map(|pairs| pairs.tile(tile).len()).sum();
+    memory::reserve(keys, n, NAME)?;
+    memory::reserve(records, n, NAME)?;
+    memory::reserve(colors, n * channels, NAME)?;
     // The pieces are short, and the first line of each is a miss.
     for pairs in chunks {
         let range = pairs.tile(tile);
@@ -100,22 +105,21 @@ pub(super) fn list<S: Simd, T: Real>(
         colors.extend_from_slice(&pairs.colors[range.start * channels..range.end * channels]);
         records.extend_from_slice(&pairs.records[range]);
     }
-    let n = keys.len();
     let mut list = List {
-        records: Vec::with_capacity(n),
-        colors: vec![T::ZERO; n * channels],
-        places: Vec::with_capacity(n),
+        records: memory::with_capacity(n, NAME)?,
+        colors: memory::filled(T::ZERO, n * channels, NAME)?,
+        places: memory::with_capacity(n, NAME)?,
         ..List::default()
     };
     if n == 0 {
-        return list;
+        return Ok(list);
     }
     keys.sort_unstable();
     for key in keys.iter() {
         list.places.push(*key as u32);
     }
     order_ties(projection, keys, records, &mut list.places);
-    shapes.resize(n);
+    shapes.resize(n)?;
     for (k, place) in list.places.iter().enumerate() {
         let place = *place as usize;
         copy_color(
@@ -125,17 +129,18 @@ pub(super) fn list<S: Simd, T: Real>(
         shapes.set(k, &records[place]);
         list.records.push(records[place]);
     }
+    make_room(n, &mut list.masks, reached)?;
     if projection.knobs.skip_blocks {
         reached_blocks(simd, shapes, n, &mut list.masks, reached);
     } else {
         all_blocks(n, &mut list.masks, reached);
     }
-    list.blocks = Vec::with_capacity(reached.iter().map(Vec::len).sum());
+    list.blocks = memory::with_capacity(reached.iter().map(Vec::len).sum(), NAME)?;
     for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
         list.blocks.extend_from_slice(records);
         *begin = list.blocks.len() as u32;
     }
-    list
+    Ok(list)
 }
 
 /// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly

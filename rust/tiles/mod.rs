@@ -13,15 +13,16 @@ mod spans;
 pub(crate) use pairs::{Chunk, Record, UNIT};
 
 use crate::{
-    constants::{MAX_PAIRS, TILE},
+    constants::{MAX_PAIR_BYTES, MAX_PAIRS, TILE},
     error::Error,
+    memory,
     project::Projection,
     scene::Camera,
     simd::Real,
 };
 use fearless_simd::dispatch;
 use lists::{List, Scratch, list};
-use pairs::Source;
+use pairs::{Source, pair_bytes};
 use rayon::prelude::*;
 use std::sync::atomic::AtomicU64;
 
@@ -56,6 +57,9 @@ impl<T> Tiles<T> {
     }
 }
 
+/// What an error calls the buffers of this folder.
+const NAME: &str = "tile lists";
+
 /// Gaussians per chunk where there are many.
 const CHUNK: usize = 8192;
 
@@ -63,12 +67,25 @@ const CHUNK: usize = 8192;
 /// channels where only weights are asked for.
 ///
 /// # Errors
-/// When there are more than [`MAX_PAIRS`] (Gaussian, tile) pairs.
+/// When the (Gaussian, tile) pairs could take more than [`MAX_PAIR_BYTES`] or are more than [`MAX_PAIRS`], or there
+/// is no memory for them.
 pub fn bin<T: Real>(
     projection: &Projection,
     colors: &[T],
     channels: usize,
     camera: &Camera,
+) -> Result<Tiles<T>, Error> {
+    let limit = (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS);
+    bin_at_most(projection, colors, channels, camera, limit)
+}
+
+/// `bin` with at most `limit` pairs.
+fn bin_at_most<T: Real>(
+    projection: &Projection,
+    colors: &[T],
+    channels: usize,
+    camera: &Camera,
+    limit: u64,
 ) -> Result<Tiles<T>, Error> {
     let n = projection.splats.len();
     let (tiles_x, tiles_y) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
@@ -83,35 +100,42 @@ pub fn bin<T: Real>(
         tiles_x,
         tiles_y,
         total: AtomicU64::new(0),
+        limit,
     };
     let level = projection.level.token;
-    let (mut chunks, pairs): (Vec<_>, Vec<_>) = (0..n.div_ceil(size))
+    let made: Vec<_> = (0..n.div_ceil(size))
         .into_par_iter()
         .map(|k| {
             let range = k * size..n.min((k + 1) * size);
             dispatch!(level, simd => source.chunk(simd, range))
         })
-        .unzip();
-    let total = source.total.into_inner();
-    if total > MAX_PAIRS {
+        .collect::<Result<_, Error>>()?;
+    let (mut chunks, pairs): (Vec<_>, Vec<_>) = made.into_iter().unzip();
+    if source.total.into_inner() > limit {
         return Err(Error::TooManyPairs {
-            pairs: total,
-            limit: MAX_PAIRS,
+            gaussians: n as u64,
+            tiles: (tiles_x * tiles_y) as u64,
+            limit,
+            bytes: limit * pair_bytes::<T>(channels),
         });
     }
     // Counts to places: in a tile chunk by chunk.
-    let mut sums = vec![0u32; tiles_x * tiles_y];
+    let mut sums = memory::filled(0u32, tiles_x * tiles_y, NAME)?;
     for chunk in &mut chunks {
         for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
             *sum += std::mem::replace(start, *sum);
         }
     }
-    let lists = (0..tiles_x * tiles_y)
-        .into_par_iter()
-        .map_init(Scratch::default, |scratch, tile| {
-            dispatch!(level, simd => list(simd, projection, &pairs, channels, tile, scratch))
-        })
-        .collect();
+    let mut lists = memory::with_capacity(tiles_x * tiles_y, NAME)?;
+    lists.resize_with(tiles_x * tiles_y, List::default);
+    lists.par_iter_mut().enumerate().try_for_each_init(
+        Scratch::default,
+        |scratch, (tile, out)| -> Result<(), Error> {
+            *out =
+                dispatch!(level, simd => list(simd, projection, &pairs, channels, tile, scratch))?;
+            Ok(())
+        },
+    )?;
     Ok(Tiles {
         tiles_x,
         tiles_y,
@@ -119,4 +143,83 @@ pub fn bin<T: Real>(
         channels,
         chunks,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{
+        project::{self, ProjectOptions},
+        scene::{Colors, synthetic::Synthetic},
+    };
+    use rayon::ThreadPoolBuilder;
+
+    #[test]
+    fn more_pairs_than_allowed_are_an_error_for_any_number_of_threads() {
+        let s = Synthetic::<f32>::new(9000, 300, 200, 1).unwrap();
+        let none = Colors::<f32>::Channels(&[], 0);
+        let options = ProjectOptions::default();
+        let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
+        let projection = projected.projection;
+        let pairs = bin::<f32>(&projection, &[], 0, &s.camera).unwrap().pairs() as u64;
+        assert!(pairs > 20_000); // of several chunks
+        for threads in [1, 3] {
+            let pool = ThreadPoolBuilder::new().num_threads(threads);
+            pool.build().unwrap().install(|| {
+                let bin = |limit| bin_at_most::<f32>(&projection, &[], 0, &s.camera, limit);
+                assert_eq!(bin(pairs).unwrap().pairs() as u64, pairs);
+                for limit in [pairs - 1, pairs / 2, 0] {
+                    let expected = Error::TooManyPairs {
+                        gaussians: 9000,
+                        tiles: 19 * 13,
+                        limit,
+                        bytes: limit * pair_bytes::<f32>(0),
+                    };
+                    assert_eq!(bin(limit).unwrap_err(), expected);
+                }
+            });
+        }
+    }
+
+    #[test]
+    fn the_counting_stops_at_the_limit() {
+        let s = Synthetic::<f32>::new(1000, 3000, 2000, 1).unwrap();
+        let none = Colors::<f32>::Channels(&[], 0);
+        let options = ProjectOptions::default();
+        let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
+        let source = |limit| Source::<f32> {
+            projection: &projected.projection,
+            colors: &[],
+            channels: 0,
+            tiles_x: 188,
+            tiles_y: 125,
+            total: AtomicU64::new(0),
+            limit,
+        };
+        let level = projected.projection.level.token;
+        let spans = |limit| {
+            let source = source(limit);
+            let (chunk, pairs) = dispatch!(level, simd => source.chunk(simd, 0..1000)).unwrap();
+            (
+                chunk.spans.len(),
+                pairs.records.len(),
+                source.total.into_inner(),
+            )
+        };
+        let (all, records, total) = spans(u64::MAX);
+        assert_eq!(records as u64, total);
+        let (some, none, counted) = spans(total / 10);
+        assert!(some < all / 4 && none == 0, "{some} of {all} spans");
+        assert!(
+            total / 10 < counted && counted < total / 2,
+            "{counted} of {total} pairs"
+        );
+    }
+
+    #[test]
+    fn the_blocks_of_one_tile_can_be_counted() {
+        // Begin and end of each block's list lie in a u32, and all pairs may reach all blocks of one tile.
+        assert!(MAX_PAIRS * crate::constants::TILE_BLOCKS as u64 <= u64::from(u32::MAX));
+        assert!(pair_bytes::<f32>(3) < pair_bytes::<f64>(3));
+    }
 }

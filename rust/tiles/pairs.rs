@@ -1,9 +1,14 @@
 //! The pairs of a Gaussian and a tile that it reaches, and what the kernels read of each.
 
-use super::spans::{Span, tile_spans};
+use super::{
+    NAME,
+    spans::{Span, tile_spans},
+};
 use crate::{
     accuracy_knobs::Spans,
-    constants::{MAX_PAIRS, TILE},
+    constants::{TILE, TILE_BLOCKS},
+    error::Error,
+    memory,
     project::{Projection, Splat},
     simd::Real,
 };
@@ -92,57 +97,80 @@ pub(super) struct Source<'a, T> {
     pub tiles_y: usize,
     /// Pairs so far.
     pub total: AtomicU64,
+    /// The most that there may be.
+    pub limit: u64,
+}
+
+/// Pairs that a chunk counts before it adds them to those of the others.
+const REPORT: u64 = 1 << 14;
+
+/// Bytes that a pair takes at most while the lists are made: as part of its chunk and of its tile's list, with an
+/// index for each block.
+pub(super) const fn pair_bytes<T>(channels: usize) -> u64 {
+    let both = size_of::<Record<T>>() + channels * size_of::<T>();
+    let of_chunk = size_of::<Span>() + size_of::<u32>();
+    let of_list = size_of::<u32>() + size_of::<u16>() + TILE_BLOCKS * size_of::<u32>();
+    (2 * both + of_chunk + of_list) as u64
 }
 
 impl<T: Real> Source<'_, T> {
-    /// The spans of the Gaussians `range`, and their pairs; not the pairs if they are too many. The chunk's
-    /// `starts` are counts.
+    /// The spans of the Gaussians `range`, and their pairs; not all of the spans and none of the pairs if those of
+    /// all chunks so far are too many. The chunk's `starts` are counts.
     #[inline(always)]
-    pub fn chunk<S: Simd>(&self, _: S, range: Range<usize>) -> (Chunk, Pairs<T>) {
-        let mut spans = Vec::with_capacity(range.len());
-        let mut counts = vec![0u32; self.tiles_x * self.tiles_y];
+    pub fn chunk<S: Simd>(&self, _: S, range: Range<usize>) -> Result<(Chunk, Pairs<T>), Error> {
+        let mut spans = memory::with_capacity(range.len(), NAME)?;
+        let mut counts = memory::filled(0u32, self.tiles_x * self.tiles_y, NAME)?;
         let exact = self.projection.knobs.spans == Spans::Ellipse;
+        let mut fresh = 0;
+        let mut too_many = self.add(0);
         for i in range.clone() {
             let splat = &self.projection.splats[i];
-            if splat.visible() {
-                tile_spans(splat, exact, |row, x0, x1| {
-                    let span = Span {
-                        gaussian: i as u32,
-                        row: row as u16,
-                        begin: x0 as u16,
-                        end: x1 as u16,
-                    };
-                    for count in &mut counts[span.tiles(self.tiles_x)] {
-                        *count += 1;
-                    }
-                    spans.push(span);
-                });
+            if too_many || !splat.visible() {
+                continue;
             }
+            let [_, _, first, last] = splat.tiles.map(usize::from);
+            memory::reserve(&mut spans, last - first, NAME)?;
+            tile_spans(splat, exact, |row, x0, x1| {
+                if too_many {
+                    return;
+                }
+                let span = Span {
+                    gaussian: i as u32,
+                    row: row as u16,
+                    begin: x0 as u16,
+                    end: x1 as u16,
+                };
+                for count in &mut counts[span.tiles(self.tiles_x)] {
+                    *count += 1;
+                }
+                spans.push(span);
+                fresh += (x1 - x0) as u64;
+                if fresh >= REPORT {
+                    too_many = self.add(std::mem::take(&mut fresh));
+                }
+            });
         }
-        let total: u64 = spans
-            .iter()
-            .map(|span| u64::from(span.end - span.begin))
-            .sum();
+        too_many = self.add(fresh);
         let chunk = Chunk {
             begin: range.start,
             end: range.end,
             spans,
             starts: counts,
         };
-        let before = self.total.fetch_add(total, Ordering::Relaxed);
-        let spans = if before + total <= MAX_PAIRS {
-            &chunk.spans[..]
-        } else {
-            &[]
-        };
-        let pairs = self.pairs(spans, &chunk.starts);
-        (chunk, pairs)
+        let spans = if too_many { &[] } else { &chunk.spans[..] };
+        let pairs = self.pairs(spans, &chunk.starts)?;
+        Ok((chunk, pairs))
+    }
+
+    /// Count more pairs. Whether there are too many.
+    fn add(&self, more: u64) -> bool {
+        self.total.fetch_add(more, Ordering::Relaxed) + more > self.limit
     }
 
     #[inline(always)]
-    fn pairs(&self, spans: &[Span], counts: &[u32]) -> Pairs<T> {
+    fn pairs(&self, spans: &[Span], counts: &[u32]) -> Result<Pairs<T>, Error> {
         let d = self.channels;
-        let mut begins = Vec::with_capacity(counts.len() + 1);
+        let mut begins = memory::with_capacity(counts.len() + 1, NAME)?;
         let mut sum = 0usize;
         for count in counts {
             begins.push(sum as u32);
@@ -152,10 +180,11 @@ impl<T: Real> Source<'_, T> {
         if spans.is_empty() {
             sum = 0;
         }
-        let mut next = begins.clone();
-        let mut depths = vec![0; sum];
-        let mut records = vec![Record::default(); sum];
-        let mut colors = vec![T::ZERO; sum * d];
+        let mut next = memory::with_capacity(begins.len(), NAME)?;
+        next.extend_from_slice(&begins);
+        let mut depths = memory::filled(0, sum, NAME)?;
+        let mut records = memory::filled(Record::default(), sum, NAME)?;
+        let mut colors = memory::filled(T::ZERO, sum * d, NAME)?;
         let middle = |k: usize| (k * TILE + TILE / 2) as f64;
         for span in spans {
             let i = span.gaussian as usize;
@@ -172,12 +201,12 @@ impl<T: Real> Source<'_, T> {
                 copy_color(&mut colors[at * d..(at + 1) * d], color);
             }
         }
-        Pairs {
+        Ok(Pairs {
             begins,
             depths,
             records,
             colors,
-        }
+        })
     }
 }
 

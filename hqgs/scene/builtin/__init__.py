@@ -2,5 +2,15 @@
 
 from hqgs.scene.builtin.scene import embedded_cameras, embedded_scene
 from hqgs.scene.builtin.shading import render_depth, render_view
+from hqgs.scene.builtin.sparse import sparse_room
+from hqgs.scene.builtin.wild import TRUE_KINDS, wild_room
 
-__all__ = ["embedded_cameras", "embedded_scene", "render_depth", "render_view"]
+__all__ = [
+    "TRUE_KINDS",
+    "embedded_cameras",
+    "embedded_scene",
+    "render_depth",
+    "render_view",
+    "sparse_room",
+    "wild_room",
+]

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from hqgs.base.files import atomic_path, write_json
+from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.points import SparsePoints, sfm_points
 from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.scene.sfm.run import PROGRAM
 
 FOCAL, WIDTH, HEIGHT = 410.0, 504, 378  # pixels; other sizes scale the intrinsics
 FOCUS = (0.05, -0.12, 4.4)  # what the cameras look at
+TEST_EVERY = 8
 REACH = (0.42, 0.28, 0.08)  # how far the cameras lie from (0, -0.15, 0)
 
 
@@ -50,25 +47,55 @@ def embedded_scene(
         raise ValueError(f"num_views must be at least 2 (one to train, one to test), got {num_views}")
     if gloss is not None and not 0 <= gloss < math.inf:
         raise ValueError(f"gloss must be at least 0 and finite, got {gloss}")
+    return assemble(
+        "embedded", embedded_cameras(width, height, num_views), cache, time_limit, threads, gloss, {}
+    )
+
+
+def assemble(
+    name: str,
+    cameras: list[Camera],
+    cache: Path | None,
+    time_limit: float,
+    threads: int | None,
+    gloss: float | None,
+    made: dict[str, Any],
+    thin: Callable[[SparsePoints], SparsePoints] = lambda points: points,
+) -> Scene:
+    """A scene of clean photos of the room by these cameras, every 8th a test view; points from the others.
+
+    The points pass through `thin`. `made` says what cameras and `thin` depend on beside the photos' size and
+    number, in JSON values, for the key of the cache.
+    """
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
-    cameras = embedded_cameras(width, height, num_views)
-    names = [f"view_{k:02d}.png" for k in range(num_views)]
-    made = _read_cache(cache, cameras, names, gloss) if cache is not None else None
-    if made is None:
-        photos = [render_view(camera, threads=threads, gloss=gloss) for camera in cameras]
-        views = [View(*parts) for parts in zip(names, cameras, photos, strict=True)]
-        points = sfm_points([v for k, v in enumerate(views) if k % 8], time_limit)
+    names = [f"view_{k:02d}.png" for k in range(len(cameras))]
+    made = {
+        "width": cameras[0].width,
+        "height": cameras[0].height,
+        "num_views": len(cameras),
+        "gloss": gloss,
+        **made,
+    }
+    kept = None if cache is None else read_kept(cache, made, names)
+    if kept is None:
+        photos = {
+            name: render_view(camera, threads=threads, gloss=gloss)
+            for name, camera in zip(names, cameras, strict=True)
+        }
+        views = [View(name, camera, photos[name]) for name, camera in zip(names, cameras, strict=True)]
+        points = thin(sfm_points([v for k, v in enumerate(views) if k % TEST_EVERY], time_limit))
         if cache is not None:
-            _write_cache(cache, views, points, gloss)
+            arrays = {key: value for key, value in points._asdict().items() if key != "note"}
+            write_kept(cache, made, Kept(photos, arrays, points.note))
     else:
-        photos, points = made
-        views = [View(*parts) for parts in zip(names, cameras, photos, strict=True)]
-    train = [v for k, v in enumerate(views) if k % 8]
+        views = [View(name, camera, kept.photos[name]) for name, camera in zip(names, cameras, strict=True)]
+        points = SparsePoints(**kept.arrays, note=kept.note)
+    train = [v for k, v in enumerate(views) if k % TEST_EVERY]
     return Scene(
-        name="embedded",
+        name=name,
         train=train,
-        test=views[::8],
+        test=views[::TEST_EVERY],
         points=points.points,
         point_colors=points.colors,
         source="embedded",
@@ -111,54 +138,3 @@ def look_at(
     viewmat[:3, :3] = [math.cos(roll) * x + math.sin(roll) * y, math.cos(roll) * y - math.sin(roll) * x, z]
     viewmat[:3, 3] = -viewmat[:3, :3] @ center
     return viewmat
-
-
-def _key(cameras: list[Camera], names: list[str], gloss: float | None) -> dict[str, Any]:
-    """What the cached files depend on: the cameras' number and size, the gloss, and the source that makes
-    them."""
-    source = b"".join(path.read_bytes() for path in [*sorted(Path(__file__).parent.glob("*.py")), PROGRAM])
-    return {
-        "source": hashlib.sha256(source).hexdigest(),
-        "width": cameras[0].width,
-        "height": cameras[0].height,
-        "num_views": len(names),
-        "gloss": gloss,
-    }
-
-
-def _write_cache(cache: Path, views: list[View], points: SparsePoints, gloss: float | None) -> None:
-    """Photos and points first, the key with their checksums last, so that a key vouches for whole files."""
-    for view in views:
-        with atomic_path(cache / view.name) as tmp:
-            Image.fromarray(view.image).save(tmp)
-    with atomic_path(cache / "points.npz") as tmp:
-        np.savez(tmp, points=points.points, colors=points.colors, photos=points.photos, rows=points.rows)
-    names = [view.name for view in views]
-    files = {name: _checksum(cache / name) for name in [*names, "points.npz"]}
-    key = {"made": _key([view.camera for view in views], names, gloss), "files": files, "note": points.note}
-    write_json(cache / "key.json", key)
-
-
-def _read_cache(
-    cache: Path, cameras: list[Camera], names: list[str], gloss: float | None
-) -> tuple[list[NDArray[np.uint8]], SparsePoints] | None:
-    """Photos and points, or None if anything is missing, damaged or made by another version."""
-    try:
-        key = json.loads((cache / "key.json").read_text(encoding="utf-8"))
-        if key["made"] != _key(cameras, names, gloss) or set(key["files"]) != {*names, "points.npz"}:
-            return None
-        if any(_checksum(cache / name) != digest for name, digest in key["files"].items()):
-            return None
-        photos = []
-        for name in names:
-            with Image.open(cache / name) as image:
-                photos.append(np.asarray(image))
-        with np.load(cache / "points.npz", allow_pickle=False) as data:
-            arrays = (data[name] for name in ("points", "colors", "photos", "rows"))
-            return photos, SparsePoints(*arrays, note=str(key["note"]))
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-        return None
-
-
-def _checksum(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Light, and the two public renderers: `render_view` (photo) and `render_depth` (view-space z)."""
+"""Light, and the public renderers: `render_view` and `render_exposure` (photos), `render_depth`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.photos.light import to_srgb
+from hqgs.scene.builtin.exposure import Exposure, still
 from hqgs.scene.builtin.raycast import Array, Surface, Vec, along, dot, in_view, nearest
 from hqgs.scene.builtin.studio import Studio, studio
 from hqgs.scene.scene import Camera
@@ -29,13 +31,31 @@ def render_view(
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    image = np.empty((camera.height, camera.width, 3), np.uint8)
-    jitter = _sample_pattern(samples)
+    return render_exposure(still(camera, sample_pattern(samples)), threads=threads, gloss=gloss)
+
+
+def render_exposure(
+    exposure: Exposure,
+    gains: NDArray[np.float64] | None = None,
+    threads: int | None = None,
+    gloss: float | None = None,
+) -> NDArray[np.uint8]:
+    """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
+
+    `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
+    in all photos: it rolls off the highlights and encodes sRGB. `threads` and `gloss` as in `render_view`.
+    """
+    width, height = exposure.size
+    image = np.empty((height, width, 3), np.uint8)
+    factor = None if gains is None else gains.astype(np.float32)
 
     def work(tile: _Tile) -> None:
-        image[tile.rows, tile.cols] = tile.picture(_render_tile(tile))
+        light = _render_tile(tile)
+        if factor is not None:
+            light *= factor
+        image[tile.rows, tile.cols] = tile.picture((_encode(light) * 255 + 0.5).astype(np.uint8))
 
-    _each_tile(camera, jitter, np.float32, work, threads, gloss)
+    _each_tile(exposure, np.float32, work, threads, gloss)
     return image
 
 
@@ -50,11 +70,11 @@ def render_depth(camera: Camera, threads: int | None = None) -> NDArray[np.float
         t, _ = nearest(tile.seen, tile.blocks, tile.eye, tile.d)
         depth[tile.rows, tile.cols] = tile.picture(t[:, 0])
 
-    _each_tile(camera, np.full((1, 2), 0.5), np.float64, work, threads)
+    _each_tile(still(camera, np.full((1, 2), 0.5)), np.float64, work, threads)
     return depth
 
 
-def _sample_pattern(n: int) -> NDArray[np.float64]:
+def sample_pattern(n: int) -> NDArray[np.float64]:
     """Offsets (x, y) in the unit pixel, [n^2, 2]: one in each cell of an n x n grid, all x and y distinct.
 
     The canonical arrangement of correlated multi-jittered sampling (Kensler 2013), without its shuffle.
@@ -66,27 +86,34 @@ def _sample_pattern(n: int) -> NDArray[np.float64]:
 class _Tile:
     """The rays of up to TILE x TILE pixels, in B blocks of S samples of n = BLOCK^2 pixels: [B, S, n]."""
 
-    def __init__(
-        self, camera: Camera, x: int, y: int, jitter: NDArray[np.float64], dtype: type, gloss: float | None
-    ) -> None:
-        self.scene, self.jitter = studio(gloss), jitter
-        width, height = min(TILE, camera.width - x), min(TILE, camera.height - y)
+    def __init__(self, exposure: Exposure, x: int, y: int, dtype: type, gloss: float | None) -> None:
+        self.scene, self.jitter = studio(gloss), exposure.jitter
+        width, height = (min(TILE, side - at) for side, at in zip(exposure.size, (x, y), strict=True))
         self.rows, self.cols = slice(y, y + height), slice(x, x + width)
         self.grid = (-(-height // BLOCK), -(-width // BLOCK))  # the last blocks may reach past the picture
         row, col = (a.reshape(-1, 1) * BLOCK for a in np.indices(self.grid))
         i, j = (a.reshape(-1) for a in np.indices((BLOCK, BLOCK)))
         px, py = (x + col + j)[:, None], (y + row + i)[:, None]
-        dx, dy, dz = _directions(camera, px + jitter[:, :1], py + jitter[:, 1:])
-        self.d: Vec = (dx.astype(dtype), dy.astype(dtype), dz.astype(dtype))
-        center = camera.center
-        self.eye: Vec = (float(center[0]), float(center[1]), float(center[2]))
+        self.eye, directions = _rays(exposure, py, px + self.jitter[:, :1], py + self.jitter[:, 1:], dtype)
+        dx, dy, dz = (a.astype(dtype) for a in directions)
+        self.d: Vec = (dx, dy, dz)
 
+        cameras, margin = exposure.seen_from(self.rows)
         square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-        around = _directions(camera, x + TILE * square[:, 0], y + TILE * square[:, 1])
-        visible = np.flatnonzero(in_view(self.scene.corners, center, np.stack(around, -1)[None]))
+
+        def meets(corners: NDArray[np.float64], left: Any, top: Any, side: int) -> NDArray[np.bool_]:
+            """Which boxes, corners [N, 8, 3], the cameras may see in squares at pixels [B, 1]; [N, B]."""
+            xs = left - margin + (side + 2 * margin) * square[:, 0]
+            ys = top - margin + (side + 2 * margin) * square[:, 1]
+            found = np.zeros((len(corners), len(xs)), bool)
+            for camera in cameras:
+                found |= in_view(corners, camera.center, np.stack(_directions(camera, xs, ys), -1))
+            return found
+
+        tile = np.zeros((1, 1), np.int64)
+        visible = np.flatnonzero(meets(self.scene.corners, x + tile, y + tile, TILE))
         self.seen = [self.scene.surfaces[k] for k in visible]
-        around = _directions(camera, x + col + BLOCK * square[:, 0], y + row + BLOCK * square[:, 1])
-        self.blocks = in_view(self.scene.corners[visible], center, np.stack(around, -1))
+        self.blocks = meets(self.scene.corners[visible], x + col, y + row, BLOCK)
 
     def picture(self, values: NDArray[Any]) -> NDArray[Any]:
         """Per-pixel values in blocks, [B, n, ...], as rows and columns of the tile."""
@@ -103,34 +130,61 @@ def _directions(camera: Camera, x: NDArray[Any], y: NDArray[Any]) -> list[NDArra
     return [R[0, k] * a + R[1, k] * b + R[2, k] for k in range(3)]
 
 
+def _rays(
+    exposure: Exposure, row: NDArray[np.int64], x: NDArray[Any], y: NDArray[Any], dtype: type
+) -> tuple[Vec, list[NDArray[np.float64]]]:
+    """Origins and world directions, as `_directions`, of the samples at x, y [B, S, n] in rows [B, 1, n].
+
+    Origins are numbers for a still pinhole, otherwise arrays [1, S, 1] or [B, S or 1, n].
+    """
+    rows = exposure.cameras
+    if len(rows) == 1 and len(rows[0]) == 1:
+        center = rows[0][0].center
+        return (float(center[0]), float(center[1]), float(center[2])), _directions(rows[0][0], x, y)
+
+    def gather(values: list[list[Any]]) -> NDArray[np.float64]:
+        """Per row and sample, [rows, samples, ...], as [..., B, S, n]."""
+        table = np.moveaxis(np.array(values), (0, 1), (-2, -1))
+        if len(rows) == 1:
+            return table[..., 0, None, :, None]
+        last = np.minimum(row[:, 0], len(rows) - 1)  # blocks may reach past the picture
+        return np.moveaxis(table[..., last, :], -1, -2)
+
+    K, R = (gather([[getattr(c, what) for c in cameras] for cameras in rows]) for what in ("K", "viewmat"))
+    a, b = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
+    ox, oy, oz = gather([[c.center for c in cameras] for cameras in rows]).astype(dtype)
+    return (ox, oy, oz), [R[0, k] * a + R[1, k] * b + R[2, k] for k in range(3)]
+
+
 def _each_tile(
-    camera: Camera,
-    jitter: NDArray[np.float64],
+    exposure: Exposure,
     dtype: type,
     work: Callable[[_Tile], None],
     threads: int | None,
     gloss: float | None = None,
 ) -> None:
     """Run `work` on fixed tiles that cover the picture; the tiles do not depend on the threads."""
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"camera must be at least 1 x 1 pixels, got {camera.width} x {camera.height}")
-    if camera.K[0, 1] != 0:
-        raise ValueError(f"camera.K must have skew 0, got {camera.K[0, 1]}")
+    width, height = exposure.size
+    if width < 1 or height < 1:
+        raise ValueError(f"camera must be at least 1 x 1 pixels, got {width} x {height}")
+    skew = exposure.cameras[0][0].K[0, 1]
+    if skew != 0:
+        raise ValueError(f"camera.K must have skew 0, got {skew}")
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
 
     def job(corner: tuple[int, int]) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # rays parallel to a side
-            work(_Tile(camera, *corner, jitter, dtype, gloss))
+            work(_Tile(exposure, *corner, dtype, gloss))
 
-    corners = [(x, y) for y in range(0, camera.height, TILE) for x in range(0, camera.width, TILE)]
+    corners = [(x, y) for y in range(0, height, TILE) for x in range(0, width, TILE)]
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:  # more would wait for Python
         for _ in pool.map(job, corners):
             pass
 
 
-def _render_tile(tile: _Tile) -> NDArray[np.uint8]:
-    """Colours, [B, n, 3]."""
+def _render_tile(tile: _Tile) -> Array:
+    """Linear light, [B, n, 3]."""
     scene, d = tile.scene, tile.d
     t, index = nearest(tile.seen, tile.blocks, tile.eye, d)
     p = along(tile.eye, np.where(index < 0, np.float32(0), t), d)
@@ -147,8 +201,7 @@ def _render_tile(tile: _Tile) -> NDArray[np.uint8]:
         to_eye = (d[0][mask] * away, d[1][mask] * away, d[2][mask] * away)
         lit = (~shadow[mask]).astype(np.float32)
         color[mask] = _shade(scene, tile.seen[k], hits, to_eye, (a, b, c), lit)
-    mean = color.sum(1, dtype=np.float32) / np.float32(len(tile.jitter))
-    return (_encode(mean) * 255 + 0.5).astype(np.uint8)
+    return color.sum(1, dtype=np.float32) / np.float32(len(tile.jitter))
 
 
 def _key_lights(scene: Studio, jitter: NDArray[np.float64]) -> Vec:
@@ -253,4 +306,4 @@ def _encode(linear: Array) -> Array:
     """Roll off the highlights above 0.7 and apply the sRGB curve; [0, inf) to [0, 1]."""
     over = np.maximum(linear - 0.7, 0)
     x = np.minimum(linear, 0.7) + 0.3 * over / (over + 0.3)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    return to_srgb(x)

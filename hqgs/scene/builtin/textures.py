@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from hqgs.photos.light import to_linear
+
 FloatArray = NDArray[np.floating]
 
 
@@ -47,14 +49,9 @@ class Texture:
         return self.alpha[row, np.clip((u * width).astype(np.int64), 0, width - 1)]
 
 
-def to_linear(srgb: FloatArray) -> NDArray[np.float32]:
-    """sRGB-encoded values in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 def colour(name: str) -> NDArray[np.float32]:
     """A hex colour such as "#c0603a" as linear RGB, [3]."""
-    return to_linear(np.array(ImageColor.getrgb(name)[:3], np.float64) / 255)
+    return to_linear(np.array(ImageColor.getrgb(name)[:3], np.float64) / 255).astype(np.float32)
 
 
 def noise(height: int, width: int, cells: tuple[int, int], seed: int, octaves: int = 4) -> FloatArray:
@@ -230,4 +227,4 @@ def text(
 
 
 def _pixels(image: Image.Image) -> NDArray[np.float32]:
-    return to_linear(np.asarray(image, np.float64) / 255)
+    return to_linear(np.asarray(image, np.float64) / 255).astype(np.float32)

@@ -22,7 +22,7 @@ from hqgs.scene.capture import (
     no_points,
     viewmat_from_pose,
 )
-from hqgs.scene.formats.ply_points import read_ply
+from hqgs.scene.formats.ply_points import read_ply_points
 
 SINGLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
 
@@ -63,7 +63,7 @@ def read_transforms(root: Path, downscale: float) -> Capture:
         path = inside(root, _text(ply, "ply_file_path", root), "ply_file_path")
         if not path.is_file():
             raise FileNotFoundError(f"ply_file_path {ply!r} names no file in {root}")
-        points, colors = keep_finite(*read_ply(path), notes)
+        points, colors = keep_finite(*read_ply_points(path), notes)
     return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
 
 

@@ -1,28 +1,56 @@
-"""What a method is: what is rasterized and which loss judges it. The training loop is the same for all."""
+"""What a method is: what is rasterized, and how a render is judged. The training loop is the same for all.
+
+To add one: write a class with what `Method` asks for (`Plain` has all but `loss` for a method that decides
+nothing), give it a name and a line of text in `METHODS` (config.py), and its maker under the same name in
+`MAKERS` (methods/__init__.py). `tests/example_method.py` is the smallest one with a tensor of its own.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.model.first_points import Colors, Points
+from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
-from hqgs.photos.pixels import floats
 from hqgs.scene.scene import Scene, View
-from hqgs.training.config import AUTO
+from hqgs.training.config import AUTO, TrainConfig
 from hqgs.training.methods.photometric import photometric_loss
-
-if TYPE_CHECKING:
-    from hqgs.training.config import TrainConfig
+from hqgs.training.state import TrainState
 
 
-class Method(Protocol):
-    """The replaceable part of a training step."""
+@dataclass(frozen=True)
+class Target:
+    """What renders of one view are compared with. Methods add to it what else they need of the view."""
+
+    photo: Tensor  # [h, w, 3], uint8 or float with white at 1
+    mask: Tensor | None  # [h, w] bool, True where the photo counts; None: everywhere
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a method decides before the first step."""
+
+    config: TrainConfig  # the given one, fitted to the scene
+    gaussians: Gaussians
+    left_out: list[LeftOut] = field(default_factory=list)  # parts of the method that the scene does not need
+
+
+T = TypeVar("T", bound=Target)
+
+
+class Method(Protocol[T]):
+    """The replaceable part of a training step.
+
+    The trainer calls `prepare` for each training view and then `start`, once. A step is `modulate`,
+    rasterization, `compare`, `loss`, which change nothing; then Adam, `rows_changed` where Gaussians came or
+    went, and `after_step`.
+    """
 
     @property
     def as_photographed(self) -> bool:
@@ -39,20 +67,12 @@ class Method(Protocol):
         """Share of the Gaussians' learning rates that the next step is to take, 0..1."""
         ...
 
-    def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
-        """What of a render [H, W, 3] is compared with what of the photo (float), and the mask of the two."""
+    def prepare(self, view: View) -> T:
+        """What renders of a training view are compared with. ValueError, which names it, for a bad one."""
         ...
 
-    def adapt(self, config: TrainConfig) -> TrainConfig:
-        """The configuration to train with: the given one, with what the method decides for this scene."""
-        ...
-
-    def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
-        """The points [N, 3] and colours [N, 3] to start from; `config` is what `adapt` gave."""
-        ...
-
-    def left_out(self) -> list[tuple[str, str]]:
-        """Parts of the method that this scene does not need: (what, why)."""
+    def start(self, scene: Scene, targets: Sequence[T], config: TrainConfig) -> Start:
+        """What to start from; `targets` are those of `scene.train`."""
         ...
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
@@ -62,12 +82,20 @@ class Method(Protocol):
         """
         ...
 
-    def rows_changed(self) -> None:
-        """Gaussians were added or removed: what was known of each of them is of no use any more."""
+    def compare(self, render: Tensor, target: T) -> Tensor:
+        """What of a render [H, W, 3] (float, not clamped) is compared with the target's photo, [h, w, 3]."""
         ...
 
-    def loss(self, render: Tensor, view: View) -> Tensor:
-        """Scalar loss of a render [H, W, 3] (float, not clamped) against a training view."""
+    def loss(self, image: Tensor, target: T) -> Tensor:
+        """Scalar loss of what `compare` gave."""
+        ...
+
+    def rows_changed(self, state: TrainState, parents: Tensor) -> None:
+        """Gaussians were added or removed: row i stems from row `parents[i]` of those before, [N]."""
+        ...
+
+    def after_step(self, state: TrainState, image: Tensor, target: T) -> None:
+        """What ages, and what is decided for the next step; `image` is what the loss was computed of."""
         ...
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -84,30 +112,37 @@ class Method(Protocol):
 
 
 class Plain:
-    """The parts of a method that has no tensors of its own and decides nothing about the training."""
+    """A method that rasterizes the Gaussians as they are and decides nothing, but for its loss.
+
+    Its targets are plain ones; a method with others overrides `prepare` and what reads them.
+    """
 
     name: str
     as_photographed = False
     noise = 0.0
     rate_left = 1.0
 
-    def compared(self, render: Tensor, view: View) -> tuple[Tensor, Tensor, Tensor | None]:
-        photo, mask = photo_tensors(view)
-        return render, floats(photo), mask
+    def prepare(self, view: View) -> Target:
+        return Target(*photo_tensors(view))
 
-    def adapt(self, config: TrainConfig) -> TrainConfig:
+    def start(self, scene: Scene, targets: Sequence[Any], config: TrainConfig) -> Start:
+        gaussians = Gaussians.from_points(scene.points, scene.point_colors, config.sh_degree)
+        return Start(self.named(config), gaussians)
+
+    def named(self, config: TrainConfig) -> TrainConfig:
+        """`config` with the name of what "auto" comes to."""
         return replace(config, method=self.name) if config.method == AUTO else config
-
-    def first_points(self, scene: Scene, config: TrainConfig) -> tuple[Points, Colors]:
-        return scene.points, scene.point_colors
-
-    def left_out(self) -> list[tuple[str, str]]:
-        return []
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         return gaussians
 
-    def rows_changed(self) -> None:
+    def compare(self, render: Tensor, target: Any) -> Tensor:
+        return render
+
+    def rows_changed(self, state: TrainState, parents: Tensor) -> None:
+        pass
+
+    def after_step(self, state: TrainState, image: Tensor, target: Any) -> None:
         pass
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -137,6 +172,5 @@ class ThreeDGS(Plain):
     as_photographed = True
     LAMBDA_DSSIM = 0.2
 
-    def loss(self, render: Tensor, view: View) -> Tensor:
-        image, mask = photo_tensors(view)
-        return photometric_loss(render, image, mask=mask, lambda_dssim=self.LAMBDA_DSSIM)
+    def loss(self, image: Tensor, target: Target) -> Tensor:
+        return photometric_loss(image, target.photo, target.mask, self.LAMBDA_DSSIM)

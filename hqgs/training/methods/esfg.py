@@ -7,12 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.gaussians import Gaussians
 from hqgs.photos.edges import edge_aware_map
 from hqgs.scene.scene import View
 from hqgs.training.config import ESFGConfig
@@ -103,91 +101,6 @@ class ESFG(nn.Module):
                 bound = 1 / math.sqrt(module.in_features)
                 for parameter in module.parameters():
                     parameter.uniform_(-bound, bound, generator=generator)
-
-
-class FeatureRows:
-    """Which row of F' each Gaussian reads.
-
-    The first Gaussians get the rows in turn: F' is replicated as often as needed. From then on the row is a
-    Gaussian's for life, however many are pruned before it, and those that are cloned or split from it
-    inherit it. (A row chosen by the present position would not do: a Gaussian that crosses into another
-    cell, or its child, would jump by a few per cent of the scene.)
-
-    Copies are recognised by their bits. A kept or cloned Gaussian has the position of its parent. The child
-    of a split has the rotation and the colour of its parent, which no other one shares once it was trained.
-    """
-
-    def __init__(self, feature_size: int) -> None:
-        self.feature_size = feature_size
-        self.rows: Tensor | None = None  # [M]; None before the first Gaussians
-        self._held: tuple[Tensor, ...] = ()  # leaves of the Gaussians of `rows`; the optimizer changes them
-        self._marks: tuple[NDArray[np.int64], ...] = ()  # of those of a checkpoint, whose leaves are gone
-
-    def start(self, gaussians: Gaussians) -> Tensor:
-        """Rows [M] of the first Gaussians. Call it before they are moved in place."""
-        self.rows = torch.arange(len(gaussians)) % self.feature_size
-        self._hold(gaussians)
-        return self.rows
-
-    def of(self, gaussians: Gaussians) -> Tensor:
-        """Rows [M] of these Gaussians, which stem from those of the call before.
-
-        ValueError for Gaussians that stem from none of them.
-        """
-        if self.rows is None:
-            raise ValueError("there are no rows yet: start with the first Gaussians")
-        if self._held and gaussians.means is self._held[0]:
-            return self.rows
-        place, look = self._marks or _fingerprints(*self._held)
-        new_place, new_look = _fingerprints(gaussians.means, gaussians.quats, gaussians.sh0)
-        parent = _find(place, new_place)
-        children = parent < 0
-        parent[children] = _find(look, new_look[children])
-        if (parent < 0).any():
-            raise ValueError(
-                f"{int((parent < 0).sum())} of {len(gaussians)} Gaussians are no copies of the "
-                f"{len(place)} before them, the first is row {int(np.argmax(parent < 0))}"
-            )
-        self.rows = self.rows[torch.from_numpy(parent)]
-        self._hold(gaussians)
-        return self.rows
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """The rows [M], and the marks [M] by which the next Gaussians find them. Empty before the start."""
-        if self.rows is None:
-            return {}
-        place, look = self._marks or _fingerprints(*self._held)
-        return {"rows": self.rows, "place": torch.from_numpy(place), "look": torch.from_numpy(look)}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.rows = state["rows"] if state else None
-        self._held = ()
-        self._marks = (state["place"].numpy(), state["look"].numpy()) if state else ()
-
-    def _hold(self, gaussians: Gaussians) -> None:
-        self._held = (gaussians.means, gaussians.quats, gaussians.sh0)
-        self._marks = ()
-
-
-def _fingerprints(means: Tensor, quats: Tensor, sh0: Tensor) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """64-bit marks [M] of the bits of each position, and of each rotation with its colour."""
-    return _hash(means), _hash(torch.cat([quats, sh0.flatten(1)], dim=1))
-
-
-def _hash(values: Tensor) -> NDArray[np.int64]:
-    """Mix the float32 bits of each row into 64: of 10^6 rows two share a mark with a chance of 3e-8."""
-    mark = np.zeros(len(values), dtype=np.uint64)
-    for column in values.detach().contiguous().numpy().view(np.uint32).T:
-        mark = (mark ^ column) * np.uint64(0x9E3779B97F4A7C15)  # odd, so no information is lost
-        mark ^= mark >> np.uint64(32)
-    return mark.view(np.int64)
-
-
-def _find(marks: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the first equal mark for each wanted one, -1 where there is none."""
-    order = np.argsort(marks, kind="stable")
-    at = np.minimum(np.searchsorted(marks, wanted, sorter=order), len(marks) - 1)
-    return np.where(marks[order[at]] == wanted, order[at], -1)
 
 
 @torch.no_grad()

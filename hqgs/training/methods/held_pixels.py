@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,8 +18,35 @@ FACTOR = 0.5  # what is left of the learning rates after a look without a gain
 LEAST = FACTOR**20  # share of the rates below which nothing moves any more
 
 
+@dataclass(frozen=True)
 class HeldPixels:
-    """Pixels of each photo that the loss leaves out, and the learning rates that they ask for.
+    """Pixels of one photo that its loss leaves out."""
+
+    photo: int  # its number in the scene
+    places: Tensor  # [P], of the rows of the photo as [H W, 3]
+    colors: Tensor  # [P, 3], white at 1
+
+    @classmethod
+    def draw(cls, number: int, photo: Tensor, mask: Tensor | None) -> tuple[HeldPixels, Tensor]:
+        """`SHARE` of the pixels [H, W, 3] that count, and the mask, bool [H, W], of the others.
+
+        The draw follows from the photo's number alone.
+        """
+        counts = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
+        places = torch.nonzero(counts.ravel())[:, 0].numpy()
+        drawn = np.random.default_rng(number).choice(places, math.ceil(SHARE * len(places)), replace=False)
+        held = torch.from_numpy(drawn)
+        counts.view(-1)[held] = False
+        colors = torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))
+        return cls(number, held, colors), counts
+
+    def error(self, image: Tensor) -> Tensor:
+        """Mean squared error there of `image` [H, W, 3], a float64 scalar."""
+        return (image.detach().reshape(-1, 3)[self.places] - self.colors).square().double().mean()
+
+
+class Plateau:
+    """The learning rates that the held pixels ask for.
 
     White noise in a pixel tells nothing of the noise beside it, so a render comes nearer to these pixels only
     where it comes nearer to the scene. Every `STEPS` steps, rounded up to whole epochs, their mean squared
@@ -26,34 +54,18 @@ class HeldPixels:
     not smaller than at the best look, the rates are halved, as on a plateau of any held-back error.
     """
 
-    def __init__(self, photos: Mapping[str, tuple[Tensor, Tensor | None]]) -> None:
-        """`photos`: at least one, by name: [H, W, 3] uint8 or float, and the mask of the pixels that count,
-        bool [H, W]. The draw is always the same."""
+    def __init__(self, num_photos: int) -> None:
         self.rate_left = 1.0  # share of the learning rates
-        self.masks: dict[str, Tensor] = {}  # bool [H, W], without the pixels that are held back
-        self._rows = {name: k for k, name in enumerate(photos)}
-        self._held: list[tuple[Tensor, Tensor]] = []  # their places, and colours [P, 3] with white at 1
-        for k, (name, (photo, mask)) in enumerate(photos.items()):
-            counts = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
-            places = torch.nonzero(counts.ravel())[:, 0].numpy()
-            drawn = np.random.default_rng(k).choice(places, math.ceil(SHARE * len(places)), replace=False)
-            held = torch.from_numpy(drawn)
-            counts.view(-1)[held] = False
-            self.masks[name] = counts
-            self._held.append((held, torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))))
-        self._interval = len(photos) * math.ceil(STEPS / len(photos))
+        self._interval = num_photos * math.ceil(STEPS / num_photos)
         self._steps = 0
-        self._sums, self._counts = torch.zeros(2, len(photos), dtype=torch.float64)
-        self._best = torch.full((len(photos),), torch.nan, dtype=torch.float64)
+        self._sums, self._counts = torch.zeros(2, num_photos, dtype=torch.float64)
+        self._best = torch.full((num_photos,), torch.nan, dtype=torch.float64)
 
-    def see(self, name: str, image: Tensor) -> None:
-        """Note a step: `image` [H, W, 3], what is compared with that photo."""
-        row = self._rows[name]
-        held, colors = self._held[row]
-        error = (image.detach().reshape(-1, 3)[held] - colors).square().double().mean()
+    def see(self, photo: int, error: Tensor) -> None:
+        """Note a step: the error of the held pixels of the photo of that number."""
         if torch.isfinite(error):  # otherwise the step is skipped, or all of the photo is masked
-            self._sums[row] += error
-            self._counts[row] += 1
+            self._sums[photo] += error
+            self._counts[photo] += 1
         self._steps += 1
         if self._steps % self._interval == 0:
             self._look()

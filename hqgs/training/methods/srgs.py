@@ -13,19 +13,19 @@ from torch import Tensor
 from hqgs.photos.operators import Separable
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import resize, resize_matrix
-from hqgs.scene.scene import Scene, View
+from hqgs.scene.scene import View
 from hqgs.training.config import SRGSConfig
-from hqgs.training.methods.base import Plain, photo_tensors
+from hqgs.training.methods.base import Plain, Target, photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
 
 
 @dataclass(frozen=True)
-class Tie:
-    """The low-resolution photo of a view, and how to bring a render to its size."""
+class TiedTarget(Target):
+    """The photo, and the low-resolution one with how to bring a render to its size."""
 
-    photo: Tensor  # [h, w, 3] float32
-    mask: Tensor | None  # [h, w] bool, True where the photo counts
-    down: Separable  # [H, W] to [h, w]
+    low: Tensor  # [h, w, 3] float32
+    low_mask: Tensor | None  # [h, w] bool, True where it counts
+    down: Separable | None  # [H, W] to [h, w]; None: the photo itself is the tie
 
 
 class SRGS(Plain):
@@ -55,43 +55,38 @@ class SRGS(Plain):
     name = "srgs"
     LAMBDA_DSSIM = 0.2
 
-    def __init__(self, scene: Scene, config: SRGSConfig) -> None:
-        """ValueError names a training view whose `low` does not fit, or two views of one name."""
+    def __init__(self, config: SRGSConfig) -> None:
         self.config = config
         self._operators: dict[tuple[int, ...], Separable] = {}  # by the sizes: H, W, h, w
-        self._ties: dict[str, Tie | None] = {}  # None: the photo itself is the tie
-        for view in scene.train:
-            if view.name in self._ties:
-                raise ValueError(f"two training views are called {view.name!r}")
-            self._ties[view.name] = self._tie(view)
 
-    def loss(self, render: Tensor, view: View) -> Tensor:
-        image, mask = photo_tensors(view)
-        texture = photometric_loss(render, image, mask=mask, lambda_dssim=self.LAMBDA_DSSIM)
-        tie = self._ties[view.name]
-        if tie is None:
-            return texture
-        low = tie.down(render)
-        subpixel = photometric_loss(low, tie.photo.to(low.dtype), tie.mask, self.LAMBDA_DSSIM)
-        weight = self.config.texture_weight
-        return (1 - weight) * subpixel + weight * texture
-
-    def _tie(self, view: View) -> Tie | None:
-        camera, photo = view.camera, view.low
-        if photo is None:
+    def prepare(self, view: View) -> TiedTarget:
+        """ValueError names a training view whose `low` does not fit."""
+        photo, mask = photo_tensors(view)
+        camera, low = view.camera, view.low
+        if low is None:
             factor = self.config.own_factor
             if factor == 1:
-                return None
+                return TiedTarget(photo, mask, photo, mask, None)
             image = as_floats(view.image)
-            photo = resize(image, -(-camera.height // factor), -(-camera.width // factor))
-        _check_low(view, photo)
-        sizes = camera.height, camera.width, *photo.shape[:2]
+            low = resize(image, -(-camera.height // factor), -(-camera.width // factor))
+        _check_low(view, low)
+        sizes = camera.height, camera.width, *low.shape[:2]
         if sizes not in self._operators:
             matrices = resize_matrix(sizes[0], sizes[2]), resize_matrix(sizes[1], sizes[3])
             self._operators[sizes] = Separable.of(*matrices)
         down = self._operators[sizes]
-        mask = None if view.mask is None else torch.from_numpy(down.mask(view.mask))
-        return Tie(torch.from_numpy(np.require(photo, requirements=["C", "W"])), mask, down)
+        low_mask = None if view.mask is None else torch.from_numpy(down.mask(view.mask))
+        low_photo = torch.from_numpy(np.require(low, requirements=["C", "W"]))
+        return TiedTarget(photo, mask, low_photo, low_mask, down)
+
+    def loss(self, image: Tensor, target: TiedTarget) -> Tensor:
+        texture = photometric_loss(image, target.photo, target.mask, self.LAMBDA_DSSIM)
+        if target.down is None:
+            return texture
+        low = target.down(image)
+        subpixel = photometric_loss(low, target.low.to(low.dtype), target.low_mask, self.LAMBDA_DSSIM)
+        weight = self.config.texture_weight
+        return (1 - weight) * subpixel + weight * texture
 
 
 def _check_low(view: View, low: NDArray[Any]) -> None:

@@ -5,7 +5,7 @@ use crate::{
     arrays::{Array, CountsByName, Scalar, by_dtype, of_type, optional_of_shape},
     error::BindingResult,
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     project::{self, GaussianGrads, ProjectCotangents, Shading},
     simd::Real,
@@ -176,7 +176,7 @@ fn project_backward_as<'py, T: Scalar>(
             }
             Ok((sums, viewmats))
         })
-    })?;
+    })??;
     let grads = sums.ok_or_else(|| Error::new("viewmats", "there is no camera"))?;
     let out = (
         wanted.means.then(|| grads.means.into_pyarray(py)),

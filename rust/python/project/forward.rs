@@ -5,7 +5,7 @@ use crate::{
     arrays::{Array, Optional, Scalar, by_dtype, join, optional},
     error::BindingResult,
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     accuracy_knobs::{AccuracyKnobs, Spans},
     counts::Counts,
@@ -119,7 +119,12 @@ fn project_as<'py, T: Scalar>(
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = means.py();
     let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
-    let colors = Array::<T>::new("colors", colors)?;
+    let name = if rest.is_some() {
+        "colors[0]"
+    } else {
+        "colors"
+    };
+    let colors = Array::<T>::new(name, colors)?;
     let rest = optional::<T>("colors[1]", rest)?;
     let cameras = cameras(viewmats, ks, width, height)?;
     let gaussians = arrays.gaussians()?;
@@ -146,13 +151,13 @@ fn project_as<'py, T: Scalar>(
                 .map(project)
                 .collect::<Result<_, Error>>()
         })
-    })?;
-    let means2d = join(&mut outs, |out| &mut out.means2d);
-    let depths = join(&mut outs, |out| &mut out.depths);
-    let conics = join(&mut outs, |out| &mut out.conics);
-    let radii = join(&mut outs, |out| &mut out.radii);
-    let opacities = join(&mut outs, |out| &mut out.opacities);
-    let colors = join(&mut outs, |out| &mut out.colors);
+    })??;
+    let means2d = join(&mut outs, |out| &mut out.means2d)?;
+    let depths = join(&mut outs, |out| &mut out.depths)?;
+    let conics = join(&mut outs, |out| &mut out.conics)?;
+    let radii = join(&mut outs, |out| &mut out.radii)?;
+    let opacities = join(&mut outs, |out| &mut out.opacities)?;
+    let colors = join(&mut outs, |out| &mut out.colors)?;
     let frame = Frame(Arc::new(Projections {
         cameras,
         counts: outs

@@ -7,7 +7,7 @@ use crate::{
     arrays::{AnyType, Array, CountsByName, Scalar},
     error::BindingResult,
 };
-use hqgs::{
+use hqgs::internals::{
     Error,
     counts::Counts,
     project::{ProjectOptions, Projection},
@@ -44,13 +44,13 @@ impl Frame {
     /// Image width in pixels.
     #[getter]
     fn width(&self) -> usize {
-        self.0.cameras.first().map_or(0, |c| c.width)
+        self.0.cameras.first().map_or(0, |c| c.width())
     }
 
     /// Image height in pixels.
     #[getter]
     fn height(&self) -> usize {
-        self.0.cameras.first().map_or(0, |c| c.height)
+        self.0.cameras.first().map_or(0, |c| c.height())
     }
 
     /// Counts of the projection.

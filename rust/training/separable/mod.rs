@@ -2,6 +2,7 @@
 
 use crate::{
     error::{Error, check_len},
+    memory,
     simd::groups::{GROUP, sixteen, transpose},
     simd::{self, Lanes, Level, Real},
 };
@@ -179,7 +180,7 @@ impl<T: Real> Separable<T> {
         let mut padded = Vec::new();
         if row < GROUP {
             pitch = GROUP;
-            padded.resize(shape[0] * pitch, T::ZERO);
+            padded = memory::filled(T::ZERO, shape[0] * pitch, "image")?;
             for (to, from) in padded.chunks_exact_mut(pitch).zip(image.chunks_exact(row)) {
                 to[..row].copy_from_slice(from);
             }
@@ -189,7 +190,7 @@ impl<T: Real> Separable<T> {
             pitch,
             channels: shape[2],
         };
-        let mut out = vec![T::ZERO; h * w * d];
+        let mut out = memory::filled(T::ZERO, h * w * d, "image")?;
         let level = level.token;
         out.par_chunks_mut(GROUP * w * d).enumerate().for_each_init(
             Buffers::default,

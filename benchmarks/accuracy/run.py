@@ -1,0 +1,228 @@
+"""The benchmark `accuracy`: the error against the run time of every knob of the rasterizer."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import hqgs
+from benchmarks.accuracy.errors import errors_against, pareto_front
+from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
+from benchmarks.accuracy.trained import trained_inputs
+from benchmarks.charts import LEGEND, color, panels
+from benchmarks.data import build, read_toml
+from benchmarks.output import Benchmark, Report, table
+from benchmarks.speed.inputs import RasterInputs, make_inputs
+from benchmarks.speed.rasterizer import measure_threads, thread_counts
+from benchmarks.speed.timing import interleaved, median, quartiles
+
+Row = dict[str, Any]
+DATA = read_toml(FILE)
+COLUMNS = DATA["columns"]
+ERRORS: dict[str, Callable[[Row], float]] = {  # of a row and an oracle's name; what the panels show
+    "image": lambda errors: errors["image"]["rms"],
+    "gradients": lambda errors: errors["gradients"]["all"]["relative"],
+}
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The sizes at which things are measured."""
+
+    repeats: int  # rounds of everything that is timed
+    size: tuple[int, int]  # width, height
+    gaussians: tuple[int, ...]
+    trained_views: int  # of the built-in scene
+    trained_steps: int
+    trained_gaussians: int  # at most
+    seed: int = 2026
+
+
+def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
+    """Errors and seconds of every case on the same numbers; the seconds of a round are taken in turn."""
+    passes = [TunedPass(inputs, knobs) for _, _, knobs in CASES]
+    oracles = {oracle: TunedPass(inputs, knobs).outputs() for oracle, knobs in ORACLES.items()}
+    found = []
+    for case in passes:
+        outputs = case.outputs()
+        found.append({oracle: errors_against(outputs, exact) for oracle, exact in oracles.items()})
+    measured = list(interleaved({str(k): p for k, p in enumerate(passes)}, repeats).values())
+    rows = []
+    for (knob, value, knobs), case, errors, rounds in zip(CASES, passes, found, measured, strict=True):
+        ratios = [a["total"] / b["total"] for a, b in zip(rounds, measured[0], strict=True)]
+        rows.append(
+            {
+                "knob": knob,
+                "value": value,
+                "settings": asdict(knobs),
+                "seconds": median(rounds),
+                "seconds_quartiles": quartiles(rounds),
+                "ratio": float(np.median(ratios)),  # to the default, in the same round
+                "ratio_quartiles": [float(q) for q in np.quantile(ratios, [0.25, 0.75])],
+                "tile_pairs": case.work[0],
+                "blocks": case.work[1],
+                "errors": errors,
+            }
+        )
+    return {
+        "inputs": name,
+        "gaussians": len(inputs),
+        "width": inputs.width,
+        "height": inputs.height,
+        "rows": rows,
+        "beaten_by": [f"{row['knob']} {row['value']}" for row in rows[1:] if beats(row, rows[0])],
+    }
+
+
+def beats(row: Row, other: Row) -> bool:
+    """Whether `row` has no larger error than the default, whatever it is held against, in clearly less time:
+    three rounds of four were faster."""
+    no_worse = all(
+        error(row["errors"][oracle]) <= error(other["errors"][oracle])
+        for oracle in ORACLES
+        for error in ERRORS.values()
+    )
+    return no_worse and row["ratio_quartiles"][1] < 1
+
+
+def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[Row]:
+    """Seconds with each number of threads, and the largest difference to one thread in any output."""
+    case = TunedPass(inputs, Knobs())
+    rows = measure_threads({"default": case}, repeats)
+    before = hqgs.get_num_threads()
+    try:
+        hqgs.set_num_threads(1)
+        one = case.outputs()
+        for row in rows:
+            hqgs.set_num_threads(row["threads"])
+            several = case.outputs()
+            row["difference"] = max(float((several[name] - one[name]).abs().max()) for name in one)
+            row["same_bits"] = all(torch.equal(several[name], one[name]) for name in one)
+    finally:
+        hqgs.set_num_threads(before)
+    return rows
+
+
+def errors_table(result: dict[str, Any]) -> str:
+    """One row for each case; the errors against the exact result, then against the definition in float64."""
+    first, lines = result["rows"][0], []
+    for row in result["rows"]:
+        exact, defined = row["errors"]["exact"], row["errors"]["defined"]
+        every = exact["gradients"]["all"]
+        lines.append(
+            row
+            | exact["image"]
+            | {
+                "quartiles": " to ".join(f"{q:.3f}" for q in row["ratio_quartiles"]),
+                "more_blocks": row["blocks"] / max(first["blocks"], 1),
+                "gradients": every["relative"],
+                "turn": None if every["cosine"] is None else 1 - every["cosine"],
+                "rms_defined": defined["image"]["rms"],
+                "gradients_defined": defined["gradients"]["all"]["relative"],
+            }
+        )
+    size = f"{result['gaussians']:,} Gaussians, {result['width']} x {result['height']}"
+    return table(f"{result['inputs']}: {size}, forward and backward", lines, COLUMNS["errors"])
+
+
+def gradient_table(result: dict[str, Any]) -> str:
+    """The relative error of each input's gradient against the exact result."""
+    lines = []
+    for row in result["rows"]:
+        found = row["errors"]["exact"]["gradients"]
+        lines.append(row | {name: error["relative"] for name, error in found.items()})
+    names = list(result["rows"][0]["errors"]["exact"]["gradients"])
+    columns = {n: COLUMNS["errors"][n] for n in ("knob", "value")} | {n: (n, ".1e") for n in names}
+    title = f"{result['inputs']}: relative error of the gradients against the exact result"
+    return table(title, lines, columns)
+
+
+def chart(result: dict[str, Any]) -> Figure:
+    """Error against time on log axes: rows are what is held against, columns are image and gradients."""
+    figure, grid = panels(11, 8, len(ORACLES), len(ERRORS), sharex=True)
+    labels = {"image": "image RMS error", "gradients": "relative error of the gradients"}
+    titles = {"exact": "against the exact result", "defined": "against the definition in float64"}
+    for axes, (oracle, what) in zip(grid, ((o, e) for o in ORACLES for e in ERRORS), strict=True):
+        points = [
+            (1000 * row["seconds"], ERRORS[what](row["errors"][oracle]), row["knob"], row["value"])
+            for row in result["rows"]
+        ]
+        _panel(axes, [p for p in points if p[1] > 0])  # what has no error has no place on a log axis
+        axes.set_title(f"{labels[what]}, {titles[oracle]}", fontsize=9, loc="left")
+        axes.set_xlabel("forward and backward (ms)")
+    handles, names = grid[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=5, **LEGEND)
+    figure.suptitle(f"{result['inputs']}, {result['gaussians']:,} Gaussians", fontsize=10)
+    return figure
+
+
+def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
+    times, errors = [p[0] for p in points], [p[1] for p in points]
+    front = pareto_front(times, errors)
+    axes.plot(
+        [times[k] for k in front], [errors[k] for k in front], color="#888888", lw=1.2,
+        drawstyle="steps-post", label="no other one is better in both",
+    )  # fmt: skip
+    for k, knob in enumerate(dict.fromkeys(case[0] for case in CASES)):
+        own = [(x, y, value) for x, y, name, value in points if name == knob]
+        first = knob == "default"
+        axes.plot(
+            [p[0] for p in own], [p[1] for p in own], linestyle="", label=knob, color=color(k),
+            marker="*" if first else "o", markersize=13 if first else 5, zorder=4 if first else 3,
+        )  # fmt: skip
+        for x, y, value in own:
+            axes.annotate(value, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6, rotation=40)
+    axes.set(xscale="log", yscale="log")
+
+
+def run(args: argparse.Namespace) -> Report:
+    """Measure every case on the clouds and on the trained Gaussians."""
+    part = "quick" if args.quick else "full"
+    sizes = replace(build(Sizes, DATA[part], f"{FILE.name}, {part}"), seed=args.seed)
+    if args.repeats is not None:
+        if args.repeats < 1:
+            raise ValueError(f"repeats is {args.repeats}, wanted at least 1")
+        sizes = replace(sizes, repeats=args.repeats)
+    report = Report(settings=asdict(sizes))
+    inputs = {f"cloud of {n:,}": make_inputs(n, *sizes.size, sizes.seed) for n in sizes.gaussians}
+    print("accuracy: training the built-in scene", file=sys.stderr)
+    inputs["built-in scene, trained"] = trained_inputs(
+        sizes.size, sizes.trained_views, sizes.trained_steps, sizes.trained_gaussians, sizes.seed,
+        args.out / "scene",
+    )  # fmt: skip
+    results = []
+    for name, x in inputs.items():
+        print(f"accuracy: {name}", file=sys.stderr)
+        results.append(measure(name, x, sizes.repeats))
+        report.tables += [errors_table(results[-1]), gradient_table(results[-1])]
+    report.results["inputs"] = results
+    name, largest = max(inputs.items(), key=lambda item: len(item[1]))
+    if len(thread_counts()) > 1:
+        rows = report.results["threads"] = measure_by_threads(largest, sizes.repeats)
+        report.tables.append(table(f"{name}: threads", rows, COLUMNS["threads"]))
+    else:
+        report.leave_out("threads", "there is one thread")
+    why = "it only groups the work: blocks of 4 x 4 pixels inside exact spans decide what is computed"
+    report.leave_out("tile size", why)
+    for result in results:
+        beaten = ", ".join(result["beaten_by"]) or "nothing"
+        report.tables.append(f"{result['inputs']}: better than the default in error and time: {beaten}.")
+        report.figures[result["inputs"].replace(" ", "_").replace(",", "")] = chart(result)
+    return report
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--repeats", type=int, metavar="N", help="rounds of each measurement (15, with --quick 2)")
+    add("--seed", type=int, default=Sizes.seed, metavar="S", help="of the Gaussians (%(default)s)")
+
+
+BENCHMARK = Benchmark("error of the rasterizer against its run time, knob by knob", options, run)

@@ -1,0 +1,43 @@
+"""Where hqgs looks up what the benchmarks time or replace: every name that is patched, in one place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from hqgs import _rust
+from hqgs.training import trainer
+from hqgs.training.methods import base
+from hqgs.training.trainer import Trainer
+
+Place = tuple[Any, str]  # a module or class, and the name that its users look up there
+
+# Replaced by benchmarks/features.
+RENDER_VIEW: Place = (trainer, "render_view")
+ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
+ADAM: Place = (trainer, "Adam")
+LOSS: Place = (base, "photometric_loss")
+
+# Replaced by benchmarks/accuracy, and timed by benchmarks/speed with the stage that they make up.
+PROJECT: Place = (_rust, "project_forward")
+COMPOSITE: Place = (_rust, "composite_forward")
+CRATE: dict[Place, str] = {
+    PROJECT: "project",
+    COMPOSITE: "bin and composite",
+    (_rust, "composite_backward"): "composite backward",
+    (_rust, "project_backward"): "project backward",
+}
+
+
+def parts_of_step(trainer: Trainer) -> dict[Place, str]:
+    """The functions that a training step calls, with the part of the step that they make up."""
+    return CRATE | {
+        RENDER_VIEW: "activations",
+        (type(trainer.method), "modulate"): "method",
+        (type(trainer.method), "loss"): "loss",
+        (torch.Tensor, "backward"): "autograd",
+        (type(trainer.state.densifier), "observe"): "density statistics",
+        (type(trainer.state.densifier), "update"): "density statistics",
+        (type(trainer.state.optimizer), "step"): "Adam",
+    }

@@ -1,0 +1,125 @@
+"""The benchmark `stability`: error of values and gradients on stiff cases, against 100 decimal digits."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.charts import BLUE, ORANGE, panels
+from benchmarks.output import Benchmark, Report, table
+from benchmarks.stability import measure
+from benchmarks.stability.cases import Case, cases
+from benchmarks.stability.measure import VALUE_F32, Condition, Outcome, misses
+from benchmarks.stability.oracle import DIGITS, load_mpmath
+
+Rows = list[tuple[Case, list[Outcome]]]  # in float32 and in float64
+ERRORS = {
+    "name": ("case", ""), "why": ("why", ""), "culled": ("culled", ""), "max": ("f32 max", ".1e"),
+    "f32": ("f32 rel", ".1e"), "f32_gradient": ("f32 grad", ".1e"), "turn": ("f32 1-cos", ".1e"),
+    "f64": ("f64 rel", ".1e"), "f64_gradient": ("f64 grad", ".1e"), "targets": ("targets", ""),
+}  # fmt: skip
+MISSED = {
+    "name": ("case", ""), "dtype": ("dtype", ""), "by": ("by", ""),
+    "value_relative": ("1 ulp: values", ".1e"), "gradient": ("1 ulp: gradient", ".1e"),
+    "cosine": ("1 ulp: cosine", ".6f"),
+}  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> Report:
+    """Evaluate the catalogue."""
+    load_mpmath()
+    if args.quick and args.long:
+        raise ValueError("--quick and --long exclude each other")
+    targets = {
+        "f64_values": measure.VALUE_F64, "f64_gradients": measure.GRADIENT_F64, "f32_ordinary": VALUE_F32,
+        "cosine": measure.COSINE, "negligible": measure.NEGLIGIBLE,
+    }  # fmt: skip
+    report = Report(settings={"long": args.long, "digits": DIGITS} | targets)
+    rows: Rows = []
+    for case in cases(args.long):
+        print(f"stability: {case.name}", file=sys.stderr)
+        rows.append((case, [measure.evaluate(case, dtype) for dtype in ("f32", "f64")]))
+    conditions = {
+        (case.name, o.dtype): measure.condition(case, o.dtype)
+        for case, outcomes in rows
+        for o in outcomes
+        if misses(case, o)
+    }
+    rounding = measure.input_rounding(next(case for case, _ in rows if case.name == "world offset 1e6"))
+    report.results = {
+        "cases": [
+            {
+                "name": case.name,
+                "reason": case.why,
+                "culled": {o.dtype: list(case.expected_culled(o.dtype)) for o in outcomes},
+                "outcomes": [{**vars(o), "misses": misses(case, o)} for o in outcomes],
+            }
+            for case, outcomes in rows
+        ],
+        "conditions": [
+            {"name": name, "dtype": dtype, **vars(found)} for (name, dtype), found in conditions.items()
+        ],
+        "world_offset_f32_input_rounding": rounding,
+    }
+    report.tables = tables(rows, conditions, rounding)
+    report.figures["errors"] = chart(rows)
+    return report
+
+
+def tables(rows: Rows, conditions: dict[tuple[str, str], Condition], rounding: float) -> list[str]:
+    lines, missed = [], []
+    for case, (single, double) in ((case, outcomes) for case, outcomes in rows if not case.poison):
+        in_f32, in_f64 = (len(case.expected_culled(dtype)) for dtype in ("f32", "f64"))
+        numbers = {
+            "max": single.value_abs, "f32": single.value_relative, "f64": double.value_relative,
+            "f32_gradient": single.gradient, "f64_gradient": double.gradient,
+            "turn": max(0.0, 1 - single.cosine),
+        }  # fmt: skip
+        culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
+        targets = "missed" if misses(case, single) + misses(case, double) else "met"
+        lines.append(numbers | {"name": case.name, "why": case.why, "culled": culled, "targets": targets})
+    for case, outcomes in rows:
+        for o in outcomes:
+            if (found := conditions.get((case.name, o.dtype))) is not None:
+                words: dict[str, Any] = {"by": "; ".join(misses(case, o)), "dtype": o.dtype}
+                missed.append({"name": case.name} | words | vars(found))
+    poison = [misses(case, o) for case, outcomes in rows if case.poison for o in outcomes]
+    good = f"{poison.count([])} of {len(poison)}"
+    return [
+        table("Error against the oracle, on the same rounded inputs", lines, ERRORS),
+        table("Targets that are missed, and what one ulp of the inputs changes", missed, MISSED),
+        f"Inputs that are not finite: {good} culled, with every other bit unchanged.",
+        f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
+    ]
+
+
+def chart(rows: Rows) -> Figure:
+    """Two panels, values and gradients: one row per case, f32 and f64, the targets as lines."""
+    shown = [(case, outcomes) for case, outcomes in rows if not case.poison]
+    figure, (left, right) = panels(10, 2 + 0.16 * len(shown), 1, 2, sharey=True)
+    y = np.arange(len(shown))
+    for axes, field, limit, what in (
+        (left, "value_relative", measure.VALUE_F64, "values, relative"),
+        (right, "gradient", measure.GRADIENT_F64, "gradients, relative L2"),
+    ):
+        for k, (dtype, color) in enumerate((("f32", ORANGE), ("f64", BLUE))):
+            errors = [max(getattr(outcomes[k], field), 1e-18) for _, outcomes in shown]
+            axes.plot(errors, y, "o", color=color, markersize=4, label=dtype)
+        axes.axvline(limit, color=BLUE, linestyle="--", linewidth=1, label=f"target f64, {limit:g}")
+        axes.set(xscale="log", xlabel=what)
+        axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=3, frameon=False)
+    left.axvline(VALUE_F32, color=ORANGE, linestyle="--", linewidth=1)  # absolute, but the values are near 1
+    left.set_yticks(y, [case.name for case, _ in shown], fontsize=7)
+    left.set_ylim(len(shown), -1)
+    return figure
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--long", action="store_true", help="also deep stacks and a large image")
+
+
+BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", options, run)

@@ -1,0 +1,284 @@
+"""One engine for all studies: rows x degradations x scenes x seeds become runs, kept in a folder as JSON.
+
+A run is taken up again where a file has its key and was made by the same sources. The key is a digest of what
+a result follows from: configuration, photos, cameras and points, what is done to the photos, version. The
+sources are a digest of the package's files (but for the command line) and of the crate's; with `any_sources`
+runs of others count too. Each run also says its commit, machine and number of threads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import hqgs
+from benchmarks.estimate import Estimate, duration
+from benchmarks.measure import Run
+from benchmarks.protocol import Protocol, Row
+from hqgs.base.files import write_json
+from hqgs.base.machine import machine_facts, version_facts
+from hqgs.photos.formula import NONE
+from hqgs.scene.scene import Scene
+from hqgs.training.checkpoint import scene_fingerprint
+from hqgs.training.config import METHODS, PAPER, TrainConfig
+from hqgs.training.trainer import TrainingError
+
+FORMAT = 1  # raised when a run records something else
+KEY = r"[A-Za-z0-9_][A-Za-z0-9._-]*"  # what a run's name looks like: no path
+KNOWN = "known"  # the folder of runs from elsewhere
+NO_RESULT = ("cli", "pipeline.py")  # of the package: what no result depends on
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One training run of a study."""
+
+    scene: Scene  # before anything is done to its photos
+    row: Row
+    config: TrainConfig
+    degradation: str = NONE
+    downscale: float = 1.0
+    tags: tuple[str, ...] = ()  # for the file's name
+    more: Mapping[str, Any] = field(default_factory=dict)  # that the result depends on, beside all these
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    @property
+    def group(self) -> tuple[str, str, int]:
+        """What it shares with the other rows: scene, degradation, seed."""
+        return self.scene.name, self.degradation, self.seed
+
+    def __str__(self) -> str:
+        parts = [self.scene.name, *([self.degradation] if self.degradation != NONE else []), self.row.label]
+        return ", ".join([*parts, f"seed {self.seed}"])
+
+
+def grid(
+    protocol: Protocol,
+    scenes: Sequence[Scene],
+    tags: Callable[[Row], tuple[str, ...]] = lambda row: (),
+    more: Callable[[Row], Mapping[str, Any]] = lambda row: {},
+) -> list[Cell]:
+    """All cells of these scenes, the seeds outermost: whole tables come early. The rows are innermost."""
+    return [
+        Cell(scene, row, protocol.train_config(row, seed), kind, protocol.downscale, tags(row), more(row))
+        for seed in protocol.seeds
+        for scene in scenes
+        for kind in protocol.degradations
+        for row in protocol.rows
+    ]
+
+
+class Store:
+    """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside."""
+
+    def __init__(self, root: Path, any_sources: bool = False) -> None:
+        self.root = root / "runs"
+        self.here = self.root / f"{hqgs.__version__}-{sources()}"
+        self.any_sources = any_sources
+
+    def read(self, key: str) -> Run | None:
+        """The finished run, None where there is none; ValueError for a damaged file."""
+        others = sorted(self.root.iterdir()) if self.any_sources and self.root.is_dir() else []
+        for folder in dict.fromkeys([self.here, self.root / KNOWN, *others]):
+            path = folder / f"{key}.json"
+            run = kept(path)
+            if run is not None:
+                if run.get("key") != key:
+                    raise ValueError(f"{path} is not the run of that name; remove it")
+                return run
+        return None
+
+    def write(self, run: Run) -> None:
+        write_json(self.here / f"{run['key']}.json", run)
+        self.failure_path(run["key"]).unlink(missing_ok=True)
+
+    def take(self, path: Path) -> None:
+        """Keep the runs of a result file of this benchmark that are not there yet, without what lies beside.
+
+        ValueError where it is no such file.
+        """
+        try:
+            runs = json.loads(path.read_text(encoding="utf-8"))["results"]["runs"]
+            keys = [run["key"] for run in runs]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"known: {path} holds no runs of this benchmark: {error!r}") from error
+        for key, run in zip(keys, runs, strict=True):
+            if not re.fullmatch(KEY, key):
+                raise ValueError(f"known: {path} has a run of the name {key!r}")
+            if not (self.root / KNOWN / f"{key}.json").exists():
+                write_json(self.root / KNOWN / f"{key}.json", run)
+
+    def beside(self, key: str, name: str) -> Path:
+        """Where a run keeps a file: to be written before the run is, which vouches for it."""
+        return self.here / key / name
+
+    def failure_path(self, key: str) -> Path:
+        """The reason why there is no run of that key."""
+        return self.here / f"{key}.failed.json"
+
+
+def kept(path: Path) -> Run | None:
+    """What an earlier call kept in this file; None where there is none, ValueError where it is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("it holds no object")
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
+    return found
+
+
+@cache
+def sources() -> str:
+    """A digest of the files that make a result: of hqgs, and of the crate where there is a checkout."""
+    package = Path(hqgs.__file__).parent
+    files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] not in NO_RESULT]
+    if (package.parent / "Cargo.toml").is_file():
+        files += [*(package.parent / "rust").rglob("*.rs"), package.parent / "Cargo.lock"]
+    sha = hashlib.sha256()
+    for path in sorted(files):
+        sha.update(f"{path.relative_to(package.parent).as_posix()}\n".encode() + path.read_bytes())
+    return sha.hexdigest()[:8]
+
+
+def key_of(cell: Cell, fingerprint: dict[str, str]) -> str:
+    """Readable, and a digest of all that the result depends on. `fingerprint`: of the cell's scene.
+
+    Options of other methods do not count, nor does the name of the row: a run serves all protocols.
+    """
+    row, config = cell.row, asdict(cell.config)
+    config = {name: value for name, value in config.items() if name not in METHODS or name == row.method}
+    if not config["leave_out"]:
+        del config["leave_out"]  # runs from before there was such a choice are the same
+    if row.method == "hqgs" and cell.config.hqgs.guidance == PAPER:
+        del config["hqgs"]["first_points"]  # so are the paper's, which has no use for it
+    facts = {"format": FORMAT, "version": hqgs.__version__, "config": config, "degradation": cell.degradation}
+    facts |= {"scene": fingerprint, **cell.more}
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
+    parts = [cell.scene.name, f"x{cell.downscale:g}", cell.degradation, row.method, f"s{cell.seed}"]
+    parts += [str(cell.config.iterations), *cell.tags, digest]
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))
+
+
+class Study:
+    """Runs what is not finished, and knows what is: `runs` and `failures` by cell."""
+
+    def __init__(
+        self,
+        name: str,
+        cells: Sequence[Cell],
+        store: Store,
+        photos: Callable[[Cell], Scene] = lambda cell: cell.scene,
+    ) -> None:
+        """`photos` gives what a cell trains on; cells of one group that follow each other share it."""
+        self.name, self.cells, self.store = name, list(cells), store
+        self._photos = photos
+        self._last: tuple[tuple[str, str, int], Scene] | None = None
+        scenes = {cell.scene.name: cell.scene for cell in cells}
+        prints = {name: scene_fingerprint(scene) for name, scene in scenes.items()}
+        self.keys = {cell: key_of(cell, prints[cell.scene.name]) for cell in cells}
+        found = {cell: store.read(key) for cell, key in self.keys.items()}
+        self.runs: dict[Cell, Run] = {cell: run for cell, run in found.items() if run is not None}
+        self.failures: dict[Cell, str] = {}
+        for cell, key in self.keys.items():
+            if cell not in self.runs and (failed := kept(store.failure_path(key))) is not None:
+                self.failures[cell] = failed["error"]
+
+    def train(self, measure: Callable[[Cell, Scene], Run]) -> None:
+        """Run the cells that are not finished, in their order; each is written as soon as it is done.
+
+        `measure` trains a cell on the photos that it gets. A ValueError or TrainingError of one cell is kept
+        and does not end the others; it is tried again by the next call.
+        """
+        pending = [cell for cell in self.cells if cell not in self.runs]
+        estimate = Estimate()
+        for cell, run in self.runs.items():
+            estimate.add(cell, run)
+        for cell in pending:
+            if not estimate.knows(cell):
+                with suppress(ValueError, TrainingError):  # the run itself will say it
+                    estimate.probe(cell, self.photos(cell))
+        self.say(f"{len(self.cells)} runs, {len(pending)} left{_about(estimate.seconds(pending))}")
+        facts = {"sources": sources(), "machine": machine_facts(), "versions": version_facts()}
+        for k, cell in enumerate(pending, 1):
+            key, started = self.keys[cell], time.perf_counter()
+            try:
+                run = measure(cell, self.photos(cell))
+            except (ValueError, TrainingError) as error:
+                self.failures[cell] = str(error)
+                write_json(self.store.failure_path(key), {"key": key, "error": str(error), **facts})
+                self.say(f"[{k}/{len(pending)}] {cell} failed: {error}")
+                continue
+            wall = time.perf_counter() - started
+            run = {"key": key, "scene": cell.scene.name, **run, "threads": hqgs.get_num_threads()}
+            self.runs[cell] = run | {"wall_seconds": wall, **facts}
+            self.store.write(self.runs[cell])
+            self.failures.pop(cell, None)
+            estimate.add(cell, self.runs[cell])
+            value = run["history"][-1]["psnr"] if run["history"] else None
+            left = _about(estimate.seconds(pending[k:])) if k < len(pending) else ""
+            self.say(
+                f"[{k}/{len(pending)}] {cell}: {'no PSNR' if value is None else f'{value:.2f} dB'}, "
+                f"{run['gaussians']:,} Gaussians, {duration(wall)}; {len(pending) - k} left{left}"
+            )
+
+    def photos(self, cell: Cell) -> Scene:
+        """What a cell trains on."""
+        if self._last is None or self._last[0] != cell.group:
+            self._last = (cell.group, self._photos(cell))
+        return self._last[1]
+
+    def left_out(self) -> list[dict[str, str]]:
+        """The runs that are not there, with the reasons."""
+        missing = [cell for cell in self.cells if cell not in self.runs]
+        return [{"what": f"run {c}", "why": self.failures.get(c, "not finished")} for c in missing]
+
+    def results(self) -> list[Run]:
+        """The finished runs with the labels of their rows, in the order of the cells."""
+        return [self.runs[c] | {"row": c.row.label} for c in self.cells if c in self.runs]
+
+    def circumstances(self) -> dict[str, list[str]]:
+        """CPU, threads, commit and sources of the finished runs, each value once."""
+        seen: defaultdict[str, set[str]] = defaultdict(set)
+        for run in self.runs.values():
+            seen["CPU"].add(" ".join(filter(None, map(run["machine"].get, ("cpu", "simd")))))
+            seen["threads"].add(str(run["threads"]))
+            seen["commit"].add(str(run["versions"]["git_commit"]))
+            seen["sources"].add(str(run.get("sources")))
+        return {name: sorted(values) for name, values in seen.items()}
+
+    def say(self, text: str) -> None:
+        print(f"{self.name}: {text}", file=sys.stderr, flush=True)
+
+
+def open_study(
+    args: argparse.Namespace,
+    name: str,
+    cells: Sequence[Cell],
+    photos: Callable[[Cell], Scene] = lambda cell: cell.scene,
+) -> Study:
+    """The study with the runs that `args.out` and `args.known` hold, and its store."""
+    store = Store(args.out, args.any_sources)
+    for path in args.known or ():
+        store.take(path)
+    return Study(name, cells, store, photos)
+
+
+def _about(seconds: float) -> str:
+    return f", about {duration(seconds)}" if seconds else ""

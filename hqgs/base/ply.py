@@ -1,0 +1,53 @@
+"""The vertices of a PLY file, whatever they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyParseError
+
+MAX_HEADER_BYTES = 1 << 16
+
+
+def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
+    """The element `vertex` as a structured array [N], a field for each property; others are passed by.
+
+    The file may be text or binary of either byte order. A header that promises more than the file holds is
+    refused before anything of that size is allocated.
+
+    Raises FileNotFoundError, or ValueError that names the file.
+    """
+    path = Path(path)
+    _check_header(path)
+    try:
+        ply = PlyData.read(str(path))
+    except (PlyParseError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ValueError(f"{path}: not a readable PLY file: {error}") from error
+    if "vertex" not in ply:
+        raise ValueError(f"{path}: a PLY file without the element vertex")
+    return ply["vertex"].data
+
+
+def _check_header(path: Path) -> None:
+    with path.open("rb") as f:
+        head = f.read(MAX_HEADER_BYTES)
+    size = path.stat().st_size
+    end = head.find(b"end_header")
+    if not head.startswith(b"ply") or end < 0:
+        raise ValueError(f"{path}: not a PLY file (no header that ends within {MAX_HEADER_BYTES} bytes)")
+    promised = rows = most = 0
+    for line in head[:end].splitlines():
+        words = line.split()
+        if words[:1] == [b"element"]:
+            if len(words) != 3 or not words[2].isdigit() or len(words[2]) > 18:
+                raise ValueError(f"{path}: not a readable PLY file: its header has the line {line[:80]!r}")
+            rows = int(words[2])
+            most = max(most, rows)
+        elif words[:1] == [b"property"]:
+            promised += rows  # a value takes at least one byte in every PLY format
+    if max(promised, most) > size:
+        raise ValueError(
+            f"{path}: the header promises {max(promised, most)} values, the file has {size} bytes"
+        )

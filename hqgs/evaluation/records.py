@@ -1,0 +1,113 @@
+"""What report.json holds, as types."""
+
+from __future__ import annotations
+
+from typing import TypeAlias, TypedDict
+
+from hqgs.base.left_out import LeftOutRecord
+from hqgs.base.machine import MachineFacts
+
+Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
+
+
+class HistoryEntry(TypedDict):
+    """Means over the held-out views at one moment of a run. None: no such value."""
+
+    iteration: int
+    seconds: float  # of training until then
+    psnr: float | None  # dB
+    ssim: float | None
+
+
+class MetricValues(TypedDict):
+    """The metrics of one view, or their means. None: the report's `reasons` say why there is none."""
+
+    psnr: float | None  # dB, up
+    ssim: float | None  # up
+    haarpsi: float | None  # up
+    lpips: float | None  # AlexNet, down
+    lpips_vgg: float | None  # VGG-16, down
+
+
+class ViewMetricValues(MetricValues):
+    """The metrics of a held-out view."""
+
+    name: str
+    picture: str | None  # photo, render, difference: a file in the run's folder; None: nothing was written
+
+
+class MetricsRecord(TypedDict):
+    """The held-out views of a run, measured."""
+
+    mean: MetricValues
+    views: list[ViewMetricValues]
+    reasons: dict[str, str]  # metric -> why the mean is None
+
+
+class GuardEvent(TypedDict):
+    """Something that was not finite. `gaussians` are row numbers at that iteration."""
+
+    iteration: int
+    view: str  # the training view of the step
+    what: str  # "photo", "loss", "gradient" or "parameter"
+    tensors: list[str]  # where it was found: "render", "means", ...; empty for a photo or the loss
+    count: int  # pixels' values of a photo, Gaussians elsewhere; 0 where no Gaussian is at fault
+    gaussians: list[int]
+
+
+class GuardRecord(TypedDict):
+    """What was not finite in a run."""
+
+    skipped_steps: int
+    culled_gaussians: int
+    num_events: int
+    events: list[GuardEvent]  # the first ones
+
+
+class SfmRecord(TypedDict):
+    """`SfmReport` in the report."""
+
+    photos: int
+    not_registered: list[str]
+    outliers: list[str]
+    rotation_error_deg: dict[str, float]
+    translation_error: dict[str, float]
+    own_cameras_px: float
+    points: int
+    point_distance: float
+    track_length: float
+    reprojection_error_px: float
+    own_points: int
+    own_track_length: float | None
+    own_reprojection_error_px: float | None
+
+
+class RunRecord(TypedDict):
+    """A run without its metrics."""
+
+    scene: str
+    source: str  # format the scene was read from
+    notes: list[str]  # what a reader should know of photos and points
+    method: str
+    seed: int
+    iterations: int
+    length: int  # iterations of the whole run; fewer were done where it was stopped
+    seconds: float  # training time, without loading and without the report
+    decision_seconds: float  # of them: to find out what may be left out
+    gaussians: int
+    scene_bytes: int | None  # of scene.ply; None: nothing was written
+    culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
+    peak_rss_mb: float | None
+    history: list[HistoryEntry]
+    left_out: list[LeftOutRecord]
+    guard: GuardRecord
+    sfm: SfmRecord | None  # None: poses and points are the scene's own
+    config: dict[str, Json]  # `TrainConfig`, as the method has fitted it to the scene
+
+
+class Report(RunRecord):
+    """report.json."""
+
+    metrics: MetricsRecord
+    machine: MachineFacts
+    versions: dict[str, str | None]

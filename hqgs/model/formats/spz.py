@@ -1,0 +1,262 @@
+"""SPZ files (Niantic's open format): a tenth of a PLY file, with a known error in every value.
+
+A gzip stream of a 16-byte header and one array after the other: positions, opacities, colours, scales,
+rotations, SH. Written is version 3; versions 2 and 3 are read. A file holds its scene in the frame RUB (x
+right, y up, z back), the Gaussians here and PLY files are RDF (x right, y down, z forward): y and z change
+their sign, and with them those parts of the rotations and of the SH that are odd in them.
+
+What a value that was written and read back may differ by, float32 rounding aside:
+
+| value | stored as | error at most | range |
+|---|---|---|---|
+| means | 24-bit fixed point | half a step of 2^-bits | the bits are chosen so that all fit |
+| scales | log, 8 bits | 1/32 in the log: 3.2 % | e^-10 to e^5.9375 world units |
+| quats | three components of 10 bits | 0.005 rad of rotation | all |
+| opacities | 8 bits | 0.5 / 255 | 0 to 1 |
+| sh0 | 8 bits | 1/76.5, a colour change of 0.0037 | -3.33 to 3.33, colours from -0.44 to 1.44 |
+| shN | 8 bits, of which the first B are used | 2^-B | -0.992 to 0.992 |
+
+Values outside a range become its end; `SpzFile.clipped` counts them.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.base.files import atomic_path
+from hqgs.model.constants import MAX_SH_DEGREE
+from hqgs.model.formats.arrays import Arrays
+
+MAGIC = 0x5053474E  # "NGSP"
+HEADER = struct.Struct("<IIIBBBB")  # magic, version, Gaussians, SH degree, fractional bits, flags, 0
+VERSION = 3
+MAX_GAUSSIANS = 10_000_000  # Niantic's reader takes no more
+GZIP = 31  # zlib's number for a stream with a gzip header
+MAX_RATIO = 1032  # deflate packs no better
+SH_BITS = (8, 8)  # of degree 1, of degrees 2 and 3; less rounds small values that many Gaussians share to 0
+
+LIMIT = (1 << 23) - 1  # of a 24-bit number; its negative is used alike
+MAX_FRACTION = 23  # bits: a step of 1.2e-7, what float32 can tell apart at 1
+FINE = 1 / 64  # the error of a position, as a share of its Gaussian's largest scale, that is fine enough
+COARSE = 1 / 8  # and the one that shows
+MISFIT_SHARE = 0.01  # of the Gaussians, whose positions or sizes the format may miss
+
+LOG_SCALE, LOG_OFFSET = 16.0, 10.0  # log scale = byte / 16 - 10
+COLOR = 0.15 * 255  # sh0 = (byte - 127.5) / COLOR
+SH_ONE = 128  # shN = byte / 128 - 1
+QUAT_BITS = 9  # of a magnitude, beside its sign
+QUAT_ONE = ((1 << QUAT_BITS) - 1) * math.sqrt(2)  # the three smallest components are at most sqrt(1/2)
+
+# Signs that turn RDF into RUB and back: a half turn about x, which SH functions odd in y z answer by -1.
+FLIP_MEANS = np.array([1.0, -1.0, -1.0])
+FLIP_QUATS = np.array([1.0, -1.0, -1.0, 1.0])  # x y z w
+FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float64)
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class SpzFile:
+    """What an SPZ file holds of the Gaussians that it was made of."""
+
+    data: bytes  # of the whole file
+    gaussians: int
+    left_out: int  # Gaussians that hold NaN or Inf, or a rotation of norm 0
+    fraction: int  # bits after the point of a position
+    clipped: dict[str, int]  # values outside the format's range, by name; only what is not 0
+
+
+def write_spz(path: str | Path, gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
+    """Write Gaussians atomically. See `encode_spz` for the errors."""
+    file = encode_spz(gaussians, sh_bits)
+    with atomic_path(path) as tmp:
+        tmp.write_bytes(file.data)
+    return file
+
+
+def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
+    """The bytes of an SPZ file, without the Gaussians that hold NaN or Inf.
+
+    Args:
+        gaussians: at most 10,000,000.
+        sh_bits: 1..8 bits for the SH coefficients of degree 1, and of degrees 2 and 3.
+
+    Raises ValueError where the format's ranges do not fit the scene: where more than 1 % of the Gaussians
+    would be displaced by more than an eighth of their largest scale, or have a largest scale out of range.
+    """
+    if len(sh_bits) != 2 or not all(1 <= bits <= 8 for bits in sh_bits):
+        raise ValueError(f"sh_bits is {sh_bits}, wanted two numbers in 1..8")
+    n, rest = gaussians["shN"].shape[:2]
+    if n > MAX_GAUSSIANS:
+        raise ValueError(f"{n:,} Gaussians, but an SPZ file takes at most {MAX_GAUSSIANS:,}")
+    from scipy.special import expit  # here: what reads no SPZ needs no scipy
+
+    arrays: dict[str, Array] = {name: np.asarray(a, np.float64) for name, a in gaussians.items()}
+    norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        arrays["quats"] = np.roll(arrays["quats"] / norm, -1, axis=1)  # x y z w
+    finite = np.all([np.isfinite(a).all(axis=tuple(range(1, a.ndim))) for a in arrays.values()], axis=0)
+    arrays = {name: a[finite] for name, a in arrays.items()}
+    means = FLIP_MEANS * arrays["means"]
+    fraction = _fraction(means, arrays["scales"])
+    clipped: dict[str, int] = {}
+    steps = np.repeat([1 << (8 - bits) for bits in sh_bits], [3, 12])  # gzip finds few values
+
+    def byte(name: str, values: Array, step: Array | int = 1) -> Bytes:
+        stored = (np.rint(values / step) * step).clip(0, 255)
+        outside = int((np.abs(stored - values) > 0.5 * step).sum())
+        clipped.update({name: outside} if outside else {})
+        return stored.astype(np.uint8)
+
+    fixed = np.rint(means * 2.0**fraction).astype("<i4")
+    sections = [
+        fixed[..., None].view(np.uint8)[..., :3],
+        byte("opacities", 255 * expit(arrays["opacities"])),
+        byte("sh0", arrays["sh0"][:, 0] * COLOR + 127.5),
+        byte("scales", (arrays["scales"] + LOG_OFFSET) * LOG_SCALE),
+        _pack_quats(FLIP_QUATS * arrays["quats"]),
+        byte("shN", FLIP_SH[:rest, None] * arrays["shN"] * SH_ONE + SH_ONE, steps[:rest, None]),
+    ]
+    header = HEADER.pack(MAGIC, VERSION, len(means), math.isqrt(rest + 1) - 1, fraction, 0, 0)
+    packer = zlib.compressobj(wbits=GZIP)
+    data = packer.compress(header) + b"".join(packer.compress(s.tobytes()) for s in sections) + packer.flush()
+    return SpzFile(data, len(means), n - len(means), fraction, clipped)
+
+
+def read_spz(path: str | Path) -> Arrays:
+    """Read an SPZ file of version 2 or 3 with harmonics of degree 0 to 3: float32 arrays.
+
+    An opacity of 0 or 1 has no finite logit: it is taken a quarter of a step inwards.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not such a file, cut off, with more data than its header says, or with a header that
+            says more than the file can hold. Memory stays in proportion to the header's count, which is at
+            most 10,000,000. The message names the file.
+    """
+    path = Path(path)
+    packed = path.read_bytes()
+    unpacker = zlib.decompressobj(wbits=GZIP)
+    head = _unpack(unpacker, packed, HEADER.size, path)
+    if len(head) < HEADER.size:
+        raise ValueError(f"{path}: not an SPZ file: it ends within the header")
+    magic, version, n, degree, fraction, flags, _ = HEADER.unpack(head)
+    if magic != MAGIC:
+        raise ValueError(f"{path}: not an SPZ file: its first number is {magic:#x}, wanted {MAGIC:#x}")
+    if version not in (2, 3):
+        raise ValueError(f"{path}: SPZ version {version}, wanted 2 or 3")
+    if degree > MAX_SH_DEGREE:
+        raise ValueError(f"{path}: harmonics of degree {degree}, wanted 0..{MAX_SH_DEGREE}")
+    if flags:
+        raise ValueError(f"{path}: flags {flags:#x}: antialiased scenes and extensions are not supported")
+    if fraction > MAX_FRACTION:
+        raise ValueError(f"{path}: {fraction} fractional bits, wanted at most {MAX_FRACTION}")
+    rest = (degree + 1) ** 2 - 1
+    widths = [9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest]
+    size = n * sum(widths)
+    if n > MAX_GAUSSIANS or size > MAX_RATIO * len(packed):
+        raise ValueError(f"{path}: the header promises {n:,} Gaussians, the file has {len(packed):,} bytes")
+    data = np.frombuffer(_unpack(unpacker, unpacker.unconsumed_tail, size, path), np.uint8)
+    more = _unpack(unpacker, unpacker.unconsumed_tail, 1, path) or unpacker.unused_data
+    if len(data) < size or not unpacker.eof or more:
+        raise ValueError(f"{path}: damaged: {'more' if more else 'less'} data than {n:,} Gaussians have")
+    bounds = np.cumsum([n * width for width in widths])[:-1]
+    means, opacities, colors, scales, quats, sh = (
+        part.reshape(n, width) for part, width in zip(np.split(data, bounds), widths, strict=True)
+    )
+    fixed = np.zeros((n, 3, 4), np.uint8)
+    fixed[..., 1:] = means.reshape(n, 3, 3)  # in the upper bytes, so that the shift below keeps the sign
+    xyzw = _unpack_quats(quats) if version == 3 else _first_three(quats)
+    from scipy.special import logit
+
+    return {
+        "means": _floats(FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**fraction),
+        "scales": _floats(scales / LOG_SCALE - LOG_OFFSET),
+        "quats": _floats(np.roll(FLIP_QUATS * xyzw, 1, axis=1)),
+        "opacities": _floats(logit(opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255)),
+        "sh0": _floats(((colors - 127.5) / COLOR)[:, None]),
+        "shN": _floats(FLIP_SH[:rest, None] * (sh.reshape(n, rest, 3) / SH_ONE - 1)),
+    }
+
+
+def _floats(values: NDArray[Any]) -> NDArray[np.float32]:
+    return values.astype(np.float32)
+
+
+def _fraction(means: Array, scales: Array) -> int:
+    """Bits after the point of a position: no more than needed, since gzip shrinks no noise; ValueError."""
+    if not len(means):
+        return 0
+    farthest = float(np.abs(means).max())
+    largest = scales.max(axis=1)  # logs
+    end = 255 / LOG_SCALE - LOG_OFFSET
+    outside = (largest < -LOG_OFFSET) | (largest > end)
+    if outside.mean() > MISFIT_SHARE:
+        raise ValueError(
+            f"scales: the largest scale of {outside.sum():,} of {len(means):,} Gaussians is not in the range "
+            f"of SPZ, {math.exp(-LOG_OFFSET):.2g} to {math.exp(end):.3g} world units; write a PLY file"
+        )
+    smallest = float(np.quantile(largest, MISFIT_SHARE, method="lower"))
+    size = math.exp(min(max(smallest, -LOG_OFFSET), end))
+    fits = math.floor(math.log2(LIMIT / max(farthest, 0.5)))
+    needed = math.ceil(-math.log2(2 * FINE * size))
+    fraction = min(fits, max(needed, 0), MAX_FRACTION)
+    error = 0.5 * 2.0**-fraction
+    if fraction < 0 or error > COARSE * size:
+        raise ValueError(
+            f"means: SPZ has 24 bits for a position, so {farthest:.3g} world units from the origin the error "
+            f"is {error:.2g}, but 1 % of the Gaussians are no larger than {size:.2g}; write a PLY file"
+        )
+    return fraction
+
+
+def _pack_quats(xyzw: Array) -> Bytes:
+    """[n, 4] unit quaternions: the place of the largest component, sign and magnitude of the others."""
+    n = len(xyzw)
+    place = np.abs(xyzw).argmax(axis=1)
+    xyzw = xyzw * np.where(xyzw[np.arange(n), place] < 0, -1, 1)[:, None]
+    magnitude = np.rint(np.abs(xyzw) * QUAT_ONE).astype(np.uint32)
+    parts = magnitude | ((xyzw < 0).astype(np.uint32) << QUAT_BITS)
+    word = place.astype(np.uint32)
+    for k in range(4):
+        word = np.where(place == k, word, word << (QUAT_BITS + 1) | parts[:, k])
+    return word.astype("<u4")[:, None].view(np.uint8)
+
+
+def _unpack_quats(packed: Bytes) -> Array:
+    word = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    place = word >> 30
+    xyzw = np.zeros((len(word), 4))
+    for k in (3, 2, 1, 0):
+        here = place == k
+        value = (word & ((1 << QUAT_BITS) - 1)) / QUAT_ONE * np.where(word >> QUAT_BITS & 1, -1, 1)
+        xyzw[:, k] = np.where(here, 0, value)
+        word = np.where(here, word, word >> (QUAT_BITS + 1))
+    xyzw[np.arange(len(word)), place] = np.sqrt(np.maximum(0, 1 - np.square(xyzw).sum(axis=1)))
+    return xyzw
+
+
+def _first_three(packed: Bytes) -> Array:
+    """Quaternions of version 2: x y z in 8 bits each, w is not negative."""
+    xyz = packed / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1)))
+    return np.concatenate([xyz, w[:, None]], axis=1)
+
+
+def _unpack(unpacker: Any, packed: bytes, size: int, path: Path) -> bytes:
+    """The next `size` bytes of a gzip stream, never more; less where it ends."""
+    if size == 0:
+        return b""  # zlib would take 0 for no limit
+    try:
+        return unpacker.decompress(packed, size)
+    except zlib.error as error:
+        raise ValueError(f"{path}: not a readable SPZ file: {error}") from error

@@ -1,0 +1,128 @@
+"""Which rays make up a photo: still, along a camera's path, through a lens, or row by row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hqgs.photos.shake import exposure_times, path_points
+from hqgs.scene.scene import Camera
+
+Floats = NDArray[np.float64]
+
+GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
+OUTLINES = 8  # cameras that stand for all when a tile asks what it may see
+MARGIN = 2.0  # px that a tile looks beyond its border for the cameras between them
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A photo as the mean of samples, each through a camera of its own.
+
+    Sample s of a pixel in row y is the ray of `cameras[y][s]` through the pixel's corner + `jitter[s]`. One
+    list stands for all rows, one camera in a list for all samples.
+    """
+
+    cameras: Sequence[Sequence[Camera]]  # 1 or height lists of 1 or S cameras
+    jitter: Floats  # [S, 2], x and y in the unit square
+    outline: Sequence[Camera] = ()  # whose views enclose those of all samples; none: they are found
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the photo."""
+        camera = self.cameras[0][0]
+        return camera.width, camera.height
+
+    def seen_from(self, rows: slice) -> tuple[Sequence[Camera], float]:
+        """Cameras whose views of these rows, widened by as many px, enclose what all samples see."""
+        if self.outline:
+            return self.outline, MARGIN
+        if len(self.cameras) == 1 and len(self.cameras[0]) == 1:
+            return self.cameras[0], 0.0
+        if len(self.cameras) == 1:
+            every = list(self.cameras[0])
+        else:
+            every = [camera for row in self.cameras[rows] for camera in row]
+        picks = np.unique(np.linspace(0, len(every) - 1, OUTLINES).round().astype(int))
+        return [every[k] for k in picks], MARGIN
+
+
+def still(camera: Camera, jitter: Floats) -> Exposure:
+    """A photo in an instant through a pinhole."""
+    return Exposure([[camera]], jitter)
+
+
+def shaken(camera: Camera, knots: Floats, count: int) -> Exposure:
+    """The mean over `count` equal parts of an exposure during which the camera moves; see `path_viewmats`."""
+    return Exposure([_moved(camera, knots, exposure_times(count))], spread(count))
+
+
+def rolling(camera: Camera, knots: Floats, jitter: Floats) -> Exposure:
+    """Row y of H in an instant at time (y + 1/2) / H - 1/2, while the camera moves; see `path_viewmats`."""
+    cameras = _moved(camera, knots, exposure_times(camera.height))
+    return Exposure([[moved] for moved in cameras], jitter)
+
+
+def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> Exposure:
+    """Through a thin lens of radius `aperture` (world units) that is sharp at view-space z = `focus`.
+
+    A point at depth d becomes a disc of radius fx aperture |1/d - 1/focus| px: the mean over `count`
+    pinholes, a sunflower on the lens, each with the principal point that keeps the plane in focus where it
+    is.
+    """
+    k = np.arange(count)
+    radii, angles = aperture * np.sqrt((k + 0.5) / count), GOLDEN * k
+    hexagon = np.arange(6.0) * math.pi / 3
+    around = aperture / math.cos(math.pi / 6)  # the hexagon encloses the lens
+
+    def pinholes(radii: NDArray[np.floating], angles: NDArray[np.floating]) -> list[Camera]:
+        points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], -1)
+        cameras = []
+        for x, y in points - points.mean(axis=0):  # a sunflower of few seeds is off its middle
+            viewmat, K = camera.viewmat.copy(), camera.K.copy()
+            viewmat[:2, 3] -= x, y
+            K[0, 2] += K[0, 0] * x / focus
+            K[1, 2] += K[1, 1] * y / focus
+            cameras.append(Camera(camera.width, camera.height, K, viewmat))
+        return cameras
+
+    return Exposure([pinholes(radii, angles)], spread(count), pinholes(np.full(6, around), hexagon))
+
+
+def path_viewmats(viewmat: Floats, knots: Floats, times: Floats) -> Floats:
+    """World-to-camera matrices [N, 4, 4] at `times` in [-1/2, 1/2] of a camera that moves around `viewmat`.
+
+    The cubic through the four `knots` [4, 6] (`hqgs.photos.shake`) gives a rotation vector w in radians and a
+    translation v in world units, both in the frame of `viewmat`: a point p of that frame is then at
+    exp([w]x) p + v.
+    """
+    points = path_points(knots, times)
+    moves = np.tile(np.eye(4), (len(times), 1, 1))
+    moves[:, :3, :3] = Rotation.from_rotvec(points[:, :3]).as_matrix()
+    moves[:, :3, 3] = points[:, 3:]
+    return moves @ viewmat
+
+
+def spread(count: int) -> Floats:
+    """Offsets [count, 2] of samples in a pixel, x and y, for samples that stand for times one after another.
+
+    A Latin square: each axis holds `count` even places once. Of 256 seeded draws the one that goes least with
+    time and least along a diagonal, without what is left of its drift over time: it would make the path
+    longer or shorter by parts of a pixel. The mean is (1/2, 1/2).
+    """
+    rng, times = np.random.default_rng(0), exposure_times(count)
+    draws = [np.stack([times, rng.permutation(times), rng.permutation(times)]) for _ in range(256)]
+    _, x, y = min(draws, key=lambda draw: float(np.square(np.triu(draw @ draw.T, 1)).sum()))
+    offsets = np.stack([x, y], -1)
+    drift = times @ offsets / max(np.square(times).sum(), 1e-12)
+    return 0.5 + offsets - times[:, None] * drift
+
+
+def _moved(camera: Camera, knots: Floats, times: Floats) -> list[Camera]:
+    viewmats = path_viewmats(camera.viewmat, knots, times)
+    return [Camera(camera.width, camera.height, camera.K, viewmat) for viewmat in viewmats]

@@ -1,0 +1,80 @@
+"""A capture as people have them: few photos from far apart, and few points."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from hqgs.scene.builtin.points import SparsePoints
+from hqgs.scene.builtin.scene import FOCAL, HEIGHT, WIDTH, assemble, look_at
+from hqgs.scene.scene import Camera, Scene
+
+TABLE = (0.0, 0.40, 3.3)  # above the middle of the table top; what the cameras look at
+ARC = math.radians(65)  # to either side of the front
+RADIUS, LOW, HIGH = 2.8, -0.25, -0.95  # of the arc, and heights of the cameras (y points down)
+
+
+def sparse_room(
+    cache: Path | None = None,
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    num_views: int = 25,
+    num_points: int = 3000,
+    time_limit: float = 120.0,
+    threads: int | None = None,
+) -> Scene:
+    """The room by `num_views` cameras on an arc of 130 degrees around its table; every 8th is a test view.
+
+    Neighbours stand 5 degrees apart, in turns low and high, so that two of one height are 10 degrees apart;
+    each sees the table from about 2.8. At most `num_points` points, a seeded choice, are kept of those that
+    the training photos give (`sfm_points`: 2,174 at the default size). The rest is as in `embedded_scene`,
+    errors included.
+    """
+    if width < 1 or height < 1:
+        raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+    if num_views < 2:
+        raise ValueError(f"num_views must be at least 2 (one to train, one to test), got {num_views}")
+    if num_points < 1:
+        raise ValueError(f"num_points must be at least 1, got {num_points}")
+    cameras = sparse_cameras(width, height, num_views)
+    made = {"cameras": "sparse", "num_points": num_points}
+    return assemble(
+        "sparse", cameras, cache, time_limit, threads, None, made, lambda points: thinned(points, num_points)
+    )
+
+
+def sparse_cameras(width: int = WIDTH, height: int = HEIGHT, num_views: int = 25) -> list[Camera]:
+    """The cameras of the sparse room, from the left to the right."""
+    rng = np.random.default_rng(2026)
+    fx, fy = FOCAL * width / WIDTH, FOCAL * height / HEIGHT
+    K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+    cameras = []
+    for k in range(num_views):
+        jitter = rng.uniform(-1, 1, 7)
+        angle = ARC * ((2 * k + 1) / num_views - 1) + 0.03 * jitter[0]
+        radius = RADIUS + 0.15 * jitter[1]
+        x, z = TABLE[0] + radius * math.sin(angle), TABLE[2] - radius * math.cos(angle)
+        center = np.array([x, (LOW if k % 2 else HIGH) + 0.15 * jitter[2], z])
+        target = np.array(TABLE) + jitter[3:6] * [0.25, 0.12, 0.25]
+        cameras.append(Camera(width, height, K, look_at(center, target, math.radians(2 * jitter[6]))))
+    return cameras
+
+
+def thinned(points: SparsePoints, count: int) -> SparsePoints:
+    """At most `count` of the points, a seeded choice, in their order."""
+    found = len(points.points)
+    if found <= count:
+        return points
+    keep = np.zeros(found, bool)
+    keep[np.random.default_rng(0).permutation(found)[:count]] = True
+    sighted = keep[points.rows]
+    place = np.cumsum(keep) - 1
+    return SparsePoints(
+        points.points[keep],
+        points.colors[keep],
+        points.photos[sighted],
+        place[points.rows[sighted]],
+        f"{points.note}, thinned out to {count}",
+    )

@@ -1,0 +1,107 @@
+"""The state of a run: what its next step starts from, and what a checkpoint keeps of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hqgs.evaluation.records import HistoryEntry
+from hqgs.model.gaussians import Gaussians
+from hqgs.training.adam import Adam
+from hqgs.training.checkpoint import part
+from hqgs.training.densify import Densifier
+from hqgs.training.guard import Guard
+from hqgs.training.schedule import Decisions
+
+
+@dataclass
+class TrainState:
+    """After `iteration` steps. What a method has beside it, the method keeps."""
+
+    gaussians: Gaussians  # leaves
+    optimizer: Adam
+    densifier: Densifier
+    decisions: Decisions
+    iteration: int = 0  # steps done
+    seconds: float = 0.0  # spent in steps
+    guard: Guard = field(default_factory=Guard)
+    history: list[HistoryEntry] = field(default_factory=list)  # of the held-out means
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All of its tensors by name, for a checkpoint."""
+        tensors = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.named().items()}
+        tensors |= {f"densify.{name}": tensor for name, tensor in self.densifier.state_dict().items()}
+        for prefix, param in _moments(self.optimizer):
+            for key, value in self.optimizer.state.get(param, {}).items():
+                tensors[prefix + key] = torch.as_tensor(value)
+        return tensors
+
+    def values(self) -> dict[str, Any]:
+        """All that is no tensor, as JSON values, for a checkpoint."""
+        return {
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "history": self.history,
+            "guard": asdict(self.guard),
+            "decisions": asdict(self.decisions),
+        }
+
+    def restored(
+        self,
+        path: str | Path,
+        tensors: dict[str, Tensor],
+        values: dict[str, Any],
+        optimizer_of: Callable[[Gaussians], Adam],
+    ) -> TrainState:
+        """The state that `tensors` and `values` of the checkpoint `path` hold; this one is of the same run.
+
+        ValueError names a tensor of another shape or type.
+        """
+        decisions, n = Decisions(**values["decisions"]), len(tensors["gaussians.means"])
+
+        def check(name: str, tensor: Tensor, like: Tensor) -> None:
+            if tensor.shape != like.shape or tensor.dtype != like.dtype:
+                raise ValueError(
+                    f"{path} is damaged: {name} is {tensor.dtype} {list(tensor.shape)}, "
+                    f"wanted {like.dtype} {list(like.shape)}"
+                )
+
+        for name, tensor in self.gaussians.named().items():
+            row = tensor.shape[1:] if name != "shN" else (decisions.num_higher, 3)
+            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *row)))
+        gaussians = Gaussians(**part("gaussians.", tensors))
+        optimizer = optimizer_of(gaussians)
+        for prefix, param in _moments(optimizer):
+            if state := part(prefix, tensors):
+                for key in ("exp_avg", "exp_avg_sq"):
+                    check(prefix + key, state[key], param)
+                check(f"{prefix}step", state["step"], torch.tensor(0.0))
+                optimizer.state[param] = state
+        statistics = part("densify.", tensors)
+        for name, tensor in statistics.items():
+            check(f"densify.{name}", tensor, torch.empty(n))
+        self.densifier.load_state_dict(statistics)
+        return TrainState(
+            gaussians,
+            optimizer,
+            self.densifier,
+            decisions,
+            values["iteration"],
+            values["seconds"],
+            Guard(**values["guard"]),
+            values["history"],
+        )
+
+
+def _moments(optimizer: Adam) -> list[tuple[str, Tensor]]:
+    """Each trained tensor, with the prefix that its moments have in a checkpoint."""
+    return [
+        (f"adam.{group['name']}.{i}.", param)
+        for group in optimizer.param_groups
+        for i, param in enumerate(group["params"])
+    ]

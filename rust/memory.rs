@@ -1,0 +1,57 @@
+//! Memory for large buffers: an error where the system gives none, in place of an abort of the process.
+
+use crate::error::Error;
+
+/// Room for `additional` more elements of what `name` says.
+#[inline(always)]
+pub(crate) fn reserve<T>(vector: &mut Vec<T>, additional: usize, name: &str) -> Result<(), Error> {
+    vector
+        .try_reserve(additional)
+        .map_err(|_| no_memory::<T>(additional, name))
+}
+
+/// A vector with room for `len` elements of what `name` says.
+pub(crate) fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> {
+    let mut vector = Vec::new();
+    match vector.try_reserve_exact(len) {
+        Ok(()) => Ok(vector),
+        Err(_) => Err(no_memory::<T>(len, name)),
+    }
+}
+
+/// A vector of `len` times the same value.
+pub(crate) fn filled<T: Clone>(value: T, len: usize, name: &str) -> Result<Vec<T>, Error> {
+    let mut vector = with_capacity(len, name)?;
+    vector.resize(len, value);
+    Ok(vector)
+}
+
+#[cold]
+fn no_memory<T>(len: usize, name: &str) -> Error {
+    Error::OutOfMemory {
+        name: name.into(),
+        bytes: (len as u64).saturating_mul(size_of::<T>() as u64),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_had_is_an_error() {
+        assert_eq!(filled(7u8, 3, "few").unwrap(), [7; 3]);
+        let expected = Error::OutOfMemory {
+            name: "image".into(),
+            bytes: 1 << 60,
+        };
+        assert_eq!(filled(0u32, 1 << 58, "image").unwrap_err(), expected);
+        let mut vector = vec![1u32];
+        assert_eq!(
+            reserve(&mut vector, 1 << 58, "image").unwrap_err(),
+            expected
+        );
+        assert_eq!(vector, [1]);
+        assert!(with_capacity::<u64>(usize::MAX, "all").is_err()); // more bytes than can be counted
+    }
+}

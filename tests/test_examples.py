@@ -1,0 +1,77 @@
+"""The examples run at a tiny size, are short, and do what they say."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_scene import tiny_scene
+
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.degrade import write_degraded_scene
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+LONGEST = 80  # lines
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A scene folder of six photos, 24 x 16."""
+    write_degraded_scene(tiny_scene(), tmp_path / "desk", parse_degradation("none"), 0)
+    return tmp_path / "desk"
+
+
+def run(name: str, cwd: Path, *arguments: str | Path) -> str:
+    """What the example says."""
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_examples_are_short() -> None:
+    files = sorted(EXAMPLES.glob("*.py"))
+    assert len(files) >= 3
+    for file in files:
+        assert len(file.read_text(encoding="utf-8").splitlines()) <= LONGEST, file.name
+        assert f"def test_{file.stem}(" in Path(__file__).read_text(encoding="utf-8")
+
+
+def test_train_llff(folder: Path, tmp_path: Path) -> None:
+    told = run("train_llff.py", tmp_path, folder, "--iterations", "20")
+    out = tmp_path / "outputs" / "desk"
+    report = json.loads((out / "report.json").read_text())
+    assert (report["method"], report["iterations"], report["config"]["leave_out"]) == ("3dgs", 20, [])
+    assert f"{report['gaussians']} Gaussians after 20 iterations" in told
+    assert f"psnr  {report['metrics']['mean']['psnr']:.4f}" in told
+    assert len(list((out / "comparison").iterdir())) == 1
+    again = run("train_llff.py", tmp_path, folder, "--iterations", "10")
+    assert "after 10 iterations" in again
+
+
+def test_bad_photos(folder: Path, tmp_path: Path) -> None:
+    told = run(
+        "bad_photos.py", tmp_path, folder, "--iterations", "20", "--downscale", "1", "--kind", "noise:40"
+    )
+    assert "\ndesk: none\n" in told  # the diagnosis: photos of this size tell nothing
+    (trained,) = re.findall(r"iteration 20 of 20: ([\d.]+) dB", told)
+    out = tmp_path / "outputs" / "bad_photos"
+    assert {file.name for file in out.iterdir()} == {"scene.ply", "scene.spz", "render.png"}
+    shown = np.asarray(Image.open(out / "render.png")) / 255.0
+    assert shown.shape == (16, 24, 3)
+    error = np.square(shown - tiny_scene().test[0].image / 255.0).mean()  # of the only held-out view
+    assert -10 * np.log10(error) == pytest.approx(float(trained), abs=0.05)
+
+
+def test_fit_picture(tmp_path: Path) -> None:
+    options = ("--size", "32", "--gaussians", "200", "--iterations", "60", "--out", "a.png")
+    told = [float(value) for value in re.findall(r"([\d.]+) dB", run("fit_picture.py", tmp_path, *options))]
+    assert len(told) == 10
+    assert told[-1] > told[0] + 3
+    assert Image.open(tmp_path / "a.png").size == (64, 32)

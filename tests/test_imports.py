@@ -1,0 +1,76 @@
+"""What is loaded when: heavy packages wait until something needs them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hqgs
+
+ROOT = Path(__file__).parent.parent
+HEAVY = {"kornia", "matplotlib", "piq", "pycolmap", "scipy"}
+
+
+def loaded(code: str) -> set[str]:
+    """The packages that a fresh Python has loaded after the code; its last line on stdout tells."""
+    code = f"import sys\n{code}\nprint(' '.join(name for name in sys.modules if '.' not in name))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_import_loads_nothing_heavy() -> None:
+    assert not loaded("import hqgs") & {*HEAVY, "torch", "numpy"}
+
+
+def test_to_render_and_to_read_a_scene_needs_torch_alone() -> None:
+    names = loaded(
+        "import hqgs\nhqgs.rasterization, hqgs.Gaussians.load, hqgs.Camera, hqgs.get_num_threads()"
+    )
+    assert "torch" in names
+    assert not names & HEAVY
+
+
+def test_to_load_and_to_train_draws_no_chart_yet() -> None:
+    assert not loaded("import hqgs\nhqgs.load, hqgs.train") & {"kornia", "matplotlib", "piq"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["--help"], 0, "usage: hqgs"),
+        (["train", "--help"], 0, "--leave-out"),
+        (["export", "--help"], 0, "--sh-degree"),
+        (["trane"], 2, "invalid choice"),
+        (["train", "embedded", "--out", "x", "--method", "4dgs"], 2, "unknown method '4dgs'"),
+        (["train", "embedded", "--out", "x", "--iterations", "0"], 2, "iterations is 0"),
+        (["train", "/no/such", "--out", "x"], 2, "there is no scene folder /no/such"),
+        (["diagnose", "/no/such"], 2, "there is no scene folder /no/such"),
+        (["degrade", "/no/such", "--kind", "blur", "--out", "x"], 2, "there is no scene folder /no/such"),
+        (["export", "/no/such", "--out", "x.ply"], 2, "there is no /no/such"),
+    ],
+)
+def test_help_and_mistakes_are_answered_without_torch(arguments: list[str], code: int, text: str) -> None:
+    program = f"""
+import contextlib, io
+from hqgs.cli.main import main
+told = io.StringIO()
+with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+    try:
+        code = main({arguments!r})
+    except SystemExit as end:
+        code = end.code
+assert code == {code}, code
+assert {text!r} in told.getvalue(), told.getvalue()
+"""
+    assert not loaded(program) & {*HEAVY, "torch"}
+
+
+def test_every_public_name_is_there() -> None:
+    assert set(hqgs.__all__) <= set(dir(hqgs))
+    assert all(getattr(hqgs, name) is not None for name in hqgs.__all__)
+    with pytest.raises(AttributeError, match="module 'hqgs' has no attribute 'trian'"):
+        hqgs.trian  # type: ignore[attr-defined]  # noqa: B018

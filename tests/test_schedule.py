@@ -1,0 +1,134 @@
+"""The schedule: what each step does, against lists made by hand; and the example of a method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from example_method import Tinted, install, loss_of
+from run_state import assert_same, whole_state
+from tiny_scene import tiny_config, tiny_scene
+
+import hqgs
+import hqgs.training.schedule as module
+from hqgs.scene.scene import View
+from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.schedule import FINEST, Decisions, Plan, Schedule, learning_rates
+from hqgs.training.trainer import Trainer
+
+DENSIFY = DensifyConfig(start=20, stop=61, every=10, reset_every=25)
+
+
+def views(count: int) -> list[View]:
+    return [replace(tiny_scene().train[0], name=f"{k}.png") for k in range(count)]
+
+
+def schedule(config: TrainConfig, count: int = 5) -> Schedule:
+    return Schedule.of(config, views(count), as_photographed=True)
+
+
+def plans(schedule: Schedule, decisions: Decisions | None = None, count: int = 99) -> list[Plan]:
+    decisions = decisions or schedule.start()
+    return [schedule.plan(iteration, decisions) for iteration in range(1, count + 1)]
+
+
+def test_growth_and_resets() -> None:
+    made = plans(schedule(tiny_config(100, densify=DENSIFY)))
+    assert [plan.iteration for plan in made if plan.grows] == [30, 40, 50, 60]
+    assert [plan.iteration for plan in made if plan.resets] == [26, 51]  # before the step after 25 and 50
+    assert [plan.iteration for plan in made if plan.observes] == list(range(1, 61))
+    assert {plan.finest for plan in made} == {None}
+
+
+def test_a_plan_follows_from_its_arguments_alone() -> None:
+    config = tiny_config(100, densify=DENSIFY, leave_out=("growth", "resolution"))
+    forwards = plans(schedule(config))
+    backwards = schedule(config)
+    again = [backwards.plan(k, backwards.start()) for k in range(99, 0, -1)]
+    assert again[::-1] == forwards
+
+
+def test_a_shortened_run_squeezes_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "EARLIEST", 1)
+    densify = replace(DENSIFY, stop=900)
+    timetable = schedule(tiny_config(1_000, densify=densify, leave_out=("iterations",)), count=12)
+    assert timetable.held == (6,)
+    held = plans(timetable, count=300)
+    assert {plan.view for plan in held} == set(range(12)) - {6}
+    decisions = replace(timetable.start(), length=450, released=300)
+    rest = [timetable.plan(k, decisions) for k in range(301, 451)]
+    assert {plan.view for plan in rest} == set(range(12))
+    assert rest[-1].part == pytest.approx(1.0)
+    assert rest[74].part == pytest.approx((0.3 + 1.0) / 2)
+    assert [plan.iteration for plan in rest if plan.observes] == list(range(301, 375))  # 1.25 x 300
+
+
+def test_a_coarse_beginning_has_coarser_limits() -> None:
+    view = views(1)[0]
+    large = replace(view, camera=replace(view.camera, width=64, height=64))
+    config = tiny_config(100, leave_out=("growth", "resolution"))
+    timetable = Schedule.of(config, [large] * 3, as_photographed=True)
+    made = plans(timetable)
+    assert [plan.coarse for plan in made] == [True] * 30 + [False] * 69
+    assert [made[k].finest for k in (0, 29, 30)] == [2 * FINEST, 2 * FINEST, FINEST]
+    degraded = Schedule.of(config, [large] * 3, as_photographed=False)
+    assert degraded.items == frozenset()
+    assert not any(plan.coarse or plan.finest for plan in plans(degraded))
+
+
+def test_the_degree_stays_below_what_was_decided() -> None:
+    timetable = schedule(tiny_config(100, sh_interval=10))
+    degrees = [plan.degree for plan in plans(timetable, Decisions(100, 2), 40)]
+    assert degrees == [0] * 9 + [1] * 10 + [2] * 21
+
+
+def test_learning_rates_by_hand() -> None:
+    config = TrainConfig(lr_means=1e-2, lr_means_final=1e-4, lr_quats=0.5)
+    rates = learning_rates(config, extent=3.0, part=0.5)
+    assert rates["means"] == pytest.approx(3e-3)
+    assert rates["quats"] == 0.5
+    assert set(rates) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
+
+
+# --- the example of a method ---
+
+
+def test_the_example_trains_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, method = tiny_scene(), Tinted()
+    view = scene.train[0]
+    render = torch.full((16, 24, 3), 0.25)
+    expected = np.abs(0.25 - view.image / 255).mean()
+    assert loss_of(method, render, view).item() == pytest.approx(expected, rel=1e-6)
+    install(monkeypatch, "tinted", method)
+    trainer = Trainer(scene, tiny_config(method="tinted"))
+    gaussians = trainer.gaussians
+    method.modulate(gaussians).sh0.sum().backward()
+    assert torch.equal(method.tint.grad, torch.full((3,), 40.0))  # type: ignore[arg-type]
+    trainer.step()
+    np.testing.assert_allclose(method.tint.detach().abs().numpy(), 0.01, rtol=1e-4)  # Adam's first step
+
+
+def test_the_example_resumes_with_the_same_bits_at_any_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    install(monkeypatch, "tinted", lambda scene, config, inspector: Tinted())
+    config = tiny_config(method="tinted")
+    whole, first, second = (Trainer(tiny_scene(), config) for _ in range(3))
+    before = hqgs.get_num_threads()
+    try:
+        hqgs.set_num_threads(1)
+        for _ in range(30):
+            whole.step()
+        hqgs.set_num_threads(2)
+        for _ in range(17):
+            first.step()
+    finally:
+        hqgs.set_num_threads(before)
+    first.save(tmp_path / "c")
+    second.restore(tmp_path / "c")
+    while second.iteration < 30:
+        second.step()
+    assert_same(whole_state(second, tmp_path / "a"), whole_state(whole, tmp_path / "b"))
