@@ -167,7 +167,7 @@ impl Scene {
             opacities: Some(&composited.opacities),
             depths: Some(&v_depths),
             conics: Some(&v_conics),
-            colors: Some(&composited.colors),
+            colors: harmonics.is_some().then_some(&composited.colors[..]),
         };
         let wanted = project::Wanted {
             means: true,
