@@ -382,6 +382,9 @@ fn each_level_agrees_with_the_best() {
                 .zip(&other.1)
                 .all(|(a, b)| (a - b).abs() < 1e-12)
         );
+        if level.is_fused() == levels()[0].is_fused() {
+            assert!(best.0.dissimilarity == other.0.dissimilarity && best.1 == other.1);
+        }
     });
 }
 

@@ -1,7 +1,7 @@
 //! The operator against dense matrices, and what must hold exactly.
 
 use super::*;
-use crate::simd::at_each_level;
+use crate::simd::{at_each_level, levels};
 use rayon::ThreadPoolBuilder;
 
 /// A number in [-1, 1] for each (a, b).
@@ -118,6 +118,9 @@ fn any_number_of_threads_gives_the_same_bits() {
     at_each_level(|level| {
         let one = run(level, 1);
         assert!(run(level, 2) == one && run(level, 5) == one);
+        if level.is_fused() == levels()[0].is_fused() {
+            assert!(run(levels()[0], 1) == one);
+        }
     });
 }
 

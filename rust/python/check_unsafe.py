@@ -1,0 +1,76 @@
+"""Calls through the binding for `rust/check_unsafe.sh`: each output is looked at, number by number.
+
+Valgrind reports a number that was never written once something depends on it.
+"""
+
+import sys
+
+import _rust
+import numpy as np
+
+WIDTH, HEIGHT, COUNT = 21, 19, 70  # no whole number of tiles, nor of groups of Gaussians
+
+
+def look(*arrays: np.ndarray | None) -> None:
+    """Make a branch of numpy depend on each number; those of Python itself are not watched."""
+    for array in arrays:
+        if array is not None and not (array < 1e30).all():
+            sys.exit(f"not below 1e30: {array}")
+
+
+def rasterize(dtype: type, degree: int | None) -> None:
+    """Forward and backward, with harmonics or with five channels."""
+    rng = np.random.default_rng(1)
+    uniform = lambda *shape: rng.uniform(0.05, 1.0, shape).astype(dtype)  # noqa: E731
+    inputs = (
+        uniform(COUNT, 3) + dtype([-0.5, -0.5, 1.0]),
+        uniform(COUNT, 4),
+        0.2 * uniform(COUNT, 3),
+        uniform(COUNT),
+    )
+    given, channels = (uniform(COUNT, 5), 5) if degree is None else (uniform(COUNT, 16, 3), 3)
+    viewmats, ks = np.eye(4)[None], np.array([[[20.0, 0, 10], [0, 20, 9], [0, 0, 1]]])
+    options = (0.01, 1e10, 0.0, 0.3, True, True)
+    frame, *outputs, colors = _rust.project_forward(
+        *inputs, given, None, viewmats, ks, WIDTH, HEIGHT, options, degree
+    )
+    look(*outputs, colors)
+    colors, background = given if degree is None else colors.reshape(COUNT, 3), uniform(1, channels)
+    composite, image, alphas = _rust.composite_forward(frame, colors, background, channels)
+    look(image, alphas, _rust.blending_weights(frame, None, dtype is np.float64))
+    v_image, v_alphas = uniform(1, HEIGHT, WIDTH, channels), uniform(1, HEIGHT, WIDTH, 1)
+    grads = _rust.composite_backward(composite, background, v_image, v_alphas, [True] * 4)
+    look(*grads[:-1])
+    means2d, whitened, opacities, _, v_colors = grads[:5]
+    cotangents = (
+        means2d.reshape(1, COUNT, 2), whitened.reshape(1, COUNT, 3), opacities.reshape(1, COUNT), None, None,
+        None if degree is None else v_colors.reshape(1, COUNT, 3),
+    )  # fmt: skip
+    wanted = [True] * 4 + [degree is not None, False, True]
+    look(*_rust.project_backward(frame, inputs, cotangents, wanted)[:-1])
+
+
+def train(dtype: type) -> None:
+    """The loss, an operator on pictures, the distance to cells and a step of Adam."""
+    rng = np.random.default_rng(2)
+    picture = rng.uniform(size=(HEIGHT, WIDTH, 3)).astype(dtype)
+    target = (255 * picture[::-1]).astype(np.uint8)
+    mask = (rng.uniform(size=(HEIGHT, WIDTH)) > 0.2).astype(np.uint8)
+    _, _, _, grad = _rust.photometric(picture, target, mask, 0.2, 0.1, True)
+    look(grad, np.array(_rust.ssim(picture, target)))
+    operator = _rust.Separable(np.eye(HEIGHT)[:7] + 0.1, np.eye(WIDTH)[:5] + 0.1, None)
+    small = operator.apply(picture, False).reshape(7, 5, 3)
+    look(small, operator.apply(small, True))
+    flat = picture.ravel()
+    distance, slope = _rust.cell_distance(flat, flat[::-1].copy(), np.full_like(flat, 0.1), 1.0, True)
+    look(np.array(distance), slope)
+    param, first, second = picture[0].copy(), np.zeros((WIDTH, 3), dtype), np.zeros((WIDTH, 3), dtype)
+    _rust.adam_step(param, picture[1].copy(), first, second, 1, (0.01, 0.9, 0.999, 1e-15), mask[0].copy(), 2)
+    look(param, first, second)
+
+
+for kind in (np.float32, np.float64):
+    rasterize(kind, 3)
+    rasterize(kind, None)
+    train(kind)
+print(_rust.simd_level(), "looked at everything")
