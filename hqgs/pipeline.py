@@ -184,8 +184,8 @@ def train(
 
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
-        out: a folder for checkpoint.safetensors, scene.ply, report.json, comparison/*.png and
-            error_vs_time.png; None: nothing is written.
+        out: a folder for checkpoint.safetensors, scene.ply, report.json, `comparison/*.png`
+            and error_vs_time.png; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
             "srgs" or "hqgs".

@@ -83,7 +83,7 @@ def rasterization(
         backgrounds: colour behind everything, [C, D]; None is 0.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), "RGB+D" or "RGB+ED"; depth is
             the last channel.
-        absgrad: also leave the sum over pixels of |d loss / d means2d| in `meta["means2d"].absgrad`.
+        absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
 

@@ -25,7 +25,7 @@ class ScsWeights:
 
     @classmethod
     def of(
-        cls, target: Tensor, g: Tensor, mask: Tensor | None = None, dtype: Any = torch.float32
+        cls, target: Tensor, g: Tensor, mask: Tensor | None = None, dtype: torch.dtype = torch.float32
     ) -> ScsWeights:
         """See `scs_loss` for the arguments and the errors; `dtype` is the render's."""
         if target.ndim != 3 or target.dtype not in (torch.uint8, torch.float32, torch.float64):
