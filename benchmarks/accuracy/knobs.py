@@ -22,7 +22,7 @@ FILE = Path(__file__).with_name("accuracy.toml")
 
 @dataclass(frozen=True)
 class Knobs:
-    """The settings of `Tuning` in rust/tuning.rs, and the dtype."""
+    """The settings of `AccuracyKnobs` in rust/accuracy_knobs.rs, and the dtype."""
 
     dtype: str = "float32"
     alpha_min: float = ALPHA_MIN  # smallest alpha that is blended

@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(eq=False)
 class WorkCounts:
-    """Sums over all cameras and calls. The crate's own counts are explained in rust/work.rs."""
+    """Sums over all cameras and calls. The crate's own counts are explained in rust/counts.rs."""
 
     # Projection.
     gaussians: int = 0  # given to it
