@@ -3,62 +3,48 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.measure import FIRST_STEPS, first_step, train
+from benchmarks.measure import Training
 from hqgs.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from benchmarks.study import Cell
 
-# A whole run's seconds per step over those of its first steps, until runs are finished that tell: the
-# built-in scene at 504 px takes 22 ms in its first 400 steps and 55 ms on average over 2,000. Runs that start
-# with nearly all the Gaussians that they may have do not get slower.
+# A whole run's seconds per step over those of its first steps, if there is room for more Gaussians: the
+# built-in scene at 504 px takes 22 ms in its first 400 steps and 55 ms on average over 2,000.
 GROWTH = 2.5
-
-Kind = tuple[str, str]  # scene, row: what a cell's speed depends on most
+WARM, FIRST = 3, 10  # steps before the first ones that count, and how many of those
 
 
 class Estimate:
     """Seconds per step by scene and row: from finished runs, else from a few steps and their growth."""
 
     def __init__(self) -> None:
-        self._finished: defaultdict[Kind, list[float]] = defaultdict(list)
-        self._first: dict[Kind, tuple[float, float]] = {}  # and how many times the Gaussians may grow
-        self._growth: list[float] = []  # of the runs that had room for it
+        self._finished: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+        self._first: dict[tuple[str, str], float] = {}
 
     def add(self, cell: Cell, run: dict[str, Any]) -> None:
         """Learn from a finished run."""
-        per_step = run["wall_seconds"] / max(run["iterations"], 1)
-        self._finished[_kind(cell)].append(per_step)
-        if run["config"]["densify"]["max_gaussians"] > GROWTH * max(run["initial_points"], 1):
-            self._growth.append(per_step / run["first_step_seconds"])
+        self._finished[cell.kind].append(run["wall_seconds"] / max(run["iterations"], 1))
 
-    def knows(self, cell: Cell) -> bool:
-        return _kind(cell) in self._finished or _kind(cell) in self._first
-
-    def probe(self, cell: Cell, photos: Scene) -> None:
-        """Train a few steps of a cell."""
-        done = train(photos, cell.config, evaluate=False, at_most=FIRST_STEPS.stop)
-        most = done.trainer.config.densify.max_gaussians
-        self._first[_kind(cell)] = first_step(done.steps), most / max(done.initial_points, 1)
+    def probe(self, cell: Cell, photos: Callable[[Cell], Scene]) -> None:
+        """Train a few steps of a cell, on its photos, if nothing is known of it."""
+        if cell.kind not in self._finished and cell.kind not in self._first:
+            done = Training(photos(cell), cell.config)
+            done.steps(WARM)
+            before = done.trainer.seconds
+            done.steps(FIRST)
+            room = done.trainer.config.densify.max_gaussians / max(done.initial_points, 1)
+            self._first[cell.kind] = min(GROWTH, room) * (done.trainer.seconds - before) / FIRST
 
     def seconds(self, cells: Iterable[Cell]) -> float:
         """What these cells will take together, as far as they are known."""
-        growth = float(np.median(self._growth)) if self._growth else GROWTH
-        total = 0.0
-        for cell in cells:
-            if done := self._finished.get(_kind(cell)):
-                per_step = float(np.mean(done))
-            else:
-                first, room = self._first.get(_kind(cell), (0.0, 1.0))
-                per_step = first * min(growth, room)
-            total += cell.config.iterations * per_step
-        return total
+        known = self._first | {kind: float(np.mean(done)) for kind, done in self._finished.items()}
+        return sum(cell.config.iterations * known.get(cell.kind, 0.0) for cell in cells)
 
 
 def duration(seconds: float) -> str:
@@ -67,7 +53,3 @@ def duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def _kind(cell: Cell) -> Kind:
-    return cell.scene.name, cell.row.label

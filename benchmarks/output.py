@@ -20,6 +20,10 @@ from hqgs.base.text import markdown_table
 NOTHING = "–"  # in the place of a number that there is not
 
 
+class UnavailableError(RuntimeError):
+    """What cannot be measured here, and why."""
+
+
 @dataclass
 class Report:
     """The outcome of a benchmark. `settings`, `results` and `left_out` hold plain JSON values."""
@@ -44,6 +48,27 @@ class Benchmark:
     help: str
     add_options: Callable[[argparse.ArgumentParser], None]  # beyond --out, --threads and --quick
     run: Callable[[argparse.Namespace], Report]  # raises ValueError or FileNotFoundError for bad options
+
+
+def add_repeats(parser: argparse.ArgumentParser, sizes: dict[str, Any]) -> None:
+    """The options of what is timed: `sizes` has a table for `--quick` and one for `full`."""
+    add: Any = parser.add_argument
+    default, quick = (sizes[name]["repeats"] for name in ("full", "quick"))
+    add(
+        "--repeats",
+        type=int,
+        metavar="N",
+        help=f"rounds of each measurement ({default}, with --quick {quick})",
+    )
+    add("--seed", type=int, default=2026, metavar="S", help="of the Gaussians (%(default)s)")
+
+
+def with_repeats(sizes: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """The sizes with what the options of `add_repeats` ask for."""
+    repeats = sizes["repeats"] if args.repeats is None else args.repeats
+    if repeats < 1:
+        raise ValueError(f"repeats is {repeats}, wanted at least 1")
+    return sizes | {"repeats": repeats, "seed": args.seed}
 
 
 def write_results(out: Path, name: str, command: str, report: Report) -> list[Path]:
@@ -90,6 +115,11 @@ def number(value: Any, form: str) -> str:
     if form == "ms":
         return f"{1000 * value:.3g}" if value < 0.1 else f"{1000 * value:.0f}"
     return format(value, form)
+
+
+def span(values: Iterable[float], form: str) -> str:
+    """`1.02 to 1.05`: quartiles, in a format of `number`."""
+    return " to ".join(number(value, form) for value in values)
 
 
 def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]) -> str:

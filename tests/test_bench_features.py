@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pandas import DataFrame
 from PIL import Image
 from tiny_scene import tiny_config, tiny_scene
 
@@ -220,6 +221,10 @@ def run_of(psnr: float, seconds: float, refined: float = 31.0) -> dict[str, Any]
     return run | {"history": []}
 
 
+def rounds(seconds: float) -> DataFrame:
+    return DataFrame({"total": [seconds] * 3})
+
+
 def compare(*arguments: Any) -> list[dict[str, Any]]:
     return report.compare(FEATURES, *arguments)
 
@@ -238,7 +243,7 @@ def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:
 def test_costs_and_verdicts_of_a_hand_made_case() -> None:
     runs = runs_of(30.06, 30.06)
     runs[DEFAULT.label] = [run_of(30.0, 10.0), run_of(30.02, 10.0)]
-    steps = {name: [{"total": 3.0}] * 3 for name in runs} | {DEFAULT.label: [{"total": 1.0}] * 3}
+    steps = {name: rounds(3.0) for name in runs} | {DEFAULT.label: rounds(1.0)}
     rows = {row["feature"]: row for row in compare(runs, steps)}
     slower, selective = rows["fused loss"], rows["selective Adam"]
     assert slower["costs_db"] == pytest.approx([0.06, 0.04])
@@ -262,7 +267,7 @@ def test_whole_runs_must_be_sure_to_cost_too_much_and_the_refined_ones_only_do()
     def passes(other: list[dict[str, Any]]) -> bool:
         runs = runs_of(30.0, 30.0)
         runs["fused loss"] = other
-        steps = {name: [{"total": 1.0}] for name in runs}
+        steps = {name: rounds(1.0) for name in runs}
         found = {row["feature"]: row for row in verdicts([{"features": compare(runs, steps)}])}
         return found["fused loss"]["passed"]
 

@@ -21,19 +21,13 @@ def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> dict
     """
     difference = outputs[IMAGE] - exact[IMAGE]
     rms = float(difference.square().mean().sqrt())
-    gradients: dict[str, dict[str, float | None]] = {}
     names = [name for name in exact if name != IMAGE]
-    for name in names:
-        gradients[name] = _direction(outputs[name].flatten(), exact[name].flatten())
+    gradients = {name: _direction(outputs[name].flatten(), exact[name].flatten()) for name in names}
     both = [torch.cat([side[name].flatten() for name in names]) for side in (outputs, exact)]
-    gradients["all"] = _direction(*both)
+    psnr = -20 * math.log10(rms) if rms > 0 else None
     return {
-        IMAGE: {
-            "max": float(difference.abs().max()),
-            "rms": rms,
-            "psnr": -20 * math.log10(rms) if rms > 0 else None,
-        },
-        "gradients": gradients,
+        IMAGE: {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
+        "gradients": gradients | {"all": _direction(*both)},
     }
 
 

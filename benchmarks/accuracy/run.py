@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
-import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,11 +17,12 @@ from benchmarks.accuracy.errors import errors_against, pareto_front
 from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
 from benchmarks.accuracy.trained import trained_inputs
 from benchmarks.charts import LEGEND, color, panels
-from benchmarks.data import build, read_toml
-from benchmarks.output import Benchmark, Report, table
+from benchmarks.data import read_toml
+from benchmarks.output import Benchmark, Report, add_repeats, span, table, with_repeats
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import measure_threads, thread_counts
-from benchmarks.speed.timing import interleaved, median, quartiles
+from benchmarks.speed.timing import interleaved, quartiles, whole
+from hqgs.scene.builtin import embedded_scene
 
 Row = dict[str, Any]
 DATA = read_toml(FILE)
@@ -31,19 +31,6 @@ ERRORS: dict[str, Callable[[Row], float]] = {  # of a row and an oracle's name; 
     "image": lambda errors: errors["image"]["rms"],
     "gradients": lambda errors: errors["gradients"]["all"]["relative"],
 }
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """The sizes at which things are measured."""
-
-    repeats: int  # rounds of everything that is timed
-    size: tuple[int, int]  # width, height
-    gaussians: tuple[int, ...]
-    trained_views: int  # of the built-in scene
-    trained_steps: int
-    trained_gaussians: int  # at most
-    seed: int = 2026
 
 
 def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
@@ -57,29 +44,13 @@ def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
     measured = list(interleaved({str(k): p for k, p in enumerate(passes)}, repeats).values())
     rows = []
     for (knob, value, knobs), case, errors, rounds in zip(CASES, passes, found, measured, strict=True):
-        ratios = [a["total"] / b["total"] for a, b in zip(rounds, measured[0], strict=True)]
-        rows.append(
-            {
-                "knob": knob,
-                "value": value,
-                "settings": asdict(knobs),
-                "seconds": median(rounds),
-                "seconds_quartiles": quartiles(rounds),
-                "ratio": float(np.median(ratios)),  # to the default, in the same round
-                "ratio_quartiles": [float(q) for q in np.quantile(ratios, [0.25, 0.75])],
-                "tile_pairs": case.work[0],
-                "blocks": case.work[1],
-                "errors": errors,
-            }
-        )
-    return {
-        "inputs": name,
-        "gaussians": len(inputs),
-        "width": inputs.width,
-        "height": inputs.height,
-        "rows": rows,
-        "beaten_by": [f"{row['knob']} {row['value']}" for row in rows[1:] if beats(row, rows[0])],
-    }
+        ratios = rounds["total"] / measured[0]["total"]  # to the default, in the same round
+        row = {"knob": knob, "value": value, "settings": asdict(knobs), **whole(rounds), "errors": errors}
+        row |= {"ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
+        rows.append(row | {"tile_pairs": case.work[0], "blocks": case.work[1]})
+    beaten = [f"{row['knob']} {row['value']}" for row in rows[1:] if beats(row, rows[0])]
+    size = {"inputs": name, "gaussians": len(inputs), "width": inputs.width, "height": inputs.height}
+    return size | {"rows": rows, "beaten_by": beaten}
 
 
 def beats(row: Row, other: Row) -> bool:
@@ -117,18 +88,10 @@ def errors_table(result: dict[str, Any]) -> str:
     for row in result["rows"]:
         exact, defined = row["errors"]["exact"], row["errors"]["defined"]
         every = exact["gradients"]["all"]
-        lines.append(
-            row
-            | exact["image"]
-            | {
-                "quartiles": " to ".join(f"{q:.3f}" for q in row["ratio_quartiles"]),
-                "more_blocks": row["blocks"] / max(first["blocks"], 1),
-                "gradients": every["relative"],
-                "turn": None if every["cosine"] is None else 1 - every["cosine"],
-                "rms_defined": defined["image"]["rms"],
-                "gradients_defined": defined["gradients"]["all"]["relative"],
-            }
-        )
+        line = row | exact["image"] | {"quartiles": span(row["ratio_quartiles"], ".3f")}
+        line |= {"more_blocks": row["blocks"] / max(first["blocks"], 1), "gradients": every["relative"]}
+        line |= {"turn": None if every["cosine"] is None else 1 - every["cosine"]}
+        lines.append(line | {f"{name}_defined": error(defined) for name, error in ERRORS.items()})
     size = f"{result['gaussians']:,} Gaussians, {result['width']} x {result['height']}"
     return table(f"{result['inputs']}: {size}, forward and backward", lines, COLUMNS["errors"])
 
@@ -185,28 +148,22 @@ def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
 
 def run(args: argparse.Namespace) -> Report:
     """Measure every case on the clouds and on the trained Gaussians."""
-    part = "quick" if args.quick else "full"
-    sizes = replace(build(Sizes, DATA[part], f"{FILE.name}, {part}"), seed=args.seed)
-    if args.repeats is not None:
-        if args.repeats < 1:
-            raise ValueError(f"repeats is {args.repeats}, wanted at least 1")
-        sizes = replace(sizes, repeats=args.repeats)
-    report = Report(settings=asdict(sizes))
-    inputs = {f"cloud of {n:,}": make_inputs(n, *sizes.size, sizes.seed) for n in sizes.gaussians}
+    sizes = with_repeats(DATA["quick" if args.quick else "full"], args)
+    report = Report(settings=sizes)
+    inputs = {f"cloud of {n:,}": make_inputs(n, *sizes["size"], seed=args.seed) for n in sizes["gaussians"]}
     print("accuracy: training the built-in scene", file=sys.stderr)
+    scene = embedded_scene(args.out / "scene", *sizes["size"], num_views=sizes["trained_views"])
     inputs["built-in scene, trained"] = trained_inputs(
-        sizes.size, sizes.trained_views, sizes.trained_steps, sizes.trained_gaussians, sizes.seed,
-        args.out / "scene",
-    )  # fmt: skip
-    results = []
+        scene, sizes["trained_steps"], sizes["trained_gaussians"], args.seed
+    )
+    results = report.results["inputs"] = []
     for name, x in inputs.items():
         print(f"accuracy: {name}", file=sys.stderr)
-        results.append(measure(name, x, sizes.repeats))
+        results.append(measure(name, x, sizes["repeats"]))
         report.tables += [errors_table(results[-1]), gradient_table(results[-1])]
-    report.results["inputs"] = results
     name, largest = max(inputs.items(), key=lambda item: len(item[1]))
     if len(thread_counts()) > 1:
-        rows = report.results["threads"] = measure_by_threads(largest, sizes.repeats)
+        rows = report.results["threads"] = measure_by_threads(largest, sizes["repeats"])
         report.tables.append(table(f"{name}: threads", rows, COLUMNS["threads"]))
     else:
         report.leave_out("threads", "there is one thread")
@@ -219,10 +176,8 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--repeats", type=int, metavar="N", help="rounds of each measurement (15, with --quick 2)")
-    add("--seed", type=int, default=Sizes.seed, metavar="S", help="of the Gaussians (%(default)s)")
-
-
-BENCHMARK = Benchmark("error of the rasterizer against its run time, knob by knob", options, run)
+BENCHMARK = Benchmark(
+    "error of the rasterizer against its run time, knob by knob",
+    lambda parser: add_repeats(parser, DATA),
+    run,
+)

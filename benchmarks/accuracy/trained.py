@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
+from benchmarks.measure import Training
 from benchmarks.protocol import Row
 from benchmarks.speed.inputs import RasterInputs
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.render import render_view
-from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.scene import Scene
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
-from hqgs.training.trainer import Trainer
 
 
-def trained_inputs(
-    size: tuple[int, int], views: int, steps: int, most: int, seed: int, cache: Path | None = None
-) -> RasterInputs:
+def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInputs:
     """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
-    scene = embedded_scene(cache, *size, num_views=views)
-    changes = {"densify": {"max_gaussians": most}, "sh_interval": 1}
-    config = Row("3dgs").train_config(seed, steps, changes)
-    trainer = Trainer(scene, config)
-    for _ in range(steps):
-        trainer.step()
-    g, view = trainer.gaussians.detached(), scene.train[0]
+    config = Row("3dgs").train_config(seed, steps, {"densify": {"max_gaussians": most}, "sh_interval": 1})
+    done = Training(scene, config)
+    done.steps(steps)
+    g, view = done.trainer.gaussians.detached(), scene.train[0]
     with one_torch_thread():
         image, _ = render_view(g, view.camera, 3, config.background)
         image.requires_grad_()

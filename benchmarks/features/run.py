@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
+from pandas import DataFrame
 
 from benchmarks.features.report import chart, compare, scene_table, verdict_table, verdicts
 from benchmarks.features.switches import DEFAULT, PROTOCOLS, Feature
-from benchmarks.measure import Run, exported, train
+from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report
-from benchmarks.protocol import Protocol, add_options, narrowed
-from benchmarks.scenes import load_scenes
-from benchmarks.speed.scene import still_config
+from benchmarks.protocol import add_options
+from benchmarks.speed.scene import still_config, trainer_from
 from benchmarks.speed.timing import Seconds, interleaved
-from benchmarks.study import Cell, Study, grid, open_study
+from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
@@ -33,13 +31,10 @@ SHOWN = ("seed", "seconds", "gaussians", "history", "psnr", "refined_psnr")  # o
 class Features:
     """The runs of all features, and steps timed on what the default run grew."""
 
-    def __init__(self, args: argparse.Namespace, protocol: Protocol, scenes: list[Scene]) -> None:
-        self.protocol = protocol
-        self.rows = [row for row in protocol.rows if isinstance(row, Feature)]
-        switches = {row.label: row.switch for row in self.rows}
-        cells = grid(protocol, scenes, lambda row: (row.label,), lambda row: {"switch": switches[row.label]})
-        self.study: Study = open_study(args, "features", cells)
-        self.cells = {(cell.scene.name, cell.row.label, cell.seed): cell for cell in cells}
+    def __init__(self, study: Study) -> None:
+        self.study = study
+        self.rows = [row for row in study.protocol.rows if isinstance(row, Feature)]
+        self.cells = {(cell.scene.name, cell.row.label, cell.seed): cell for cell in study.cells}
 
     def measure(self, cell: Cell, photos: Scene) -> Run:
         """Train whole, and train on what the default run grew."""
@@ -47,17 +42,14 @@ class Features:
         with cell.row.switched():
             done = train(photos, cell.config)
         if cell.row == DEFAULT:
-            path = self.grown(cell)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            exported(done.trainer).save(path)
+            done.trainer.shown().save(self.grown(cell))
         psnr = done.trainer.history[-1]["psnr"]
         refined = self.refined(cell, cell.row) if cell.row.refinable else None
         return done.record() | {"psnr": psnr, "refined_psnr": refined}
 
     def grown(self, cell: Cell) -> Path:
         """The final Gaussians of the default run of the same scene and seed."""
-        default = self.cells[cell.scene.name, DEFAULT.label, cell.seed]
-        return self.study.store.beside(self.study.keys[default], PLY)
+        return self.study.beside(self.cells[cell.scene.name, DEFAULT.label, cell.seed], PLY)
 
     def refined(self, cell: Cell, feature: Feature) -> float | None:
         """Held-out PSNR of the default run's final Gaussians when they are trained on, their number fixed."""
@@ -71,41 +63,40 @@ class Features:
             trainer.evaluate()
         return trainer.history[-1]["psnr"]
 
-    def final_steps(self, scene: Scene) -> dict[str, list[Seconds]]:
+    def final_steps(self, scene: Scene) -> dict[str, DataFrame]:
         """Seconds of steps on the final Gaussians of the default run, all features in turn."""
-        cell = self.cells[scene.name, DEFAULT.label, self.protocol.seeds[0]]
+        cell = self.cells[scene.name, DEFAULT.label, self.study.protocol.seeds[0]]
         final = Gaussians.load(self.grown(cell))
-        return interleaved({f.label: self._timed(f, scene, final) for f in self.rows}, self.protocol.repeats)
 
-    def _timed(self, feature: Feature, scene: Scene, final: Gaussians) -> Callable[[], Seconds]:
-        config = self.protocol.train_config(feature, self.protocol.seeds[0])
-        with feature.switched():
-            trainer = still_trainer(scene, config, final)
-
-        def call() -> Seconds:
+        def timed(feature: Feature) -> Callable[[], Seconds]:
+            config = self.study.protocol.train_config(feature, cell.seed)
             with feature.switched():
-                trainer.step()  # a switch may have made new threads, without memory of their own
-                before = trainer.seconds
-                trainer.step()
-            return {"total": trainer.seconds - before}
+                trainer = still_trainer(scene, config, final)
 
-        return call
+            def call() -> Seconds:
+                with feature.switched():
+                    trainer.step()  # a switch may have made new threads, without memory of their own
+                    before = trainer.seconds
+                    trainer.step()
+                return {"total": trainer.seconds - before}
+
+            return call
+
+        return interleaved({f.label: timed(f) for f in self.rows}, self.study.protocol.repeats)
 
     def compare(self, scene: Scene) -> dict[str, Any] | None:
         """The results of a scene; None where a run of it is not finished."""
-        keys = [(scene.name, f.label, seed) for f in self.rows for seed in self.protocol.seeds]
-        if any(self.cells[key] not in self.study.runs for key in keys):
+        seeds, done = self.study.protocol.seeds, self.study.runs
+        cells = {f.label: [self.cells[scene.name, f.label, seed] for seed in seeds] for f in self.rows}
+        if any(cell not in done for same in cells.values() for cell in same):
             return None
-        runs: dict[str, list[Run]] = {f.label: [] for f in self.rows}
-        for key in keys:
-            run = self.study.runs[self.cells[key]]
-            runs[key[1]].append({name: run[name] for name in SHOWN})
+        runs = {label: [{n: done[c][n] for n in SHOWN} for c in same] for label, same in cells.items()}
         camera = scene.train[0].camera
         return {
             "scene": scene.name,
             "width": camera.width,
             "height": camera.height,
-            "iterations": self.protocol.iterations,
+            "iterations": self.study.protocol.iterations,
             "default": runs[DEFAULT.label],
             "features": compare(self.rows[1:], runs, self.final_steps(scene)),
         }
@@ -122,28 +113,13 @@ def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Tr
     return trainer
 
 
-def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
-    """A trainer that starts with these Gaussians in place of the scene's points."""
-    points = gaussians.means.numpy()
-    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
-    with torch.no_grad():
-        for name, tensor in trainer.gaussians.named().items():
-            tensor.copy_(getattr(gaussians, name))
-    return trainer
-
-
 def run(args: argparse.Namespace) -> Report:
     """Train every scene with every feature switched, then time steps of all of them in turn."""
-    protocol = PROTOCOLS["quick" if args.quick else "standard"]
     rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
-    protocol = narrowed(protocol, None, rows, args.seeds, args.iterations, args.downscale, args.repeats)
-    scenes = load_scenes(args.scenes, protocol.downscale, protocol.embedded, args.out / "scenes", False)
-    features = Features(args, protocol, scenes)
-    if not args.finished:
-        features.study.train(features.measure)
-    settings = asdict(protocol) | {"scenes": [scene.name for scene in scenes]}
-    report = Report(settings | features.study.circumstances(), left_out=features.study.left_out())
-    results = [result for scene in scenes if (result := features.compare(scene)) is not None]
+    features = Features(begin(args, "features", PROTOCOLS["quick" if args.quick else "standard"], rows=rows))
+    features.study.train(features.measure)
+    report = features.study.report()
+    results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
     for result in results:
         report.tables.append(scene_table(result))
         report.figures[result["scene"]] = chart(result)

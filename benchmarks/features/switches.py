@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
@@ -119,21 +119,16 @@ class Feature(Row):
 
     other: str = ""  # what is done instead in the run of this feature
     by_default: bool = True  # whether the product has it on
-    switch: str = ""
+    switch: Literal["", "float64", "boxes", "every block", "torch's loss", "torch's Adam", "one thread"] = ""
     refinable: bool = True  # whether Gaussians that were grown once and trained on can tell
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.switch not in SWITCHES:
-            raise ValueError(f"switch is {self.switch!r}, wanted one of: {', '.join(filter(None, SWITCHES))}")
+    @property
+    def more(self) -> dict[str, Any]:
+        return {"switch": self.switch}
 
     def switched(self) -> Any:
         """A context manager: inside it the other choice is in place, as far as it is none of the config."""
         return SWITCHES[self.switch]()
-
-    @property
-    def name(self) -> str:
-        return f"{self.label}: {self.other}" if self.other else self.label
 
 
 PROTOCOLS = read_protocols(Path(__file__).with_name("features.toml"), Feature)

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.measure import Run, Trained, exported, train
+from benchmarks.measure import Run, train
 from benchmarks.quality.regions import count_regions
-from benchmarks.study import Cell, Store
+from benchmarks.study import Cell, Store, Study
 from hqgs.base.files import atomic_path
-from hqgs.base.machine import peak_rss_mb
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import METRICS, evaluate_view, mean_metrics
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO
+from hqgs.training.trainer import Trainer
 
 RENDERS = 3  # times that each held-out view is rendered
 
@@ -30,7 +30,7 @@ def render_path(store: Store, key: str, view: int) -> Path:
     return store.beside(key, f"{view}.png")
 
 
-def run_cell(cell: Cell, photos: Scene, store: Store, key: str, renders: int = 0) -> Run:
+def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
     """Train, measure and describe one cell; so many of its held-out views are kept in the store.
 
     `photos` is what is trained. Raises ValueError as `Trainer` does, and TrainingError.
@@ -42,7 +42,7 @@ def run_cell(cell: Cell, photos: Scene, store: Store, key: str, renders: int = 0
     mean = asdict(mean_metrics(measured))
     formation = trainer.config.hqgs.formation if cell.row.method == "hqgs" else AUTO
     for k, view in enumerate(views[:renders]):
-        with atomic_path(render_path(store, key, k)) as tmp:
+        with atomic_path(render_path(study.store, study.keys[cell], k)) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
     return done.record() | {
         "downscale": cell.downscale,
@@ -55,25 +55,24 @@ def run_cell(cell: Cell, photos: Scene, store: Store, key: str, renders: int = 0
             for view, m in zip(views, measured, strict=True)
         ],
         "skipped_steps": trainer.guard.skipped,
-        "render_ms": _render_ms(done),
-        "regions": count_regions(exported(trainer).means.detach().numpy(), cell.scene.train),
+        "render_ms": _render_ms(trainer),
+        "regions": count_regions(trainer.shown().means.detach().numpy(), cell.scene.train),
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
         "left_out": [item.known() for item in trainer.method_left_out],
         "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
         "notes": photos.notes,
         "sfm": None if photos.sfm is None else asdict(photos.sfm),
-        "peak_rss_mb": None if done.peak_rss_mb is None else peak_rss_mb(),  # of the whole cell
+        "peak_rss_mb": done.peak_rss_mb(),  # of the whole cell
     }
 
 
-def _render_ms(done: Trained) -> float:
+def _render_ms(trainer: Trainer) -> float:
     """Median milliseconds in which the trained scene, as it would be exported, gives one held-out view."""
-    config, gaussians = done.trainer.config, exported(done.trainer)
+    config, gaussians = trainer.config, trainer.shown()
     milliseconds = []
     with one_torch_thread(), torch.no_grad():
-        for _ in range(RENDERS):
-            for view in done.trainer.scene.test:
-                started = time.perf_counter()
-                render_view(gaussians, view.camera, config.sh_degree, config.background)
-                milliseconds.append(1_000 * (time.perf_counter() - started))
+        for view in RENDERS * trainer.scene.test:
+            started = time.perf_counter()
+            render_view(gaussians, view.camera, config.sh_degree, config.background)
+            milliseconds.append(1_000 * (time.perf_counter() - started))
     return float(np.median(milliseconds))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.quality.cell import render_path
-from benchmarks.scenes import degraded_views
+from benchmarks.scenes import degraded_view
 from benchmarks.study import Store
 from hqgs.base.files import atomic_path
 from hqgs.evaluation.metrics import psnr
@@ -36,18 +36,19 @@ def write_sheet(
         return False
     first = next(iter(runs.values()))
     view = clean.test[number]
-    bad = degraded_views(clean, [view], first["degradation"], first["seed"])[0].image
+    bad = degraded_view(clean, view, first["degradation"], first["seed"]).image
     photo = _uint8(view.image)
-    panels = [
-        (f"photo {view.name}", photo),
-        (_caption(first["degradation"], psnr(bad, photo, view.mask)), _uint8(bad)),
-    ]
+    panels = [(f"photo {view.name}", photo)]
+    panels.append((_caption(first["degradation"], psnr(bad, photo, view.mask)), _uint8(bad)))
     for label, run in runs.items():
         with Image.open(files[label]) as image:
             panels.append((_caption(label, run["views"][number]["psnr"]), np.asarray(image.convert("RGB"))))
     below = [("", np.full_like(photo, 255))]
     for _, panel in panels[1:]:
-        below.append((f"difference x{AMPLIFICATION}", _difference(panel, photo, view.mask)))
+        error = np.minimum(AMPLIFICATION * np.abs(panel.astype(np.int64) - photo), 255).astype(np.uint8)
+        if view.mask is not None:
+            error[~view.mask] = MASKED
+        below.append((f"difference x{AMPLIFICATION}", error))
     with atomic_path(path) as tmp:
         _grid([panels, below]).save(tmp)
     return True
@@ -55,14 +56,6 @@ def write_sheet(
 
 def _caption(label: str, value: float | None) -> str:
     return label if value is None else f"{label}  {value:.2f} dB"
-
-
-def _difference(panel: Uint8, photo: Uint8, mask: NDArray[np.bool_] | None) -> Uint8:
-    error = AMPLIFICATION * np.abs(panel.astype(np.int64) - photo)
-    out = np.minimum(error, 255).astype(np.uint8)
-    if mask is not None:
-        out[~mask] = MASKED
-    return out
 
 
 def _grid(rows: list[list[tuple[str, Uint8]]]) -> Image.Image:

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pandas import DataFrame
 
-from benchmarks.scenes import degraded_views
+from benchmarks.scenes import degraded
+from hqgs._rust import NEAR_PLANE
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.edges import edge_magnitude
@@ -18,7 +20,6 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training.methods.base import photo_tensors
 
 EDGE_SHARE = 0.2  # of the pixels of a photo, those with the largest gradient, are its edges
-NEAR = 0.01  # world units; nearer means are not drawn
 MAX_PHOTOS = 8  # of a scene, whose edge maps are compared
 
 
@@ -29,11 +30,11 @@ def count_regions(means: NDArray[np.float32], views: Sequence[View]) -> dict[str
     transparent. Edges are the `EDGE_SHARE` of a clean photo's pixels with the largest Sobel gradient, mean
     over channels; ties at the limit are flat. `density` is Gaussians per 1,000 pixels.
     """
-    regions = {name: {"gaussians": 0, "pixels": 0} for name in ("edge", "flat")}
+    regions: dict[str, Any] = {name: {"gaussians": 0, "pixels": 0} for name in ("edge", "flat")}
     for view in views:
         camera = view.camera
         pixels, depths = project(camera, means.astype(np.float64))
-        pixels = np.floor(pixels[depths > NEAR])  # column, row: pixel j spans j to j + 1
+        pixels = np.floor(pixels[depths > NEAR_PLANE])  # column, row: pixel j spans j to j + 1
         inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         columns, rows = pixels[inside].astype(np.int64).T
         hits = np.zeros((camera.height, camera.width), np.int64)
@@ -44,43 +45,41 @@ def count_regions(means: NDArray[np.float32], views: Sequence[View]) -> dict[str
         for name, where in (("edge", counted & (edges > limit)), ("flat", counted & (edges <= limit))):
             regions[name]["gaussians"] += int(hits[where].sum())
             regions[name]["pixels"] += int(where.sum())
-    return {name: {**region, "density": _density(**region)} for name, region in regions.items()}
+    for region in regions.values():
+        region["density"] = 1_000 * region["gaussians"] / region["pixels"] if region["pixels"] else None
+    return regions
 
 
 def edge_robustness(scene: Scene, degradations: Sequence[str], seed: int) -> dict[str, Any]:
     """How alike photos and their edge maps are before and after each degradation.
 
     Up to `MAX_PHOTOS` training photos, spread over the scene: PSNR of the degraded photo against the clean
-    one, and of the edge map of the one against that of the other; means over photos. The variances are over
-    the degradations (sample variance, dB^2; None for fewer than two).
+    one, and of the edge map of the one against that of the other; means over the photos that the degradation
+    changes. The variances are over the degradations (sample variance, dB^2; None for fewer than two).
     """
     spread = np.unique(np.linspace(0, len(scene.train) - 1, MAX_PHOTOS).round().astype(np.int64))
-    views = [scene.train[k] for k in spread]
     values: dict[str, dict[str, float]] = {}
     for degradation in degradations:
+        bad = degraded(
+            scene, degradation, seed
+        ).train  # all of them: what happens to one may hang on the others
         pairs = []
-        for clean, bad in zip(views, degraded_views(scene, views, degradation, seed), strict=True):
-            photo = psnr(bad.image, clean.image, clean.mask)
-            edges = psnr(_edge_map(bad), _edge_map(clean), clean.mask)
+        for clean, view in ((scene.train[k], bad[k]) for k in spread):
+            photo = psnr(view.image, clean.image, clean.mask)
+            edges = psnr(_edge_map(view), _edge_map(clean), clean.mask)
             if photo is not None and edges is not None:
                 pairs.append((photo, edges))
-        if len(pairs) == len(views):  # "none" leaves them identical
-            photo, edges = np.mean(pairs, axis=0)
-            values[degradation] = {"photo_psnr": float(photo), "edge_psnr": float(edges)}
+        if pairs:  # "none" leaves them identical
+            photo, edges = np.mean(pairs, axis=0).tolist()
+            values[degradation] = {"photo_psnr": photo, "edge_psnr": edges}
+    found = DataFrame(values.values(), columns=["photo_psnr", "edge_psnr"]).var()
     variances = {
-        f"{name}_variance": float(np.var([v[f"{name}_psnr"] for v in values.values()], ddof=1))
-        if len(values) > 1
-        else None
-        for name in ("photo", "edge")
+        str(name).replace("psnr", "variance"): None if v != v else float(v) for name, v in found.items()
     }
-    return {"scene": scene.name, "photos": len(views), "degradations": values, **variances}
+    return {"scene": scene.name, "photos": len(spread), "degradations": values, **variances}
 
 
 def _edge_map(view: View) -> NDArray[np.float32]:
     photo, mask = photo_tensors(view)
     with one_torch_thread(), torch.no_grad():
         return edge_magnitude(photo, mask).float().numpy()
-
-
-def _density(gaussians: int, pixels: int) -> float | None:
-    return 1_000 * gaussians / pixels if pixels else None

@@ -5,7 +5,7 @@ A mean is that of all runs of its group: where one of them lacks the number, the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,18 +19,8 @@ from hqgs.photos.formula import NONE
 DEGRADED = "degraded"  # in the place of a degradation: all of them, without the clean photos
 GROUP = ["scene", "degradation", "seed"]  # the runs that see the same photos
 GAINS = ("gain", "equal_time_gain")  # over the baseline, dB
-COSTS: dict[str, Callable[[Run], float | None]] = {
-    "seconds": lambda run: run["seconds"],
-    "cpu_seconds": lambda run: run["cpu_seconds"],
-    "setup_seconds": lambda run: run["setup_seconds"],
-    "ms_per_step": lambda run: 1_000 * run["seconds"] / run["iterations"],
-    "render_ms": lambda run: run["render_ms"],
-    "initial_points": lambda run: run["initial_points"],
-    "gaussians": lambda run: run["gaussians"],
-    "peak_rss_mb": lambda run: run["peak_rss_mb"],
-    "edge_density": lambda run: run["regions"]["edge"]["density"],
-    "flat_density": lambda run: run["regions"]["flat"]["density"],
-}
+KEPT = ("seconds", "cpu_seconds", "setup_seconds", "render_ms", "initial_points", "gaussians", "peak_rss_mb")
+COSTS = (*KEPT, "ms_per_step", "edge_density", "flat_density")
 
 
 def frame_of(runs: Iterable[tuple[Cell, Run]], baseline: str | None = None) -> DataFrame:
@@ -44,7 +34,10 @@ def frame_of(runs: Iterable[tuple[Cell, Run]], baseline: str | None = None) -> D
     for cell, run in pairs:
         line = dict(zip(GROUP, cell.group, strict=True)) | {"row": cell.row.label, "run": run}
         line |= {name: run["metrics"][name] for name in METRICS}
-        line |= {name: cost(run) for name, cost in COSTS.items()}
+        line |= {name: run[name] for name in KEPT} | {
+            "ms_per_step": 1_000 * run["seconds"] / run["iterations"]
+        }
+        line |= {f"{name}_density": region["density"] for name, region in run["regions"].items()}
         if baseline is not None:
             line["gain"] = psnr_gain(run, base[cell.group])
             line["equal_time_gain"] = equal_time_gain(run, base[cell.group])

@@ -1,4 +1,4 @@
-"""EWA projection in float64 numpy, by the formulas of docs/conventions.md; no code of the crate."""
+"""EWA projection in float64 numpy, by the formulas of docs/conventions.md; of the crate only a constant."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.99, 0.999e-4
-EPS2D, NEAR_PLANE, FOV_MARGIN = 0.3, 0.01, 0.3
+from hqgs._rust import FOV_MARGIN
 
 
 def project(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ FOCAL = 400.0  # pixels, at 504
 NEAR, FAR = 2.0, 6.0  # depths of the cloud, world units
 MARGIN = 0.05  # of the image, on each side, that the cloud reaches beyond it
 COVERAGE = 39.0  # supports per pixel; a few pixels are full before their last one
+LEAVES = ("means", "quats", "scales", "opacities", "sh")  # what gets a gradient
 SAMPLE = 20_000  # Gaussians from which the size is computed
 
 
@@ -92,38 +92,14 @@ def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int =
 def fitted(inputs: RasterInputs, n: int, width: int, height: int) -> RasterInputs:
     """The first `n` Gaussians with the image and the overlap of `make_inputs`; other arrays are shared."""
     focal = FOCAL * width / SIZE[0]
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     v_image = np.random.default_rng(n).standard_normal((height, width, 3), dtype=np.float32)
     first = replace(
         inputs,
-        means=inputs.means[:n],
-        quats=inputs.quats[:n],
-        scales=inputs.scales[:n],
-        opacities=inputs.opacities[:n],
-        sh=inputs.sh[:n],
         v_image=v_image / np.float32(v_image.size),
-        K=K,
+        K=np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
+        **{name: getattr(inputs, name)[:n] for name in LEAVES},
     )
     return replace(first, scales=first.scales * np.float32(_size(first)))
-
-
-def load_inputs(folder: Path, n: int) -> RasterInputs:
-    """Read `inputs_N.npz`; FileNotFoundError or ValueError names what is missing or has the wrong shape."""
-    path = folder / f"inputs_{n}.npz"
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no {path}")
-    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, 16, 3)}
-    shapes |= {"v_output": ("H", "W", 3), "viewmat": (4, 4), "K": (3, 3), "background": (3,)}
-    arrays: dict[str, Any] = {}
-    with np.load(path, allow_pickle=False) as data:
-        if missing := [name for name in shapes if name not in data]:
-            raise ValueError(f"{path} lacks {', '.join(missing)}")
-        for name, wanted in shapes.items():
-            array = data[name].astype(np.float64 if name in ("viewmat", "K") else np.float32)
-            if array.shape != ((*array.shape[:2], 3) if name == "v_output" else wanted):
-                raise ValueError(f"{path}: {name} has shape {list(array.shape)}, wanted {list(wanted)}")
-            arrays[name] = array
-    return RasterInputs(v_image=arrays.pop("v_output"), **arrays)
 
 
 def _size(inputs: RasterInputs) -> float:

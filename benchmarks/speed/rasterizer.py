@@ -7,13 +7,12 @@ from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
 
-import numpy as np
 import torch
 
 import hqgs
 from benchmarks.places import COMPOSITE, CRATE
-from benchmarks.speed.inputs import RasterInputs
-from benchmarks.speed.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
+from benchmarks.speed.inputs import LEAVES, RasterInputs
+from benchmarks.speed.timing import Seconds, StageClock, interleaved, median_ratio, whole
 from benchmarks.speed.work import count_work
 from hqgs.base.threads import one_torch_thread
 
@@ -33,8 +32,8 @@ class RasterPass:
         device: str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        names = ("means", "quats", "scales", "opacities", "sh")
-        self.leaves = [torch.from_numpy(getattr(inputs, n)).to(device, dtype).requires_grad_() for n in names]
+        tensors = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
+        self.leaves = [tensor.to(device, dtype).requires_grad_() for tensor in tensors]
         viewmat, K = (torch.from_numpy(m[None]).float().to(device) for m in (inputs.viewmat, inputs.K))
         self.view = (viewmat, K, inputs.width, inputs.height)
         self.background = torch.from_numpy(inputs.background[None]).to(device, dtype)
@@ -90,29 +89,24 @@ def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
 
 def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
     """Time and work of each of the inputs."""
-    passes = {str(len(x)): RasterPass(x) for x in inputs}
-    measured = interleaved({name: warmed(case) for name, case in passes.items()}, repeats)
+    passes = [RasterPass(x) for x in inputs]
+    measured = interleaved({str(k): warmed(case) for k, case in enumerate(passes)}, repeats)
     rows = []
-    for x, (name, rounds) in zip(inputs, measured.items(), strict=True):
-        stages = {stage: median(rounds, stage) for stage in [*STAGES, "rest"]}
-        work = count_work(passes[name].blended, x.width * x.height, *passes[name].work)
+    for x, case, rounds in zip(inputs, passes, measured.values(), strict=True):
+        work = count_work(case.blended, x.width * x.height, *case.work)
         limit = work["limit_core_seconds"] / hqgs.get_num_threads()
-        compositing = [r["bin and composite"] - r[BIN] + r["composite backward"] for r in rounds]
+        compositing = (rounds["bin and composite"] - rounds[BIN] + rounds["composite backward"]).median()
         rows.append(
-            {
-                "gaussians": len(x),
-                "width": x.width,
-                "height": x.height,
-                "seconds": median(rounds),
-                "seconds_quartiles": quartiles(rounds),
-                "stages": stages,
+            {"gaussians": len(x), "width": x.width, "height": x.height, **whole(rounds)}
+            | {
+                "stages": rounds[[*STAGES, "rest"]].median().to_dict(),
                 "limit_seconds": limit,
-                "times_limit": median(rounds) / limit,
-                "bin_seconds": median(rounds, BIN),
-                "compositing_seconds": float(np.median(compositing)),
-                "compositing_times_limit": float(np.median(compositing)) / limit,
+                "times_limit": rounds["total"].median() / limit,
+                "bin_seconds": rounds[BIN].median(),
+                "compositing_seconds": compositing,
+                "compositing_times_limit": compositing / limit,
                 "work": work,
-                "rounds": rounds,
+                "rounds": rounds.to_dict("records"),
             }
         )
     return rows
@@ -135,18 +129,14 @@ def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> li
 
         return call
 
+    rows = []
+    jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
     try:
-        jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
         measured = interleaved(jobs, repeats)
     finally:
         hqgs.set_num_threads(threads[-1])
-    return [
-        {
-            "case": name,
-            "threads": t,
-            "seconds": median(measured[f"{name}/{t}"]),
-            "speedup": median_ratio(measured[f"{name}/1"], measured[f"{name}/{t}"]),
-        }
-        for name in cases
-        for t in threads
-    ]
+    for key, rounds in measured.items():
+        name, count = key.rsplit("/", 1)
+        line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}
+        rows.append(line | {"speedup": median_ratio(measured[f"{name}/1"], rounds)})
+    return rows

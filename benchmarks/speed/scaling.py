@@ -14,18 +14,14 @@ from benchmarks import charts
 from benchmarks.charts import BLUE, LEGEND, ORANGE, panels
 from benchmarks.speed.inputs import fitted, make_inputs
 from benchmarks.speed.rasterizer import RasterPass, warmed
-from benchmarks.speed.timing import exponent, interleaved, median, quartiles
+from benchmarks.speed.timing import exponent, interleaved, whole
 
+Size = tuple[int, int]  # width, height
 TARGET = 1.05  # the largest exponent that is good
 
 
 def measure_scaling(
-    sizes: Sequence[int],
-    image: tuple[int, int],
-    images: Sequence[tuple[int, int]],
-    gaussians: int,
-    repeats: int,
-    seed: int,
+    sizes: Sequence[int], image: Size, images: Sequence[Size], gaussians: int, repeats: int, seed: int
 ) -> dict[str, Any]:
     """Time against the number of Gaussians in one image, and of `gaussians` against the size of the image.
 
@@ -47,15 +43,11 @@ def measure_scaling(
 
 def _curve(x: Sequence[int], passes: Sequence[RasterPass], repeats: int) -> dict[str, Any]:
     measured = interleaved({str(v): warmed(p) for v, p in zip(x, passes, strict=True)}, repeats)
-    seconds = [median(rounds) for rounds in measured.values()]
-    slopes = [exponent(*zip(*ends, strict=True)) for ends in pairwise(zip(x, seconds, strict=True))]
-    return {
-        "x": list(x),
-        "seconds": seconds,
-        "seconds_quartiles": [quartiles(rounds) for rounds in measured.values()],
-        "exponent": exponent(x, seconds),
-        "steepest": max(slopes),  # between two neighbours
-    }
+    rows = [whole(rounds) for rounds in measured.values()]
+    curve = {name: [row[name] for row in rows] for name in ("seconds", "seconds_quartiles")}
+    ends = pairwise(zip(x, curve["seconds"], strict=True))
+    steepest = max(exponent(*zip(*two, strict=True)) for two in ends)  # between two neighbours
+    return {"x": list(x), **curve, "exponent": exponent(x, curve["seconds"]), "steepest": steepest}
 
 
 def scaling_chart(scaling: dict[str, Any]) -> Figure:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from benchmarks.speed.inputs import FAR, NEAR, RasterInputs, make_inputs
+from benchmarks.speed.inputs import FAR, LEAVES, NEAR, RasterInputs, make_inputs
+from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
 from hqgs.training.trainer import Trainer
@@ -31,30 +33,33 @@ def still_config(config: TrainConfig, n: int) -> TrainConfig:
 
 
 def make_trainer(
-    n: int, width: int, height: int, photos: int, method: str, seed: int, options: HQGSConfig | None = None
+    gaussians: int, width: int, height: int, photos: int, method: str, seed: int, options: Any = None
 ) -> Trainer:
-    """A trainer that holds the N Gaussians of `make_inputs`. `options`: of method hqgs.
+    """A trainer that holds the Gaussians of `make_inputs`. `options`: of method hqgs, a HQGSConfig.
 
     It never changes their number, but gathers the statistics for it in each step. Raises ValueError as
     `make_inputs` and `Trainer` do.
     """
-    inputs = make_inputs(n, width, height, seed)
+    inputs = make_inputs(gaussians, width, height, seed)
     rng = np.random.default_rng(seed)
     views = [
         View(f"{k:03d}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8))
         for k, camera in enumerate(_cameras(inputs, photos, rng))
     ]
-    colors = rng.integers(0, 256, (n, 3), dtype=np.uint8)
-    scene = Scene("cloud", views, [], inputs.means, colors, "benchmark")
+    scene = Scene("cloud", views, [], inputs.means, np.zeros(inputs.means.shape, np.uint8), "benchmark")
     config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
-    trainer = Trainer(scene, still_config(config, n))
-    gaussians = trainer.gaussians
+    means, quats, scales, opacities, sh = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
+    start = Gaussians(means, scales.log(), quats, opacities.logit(), sh[:, :1], sh[:, 1:])
+    return trainer_from(scene, still_config(config, gaussians), start)
+
+
+def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
+    """A trainer that starts with these Gaussians in place of the scene's points."""
+    points = gaussians.means.numpy()
+    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
     with torch.no_grad():
-        gaussians.scales.copy_(torch.from_numpy(inputs.scales).log())
-        gaussians.quats.copy_(torch.from_numpy(inputs.quats))
-        gaussians.opacities.copy_(torch.from_numpy(inputs.opacities).logit())
-        gaussians.sh0.copy_(torch.from_numpy(inputs.sh[:, :1]))
-        gaussians.shN.copy_(torch.from_numpy(inputs.sh[:, 1:]))
+        for name, tensor in trainer.gaussians.named().items():
+            tensor.copy_(getattr(gaussians, name))
     return trainer
 
 
