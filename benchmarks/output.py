@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 import hqgs
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.base.text import markdown_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NOTHING = "–"  # in the place of a number that there is not
 

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import hqgs
-from benchmarks.estimate import Estimate, duration
-from benchmarks.measure import Run
+from benchmarks.measure import Estimate, Run, duration
 from benchmarks.output import Report
 from benchmarks.protocol import Protocol, Row, narrowed
 from benchmarks.scenes import degraded, load_scenes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.speed.ewa import project
+from benchmarks.speed.inputs import project
 from hqgs._rust import ALPHA_MAX, ALPHA_MIN, EPS2D, NEAR_PLANE, TRANSMITTANCE_MIN
 
 if TYPE_CHECKING:

@@ -19,9 +19,8 @@ from scenes import random_scene
 
 import hqgs
 from benchmarks import cli
-from benchmarks.accuracy.errors import errors_against, pareto_front
 from benchmarks.accuracy.knobs import CASES, ORACLES, Knobs, TunedPass
-from benchmarks.accuracy.run import beats
+from benchmarks.accuracy.run import beats, errors_against, pareto_front
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust

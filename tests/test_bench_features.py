@@ -16,7 +16,6 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from benchmarks import cli, places
-from benchmarks.features import report
 from benchmarks.features import run as features
 from benchmarks.features.run import still_trainer
 from benchmarks.features.switches import DEFAULT, FEATURES, PROTOCOLS, TorchAdam, torch_loss
@@ -174,7 +173,7 @@ def test_the_loss_in_torch_is_the_loss(masked: bool, shape: tuple[int, int, int]
 
 def test_switches_are_undone() -> None:
     before = hqgs.get_num_threads(), torch.get_num_threads()
-    watched = places.PROJECT, places.RENDER_VIEW, places.ADAM, places.ONE_TORCH_THREAD, places.LOSS
+    watched = places.PROJECT, places.RASTERIZATION, places.ADAM, places.ONE_TORCH_THREAD, places.LOSS
     found = [getattr(*place) for place in watched]
     default = PROTOCOLS["quick"].train_config(DEFAULT, 0)
     changed: set[str] = set()
@@ -226,11 +225,11 @@ def rounds(seconds: float) -> DataFrame:
 
 
 def compare(*arguments: Any) -> list[dict[str, Any]]:
-    return report.compare(FEATURES, *arguments)
+    return features.compare(FEATURES, *arguments)
 
 
 def verdicts(scenes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return report.verdicts(FEATURES, scenes)
+    return features.verdicts(FEATURES, scenes)
 
 
 def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:

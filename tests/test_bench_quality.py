@@ -18,14 +18,13 @@ from scipy import ndimage
 
 import hqgs
 from benchmarks import cli, study
-from benchmarks.estimate import Estimate, duration
+from benchmarks.measure import Estimate, duration
 from benchmarks.protocol import Protocol, narrowed
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality
-from benchmarks.quality.regions import count_regions, edge_robustness
+from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
-from benchmarks.quality.summary import equal_time_gain, means, psnr_at, spread, with_degraded
-from benchmarks.quality.tables import courses, metrics
+from benchmarks.quality.tables import courses, equal_time_gain, means, metrics, psnr_at, spread, with_degraded
 from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
 from benchmarks.study import Cell, Store, Study, grid, key_of
 from hqgs.evaluation.metrics import psnr

@@ -21,9 +21,9 @@ import hqgs
 from benchmarks import cli
 from benchmarks.output import command_line
 from benchmarks.speed.inputs import make_inputs
-from benchmarks.speed.peers import find_gsplat
-from benchmarks.speed.scene import make_trainer, warm_up
+from benchmarks.speed.rasterizer import find_gsplat
 from benchmarks.speed.timing import StageClock, exponent, interleaved, median_ratio
+from benchmarks.speed.training import make_trainer
 from benchmarks.speed.work import count_work
 from hqgs import _rust
 from hqgs.base.text import markdown_table
@@ -273,8 +273,7 @@ def test_operations_and_limit_of_a_hand_made_case() -> None:
 def test_the_scene_stays_what_it_is_while_it_is_timed() -> None:
     trainer = make_trainer(400, 64, 48, 2, "3dgs", seed=1)
     before = {name: tensor.detach().clone() for name, tensor in trainer.gaussians.named().items()}
-    warm_up(trainer)
-    for _ in range(5):
+    for _ in range(8):
         trainer.step()
     for name, tensor in trainer.gaussians.named().items():
         assert torch.allclose(tensor, before[name], atol=1e-4), name

@@ -3,31 +3,40 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 import hqgs
-from benchmarks.accuracy.errors import errors_against, pareto_front
 from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
-from benchmarks.accuracy.trained import trained_inputs
 from benchmarks.charts import LEGEND, color, panels
 from benchmarks.data import read_toml
+from benchmarks.measure import Training
 from benchmarks.output import Benchmark, Report, add_repeats, span, table, with_repeats
+from benchmarks.protocol import Row
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import measure_threads, thread_counts
 from benchmarks.speed.timing import interleaved, quartiles, whole
+from hqgs.base.threads import one_torch_thread
+from hqgs.model.render import render_view
 from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.scene import Scene
+from hqgs.training.methods.base import photo_tensors
+from hqgs.training.methods.photometric import photometric_loss
 
-Row = dict[str, Any]
 DATA = read_toml(FILE)
 COLUMNS = DATA["columns"]
-ERRORS: dict[str, Callable[[Row], float]] = {  # of a row and an oracle's name; what the panels show
+ERRORS: dict[
+    str, Callable[[dict[str, Any]], float]
+] = {  # of a row and an oracle's name; what the panels show
     "image": lambda errors: errors["image"]["rms"],
     "gradients": lambda errors: errors["gradients"]["all"]["relative"],
 }
@@ -53,7 +62,7 @@ def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
     return size | {"rows": rows, "beaten_by": beaten}
 
 
-def beats(row: Row, other: Row) -> bool:
+def beats(row: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether `row` has no larger error than the default, whatever it is held against, in clearly less time:
     three rounds of four were faster."""
     no_worse = all(
@@ -64,7 +73,7 @@ def beats(row: Row, other: Row) -> bool:
     return no_worse and row["ratio_quartiles"][1] < 1
 
 
-def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[Row]:
+def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[dict[str, Any]]:
     """Seconds with each number of threads, and the largest difference to one thread in any output."""
     case = TunedPass(inputs, Knobs())
     rows = measure_threads({"default": case}, repeats)
@@ -181,3 +190,67 @@ BENCHMARK = Benchmark(
     lambda parser: add_repeats(parser, DATA),
     run,
 )
+
+
+IMAGE = "image"
+
+
+def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, Any]:
+    """Image and gradients against `exact`; both hold "image" and the gradients by name, float64.
+
+    The image: largest and root-mean-square error, and PSNR in dB where white is 1 (None: no error). Each
+    gradient, and "all" of them as one vector: |g - exact| / |exact|, and the cosine of the angle between the
+    two (None: one of them is 0).
+    """
+    difference = outputs[IMAGE] - exact[IMAGE]
+    rms = float(difference.square().mean().sqrt())
+    names = [name for name in exact if name != IMAGE]
+    gradients = {name: _direction(outputs[name].flatten(), exact[name].flatten()) for name in names}
+    both = [torch.cat([side[name].flatten() for name in names]) for side in (outputs, exact)]
+    psnr = -20 * math.log10(rms) if rms > 0 else None
+    return {
+        IMAGE: {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
+        "gradients": gradients | {"all": _direction(*both)},
+    }
+
+
+def _direction(found: Tensor, exact: Tensor) -> dict[str, float | None]:
+    length, other = float(exact.norm()), float(found.norm())
+    if length == 0 or other == 0:
+        return {"relative": None, "cosine": None}
+    cosine = float(found @ exact) / (length * other)
+    return {"relative": float((found - exact).norm()) / length, "cosine": min(1.0, cosine)}
+
+
+def pareto_front(times: Sequence[float], errors: Sequence[float]) -> list[int]:
+    """The indices of the points that no other one beats in time and error, by rising time."""
+    front: list[int] = []
+    for i in sorted(range(len(times)), key=lambda k: (times[k], errors[k])):
+        if not front or errors[i] < errors[front[-1]]:
+            front.append(i)
+    return front
+
+
+def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInputs:
+    """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
+    config = Row("3dgs").train_config(seed, steps, {"densify": {"max_gaussians": most}, "sh_interval": 1})
+    done = Training(scene, config)
+    done.steps(steps)
+    g, view = done.trainer.gaussians.detached(), scene.train[0]
+    with one_torch_thread():
+        image, _ = render_view(g, view.camera, 3, config.background)
+        image.requires_grad_()
+        photo, mask = photo_tensors(view)
+        photometric_loss(image, photo, mask).backward()
+    assert image.grad is not None
+    return RasterInputs(
+        means=g.means.numpy(),
+        quats=g.quats.numpy(),
+        scales=g.activated_scales().numpy(),
+        opacities=g.activated_opacities().numpy(),
+        sh=torch.cat([g.sh0, g.shN], dim=1).numpy(),
+        v_image=image.grad.numpy(),
+        viewmat=view.camera.viewmat,
+        K=view.camera.K,
+        background=np.array(config.background, np.float32),
+    )

@@ -18,9 +18,7 @@ import hqgs
 from benchmarks import places
 from benchmarks.accuracy.knobs import Knobs, tuned
 from benchmarks.protocol import Row, read_protocols
-from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import RasterizationMeta
-from hqgs.scene.scene import Camera
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 
@@ -49,24 +47,17 @@ def _in_torch(place: places.Place, function: Any) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def render_in_float64(
-    gaussians: Gaussians, camera: Camera, sh_degree: int, background: tuple[float, float, float]
-) -> tuple[Tensor, RasterizationMeta]:
-    """`hqgs.render.render_view` with a rasterizer in float64; the image is float32 again."""
-    images, _, meta = hqgs.rasterization(
-        gaussians.means.double(),
-        gaussians.quats.double(),
-        gaussians.activated_scales().double(),
-        gaussians.activated_opacities().double(),
-        (gaussians.sh0.double(), gaussians.shN.double()),
-        torch.tensor(camera.viewmat[None]),
-        torch.tensor(camera.K[None]),
-        camera.width,
-        camera.height,
-        sh_degree=sh_degree,
-        backgrounds=torch.tensor([background], dtype=torch.float64),
-    )
-    return images[0].float(), meta
+def in_float64(*args: Any, **options: Any) -> tuple[Tensor, Tensor, RasterizationMeta]:
+    """`hqgs.rasterization` in float64; the image is float32 again."""
+
+    def double(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(double, value))
+        return value.double() if isinstance(value, Tensor) else value
+
+    options = {name: double(value) for name, value in options.items()}
+    images, alphas, meta = hqgs.rasterization(*map(double, args), **options)
+    return images.float(), alphas.float(), meta
 
 
 def torch_loss(
@@ -104,7 +95,7 @@ class TorchAdam(torch.optim.Adam):
 
 SWITCHES: dict[str, Callable[[], Any]] = {  # context managers: inside them the other choice is in place
     "": nullcontext,
-    "float64": partial(patch.object, *places.RENDER_VIEW, render_in_float64),
+    "float64": partial(patch.object, *places.RASTERIZATION, in_float64),
     "boxes": partial(tuned, Knobs(spans="box")),
     "every block": partial(tuned, Knobs(skip_blocks=False)),
     "torch's loss": partial(_in_torch, places.LOSS, torch_loss),

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from benchmarks.charts import LEGEND, color, panels, title
-from benchmarks.quality.summary import means, with_degraded
+from benchmarks.quality.tables import means, with_degraded
 
 ACROSS = 3  # panels in a row
 

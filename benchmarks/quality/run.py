@@ -12,11 +12,10 @@ from pandas import DataFrame
 from benchmarks.output import Benchmark, Report
 from benchmarks.protocol import add_options, read_protocols
 from benchmarks.quality import tables
-from benchmarks.quality.cell import run_cell
+from benchmarks.quality.cell import edge_robustness, run_cell
 from benchmarks.quality.charts import gain_chart, region_chart, time_chart
 from benchmarks.quality.pictures import write_sheet
-from benchmarks.quality.regions import edge_robustness
-from benchmarks.quality.summary import frame_of, summary
+from benchmarks.quality.tables import frame_of, summary
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
 from hqgs.photos.formula import NONE

@@ -14,12 +14,16 @@ from benchmarks.data import read_toml
 from benchmarks.output import Benchmark, Report, UnavailableError, add_repeats, with_repeats
 from benchmarks.speed import tables
 from benchmarks.speed.inputs import RasterInputs, make_inputs
-from benchmarks.speed.memory import measure_memory
-from benchmarks.speed.peers import measure_gsplat
-from benchmarks.speed.rasterizer import RasterPass, measure, measure_threads
-from benchmarks.speed.scaling import measure_scaling, scaling_chart
-from benchmarks.speed.scene import make_trainer, warm_up
+from benchmarks.speed.rasterizer import (
+    RasterPass,
+    measure,
+    measure_gsplat,
+    measure_scaling,
+    measure_threads,
+    scaling_chart,
+)
 from benchmarks.speed.step import measure_steps, whole_step
+from benchmarks.speed.training import make_trainer, measure_memory
 from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import Trainer
@@ -37,9 +41,8 @@ class Speed:
 
     @cached_property
     def inputs(self) -> list[RasterInputs]:
-        return [
-            make_inputs(n, *self.config["size"], seed=self.config["seed"]) for n in self.config["gaussians"]
-        ]
+        c = self.config
+        return [make_inputs(n, *c["size"], seed=c["seed"]) for n in c["gaussians"]]
 
     @cached_property
     def trainers(self) -> dict[str, Trainer]:
@@ -48,10 +51,8 @@ class Speed:
 
     def _trainer(self, n: int, method: str, options: HQGSConfig | None = None) -> Trainer:
         c = self.config
-        size = {"width": c["size"][0], "height": c["size"][1], "photos": c["step_photos"]}
-        trainer = make_trainer(n, **size, method=method, seed=c["seed"], options=options)
-        warm_up(trainer)
-        return trainer
+        width, height = c["size"]
+        return make_trainer(n, width, height, c["step_photos"], method, c["seed"], options, warm=True)
 
     def rasterizer(self) -> tuple[Any, list[str]]:
         rows = measure(self.inputs, self.repeats)

@@ -1,15 +1,21 @@
-"""A trainer at the size that a benchmark asks for: noise photos of a cloud of Gaussians."""
+"""A trainer at the size that a benchmark asks for, and the memory that its process needs."""
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+import hqgs
+from benchmarks.output import UnavailableError
 from benchmarks.speed.inputs import FAR, LEAVES, NEAR, RasterInputs, make_inputs
+from hqgs.base.machine import peak_rss_mb
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
@@ -17,6 +23,7 @@ from hqgs.training.trainer import Trainer
 
 TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
 WARM_UP = 3  # steps
+TARGET_MB = 3000.0
 
 
 def still_config(config: TrainConfig, n: int) -> TrainConfig:
@@ -33,9 +40,17 @@ def still_config(config: TrainConfig, n: int) -> TrainConfig:
 
 
 def make_trainer(
-    gaussians: int, width: int, height: int, photos: int, method: str, seed: int, options: Any = None
+    gaussians: int,
+    width: int,
+    height: int,
+    photos: int,
+    method: str,
+    seed: int,
+    options: HQGSConfig | None = None,
+    warm: bool = False,
 ) -> Trainer:
-    """A trainer that holds the Gaussians of `make_inputs`. `options`: of method hqgs, a HQGSConfig.
+    """A trainer that holds the Gaussians of `make_inputs`. `options`: of method hqgs. `warm`: it has made the
+    steps until harmonics of degree 3 are trained.
 
     It never changes their number, but gathers the statistics for it in each step. Raises ValueError as
     `make_inputs` and `Trainer` do.
@@ -50,7 +65,10 @@ def make_trainer(
     config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
     means, quats, scales, opacities, sh = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
     start = Gaussians(means, scales.log(), quats, opacities.logit(), sh[:, :1], sh[:, 1:])
-    return trainer_from(scene, still_config(config, gaussians), start)
+    trainer = trainer_from(scene, still_config(config, gaussians), start)
+    for _ in range(WARM_UP if warm else 0):
+        trainer.step()
+    return trainer
 
 
 def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
@@ -63,12 +81,6 @@ def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Tra
     return trainer
 
 
-def warm_up(trainer: Trainer) -> None:
-    """The steps until harmonics of degree 3 are trained."""
-    for _ in range(WARM_UP):
-        trainer.step()
-
-
 def _cameras(inputs: RasterInputs, count: int, rng: np.random.Generator) -> list[Camera]:
     """Cameras that look at the middle of the cloud from about the same side, a few degrees apart."""
     middle = np.array([0, 0, (NEAR + FAR) / 2])
@@ -79,3 +91,30 @@ def _cameras(inputs: RasterInputs, count: int, rng: np.random.Generator) -> list
         turn[:3, 3] = middle - turn[:3, :3] @ middle
         cameras.append(Camera(inputs.width, inputs.height, inputs.K, turn @ inputs.viewmat))
     return cameras
+
+
+def measure_memory(settings: dict[str, Any]) -> dict[str, Any]:
+    """Peak resident memory in MB (10^6 bytes) after the imports, with the scene, and of the training.
+
+    `settings`: the arguments of `make_trainer`, and the `steps`. Raises UnavailableError where the process is
+    killed or runs out of memory, or the system does not tell.
+    """
+    settings = settings | {"threads": hqgs.get_num_threads()}
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        try:
+            peaks = pool.submit(_measure, **settings).result()
+        except (BrokenProcessPool, MemoryError) as error:
+            raise UnavailableError(f"the process that measures the memory ended: {error}") from error
+    if None in peaks.values():
+        raise UnavailableError("this system does not tell the peak memory of a process")
+    return {**settings, **peaks, "target_mb": TARGET_MB}
+
+
+def _measure(threads: int, steps: int, **settings: Any) -> dict[str, float | None]:
+    peaks = {"imports_mb": peak_rss_mb()}
+    hqgs.set_num_threads(threads)
+    trainer = make_trainer(**settings)
+    peaks["scene_mb"] = peak_rss_mb()
+    for _ in range(steps):
+        trainer.step()
+    return peaks | {"peak_mb": peak_rss_mb()}
