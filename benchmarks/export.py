@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.charts import GREY, LEGEND, color, panels, title
+from benchmarks.charts import GREY, LEGEND, color, panels, title, unbeaten
 from benchmarks.data import build, read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
@@ -51,19 +50,8 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
         row |= {"psnr_to_original": psnr(a, b), "largest_change": float(np.abs(a - b).max())}
         rows.append(asdict(written) | row)
         del rows[-1]["path"]
-    for row, better in zip(rows, pareto(rows), strict=True):
-        row["pareto"] = better
-    return rows
-
-
-def pareto(rows: Sequence[dict[str, Any]]) -> list[bool]:
-    """Of each row, whether no other is smaller or as small and better, or better and as small."""
-
-    def beats(a: dict[str, Any], b: dict[str, Any]) -> bool:
-        no_worse = a["bytes"] <= b["bytes"] and a["psnr"] >= b["psnr"]
-        return no_worse and (a["bytes"], a["psnr"]) != (b["bytes"], b["psnr"])
-
-    return [not any(beats(other, row) for other in rows) for row in rows]
+    best = unbeaten([(row["bytes"], -row["psnr"]) for row in rows])
+    return [row | {"pareto": k in best} for k, row in enumerate(rows)]
 
 
 def files_table(result: dict[str, Any]) -> str:

@@ -15,7 +15,14 @@ from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Step, Trainer
 
+if TYPE_CHECKING:
+    from benchmarks.study import Cell
+
 Run = dict[str, Any]  # plain JSON values
+# A whole run's seconds per step over those of its first steps, if there is room for more Gaussians: the
+# built-in scene at 504 px takes 22 ms in its first 400 steps and 55 ms on average over 2,000.
+GROWTH = 2.5
+WARM, FIRST = 3, 10  # steps before the first ones that count, and how many of those
 
 
 class Training:
@@ -76,15 +83,6 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
     if evaluate:
         trainer.evaluate()
     return done
-
-
-if TYPE_CHECKING:
-    from benchmarks.study import Cell
-
-# A whole run's seconds per step over those of its first steps, if there is room for more Gaussians: the
-# built-in scene at 504 px takes 22 ms in its first 400 steps and 55 ms on average over 2,000.
-GROWTH = 2.5
-WARM, FIRST = 3, 10  # steps before the first ones that count, and how many of those
 
 
 class Estimate:

@@ -92,7 +92,10 @@ def grid(protocol: Protocol, scenes: Sequence[Scene], labelled: bool = False, *t
 
 
 class Store:
-    """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside."""
+    """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside.
+
+    A run that failed holds `error`, and is to be tried again.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root / "runs"
@@ -101,16 +104,19 @@ class Store:
     def read(self, key: str) -> Run | None:
         """The finished run, None where there is none; ValueError for a damaged file."""
         for path in (self.here / f"{key}.json", self.root / KNOWN / f"{key}.json"):
-            run = kept(path)
-            if run is not None:
-                if run.get("key") != key:
-                    raise ValueError(f"{path} is not the run of that name; remove it")
+            if path.is_file():
+                try:
+                    run = json.loads(path.read_text(encoding="utf-8"))
+                    if run["key"] != key:
+                        raise ValueError(f"it holds the run {run['key']}")
+                except (ValueError, KeyError, TypeError) as error:
+                    why = f"{path} is damaged: {error!r}"
+                    raise ValueError(f"{why}; remove it, and the run is repeated") from error
                 return run
         return None
 
     def write(self, run: Run) -> None:
         write_json(self.here / f"{run['key']}.json", run)
-        self.failure_path(run["key"]).unlink(missing_ok=True)
 
     def take(self, path: Path) -> None:
         """Keep the runs of a result file of this benchmark that are not there yet, without what lies beside.
@@ -131,23 +137,6 @@ class Store:
     def beside(self, key: str, name: str) -> Path:
         """Where a run keeps a file: to be written before the run is, which vouches for it."""
         return self.here / key / name
-
-    def failure_path(self, key: str) -> Path:
-        """The reason why there is no run of that key."""
-        return self.here / f"{key}.failed.json"
-
-
-def kept(path: Path) -> Run | None:
-    """What an earlier call kept in this file; None where there is none, ValueError where it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError("it holds no object")
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
-    return found
 
 
 @cache
@@ -199,11 +188,8 @@ class Study:
         prints = {scene.name: scene_fingerprint(scene) for scene in scenes}
         self.keys = {cell: key_of(cell, prints[cell.scene.name]) for cell in self.cells}
         found = {cell: self.store.read(key) for cell, key in self.keys.items()}
-        self.runs: dict[Cell, Run] = {cell: run for cell, run in found.items() if run is not None}
-        self.failures: dict[Cell, str] = {}
-        for cell, key in self.keys.items():
-            if cell not in self.runs and (failed := kept(self.store.failure_path(key))) is not None:
-                self.failures[cell] = failed["error"]
+        self.runs: dict[Cell, Run] = {cell: run for cell, run in found.items() if run and "error" not in run}
+        self.failures = {cell: run["error"] for cell, run in found.items() if run and "error" in run}
 
     def train(self, measure: Callable[[Cell, Scene], Run]) -> None:
         """Run the cells that are not finished, in their order; each is written as soon as it is done.
@@ -228,7 +214,7 @@ class Study:
                 run = measure(cell, self.photos(cell))
             except (ValueError, TrainingError) as error:
                 self.failures[cell] = str(error)
-                write_json(self.store.failure_path(key), {"key": key, "error": str(error), **facts})
+                self.store.write({"key": key, "error": str(error), **facts})
                 self.say(f"[{k}/{len(pending)}] {cell} failed: {error}")
                 continue
             wall = time.perf_counter() - started

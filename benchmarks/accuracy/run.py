@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -17,7 +17,7 @@ from torch import Tensor
 
 import hqgs
 from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
-from benchmarks.charts import LEGEND, color, panels
+from benchmarks.charts import LEGEND, color, panels, unbeaten
 from benchmarks.data import read_toml
 from benchmarks.measure import Training
 from benchmarks.output import Benchmark, Report, add_repeats, span, table, with_repeats
@@ -34,9 +34,9 @@ from hqgs.training.methods.photometric import photometric_loss
 
 DATA = read_toml(FILE)
 COLUMNS = DATA["columns"]
-ERRORS: dict[
-    str, Callable[[dict[str, Any]], float]
-] = {  # of a row and an oracle's name; what the panels show
+IMAGE = "image"
+Errors = dict[str, Any]  # of a row against an oracle
+ERRORS: dict[str, Callable[[Errors], float]] = {  # what the panels show
     "image": lambda errors: errors["image"]["rms"],
     "gradients": lambda errors: errors["gradients"]["all"]["relative"],
 }
@@ -137,12 +137,9 @@ def chart(result: dict[str, Any]) -> Figure:
 
 
 def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
-    times, errors = [p[0] for p in points], [p[1] for p in points]
-    front = pareto_front(times, errors)
-    axes.plot(
-        [times[k] for k in front], [errors[k] for k in front], color="#888888", lw=1.2,
-        drawstyle="steps-post", label="no other one is better in both",
-    )  # fmt: skip
+    times, errors = zip(*(points[k][:2] for k in unbeaten([p[:2] for p in points])), strict=True)
+    label = "no other one is better in both"
+    axes.plot(times, errors, color="#888888", lw=1.2, drawstyle="steps-post", label=label)
     for k, knob in enumerate(dict.fromkeys(case[0] for case in CASES)):
         own = [(x, y, value) for x, y, name, value in points if name == knob]
         first = knob == "default"
@@ -153,6 +150,58 @@ def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
         for x, y, value in own:
             axes.annotate(value, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6, rotation=40)
     axes.set(xscale="log", yscale="log")
+
+
+def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, Any]:
+    """Image and gradients against `exact`; both hold "image" and the gradients by name, float64.
+
+    The image: largest and root-mean-square error, and PSNR in dB where white is 1 (None: no error). Each
+    gradient, and "all" of them as one vector: |g - exact| / |exact|, and the cosine of the angle between the
+    two (None: one of them is 0).
+    """
+    difference = outputs[IMAGE] - exact[IMAGE]
+    rms = float(difference.square().mean().sqrt())
+    names = [name for name in exact if name != IMAGE]
+    gradients = {name: _direction(outputs[name].flatten(), exact[name].flatten()) for name in names}
+    both = [torch.cat([side[name].flatten() for name in names]) for side in (outputs, exact)]
+    psnr = -20 * math.log10(rms) if rms > 0 else None
+    return {
+        IMAGE: {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
+        "gradients": gradients | {"all": _direction(*both)},
+    }
+
+
+def _direction(found: Tensor, exact: Tensor) -> dict[str, float | None]:
+    length, other = float(exact.norm()), float(found.norm())
+    if length == 0 or other == 0:
+        return {"relative": None, "cosine": None}
+    cosine = float(found @ exact) / (length * other)
+    return {"relative": float((found - exact).norm()) / length, "cosine": min(1.0, cosine)}
+
+
+def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInputs:
+    """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
+    config = Row("3dgs").train_config(seed, steps, {"densify": {"max_gaussians": most}, "sh_interval": 1})
+    done = Training(scene, config)
+    done.steps(steps)
+    g, view = done.trainer.gaussians.detached(), scene.train[0]
+    with one_torch_thread():
+        image, _ = render_view(g, view.camera, 3, config.background)
+        image.requires_grad_()
+        photo, mask = photo_tensors(view)
+        photometric_loss(image, photo, mask).backward()
+    assert image.grad is not None
+    return RasterInputs(
+        means=g.means.numpy(),
+        quats=g.quats.numpy(),
+        scales=g.activated_scales().numpy(),
+        opacities=g.activated_opacities().numpy(),
+        sh=torch.cat([g.sh0, g.shN], dim=1).numpy(),
+        v_image=image.grad.numpy(),
+        viewmat=view.camera.viewmat,
+        K=view.camera.K,
+        background=np.array(config.background, np.float32),
+    )
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -190,67 +239,3 @@ BENCHMARK = Benchmark(
     lambda parser: add_repeats(parser, DATA),
     run,
 )
-
-
-IMAGE = "image"
-
-
-def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, Any]:
-    """Image and gradients against `exact`; both hold "image" and the gradients by name, float64.
-
-    The image: largest and root-mean-square error, and PSNR in dB where white is 1 (None: no error). Each
-    gradient, and "all" of them as one vector: |g - exact| / |exact|, and the cosine of the angle between the
-    two (None: one of them is 0).
-    """
-    difference = outputs[IMAGE] - exact[IMAGE]
-    rms = float(difference.square().mean().sqrt())
-    names = [name for name in exact if name != IMAGE]
-    gradients = {name: _direction(outputs[name].flatten(), exact[name].flatten()) for name in names}
-    both = [torch.cat([side[name].flatten() for name in names]) for side in (outputs, exact)]
-    psnr = -20 * math.log10(rms) if rms > 0 else None
-    return {
-        IMAGE: {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
-        "gradients": gradients | {"all": _direction(*both)},
-    }
-
-
-def _direction(found: Tensor, exact: Tensor) -> dict[str, float | None]:
-    length, other = float(exact.norm()), float(found.norm())
-    if length == 0 or other == 0:
-        return {"relative": None, "cosine": None}
-    cosine = float(found @ exact) / (length * other)
-    return {"relative": float((found - exact).norm()) / length, "cosine": min(1.0, cosine)}
-
-
-def pareto_front(times: Sequence[float], errors: Sequence[float]) -> list[int]:
-    """The indices of the points that no other one beats in time and error, by rising time."""
-    front: list[int] = []
-    for i in sorted(range(len(times)), key=lambda k: (times[k], errors[k])):
-        if not front or errors[i] < errors[front[-1]]:
-            front.append(i)
-    return front
-
-
-def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInputs:
-    """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
-    config = Row("3dgs").train_config(seed, steps, {"densify": {"max_gaussians": most}, "sh_interval": 1})
-    done = Training(scene, config)
-    done.steps(steps)
-    g, view = done.trainer.gaussians.detached(), scene.train[0]
-    with one_torch_thread():
-        image, _ = render_view(g, view.camera, 3, config.background)
-        image.requires_grad_()
-        photo, mask = photo_tensors(view)
-        photometric_loss(image, photo, mask).backward()
-    assert image.grad is not None
-    return RasterInputs(
-        means=g.means.numpy(),
-        quats=g.quats.numpy(),
-        scales=g.activated_scales().numpy(),
-        opacities=g.activated_opacities().numpy(),
-        sh=torch.cat([g.sh0, g.shN], dim=1).numpy(),
-        v_image=image.grad.numpy(),
-        viewmat=view.camera.viewmat,
-        K=view.camera.K,
-        background=np.array(config.background, np.float32),
-    )

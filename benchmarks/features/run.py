@@ -28,6 +28,10 @@ from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Trainer
 
 REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
+LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
+SURE = 2.0  # standard errors by which whole runs must be over the limit before they fail a feature
+ON = {True: "on", False: "off"}
+COLUMNS = read_toml(Path(__file__).with_name("features.toml"))["columns"]
 SHOWN = ("seed", "seconds", "gaussians", "history", "psnr", "refined_psnr")  # of a run, in the results
 
 
@@ -114,36 +118,6 @@ def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Tr
     for _ in range(config.sh_degree):
         trainer.step()
     return trainer
-
-
-def run(args: argparse.Namespace) -> Report:
-    """Train every scene with every feature switched, then time steps of all of them in turn."""
-    rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
-    features = Features(begin(args, "features", PROTOCOLS["quick" if args.quick else "standard"], rows=rows))
-    features.study.train(features.measure)
-    report = features.study.report()
-    results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
-    for result in results:
-        report.tables.append(scene_table(result))
-        report.figures[result["scene"]] = chart(result)
-    report.results = {"scenes": results, "verdicts": verdicts(features.rows[1:], results) if results else []}
-    if results:
-        report.tables.append(verdict_table(report.results["verdicts"]))
-    return report
-
-
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
-    parser.add_argument("--repeats", type=int, metavar="N", help="rounds of timed steps (15, with --quick 2)")
-
-
-BENCHMARK = Benchmark("what each speed feature saves in time and costs in held-out error", options, run)
-
-
-LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
-SURE = 2.0  # standard errors by which whole runs must be over the limit before they fail a feature
-ON = {True: "on", False: "off"}
-COLUMNS = read_toml(Path(__file__).with_name("features.toml"))["columns"]
 
 
 def compare(
@@ -251,3 +225,27 @@ def chart(scene: dict[str, Any]) -> Figure:
     title(axes, scene["scene"])
     axes.legend(**LEGEND)
     return figure
+
+
+def run(args: argparse.Namespace) -> Report:
+    """Train every scene with every feature switched, then time steps of all of them in turn."""
+    rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
+    features = Features(begin(args, "features", PROTOCOLS["quick" if args.quick else "standard"], rows=rows))
+    features.study.train(features.measure)
+    report = features.study.report()
+    results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
+    for result in results:
+        report.tables.append(scene_table(result))
+        report.figures[result["scene"]] = chart(result)
+    report.results = {"scenes": results, "verdicts": verdicts(features.rows[1:], results) if results else []}
+    if results:
+        report.tables.append(verdict_table(report.results["verdicts"]))
+    return report
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    add_options(parser, PROTOCOLS["standard"])
+    parser.add_argument("--repeats", type=int, metavar="N", help="rounds of timed steps (15, with --quick 2)")
+
+
+BENCHMARK = Benchmark("what each speed feature saves in time and costs in held-out error", options, run)

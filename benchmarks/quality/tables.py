@@ -1,4 +1,7 @@
-"""The quality benchmark's numbers as Markdown tables, in the layout of the paper's."""
+"""The quality benchmark's numbers, and Markdown tables of them in the layout of the paper's.
+
+A mean is that of all runs of its group: where one of them lacks the number, there is none.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,11 @@ from hqgs.photos.formula import NONE
 
 COLUMNS = read_toml(Path(__file__).with_name("protocols.toml"))["columns"]
 LABEL = {"row": ("", "")}
+DEGRADED = "degraded"  # in the place of a degradation: all of them, without the clean photos
+GROUP = ["scene", "degradation", "seed"]  # the runs that see the same photos
+GAINS = ("gain", "equal_time_gain")  # over the baseline, dB
+KEPT = ("seconds", "cpu_seconds", "setup_seconds", "render_ms", "initial_points", "gaussians", "peak_rss_mb")
+COSTS = (*KEPT, "ms_per_step", "edge_density", "flat_density")
 
 
 def by_degradation(title: str, frame: DataFrame, text: Callable[[DataFrame], str]) -> str:
@@ -146,13 +154,6 @@ def _records(frame: DataFrame) -> list[dict[str, Any]]:
     return frame.reset_index().to_dict("records")
 
 
-DEGRADED = "degraded"  # in the place of a degradation: all of them, without the clean photos
-GROUP = ["scene", "degradation", "seed"]  # the runs that see the same photos
-GAINS = ("gain", "equal_time_gain")  # over the baseline, dB
-KEPT = ("seconds", "cpu_seconds", "setup_seconds", "render_ms", "initial_points", "gaussians", "peak_rss_mb")
-COSTS = (*KEPT, "ms_per_step", "edge_density", "flat_density")
-
-
 def frame_of(runs: Iterable[tuple[Cell, Run]], baseline: str | None = None) -> DataFrame:
     """A line for each run with all numbers of the tables, NaN where there is none; the runs are in `run`.
 
@@ -164,9 +165,8 @@ def frame_of(runs: Iterable[tuple[Cell, Run]], baseline: str | None = None) -> D
     for cell, run in pairs:
         line = dict(zip(GROUP, cell.group, strict=True)) | {"row": cell.row.label, "run": run}
         line |= {name: run["metrics"][name] for name in METRICS}
-        line |= {name: run[name] for name in KEPT} | {
-            "ms_per_step": 1_000 * run["seconds"] / run["iterations"]
-        }
+        line |= {name: run[name] for name in KEPT}
+        line["ms_per_step"] = 1_000 * run["seconds"] / run["iterations"]
         line |= {f"{name}_density": region["density"] for name, region in run["regions"].items()}
         if baseline is not None:
             line["gain"] = psnr_gain(run, base[cell.group])

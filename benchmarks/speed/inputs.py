@@ -55,6 +55,10 @@ class RasterInputs:
     def height(self) -> int:
         return self.v_image.shape[0]
 
+    def first(self, n: int) -> RasterInputs:
+        """With so many Gaussians; the arrays are shared."""
+        return replace(self, **{name: getattr(self, name)[:n] for name in LEAVES})
+
 
 def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int = 2026) -> RasterInputs:
     """N Gaussians, uniform in the volume that a camera of this size sees between two depths.
@@ -92,12 +96,8 @@ def fitted(inputs: RasterInputs, n: int, width: int, height: int) -> RasterInput
     """The first `n` Gaussians with the image and the overlap of `make_inputs`; other arrays are shared."""
     focal = FOCAL * width / SIZE[0]
     v_image = np.random.default_rng(n).standard_normal((height, width, 3), dtype=np.float32)
-    first = replace(
-        inputs,
-        v_image=v_image / np.float32(v_image.size),
-        K=np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]),
-        **{name: getattr(inputs, name)[:n] for name in LEAVES},
-    )
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    first = replace(inputs.first(n), v_image=v_image / np.float32(v_image.size), K=K)
     return replace(first, scales=first.scales * np.float32(_size(first)))
 
 
@@ -106,13 +106,9 @@ def _size(inputs: RasterInputs) -> float:
 
     A support is the ellipse where alpha >= 1/255: 2 pi ln(255 opacity) sqrt(det(cov2d)) square pixels.
     """
-    part = slice(SAMPLE)
-    opacities = inputs.opacities[part].astype(np.float64)
-    _, _, cov = project(
-        inputs.means[part], inputs.quats[part], inputs.scales[part], inputs.viewmat, inputs.K,
-        inputs.width, inputs.height,
-    )  # fmt: skip
-    reach2 = 2 * np.log(np.maximum(opacities / ALPHA_MIN, 1))
+    sample = inputs.first(SAMPLE)
+    _, _, cov = project(sample)
+    reach2 = 2 * np.log(np.maximum(sample.opacities.astype(np.float64) / ALPHA_MIN, 1))
     area = (1 + 2 * MARGIN) ** 2 * inputs.width * inputs.height
 
     def excess(log_factor: float) -> float:
@@ -132,26 +128,20 @@ def _f32(values: Any) -> Array32:
     return np.ascontiguousarray(values, np.float32)
 
 
-def project(
-    means: NDArray[np.float32],
-    quats: NDArray[np.float32],
-    scales: NDArray[np.float32],
-    viewmat: NDArray[np.float64],
-    K: NDArray[np.float64],
-    width: int,
-    height: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """EWA projection: centres [N, 2] in pixels, depths [N], covariances [N, 2, 2] before the low-pass."""
-    p = means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
+def project(inputs: RasterInputs) -> tuple[Array64, Array64, Array64]:
+    """EWA projection in float64, by the formulas of docs/conventions.md with no code of the crate: centres
+    [N, 2] in pixels, depths [N], covariances [N, 2, 2] before the low-pass."""
+    viewmat, K = inputs.viewmat, inputs.K
+    p = inputs.means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
     x, y, z = p.T
     focal, center = np.diag(K)[:2], K[:2, 2]
-    size = np.array([width, height])
+    size = np.array([inputs.width, inputs.height])
     margin = FOV_MARGIN * size / (2 * focal)
     low, high = -center / focal - margin, (size - center) / focal + margin
     slope = np.clip(p[:, :2] / z[:, None], low, high)
     jacobian = np.zeros((len(p), 2, 3))
     jacobian[:, 0, 0], jacobian[:, 1, 1] = focal[0] / z, focal[1] / z
     jacobian[:, :, 2] = -focal * slope / z[:, None]
-    rotation = Rotation.from_quat(quats[:, [1, 2, 3, 0]].astype(np.float64)).as_matrix()
-    factor = jacobian @ viewmat[:3, :3] @ (rotation * scales[:, None, :].astype(np.float64))
+    rotation = Rotation.from_quat(inputs.quats[:, [1, 2, 3, 0]].astype(np.float64)).as_matrix()
+    factor = jacobian @ viewmat[:3, :3] @ (rotation * inputs.scales[:, None, :].astype(np.float64))
     return focal * np.stack([x, y], axis=1) / z[:, None] + center, z, factor @ factor.swapaxes(1, 2)

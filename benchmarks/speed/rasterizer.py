@@ -26,6 +26,8 @@ from benchmarks.speed.work import count_work
 from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
+Size = tuple[int, int]  # width, height
+TARGET = 1.05  # the largest exponent that is good
 BIN = "bin"  # the part of "bin and composite" before the first pixel
 
 
@@ -187,10 +189,6 @@ def _on_cuda(raster_pass: RasterPass) -> Callable[[], Seconds]:
         return seconds
 
     return call
-
-
-Size = tuple[int, int]  # width, height
-TARGET = 1.05  # the largest exponent that is good
 
 
 def measure_scaling(
