@@ -17,7 +17,7 @@ from benchmarks.charts import LEGEND, color, panels
 from benchmarks.data import read_toml
 from benchmarks.measure import Run, Training
 from benchmarks.output import NOTHING, Benchmark, Report, table
-from benchmarks.protocol import Protocol, Row, add_options, read_protocols
+from benchmarks.protocol import Protocol, Row, read_protocols
 from benchmarks.study import Cell, begin
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
@@ -199,7 +199,5 @@ def run(args: argparse.Namespace) -> Report:
 
 
 BENCHMARK = Benchmark(
-    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size",
-    lambda parser: add_options(parser, PROTOCOLS["standard"]),
-    run,
+    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size", run, PROTOCOLS
 )

@@ -16,7 +16,7 @@ from benchmarks.charts import GREY, LEGEND, color, panels, title, unbeaten
 from benchmarks.data import build, read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import add_options, read_protocols
+from benchmarks.protocol import read_protocols
 from benchmarks.study import Cell, begin
 from hqgs.base.files import PLY
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
@@ -132,10 +132,6 @@ def run(args: argparse.Namespace) -> Report:
     return Report(settings, results=result, tables=[files_table(result)], figures={"size": chart(result)})
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
-    text = "write the Gaussians of this run of the scene instead"
-    parser.add_argument("--run-folder", type=Path, metavar="DIR", help=text)
-
-
-BENCHMARK = Benchmark("the size of a scene file against its cost in held-out error", options, run)
+HELP = "write the Gaussians of this run of the scene instead"
+OPTIONS = {"--run-folder": {"type": Path, "metavar": "DIR", "help": HELP}}
+BENCHMARK = Benchmark("the size of a scene file against its cost in held-out error", run, PROTOCOLS, OPTIONS)

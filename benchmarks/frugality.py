@@ -14,7 +14,7 @@ from benchmarks.charts import GREY, LEGEND, color, panels
 from benchmarks.data import read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
-from benchmarks.protocol import Protocol, add_options, read_protocols
+from benchmarks.protocol import Protocol, read_protocols
 from benchmarks.study import Cell, begin
 from hqgs.base.files import PLY
 from hqgs.scene.scene import Scene
@@ -146,9 +146,5 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
-    parser.add_argument("--validate", action="store_true", help="judge by held-back training photos: to tune")
-
-
-BENCHMARK = Benchmark("what leaving out saves and costs, one thing at a time", options, run)
+OPTIONS = {"--validate": {"action": "store_true", "help": "judge by held-back training photos: to tune"}}
+BENCHMARK = Benchmark("what leaving out saves and costs, one thing at a time", run, PROTOCOLS, OPTIONS)

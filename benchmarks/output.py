@@ -18,6 +18,8 @@ from hqgs.base.text import markdown_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from benchmarks.protocol import Protocol
+
 NOTHING = "–"  # in the place of a number that there is not
 
 
@@ -47,25 +49,21 @@ class Benchmark:
     """A subcommand of `python -m benchmarks`."""
 
     help: str
-    add_options: Callable[[argparse.ArgumentParser], None]  # beyond --out, --threads and --quick
     run: Callable[[argparse.Namespace], Report]  # raises ValueError or FileNotFoundError for bad options
+    protocols: dict[str, Protocol] | None = None  # of a study
+    options: Mapping[str, dict[str, Any]] = field(default_factory=dict)  # beyond those of all, for argparse
 
 
-def add_repeats(parser: argparse.ArgumentParser, sizes: dict[str, Any]) -> None:
+def repeats_and_seed(sizes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The options of what is timed: `sizes` has a table for `--quick` and one for `full`."""
-    add: Any = parser.add_argument
     default, quick = (sizes[name]["repeats"] for name in ("full", "quick"))
-    add(
-        "--repeats",
-        type=int,
-        metavar="N",
-        help=f"rounds of each measurement ({default}, with --quick {quick})",
-    )
-    add("--seed", type=int, default=2026, metavar="S", help="of the Gaussians (%(default)s)")
+    rounds = f"rounds of each measurement ({default}, with --quick {quick})"
+    seed = {"type": int, "default": 2026, "metavar": "S", "help": "of the Gaussians (%(default)s)"}
+    return {"--repeats": {"type": int, "metavar": "N", "help": rounds}, "--seed": seed}
 
 
 def with_repeats(sizes: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
-    """The sizes with what the options of `add_repeats` ask for."""
+    """The sizes with what the options of `repeats_and_seed` ask for."""
     repeats = sizes["repeats"] if args.repeats is None else args.repeats
     if repeats < 1:
         raise ValueError(f"repeats is {repeats}, wanted at least 1")

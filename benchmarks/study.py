@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -79,16 +80,12 @@ def grid(protocol: Protocol, scenes: Sequence[Scene], labelled: bool = False, *t
     The files' names hold the tags, and the labels of the rows where they are `labelled`.
     """
     more = {"sfm": True} if "sfm" in tags else {}
-    return [
-        Cell(
-            scene, row, protocol.train_config(row, seed), kind, protocol.downscale,
-            (*([row.label] if labelled else []), *tags), row.more | more,
-        )
-        for seed in protocol.seeds
-        for scene in scenes
-        for kind in protocol.degradations
-        for row in protocol.rows
-    ]  # fmt: skip
+    cells = []
+    for seed, scene, kind, row in product(protocol.seeds, scenes, protocol.degradations, protocol.rows):
+        names = (*([row.label] if labelled else []), *tags)
+        config = protocol.train_config(row, seed)
+        cells.append(Cell(scene, row, config, kind, protocol.downscale, names, row.more | more))
+    return cells
 
 
 class Store:

@@ -20,7 +20,7 @@ from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
 from benchmarks.charts import LEGEND, color, panels, unbeaten
 from benchmarks.data import read_toml
 from benchmarks.measure import Training
-from benchmarks.output import Benchmark, Report, add_repeats, span, table, with_repeats
+from benchmarks.output import Benchmark, Report, repeats_and_seed, span, table, with_repeats
 from benchmarks.protocol import Row
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import measure_threads, thread_counts
@@ -234,8 +234,5 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-BENCHMARK = Benchmark(
-    "error of the rasterizer against its run time, knob by knob",
-    lambda parser: add_repeats(parser, DATA),
-    run,
-)
+HELP = "error of the rasterizer against its run time, knob by knob"
+BENCHMARK = Benchmark(HELP, run, options=repeats_and_seed(DATA))

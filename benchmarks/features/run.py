@@ -17,7 +17,6 @@ from benchmarks.data import read_toml
 from benchmarks.features.switches import DEFAULT, PROTOCOLS, Feature
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, span, table
-from benchmarks.protocol import add_options
 from benchmarks.speed.timing import Seconds, interleaved, quartiles
 from benchmarks.speed.training import still_config, trainer_from
 from benchmarks.study import Cell, Study, begin
@@ -243,9 +242,6 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
-    parser.add_argument("--repeats", type=int, metavar="N", help="rounds of timed steps (15, with --quick 2)")
-
-
-BENCHMARK = Benchmark("what each speed feature saves in time and costs in held-out error", options, run)
+HELP = "what each speed feature saves in time and costs in held-out error"
+OPTIONS = {"--repeats": {"type": int, "metavar": "N", "help": "rounds of timed steps (15, with --quick 2)"}}
+BENCHMARK = Benchmark(HELP, run, PROTOCOLS, OPTIONS)

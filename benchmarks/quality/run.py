@@ -10,7 +10,7 @@ from typing import Any
 from pandas import DataFrame
 
 from benchmarks.output import Benchmark, Report
-from benchmarks.protocol import add_options, read_protocols
+from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
 from benchmarks.quality.cell import edge_robustness, run_cell
 from benchmarks.quality.charts import gain_chart, region_chart, time_chart
@@ -136,15 +136,13 @@ def run(args: argparse.Namespace) -> Report:
     return quality.report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add: Any = parser.add_argument
-    listed = "; ".join(f"{name}: {protocol.help}" for name, protocol in PROTOCOLS.items())
-    add("--protocol", choices=PROTOCOLS, default="standard", metavar="NAME", help=f"{listed} (%(default)s)")
-    add_options(parser, PROTOCOLS["standard"])
-    add("--degradations", nargs="+", metavar="KIND", help="instead of the protocol's")
-    add("--validate", action="store_true", help="for tuning: judge on training photos, leave test views out")
-    add("--sfm", action="store_true", help="poses and points from the degraded photos, the same for all rows")
-    add("--pictures", type=int, default=1, metavar="N", help="sheets per scene and degradation (%(default)s)")
-
-
-BENCHMARK = Benchmark("error of each method over scenes, degradations and seeds", options, run)
+LISTED = "; ".join(f"{name}: {protocol.help}" for name, protocol in PROTOCOLS.items())
+SFM = "poses and points from the degraded photos, the same for all rows"
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": LISTED},
+    "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
+    "--validate": {"action": "store_true", "help": "for tuning: judge on training photos, not on test views"},
+    "--sfm": {"action": "store_true", "help": SFM},
+    "--pictures": {"type": int, "default": 1, "metavar": "N", "help": "sheets per scene and degradation"},
+}
+BENCHMARK = Benchmark("error of each method over scenes, degradations and seeds", run, PROTOCOLS, OPTIONS)

@@ -11,7 +11,7 @@ from typing import Any
 
 import hqgs
 from benchmarks.data import read_toml
-from benchmarks.output import Benchmark, Report, UnavailableError, add_repeats, with_repeats
+from benchmarks.output import Benchmark, Report, UnavailableError, repeats_and_seed, with_repeats
 from benchmarks.speed import tables
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import (
@@ -116,12 +116,11 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add: Any = parser.add_argument
-    listed = ", ".join(PARTS)
-    add("--parts", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART", help=f"of: {listed}")
-    add_repeats(parser, DATA)
-    add("--method", default="3dgs", help=f"of the training step: {', '.join(METHODS)} (%(default)s)")
-
-
-BENCHMARK = Benchmark("time and memory of the rasterizer and of a training step", options, run)
+LISTED = f"of: {', '.join(PARTS)}"
+METHOD = f"of the training step: {', '.join(METHODS)} (%(default)s)"
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--parts": {"nargs": "+", "choices": PARTS, "default": list(PARTS), "metavar": "PART", "help": LISTED},
+    "--method": {"default": "3dgs", "help": METHOD},
+    **repeats_and_seed(DATA),
+}
+BENCHMARK = Benchmark("time and memory of the rasterizer and of a training step", run, options=OPTIONS)

@@ -100,8 +100,5 @@ def chart(rows: Rows) -> Figure:
     return figure
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--long", action="store_true", help="also deep stacks and a large image")
-
-
-BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", options, run)
+OPTIONS = {"--long": {"action": "store_true", "help": "also deep stacks and a large image"}}
+BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", run, options=OPTIONS)
