@@ -99,7 +99,8 @@ class Store:
         self.here = self.root / f"{hqgs.__version__}-{sources()}"
 
     def read(self, key: str) -> Run | None:
-        """The finished run, None where there is none; ValueError for a damaged file."""
+        """The finished run, else the failed one, else None; ValueError for a damaged file."""
+        failed = None
         for path in (self.here / f"{key}.json", self.root / KNOWN / f"{key}.json"):
             if path.is_file():
                 try:
@@ -109,8 +110,10 @@ class Store:
                 except (ValueError, KeyError, TypeError) as error:
                     why = f"{path} is damaged: {error!r}"
                     raise ValueError(f"{why}; remove it, and the run is repeated") from error
-                return run
-        return None
+                if "error" not in run:
+                    return run
+                failed = run
+        return failed
 
     def write(self, run: Run) -> None:
         write_json(self.here / f"{run['key']}.json", run)

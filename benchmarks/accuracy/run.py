@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-import hqgs
 from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
 from benchmarks.charts import LEGEND, color, panels, unbeaten
 from benchmarks.data import read_toml
@@ -24,7 +23,7 @@ from benchmarks.output import Benchmark, Report, repeats_and_seed, span, table, 
 from benchmarks.protocol import Row
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import measure_threads, thread_counts
-from benchmarks.speed.timing import interleaved, quartiles, whole
+from benchmarks.speed.timing import interleaved, quartiles, using_threads, whole
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.render import render_view
 from hqgs.scene.builtin import embedded_scene
@@ -77,17 +76,13 @@ def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[dict[str, Any
     """Seconds with each number of threads, and the largest difference to one thread in any output."""
     case = TunedPass(inputs, Knobs())
     rows = measure_threads({"default": case}, repeats)
-    before = hqgs.get_num_threads()
-    try:
-        hqgs.set_num_threads(1)
+    with using_threads(1):
         one = case.outputs()
-        for row in rows:
-            hqgs.set_num_threads(row["threads"])
+    for row in rows:
+        with using_threads(row["threads"]):
             several = case.outputs()
-            row["difference"] = max(float((several[name] - one[name]).abs().max()) for name in one)
-            row["same_bits"] = all(torch.equal(several[name], one[name]) for name in one)
-    finally:
-        hqgs.set_num_threads(before)
+        row["difference"] = max(float((several[name] - one[name]).abs().max()) for name in one)
+        row["same_bits"] = all(torch.equal(several[name], one[name]) for name in one)
     return rows
 
 

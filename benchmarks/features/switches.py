@@ -18,19 +18,10 @@ import hqgs
 from benchmarks import places
 from benchmarks.accuracy.knobs import Knobs, tuned
 from benchmarks.protocol import Row, read_protocols
+from benchmarks.speed.timing import using_threads
 from hqgs.model.rasterization import RasterizationMeta
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = hqgs.get_num_threads()
-    hqgs.set_num_threads(count)
-    try:
-        yield
-    finally:
-        hqgs.set_num_threads(before)
 
 
 @contextmanager
@@ -100,7 +91,7 @@ SWITCHES: dict[str, Callable[[], Any]] = {  # context managers: inside them the 
     "every block": partial(tuned, Knobs(skip_blocks=False)),
     "torch's loss": partial(_in_torch, places.LOSS, torch_loss),
     "torch's Adam": partial(_in_torch, places.ADAM, TorchAdam),
-    "one thread": partial(_threads, 1),
+    "one thread": partial(using_threads, 1),
 }
 
 

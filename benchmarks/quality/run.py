@@ -13,8 +13,7 @@ from benchmarks.output import Benchmark, Report
 from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
 from benchmarks.quality.cell import edge_robustness, run_cell
-from benchmarks.quality.charts import gain_chart, region_chart, time_chart
-from benchmarks.quality.pictures import write_sheet
+from benchmarks.quality.charts import gain_chart, region_chart, time_chart, write_sheet
 from benchmarks.quality.tables import frame_of, summary
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text

@@ -21,7 +21,15 @@ from benchmarks.charts import BLUE, LEGEND, ORANGE, panels
 from benchmarks.output import UnavailableError
 from benchmarks.places import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
-from benchmarks.speed.timing import Seconds, StageClock, exponent, interleaved, median_ratio, whole
+from benchmarks.speed.timing import (
+    Seconds,
+    StageClock,
+    exponent,
+    interleaved,
+    median_ratio,
+    using_threads,
+    whole,
+)
 from benchmarks.speed.work import count_work
 from hqgs.base.threads import one_torch_thread
 
@@ -135,17 +143,13 @@ def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> li
 
     def with_threads(case: Callable[[], Seconds], count: int) -> Callable[[], Seconds]:
         def call() -> Seconds:
-            hqgs.set_num_threads(count)
-            return warmed(case)()  # new threads start with no memory of their own
+            with using_threads(count):
+                return warmed(case)()  # new threads start with no memory of their own
 
         return call
 
-    rows = []
     jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
-    try:
-        measured = interleaved(jobs, repeats)
-    finally:
-        hqgs.set_num_threads(threads[-1])
+    measured, rows = interleaved(jobs, repeats), []
     for key, rounds in measured.items():
         name, count = key.rsplit("/", 1)
         line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}

@@ -13,6 +13,8 @@ from unittest.mock import patch
 import numpy as np
 from pandas import DataFrame
 
+import hqgs
+
 Seconds = dict[str, float]  # by stage; "total" is the whole, and what no stage holds is "rest"
 
 
@@ -34,6 +36,17 @@ def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dic
         if collecting:
             gc.enable()
     return {name: DataFrame(rounds) for name, rounds in measured.items()}
+
+
+@contextmanager
+def using_threads(count: int) -> Iterator[None]:
+    """Inside it the crate has this many threads."""
+    before = hqgs.get_num_threads()
+    hqgs.set_num_threads(count)
+    try:
+        yield
+    finally:
+        hqgs.set_num_threads(before)
 
 
 def quartiles(values: Any) -> list[float]:
