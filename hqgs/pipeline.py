@@ -11,7 +11,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.base.files import CHECKPOINT, PLY, lock_folder, remove_leftovers
+from hqgs import __version__
+from hqgs.base.files import CHECKPOINT, CONFIG, PLY, lock_folder, remove_leftovers, write_json
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
@@ -22,6 +23,7 @@ from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
+from hqgs.training.settings import config_values
 from hqgs.training.trainer import Step, Trainer
 
 
@@ -93,7 +95,7 @@ def train(
 
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
-        out: a folder for checkpoint.safetensors, scene.ply, report.json, `comparison/*.png`
+        out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, `comparison/*.png`
             and error_vs_time.png; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
@@ -106,7 +108,8 @@ def train(
         formation: what hqgs takes for the photos' degradation, as `hqgs.degrade` reads it; "auto": it looks.
         eval_every: iterations between evaluations; None: a tenth of the run.
         config: the whole configuration, in place of the seven before it.
-        resume: go on from the checkpoint in `out`, if there is one.
+        resume: go on from the checkpoint in `out`, if there is one; a run that has come to its end goes on
+            where `iterations` is larger, with the schedule of the longer run from there on.
         overwrite: begin anew in a folder that holds a run.
         progress: is called after each step.
 
@@ -155,6 +158,8 @@ def open_run(
             checkpoint.unlink(missing_ok=True)
         elif checkpoint.exists():
             trainer.restore(checkpoint)
+        asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
+        write_json(Path(out) / CONFIG, asked)
         yield trainer
 
 
@@ -249,6 +254,11 @@ def _notes(trainer: Trainer) -> list[str]:
     own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
     if more := trainer.first_points - own:
         notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+    if trainer.lengthened is not None:
+        notes.append(
+            f"the run had ended at iteration {trainer.lengthened}; from there on its schedule is that of "
+            f"{trainer.config.iterations} iterations: learning rates rose again"
+        )
     if left < 1:
         why = "pixels held back from the noisy photos showed no gain any more"
         notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")

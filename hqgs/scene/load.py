@@ -110,7 +110,7 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
     ValueError where it holds neither.
     """
     root = existing_folder(path)
-    if _formats(root, downscale) or (found := bare_photos(root, downscale)) is None:
+    if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
     chosen = sorted({round(k) for k in np.linspace(0, len(photos.names) - 1, most)})
@@ -132,7 +132,7 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
     return Scene(root.name, views, [], *nothing, "photos", notes if photos.unreadable else [])
 
 
-def _formats(root: Path, downscale: float) -> list[str]:
+def formats_of(root: Path, downscale: float) -> list[str]:
     """Names of the formats that a folder is in."""
     has_model, has_photos = bool(find_models(root)), photo_folder(root, downscale) is not None
     others = [name for name in (SINGLE, TRAIN, POSES) if (root / name).is_file()]
@@ -140,7 +140,7 @@ def _formats(root: Path, downscale: float) -> list[str]:
 
 
 def _read(root: Path, downscale: float, keep_sfm: Path | None, told: OnStage, sfm: bool) -> Capture:
-    formats = _formats(root, downscale)
+    formats = formats_of(root, downscale)
     others = [name for name in formats if name != COLMAP]
     if COLMAP in formats:
         capture = read_colmap(root, downscale)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,9 @@ class Scene:
     tracks: Tracks | None = None  # of the points, px of the views; None: its files do not tell
     seen: dict[str, NDArray[np.intp]] | None = None  # rows of the points that each photo shows; None as above
     sfm: SfmReport | None = None  # of poses and points from the photos; None: they are its files'
+    origin: dict[str, Any] | None = (
+        None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
+    )
 
     @property
     def extent(self) -> float:

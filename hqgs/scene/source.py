@@ -5,12 +5,13 @@ The command line and `import hqgs` both call what is here, so that both have one
 
 from __future__ import annotations
 
+import json
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hqgs.base.files import EMBEDDED, is_film
+from hqgs.base.files import CONFIG, EMBEDDED, is_film
 from hqgs.base.stages import OnStage, untold
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import embedded_scene
@@ -69,6 +70,18 @@ def load(
         FileNotFoundError: a folder, photo or file of weights that is not there.
         ValueError: anything else that is wrong; the message names the file or the photo.
     """
+    origin = {
+        "path": EMBEDDED if str(path) == EMBEDDED else str(Path(path).resolve()),
+        "downscale": downscale,
+        "test_every": test_every,
+        "sfm": sfm,
+        "degrade": degrade,
+        "seed": seed,
+        "restore": None if restore is None else str(Path(restore).resolve()),
+        "skip_unreadable": skip_unreadable,
+        "longest": longest,
+        "frames": frames,
+    }
     degradation = parse_degradation(degrade)
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
@@ -103,7 +116,23 @@ def load(
         scene = degrade_scene(scene, degradation, seed)
     if sfm and (scene.source != "photos" or degradation.steps):
         scene = sfm_scene(scene, models, told)
-    return scene if restore is None else restore_scene(scene, restore)
+    scene = scene if restore is None else restore_scene(scene, restore)
+    return replace(scene, origin=origin)
+
+
+def load_again(run: str | Path, told: OnStage = untold) -> Scene:
+    """The scene that the run in a folder was trained on, from the photos, where they still lie.
+
+    ValueError where its config.json does not tell, FileNotFoundError where the photos are gone.
+    """
+    path = Path(run) / CONFIG
+    try:
+        origin = json.loads(path.read_text(encoding="utf-8"))["scene"]
+        return load(**origin, cache=run, told=told)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"the photos of the run {run} are not known: {error}") from error
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} does not tell which scene was trained: {error!r}") from error
 
 
 def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = None) -> Scene:

@@ -27,6 +27,7 @@ ITEMS = {
 ASKED_FOR = ("resolution", "iterations")  # not automatic: the first costs, a number of iterations means it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
+CLOSEST = 50  # iterations between evaluations, unless asked for: each one takes as long as some steps
 Loss = Literal["l1", "l1+dssim", "l1+scs"]
 
 
@@ -203,10 +204,10 @@ class TrainConfig:
     configuration of a run as a user asks for it.
     """
 
-    iterations: int = 30_000
-    method: str = AUTO
-    seed: int = 0
-    sh_degree: int = MAX_SH_DEGREE
+    iterations: int = 30_000  # training steps
+    method: str = AUTO  # one of METHODS
+    seed: int = 0  # of everything random
+    sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
     lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
     lr_means_final: float = 1.6e-6  # this at the end of the run
@@ -242,14 +243,14 @@ class TrainConfig:
     def scaled(self) -> TrainConfig:
         """The same run with the schedule fitted to `iterations`; see `DensifyConfig.scaled` too.
 
-        The SH degrees come in within three sevenths of a short run. Evaluates 10 times; saves every 1,000
-        iterations, in short runs 10 times.
+        The SH degrees come in within three sevenths of a short run. Evaluates 10 times, but not more often
+        than every 50 iterations; saves every 1,000 iterations, in short runs 10 times.
         """
         tenth = math.ceil(self.iterations / 10)
         return replace(
             self,
             sh_interval=min(self.sh_interval, max(1, self.iterations // 7)),
-            eval_every=tenth,
+            eval_every=max(tenth, CLOSEST),
             checkpoint_every=min(self.checkpoint_every, tenth),
             densify=self.densify.scaled(self.iterations),
         )

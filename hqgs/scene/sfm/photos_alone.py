@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,56 @@ from scipy.spatial.transform import Rotation
 
 from hqgs.base.stages import OnStage, untold
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
-from hqgs.scene.formats.colmap import model_points, seen_points
+from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, Tracks
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.run import run_colmap
 
 UP = np.array([0.0, -1.0, 0.0])  # in the world of photos alone, as in an upright camera's frame
 LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
+
+
+@dataclass(frozen=True)
+class Found:
+    """What COLMAP found in photos alone, upright."""
+
+    photos: BarePhotos  # those that can be read
+    model: pycolmap.Reconstruction
+    report: SfmReport
+
+
+def find_cameras(root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold) -> Found:
+    """Cameras and points of photos alone, by COLMAP, as `read_photos` has them."""
+    photos = readable(photos, told)
+    names = photos.colmap_names
+    try:
+        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, told)
+        poses = ran.poses()
+    except ValueError as error:
+        raise ValueError(f"{root}: {error}") from error
+    model = ran.found
+    turns = {name: exif.turn for name, exif in zip(photos.names, photos.exif, strict=True)}
+    upright = _upright(np.stack(list(poses.values())), [turns[names[name]] for name in poses])
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
+    report = SfmReport(
+        photos=len(names),
+        not_registered=[name for own, name in names.items() if own not in poses],
+        outliers=[],
+        rotation_error_deg=None,
+        translation_error=None,
+        own_cameras_px=None,
+        points=model.num_points3D(),
+        point_distance=None,
+        track_length=model.compute_mean_track_length(),
+        reprojection_error_px=model.compute_mean_reprojection_error(),
+        own_points=None,
+        own_track_length=None,
+        own_reprojection_error_px=None,
+        unreadable=photos.unreadable,
+        first_pass=ran.first_pass,
+        advice=ran.advice(),
+    )
+    return Found(photos, model, report)
 
 
 def read_photos(root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold) -> Capture:
@@ -29,42 +73,14 @@ def read_photos(root: Path, photos: BarePhotos, keep: Path | None = None, told: 
     turned so that the photos' mean up is -y; up is what EXIF says of how each was held. `keep`: a folder for
     the reconstruction, see `run_colmap`. ValueError where COLMAP cannot make a model of half of the photos.
     """
-    photos = readable(photos, told)
-    names = photos.colmap_names
-    try:
-        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, told)
-        model, poses = ran.found, ran.poses()
-    except ValueError as error:
-        raise ValueError(f"{root}: {error}") from error
-    turns = {name: exif.turn for name, exif in zip(photos.names, photos.exif, strict=True)}
-    upright = _upright(np.stack(list(poses.values())), [turns[names[name]] for name in poses])
-    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
-    poses = ran.poses()
-    cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    cameras = find_cameras(root, photos, keep, told)
+    model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
+    of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     found = [
-        Photo(names[name], photos.folder / names[name], cameras[name], viewmat, find_mask(root, names[name]))
-        for name, viewmat in poses.items()
+        Photo(names[name], folder / names[name], of_image[name], viewmat, find_mask(root, names[name]))
+        for name, viewmat in registered(model).items()
     ]
-    tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
-    report = SfmReport(
-        photos=len(names),
-        not_registered=[name for own, name in names.items() if own not in poses],
-        outliers=[],
-        rotation_error_deg=None,
-        translation_error=None,
-        own_cameras_px=None,
-        points=model.num_points3D(),
-        point_distance=None,
-        track_length=tracks.length,
-        reprojection_error_px=tracks.error,
-        own_points=None,
-        own_track_length=None,
-        own_reprojection_error_px=None,
-        unreadable=photos.unreadable,
-        first_pass=ran.first_pass,
-        advice=ran.advice(),
-    )
-    notes = [str(report), *photos.notes]
+    notes = [str(cameras.report), *cameras.photos.notes]
     points, colors = keep_finite(*model_points(model), notes)
     seen = None
     if len(points) == model.num_points3D():
@@ -72,14 +88,14 @@ def read_photos(root: Path, photos: BarePhotos, keep: Path | None = None, told: 
     return Capture(
         "photos",
         found,
-        photos.downscale,
+        cameras.photos.downscale,
         points,
         colors,
-        folder=photos.folder,
+        folder=folder,
         notes=notes,
-        tracks=tracks,
+        tracks=Tracks(cameras.report.track_length, cameras.report.reprojection_error_px),
         seen=seen,
-        sfm=report,
+        sfm=cameras.report,
     )
 
 
