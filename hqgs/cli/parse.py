@@ -20,7 +20,7 @@ WORDS = {  # tyro's, and ours
     r"Unrecognized options?:": "there is no option",
     r"Missing from hqgs \w+:": "missing:",
     r"Perhaps you meant:": "- did you mean",
-    r"Error parsing (\S+): no type matching (\S+) could be instantiated from \['?(.*?)'?\]\.": r"\1 is \3, wanted \2",
+    r"Error parsing (\S+): no type matching (\S+) could be .*? from \['?(.*?)'?\]\.": r"\1 is \3, wanted \2",
     r"Error parsing \S+: (?!no type)": "",
 }
 GPU = ("--device", "--cuda", "--gpu", "--gpus")

@@ -21,7 +21,7 @@ from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
 from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
-from hqgs.training.config import AUTO, GUIDANCES, ITEMS, METHODS, NONE, TrainConfig, run_config
+from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
 from hqgs.training.settings import PRESETS, read_config, with_iterations
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ class Train(Photos):
     formation: Annotated[str | None, tyro.conf.arg(metavar="KIND", help_behavior_hint="")] = None
     """What hqgs takes for the photos' degradation (auto: it looks)."""
     guidance: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", help_behavior_hint="", help=f"Of hqgs: {' or '.join(GUIDANCES)}."),
+        Literal["formation", "paper"] | None,
+        tyro.conf.arg(help="Of hqgs: formation, or paper, its published form.", help_behavior_hint=""),
     ] = None
     leave_out: Annotated[
         str | None,
@@ -166,8 +166,8 @@ def run(options: Train) -> int:
             scene = _load(options, config, screen)
         tell_notes(scene)
         loading = time.perf_counter() - started
+        print(f"looking at the photos, then at most {config.iterations:,} iterations", flush=True)
         with TrainingScreen() as bar:
-            bar.say(f"preparing: looking at the photos ({config.iterations:,} iterations at most)")
             done = hqgs.train(
                 scene,
                 out=options.out,
@@ -183,7 +183,7 @@ def run(options: Train) -> int:
     except hqgs.TrainingError as error:
         return fail(1, str(error))
     total = time.perf_counter() - started
-    _summary(options.out, done, loading, screen.colmap_seconds, total)
+    _summary(options, done, loading, screen.colmap_seconds, total)
     if not done.finished:
         command = shlex.join(["hqgs", "train", options.scene, "--out", str(options.out), "--resume"])
         print(
@@ -209,8 +209,8 @@ def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
     )
 
 
-def _summary(out: Path, done: Run, loading: float, colmap: float, total: float) -> None:
-    last = done.history[-1]
+def _summary(options: Train, done: Run, loading: float, colmap: float, total: float) -> None:
+    out, last = options.out, done.history[-1]
     numbers = [f"{done.iterations} iterations", f"{len(done.model)} Gaussians", f"{done.seconds:.0f} s"]
     numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
     numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
@@ -219,7 +219,8 @@ def _summary(out: Path, done: Run, loading: float, colmap: float, total: float) 
         print(table)
     word, why = verdict(last["psnr"])
     print(f"quality: {word} ({why})")
-    parts = [f"training {duration(done.seconds)}", f"loading {duration(loading)}"]
+    before = " with what was done before" if options.resume else ""
+    parts = [f"training {duration(done.seconds)}{before}", f"loading {duration(loading)}"]
     if colmap >= 1:
         parts[1] += f" (of it COLMAP {duration(colmap)})"
     print(f"time: {duration(total)}: {', '.join(parts)}, the rest evaluation and report")
