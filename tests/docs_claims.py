@@ -33,10 +33,11 @@ TOOLS = ("pip", "pytest", "ruff", "sphinx-build")  # of others, whose flags are 
 @lru_cache(maxsize=1)
 def _hqgs_commands() -> dict[str, argparse.ArgumentParser]:
     options = {name: importlib.import_module(one.module).OPTIONS for name, one in COMMANDS.items()}
-    return {
+    parsers: dict[str, Any] = {
         name: tyro.extras.get_parser(Whole if name == "train" else kind, prog=name, config=MARKERS)
         for name, kind in options.items()
     }
+    return parsers
 
 
 def hqgs_parser() -> argparse.ArgumentParser:

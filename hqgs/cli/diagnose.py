@@ -31,7 +31,7 @@ def run(options: Diagnose) -> int:
         ready(options.scene)
         from hqgs.scene.source import pictures  # here: it loads torch
 
-        scene = pictures(options.scene, downscale=options.downscale or 1.0)
+        scene = pictures(options.scene, downscale=1.0 if options.downscale is None else options.downscale)
         diagnosis = hqgs.diagnose(scene)
         if options.out is not None:
             write_json(options.out, asdict(diagnosis))

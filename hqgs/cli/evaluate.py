@@ -51,7 +51,11 @@ def run(options: Evaluate) -> int:
             if options.scene is None:
                 scene = load_again(options.source, told=screen)
             else:
-                scene = load(options.scene, downscale=options.downscale or 1.0, told=screen)
+                scene = load(
+                    options.scene,
+                    downscale=1.0 if options.downscale is None else options.downscale,
+                    told=screen,
+                )
         if not scene.test:
             raise ValueError(f"{scene.name} has no held-out photo to measure with")
         views = held_out_renders(scene, Gaussians.load(source))

@@ -70,10 +70,9 @@ def tell_notes(scene: Scene) -> None:
     sys.stdout.flush()
 
 
-def load(photos: Photos, told: OnStage, **more: object) -> Scene:
+def load(photos: Photos, told: OnStage) -> Scene:
     """The scene of a command that takes no more than the photos."""
     from hqgs.scene.source import load as load_source  # here: it loads torch
 
-    return load_source(
-        photos.scene, downscale=photos.downscale or 1.0, skip_unreadable=False, told=told, **more
-    )  # pyright: ignore[reportArgumentType]
+    downscale = 1.0 if photos.downscale is None else photos.downscale
+    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, told=told)
