@@ -291,3 +291,46 @@ def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
 
     monkeypatch.setattr(source, "embedded_scene", interrupting)
     assert call("train", "embedded", "--out", tmp_path) == 130
+
+
+def test_a_resumed_run_has_the_scene_that_it_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its size, its held-out views and its degradation, without saying them again."""
+    calls: list[dict[str, Any]] = []
+
+    def load(path: str, downscale: float, **more: Any) -> Scene:
+        calls.append({"downscale": downscale, **more})
+        return tiny_scene()
+
+    monkeypatch.setattr(source, "load_scene", load)
+    (tmp_path / "photos").mkdir()
+    command = ["train", tmp_path / "photos", "--out", tmp_path / "run"]
+    options = ["--preset", "quick", "--iterations", "3", "--test-every", "5", "--degrade", "noise:9"]
+    assert call(*command, *options) == 0
+    assert (calls[0]["longest"], calls[0]["test_every"]) == (480, 5)
+    assert call(*command, "--resume") == 0
+    assert {**calls[1], "told": None} == {**calls[0], "told": None}
+    assert call(*command, "--resume", "--iterations", "5") == 0
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["iterations"] == 5
+    assert call(*command, "--resume", "--downscale", "2") == 0
+    assert (calls[3]["longest"], calls[3]["downscale"]) == (None, 2.0)
+
+
+def test_the_last_lines_say_how_good_it_is_and_what_to_do(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call("train", "embedded", "--out", tmp_path, "--iterations", "3") == 0
+    *_, quality, time, now = capsys.readouterr().out.splitlines()
+    assert quality.startswith("quality: poor (below 20 dB ")
+    assert "loading" in time
+    assert "preparing" in time
+    assert now.startswith(f"now open {tmp_path / 'scene.ply'} in SuperSplat")
+    assert call("info", tmp_path) == 0
+    assert "3 of 3 iterations" in capsys.readouterr().out
+    assert call("eval", tmp_path) == 0
+    assert "view0.png" in capsys.readouterr().out
+
+
+def test_a_start_that_fails_leaves_no_folder(asked: list[dict[str, Any]], tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "run"
+    assert call("train", "embedded", "--out", out, "--max-gaussians", "9") == 2
+    assert list(tmp_path.iterdir()) == []

@@ -111,6 +111,9 @@ def test_it_tells_which_photos_show_which_points(found: Scene) -> None:
 def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> None:
     report = found.sfm
     assert report is not None
+    assert report.translation_error is not None
+    assert report.rotation_error_deg is not None
+    assert report.own_cameras_px is not None
     errors = [
         np.linalg.norm(new.camera.center - own.camera.center) / cards.extent
         for new, own in zip(found.train, cards.train, strict=True)

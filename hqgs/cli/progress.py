@@ -93,9 +93,13 @@ class TrainingScreen(Screen):
         self._held_out = "not measured yet"
         self._first: tuple[int, float] | None = None  # iteration and seconds from which on steps are timed
         self._told = False
+        self.began: float | None = None  # `time.perf_counter` after the first step
+        self.ended: float | None = None  # and after the last one
 
     def __call__(self, now: Progress) -> None:
         """Show a step."""
+        self.ended = time.perf_counter()
+        self.began = self.began or self.ended
         if now.evaluated is not None:
             psnr = now.evaluated["psnr"]
             self._held_out = "no PSNR" if psnr is None else f"{psnr:.2f} dB"

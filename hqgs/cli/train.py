@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
 import time
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
 
 EXPERT = "--config."
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames")  # options that shape the scene
 VIEWERS = "SuperSplat (superspl.at/editor) or any other viewer of 3DGS files"
 
 
@@ -101,6 +103,27 @@ class Whole(Train):
 OPTIONS = Train
 
 
+@dataclass(frozen=True)
+class Times:
+    """When the parts of a command began, s."""
+
+    start: float
+    loaded: float
+    trained_from: float
+    trained_to: float
+    end: float
+
+    def told(self, colmap: float) -> str:
+        """How long each part took; `colmap`: s, of the loading."""
+        of_it = f" (COLMAP {duration(colmap)})" if colmap >= 1 else ""
+        return (
+            f"{duration(self.end - self.start)}: loading {duration(self.loaded - self.start)}{of_it}, "
+            f"preparing {duration(self.trained_from - self.loaded)}, "
+            f"training {duration(self.trained_to - self.trained_from)}, "
+            f"report {duration(self.end - self.trained_to)}"
+        )
+
+
 def read(options: type[Train], command: str, about: str, arguments: Sequence[str]) -> Train:
     """As `parse`; options of the configuration change what the other options come to."""
     if "--help-all" in arguments:
@@ -146,6 +169,17 @@ def config_of(options: Train) -> TrainConfig:
     return replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
 
 
+def scene_of_run(out: Path) -> dict[str, Any]:
+    """What the run in a folder asked `hqgs.load` for; empty where nothing tells."""
+    if not ((out / CONFIG).is_file() and (out / CHECKPOINT).is_file()):
+        return {}
+    try:
+        origin = json.loads((out / CONFIG).read_text(encoding="utf-8")).get("scene") or {}
+    except (ValueError, AttributeError):
+        return {}
+    return {name: value for name, value in origin.items() if name in (*LOADING, "longest")}
+
+
 def run(options: Train) -> int:
     """Train what the options say; return the exit code."""
     started = time.perf_counter()
@@ -165,7 +199,7 @@ def run(options: Train) -> int:
         with LoadingScreen() as screen:
             scene = _load(options, config, screen)
         tell_notes(scene)
-        loading = time.perf_counter() - started
+        loaded = time.perf_counter()
         print(f"looking at the photos, then at most {config.iterations:,} iterations", flush=True)
         with TrainingScreen() as bar:
             done = hqgs.train(
@@ -182,8 +216,8 @@ def run(options: Train) -> int:
         return fail(1, f"{options.out}: {error}")
     except hqgs.TrainingError as error:
         return fail(1, str(error))
-    total = time.perf_counter() - started
-    _summary(options, done, loading, screen.colmap_seconds, total)
+    times = Times(started, loaded, bar.began or loaded, bar.ended or loaded, time.perf_counter())
+    _summary(options, done, screen.colmap_seconds, times)
     if not done.finished:
         command = shlex.join(["hqgs", "train", options.scene, "--out", str(options.out), "--resume"])
         print(
@@ -193,23 +227,24 @@ def run(options: Train) -> int:
 
 
 def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
+    """The scene; where a run goes on, as it was, but for what the options say otherwise."""
+    asked: dict[str, Any] = {
+        name: value for name in LOADING if (value := getattr(options, name)) != getattr(Train, name)
+    }
+    sized = options.downscale is not None or options.preset != Train.preset
+    before = scene_of_run(options.out) if options.resume else {}
+    if sized or not before:
+        asked["longest"] = PRESETS[options.preset].longest if options.downscale is None else None
+        before.pop("downscale", None)
     return hqgs.load(
-        options.scene,
-        downscale=options.downscale if options.downscale is not None else 1.0,
-        longest=PRESETS[options.preset].longest if options.downscale is None else None,
-        test_every=options.test_every,
-        sfm=options.sfm,
-        degrade=options.degrade,
-        seed=config.seed,
-        restore=options.restore,
+        **(before | asked | {"path": options.scene, "seed": config.seed}),
         skip_unreadable="photos" in config.leave_out,
         cache=options.out,
-        frames=options.frames,
         told=screen,
     )
 
 
-def _summary(options: Train, done: Run, loading: float, colmap: float, total: float) -> None:
+def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     out, last = options.out, done.history[-1]
     numbers = [f"{done.iterations} iterations", f"{len(done.model)} Gaussians", f"{done.seconds:.0f} s"]
     numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
@@ -219,9 +254,5 @@ def _summary(options: Train, done: Run, loading: float, colmap: float, total: fl
         print(table)
     word, why = verdict(last["psnr"])
     print(f"quality: {word} ({why})")
-    before = " with what was done before" if options.resume else ""
-    parts = [f"training {duration(done.seconds)}{before}", f"loading {duration(loading)}"]
-    if colmap >= 1:
-        parts[1] += f" (of it COLMAP {duration(colmap)})"
-    print(f"time: {duration(total)}: {', '.join(parts)}, the rest evaluation and report")
+    print(f"time: {times.told(colmap)}")
     print(f"now open {out / 'scene.ply'} in {VIEWERS}; the numbers are in {out / 'report.json'}")

@@ -127,7 +127,7 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
         ],
         photos.downscale,
     )
-    notes = [f"{len(photos.unreadable)} files cannot be read: {some(sorted(photos.unreadable))}"]
+    notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
     nothing = no_points()
     return Scene(root.name, views, [], *nothing, "photos", notes if photos.unreadable else [])
 

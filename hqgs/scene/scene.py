@@ -129,7 +129,7 @@ class SfmReport:
             )
         if self.unreadable:
             files = ", ".join(f"{name} ({why})" for name, why in self.unreadable.items())
-            text += f"; {len(self.unreadable)} files left out, as they cannot be read: {files}"
+            text += f"; left out, as they cannot be read ({len(self.unreadable)}): {files}"
         if self.advice is not None:
             text += f". {self.advice}"
         return text

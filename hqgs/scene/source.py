@@ -96,8 +96,9 @@ def load(
         scene = embedded_scene(cache=None if kept is None else kept / "scene", width=width, height=height)
     else:
         with ExitStack() as stack:
-            notes = list[str]()
+            notes, name = list[str](), None
             if is_film(path):
+                name = Path(path).stem
                 folder = kept or Path(stack.enter_context(TemporaryDirectory(prefix="hqgs-film-")))
                 path, note = film_frames(Path(path), folder / "frames", frames, told)
                 notes.append(note)
@@ -111,7 +112,7 @@ def load(
                 told=told,
                 sfm=sfm,
             )
-            scene = replace(scene, notes=[*notes, *scene.notes])
+            scene = replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
     if degradation.steps:
         scene = degrade_scene(scene, degradation, seed)
     if sfm and (scene.source != "photos" or degradation.steps):
