@@ -20,10 +20,9 @@ from benchmarks.quality.regions import edge_robustness
 from benchmarks.quality.summary import frame_of, summary
 from benchmarks.scenes import load_scenes, trained
 from benchmarks.study import Cell, Study, grid, open_study
-from hqgs.base.files import write_text
+from hqgs.base.files import KEPT, write_text
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.reconstruct import KEPT
 
 PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml")
 SMOKE = "smoke"

@@ -20,6 +20,7 @@ EMBEDDED = "embedded"  # in the place of a scene folder: the scene that is built
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 CHECKPOINT, PLY, CONFIG = "checkpoint.safetensors", "scene.ply", "config.json"
+KEPT = "sfm"  # in the folder of a run: what COLMAP found
 
 
 @contextmanager

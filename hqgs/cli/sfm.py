@@ -22,18 +22,24 @@ class Sfm:
     """Frames to take from a film (two a second, 30 to 90)."""
 
 
+WORK = ".sfm"  # in the new folder, while COLMAP works
 OPTIONS = Sfm
 
 
 def run(options: Sfm) -> int:
     """Write the scene; return the exit code (0 done, 1 failed, 2 bad input)."""
     try:
-        check_new_folder(options.out)
+        if not (options.out / WORK).is_dir():  # of a call that was stopped
+            check_new_folder(options.out)
         ready(options.scene)
         from hqgs.scene.sfm.folder import write_colmap_folder  # here: it loads torch
 
         with LoadingScreen() as screen:
-            report = write_colmap_folder(options.scene, options.out, options.frames, screen)
+            report = write_colmap_folder(
+                options.scene, options.out, options.out / WORK, options.frames, screen
+            )
+    except KeyboardInterrupt:
+        return fail(130, "stopped; the same command goes on with what COLMAP has found")
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 import hqgs
-from hqgs.base.files import CHECKPOINT, CONFIG
+from hqgs.base.files import CHECKPOINT, CONFIG, KEPT
 from hqgs.base.left_out import format_left_out
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
@@ -216,6 +216,13 @@ def run(options: Train) -> int:
         return fail(1, f"{options.out}: {error}")
     except hqgs.TrainingError as error:
         return fail(1, str(error))
+    except KeyboardInterrupt:
+        if (options.out / CHECKPOINT).exists():
+            return fail(130, "stopped at once; --resume goes on from the last checkpoint")
+        found = (
+            " The same command goes on with what COLMAP has found" if (options.out / KEPT).exists() else ""
+        )
+        return fail(130, f"stopped before the first checkpoint.{found}")
     times = Times(started, loaded, bar.began or loaded, bar.ended or loaded, time.perf_counter())
     _summary(options, done, screen.colmap_seconds, times)
     if not done.finished:

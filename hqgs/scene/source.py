@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hqgs.base.files import CONFIG, EMBEDDED, is_film
+from hqgs.base.files import CONFIG, EMBEDDED, KEPT, is_film
 from hqgs.base.stages import OnStage, untold
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import embedded_scene
@@ -20,7 +20,7 @@ from hqgs.scene.film import film_frames
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
+from hqgs.scene.sfm.reconstruct import sfm_scene
 
 EMBEDDED_SIZE = (504, 378)  # pixels
 EMBEDDED_TEST_EVERY = 8

@@ -19,13 +19,13 @@ from hqgs.scene.sfm.photos_alone import find_cameras
 
 
 def write_colmap_folder(
-    source: str | Path, out: Path, frames: int | None = None, told: OnStage = untold
+    source: str | Path, out: Path, work: Path, frames: int | None = None, told: OnStage = untold
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 
-    `images` has every photo that can be read: others of WebP or HEIC as JPEG, the rest as they are. While it
-    runs the folder holds COLMAP's work, with which the next call goes on. ValueError where there are no
-    photos, or COLMAP finds no scene in them.
+    `images` has every photo with a place: those of WebP or HEIC as JPEG, the others as they are. `work` is a
+    folder for what the next call goes on with if this one is stopped; it is removed at the end. ValueError
+    where there are no photos, or COLMAP finds no scene in them.
     """
     with TemporaryDirectory(prefix="hqgs-film-") as name:
         if is_film(source):
@@ -34,7 +34,7 @@ def write_colmap_folder(
         photos = bare_photos(root, 1.0)
         if photos is None:
             raise ValueError(f"{root} holds no photos")
-        found = find_cameras(root, photos, out / ".sfm", told)
+        found = find_cameras(root, photos, work, told)
         images = out / "images"
         for image in found.model.images.values():
             original = found.photos.colmap_names[image.name]
@@ -48,5 +48,5 @@ def write_colmap_folder(
         (out / "sparse" / "0").mkdir(parents=True)
         model: pycolmap.Reconstruction = found.model
         model.write_binary(out / "sparse" / "0")
-        shutil.rmtree(out / ".sfm", ignore_errors=True)
+        shutil.rmtree(work, ignore_errors=True)
         return found.report

@@ -18,8 +18,6 @@ from hqgs.scene.scene import Scene, SfmReport, Tracks, View
 from hqgs.scene.sfm.align import Observations, align, camera_centers, refine, rotation_angles
 from hqgs.scene.sfm.run import run_colmap
 
-KEPT = "sfm"  # in the folder of a run: its reconstructions
-
 
 def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
