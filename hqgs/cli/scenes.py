@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from hqgs.base.files import EMBEDDED, existing_folder, is_film
+from hqgs.cli.errors import fail
 
 if TYPE_CHECKING:
     from hqgs.base.stages import OnStage
@@ -50,11 +52,20 @@ def ready(scene: str) -> None:
     warnings.filterwarnings(
         "ignore", category=FutureWarning, message=".*torch.jit"
     )  # of libraries, not of us
+    on_main = threading.current_thread() is threading.main_thread()
+    if on_main:
+        signal.signal(signal.SIGINT, _stop)  # packages that are half loaded take an exception for their own
     import_module("hqgs.pipeline")
     import_module("hqgs.scene.source")
-    if threading.current_thread() is threading.main_thread():
+    if on_main:
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # instead of pycolmap's, with a stack trace
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _stop(number: int, frame: object) -> None:
+    """End at once: nothing has been written yet."""
+    fail(130, "stopped")
+    os._exit(130)
 
 
 def tell_notes(scene: Scene) -> None:

@@ -210,12 +210,6 @@ def run(options: Train) -> int:
                 overwrite=options.overwrite,
                 progress=bar,
             )
-    except BAD_INPUT as error:
-        return fail(2, error)
-    except OSError as error:
-        return fail(1, f"{options.out}: {error}")
-    except hqgs.TrainingError as error:
-        return fail(1, str(error))
     except KeyboardInterrupt:
         if (options.out / CHECKPOINT).exists():
             return fail(130, "stopped at once; --resume goes on from the last checkpoint")
@@ -223,6 +217,12 @@ def run(options: Train) -> int:
             " The same command goes on with what COLMAP has found" if (options.out / KEPT).exists() else ""
         )
         return fail(130, f"stopped before the first checkpoint.{found}")
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out}: {error}")
+    except hqgs.TrainingError as error:
+        return fail(1, str(error))
     times = Times(started, loaded, bar.began or loaded, bar.ended or loaded, time.perf_counter())
     _summary(options, done, screen.colmap_seconds, times)
     if not done.finished:

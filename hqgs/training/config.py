@@ -243,14 +243,14 @@ class TrainConfig:
     def scaled(self) -> TrainConfig:
         """The same run with the schedule fitted to `iterations`; see `DensifyConfig.scaled` too.
 
-        The SH degrees come in within three sevenths of a short run. Evaluates 10 times, but not more often
-        than every 50 iterations; saves every 1,000 iterations, in short runs 10 times.
+        The SH degrees come in within three sevenths of a short run. Evaluates 10 times; saves every 1,000
+        iterations, in short runs 10 times.
         """
         tenth = math.ceil(self.iterations / 10)
         return replace(
             self,
             sh_interval=min(self.sh_interval, max(1, self.iterations // 7)),
-            eval_every=max(tenth, CLOSEST),
+            eval_every=tenth,
             checkpoint_every=min(self.checkpoint_every, tenth),
             densify=self.densify.scaled(self.iterations),
         )
@@ -277,7 +277,7 @@ def run_config(
         max_gaussians: bounds the memory.
         guidance: of the method hqgs, one of GUIDANCES.
         formation: what happened to the photos, as `parse_formation` reads it; "auto": hqgs looks.
-        eval_every: iterations between evaluations; None: a tenth of the run.
+        eval_every: iterations between evaluations; None: a tenth of the run, and at least CLOSEST.
 
     Raises ValueError for a name that there is not, or a number out of range.
     """
@@ -292,4 +292,4 @@ def run_config(
         densify=DensifyConfig(max_gaussians=max_gaussians),
         hqgs=HQGSConfig(guidance=guidance, formation=formation),
     ).scaled()
-    return config if eval_every is None else replace(config, eval_every=eval_every)
+    return replace(config, eval_every=max(config.eval_every, CLOSEST) if eval_every is None else eval_every)

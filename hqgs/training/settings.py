@@ -8,10 +8,10 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from hqgs.training.config import TrainConfig
+from hqgs.training.config import TrainConfig, run_config
 
 T = TypeVar("T")
-SCHEDULE = ("sh_interval", "eval_every", "checkpoint_every")  # fields that `TrainConfig.scaled` sets
+SCHEDULE = ("sh_interval", "eval_every", "checkpoint_every")  # fields that follow from the length
 GROWTH = ("start", "stop", "every")  # those of `TrainConfig.densify`
 
 
@@ -60,8 +60,7 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
 
     It trains all of that length: the item "iterations" is not left out.
     """
-    before = TrainConfig(iterations=config.iterations).scaled()
-    after = TrainConfig(iterations=iterations).scaled()
+    before, after = run_config(iterations=config.iterations), run_config(iterations=iterations)
 
     def fitted(mine: Any, old: Any, new: Any, names: tuple[str, ...]) -> dict[str, Any]:
         same = [name for name in names if getattr(mine, name) == getattr(old, name)]
