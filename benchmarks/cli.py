@@ -64,7 +64,7 @@ def _run(args: argparse.Namespace) -> int:
         report = BENCHMARKS[name].run(args)
         files = write_results(args.out, name, command_line(args), report)
     except BAD_INPUT as error:
-        return fail(2, str(error))
+        return fail(2, error)
     except TrainingError as error:
         return fail(1, str(error))
     except OSError as error:

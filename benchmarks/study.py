@@ -28,11 +28,11 @@ from benchmarks.measure import Estimate, Run, duration
 from benchmarks.output import Report
 from benchmarks.protocol import Protocol, Row, narrowed
 from benchmarks.scenes import degraded, load_scenes
-from hqgs.base.files import write_json
+from hqgs.base.files import KEPT, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
+from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.training.checkpoint import scene_fingerprint
 from hqgs.training.config import METHODS, PAPER, TrainConfig
 from hqgs.training.trainer import TrainingError

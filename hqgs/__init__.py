@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from hqgs.diagnosis.scene import diagnose_scene as diagnose
     from hqgs.model.gaussians import Gaussians
     from hqgs.model.rasterization import RasterizationMeta, rasterization
-    from hqgs.pipeline import Progress, Run, degrade, load, train
+    from hqgs.pipeline import Progress, Run, train
     from hqgs.scene.scene import Camera, Scene, View
+    from hqgs.scene.source import degrade, load
     from hqgs.training.config import TrainConfig
     from hqgs.training.trainer import TrainingError
 
@@ -58,10 +59,10 @@ _HOMES = {
     "TrainConfig": "hqgs.training.config",
     "TrainingError": "hqgs.training.trainer",
     "View": "hqgs.scene.scene",
-    "degrade": "hqgs.pipeline",
+    "degrade": "hqgs.scene.source",
     "diagnose": "hqgs.diagnosis.scene:diagnose_scene",
     "get_num_threads": "hqgs._rust",
-    "load": "hqgs.pipeline",
+    "load": "hqgs.scene.source",
     "rasterization": "hqgs.model.rasterization",
     "set_num_threads": "hqgs._rust",
     "train": "hqgs.pipeline",

@@ -2,7 +2,10 @@
 
 import sys
 
-from hqgs.cli.main import main
-
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        from hqgs.cli.main import main
+
+        sys.exit(main())
+    except KeyboardInterrupt:  # before the command line itself can tell
+        sys.exit(130)

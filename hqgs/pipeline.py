@@ -1,7 +1,4 @@
-"""From a folder of photos to a trained scene: load, degrade, sfm, restore, train, report.
-
-The command line and `import hqgs` both call what is here, so that both have one set of defaults.
-"""
+"""From a scene to a trained one: train, report. The command line and `import hqgs` both call what is here."""
 
 from __future__ import annotations
 
@@ -14,7 +11,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.base.files import CHECKPOINT, EMBEDDED, PLY, lock_folder, remove_leftovers
+from hqgs import __version__
+from hqgs.base.files import CHECKPOINT, CONFIG, PLY, lock_folder, remove_leftovers, write_json
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
@@ -23,97 +21,10 @@ from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
-from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin import embedded_scene
-from hqgs.scene.degrade import degrade_scene
-from hqgs.scene.load import load_scene
-from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
+from hqgs.training.settings import config_values
 from hqgs.training.trainer import Step, Trainer
-
-EMBEDDED_SIZE = (504, 378)  # pixels
-EMBEDDED_TEST_EVERY = 8
-
-
-def load(
-    path: str | Path,
-    *,
-    downscale: float = 1.0,
-    test_every: int = 8,
-    sfm: bool = False,
-    degrade: str = "none",
-    seed: int = 0,
-    restore: str | Path | None = None,
-    skip_unreadable: bool = True,
-    cache: str | Path | None = None,
-) -> Scene:
-    """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
-
-    Args:
-        path: a COLMAP, LLFF, Deblur-NeRF, nerfstudio, instant-ngp or Blender folder; with `sfm` a folder of
-            photos alone; or "embedded", the room that is built in (504 x 378 px, 24 views).
-        downscale: divide the photos' sides by this, at least 1.
-        test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
-            folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
-        sfm: take cameras and points from the training photos, by COLMAP.
-        degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
-        seed: of the degradation.
-        restore: weights of an image network that the training photos go through at last.
-        skip_unreadable: leave out training photos that cannot be read, as long as at least half of them can;
-            `Scene.notes` names them. False: an error.
-        cache: a folder that keeps what takes long, for the next call: COLMAP's models, the embedded scene.
-
-    Returns:
-        Photos [H, W, 3], sRGB, uint8 (float32 where they were degraded or restored from that); world units
-        and frame are those of the files, cameras are in the OpenCV frame.
-
-    Raises:
-        FileNotFoundError: a folder, photo or file of weights that is not there.
-        ValueError: anything else that is wrong; the message names the file or the photo.
-    """
-    degradation = parse_degradation(degrade)
-    kept = None if cache is None else Path(cache)
-    models = None if kept is None else kept / KEPT
-    if str(path) == EMBEDDED:
-        if not downscale >= 1:
-            raise ValueError(f"downscale must be at least 1, got {downscale}")
-        if test_every != EMBEDDED_TEST_EVERY:
-            raise ValueError(
-                f"test_every is {test_every}, but the embedded scene holds out every {EMBEDDED_TEST_EVERY}th"
-            )
-        width, height = (round(size / downscale) for size in EMBEDDED_SIZE)
-        scene = embedded_scene(cache=None if kept is None else kept / "scene", width=width, height=height)
-    else:
-        scene = load_scene(
-            path,
-            downscale,
-            test_every=test_every,
-            reconstruct=sfm,
-            skip_unreadable=skip_unreadable,
-            keep_sfm=models,
-        )
-    if degradation.steps:
-        scene = degrade_scene(scene, degradation, seed)
-    if sfm and (scene.source != "photos" or degradation.steps):
-        scene = sfm_scene(scene, models)
-    return scene if restore is None else restore_scene(scene, restore)
-
-
-def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
-    """The scene with degraded training photos (float32, 1 is white); held-out ones stay as they are.
-
-    Args:
-        kind: jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH] (white
-            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], chat[:SIDE] (each photo in its
-            own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND (half of the
-            photos only); several joined by + in their order, mixed, or none.
-        seed: of everything random. Each photo has its own numbers, whatever the others are.
-
-    Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.
-    """
-    return degrade_scene(scene, parse_degradation(kind), seed)
 
 
 @dataclass(frozen=True)
@@ -184,7 +95,7 @@ def train(
 
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
-        out: a folder for checkpoint.safetensors, scene.ply, report.json, `comparison/*.png`
+        out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, `comparison/*.png`
             and error_vs_time.png; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
@@ -197,7 +108,8 @@ def train(
         formation: what hqgs takes for the photos' degradation, as `hqgs.degrade` reads it; "auto": it looks.
         eval_every: iterations between evaluations; None: a tenth of the run.
         config: the whole configuration, in place of the seven before it.
-        resume: go on from the checkpoint in `out`, if there is one.
+        resume: go on from the checkpoint in `out`, if there is one; a run that has come to its end goes on
+            where `iterations` is larger, with the schedule of the longer run from there on.
         overwrite: begin anew in a folder that holds a run.
         progress: is called after each step.
 
@@ -246,6 +158,8 @@ def open_run(
             checkpoint.unlink(missing_ok=True)
         elif checkpoint.exists():
             trainer.restore(checkpoint)
+        asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
+        write_json(Path(out) / CONFIG, asked)
         yield trainer
 
 
@@ -340,6 +254,11 @@ def _notes(trainer: Trainer) -> list[str]:
     own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
     if more := trainer.first_points - own:
         notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+    if trainer.lengthened is not None:
+        notes.append(
+            f"the run had ended at iteration {trainer.lengthened}; from there on its schedule is that of "
+            f"{trainer.config.iterations} iterations: learning rates rose again"
+        )
     if left < 1:
         why = "pixels held back from the noisy photos showed no gain any more"
         notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")

@@ -15,8 +15,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from benchmarks.cli import make_parser as benchmarks_parser
-from hqgs.cli.main import _parser as hqgs_parser
+from hqgs.cli.main import COMMANDS
+from hqgs.cli.parse import MARKERS
+from hqgs.cli.train import Whole
 
 ROOT = Path(__file__).parent.parent
 PAGES = [*ROOT.glob("*.md"), *sorted(ROOT.glob("docs/**/*.md"))]
@@ -24,6 +28,27 @@ FOLDERS = ("benchmarks", "docs", "examples", "hqgs", "rust", "tests", ".ci")  # 
 SOURCES = (".py", ".rs", ".toml", ".md")  # a name with such an end is a path from the repository's top
 CLASSES = ("hqgs", "hqgs.model.gaussians", "hqgs.scene.scene", "hqgs.training.config")  # of `Scene.extent`
 TOOLS = ("pip", "pytest", "ruff", "sphinx-build")  # of others, whose flags are not checked
+
+
+@lru_cache(maxsize=1)
+def _hqgs_commands() -> dict[str, argparse.ArgumentParser]:
+    options = {name: importlib.import_module(one.module).OPTIONS for name, one in COMMANDS.items()}
+    parsers: dict[str, Any] = {
+        name: tyro.extras.get_parser(Whole if name == "train" else kind, prog=name, config=MARKERS)
+        for name, kind in options.items()
+    }
+    return parsers
+
+
+def hqgs_parser() -> argparse.ArgumentParser:
+    """The commands' parsers below one of argparse, which knows the same options."""
+    parser = argparse.ArgumentParser(prog="hqgs")
+    parser.add_argument("--version", action="store_true")
+    commands = parser.add_subparsers(required=True)
+    commands._name_parser_map.update(_hqgs_commands())
+    return parser
+
+
 PARSERS = {"hqgs": hqgs_parser, "benchmarks": benchmarks_parser}
 FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", flags=re.DOTALL | re.MULTILINE)
 

@@ -15,10 +15,10 @@ import torch
 from tiny_scene import DEPTH, tiny_config, tiny_scene
 
 import hqgs
-from hqgs import pipeline
 from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.cli import main as cli
 from hqgs.evaluation.report import read_report
+from hqgs.scene import source
 from hqgs.training.config import AUTOMATIC, run_config
 
 
@@ -26,7 +26,7 @@ from hqgs.training.config import AUTOMATIC, run_config
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A working folder of its own, and the tiny scene in place of the embedded one."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(pipeline, "embedded_scene", lambda **_: tiny_scene())
+    monkeypatch.setattr(source, "embedded_scene", lambda **_: tiny_scene())
 
 
 def a_model() -> hqgs.Gaussians:
@@ -129,7 +129,7 @@ def test_the_first_ctrl_c_returns_what_there_is() -> None:
 def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, Any]] = []
 
-    def reconstruct(scene: hqgs.Scene, keep: Path | None) -> hqgs.Scene:
+    def reconstruct(scene: hqgs.Scene, keep: Path | None, told: object) -> hqgs.Scene:
         calls.append(("sfm", keep))
         assert scene.train[0].image.dtype == np.float32  # the photos are degraded by then
         return scene
@@ -138,8 +138,8 @@ def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) 
         calls.append(("restore", weights))
         return scene
 
-    monkeypatch.setattr(pipeline, "sfm_scene", reconstruct)
-    monkeypatch.setattr(pipeline, "restore_scene", restored)
+    monkeypatch.setattr(source, "sfm_scene", reconstruct)
+    monkeypatch.setattr(source, "restore_scene", restored)
     scene = hqgs.load("embedded", sfm=True, degrade="noise:25", seed=3, restore="w.pth", cache="kept")
     assert calls == [("sfm", Path("kept/sfm")), ("restore", "w.pth")]
     by_hand = hqgs.degrade(tiny_scene(), "noise:25", seed=3)

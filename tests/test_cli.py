@@ -13,10 +13,10 @@ import pytest
 from tiny_scene import tiny_scene
 
 import hqgs
-from hqgs import pipeline
 from hqgs.base.files import CHECKPOINT
 from hqgs.cli import main as cli
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene import source
 from hqgs.scene.scene import Scene, SfmReport
 from hqgs.training.methods.base import ThreeDGS
 
@@ -30,7 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         calls.append(arguments)
         return tiny_scene()
 
-    monkeypatch.setattr(pipeline, "embedded_scene", embedded)
+    monkeypatch.setattr(source, "embedded_scene", embedded)
     return calls
 
 
@@ -70,9 +70,9 @@ def test_train_on_degraded_photos(asked: list[dict[str, Any]], tmp_path: Path) -
     assert call("train", "embedded", "--out", tmp_path, *options[:-1], "noise:24", "--resume") == 2
 
 
-@pytest.mark.parametrize(("source", "kind"), [("colmap", "none"), ("photos", "none"), ("photos", "noise:9")])
+@pytest.mark.parametrize(("form", "kind"), [("colmap", "none"), ("photos", "none"), ("photos", "noise:9")])
 def test_sfm_replaces_poses_and_points_once(
-    source: str,
+    form: str,
     kind: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -83,26 +83,25 @@ def test_sfm_replaces_poses_and_points_once(
     report = SfmReport(5, ["lost.png"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, None)
     seen: list[Any] = []
 
-    def load(path: str, downscale: float, reconstruct: bool, **_: Any) -> Scene:
-        seen.append(reconstruct)
-        return replace(tiny_scene(), source=source)
+    def load(path: str, downscale: float, **_: Any) -> Scene:
+        return replace(tiny_scene(), source=form)
 
-    def sfm(scene: Scene, keep: Path) -> Scene:
+    def sfm(scene: Scene, keep: Path, told: Any) -> Scene:
         assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image.dtype)
-        return replace(scene, sfm=report)
+        return replace(scene, sfm=report, notes=[str(report)])
 
-    monkeypatch.setattr(pipeline, "load_scene", load)
-    monkeypatch.setattr(pipeline, "sfm_scene", sfm)
+    monkeypatch.setattr(source, "load_scene", load)
+    monkeypatch.setattr(source, "sfm_scene", sfm)
     options = ["--sfm", "--degrade", kind, "--iterations", "2"]
     (tmp_path / "photos").mkdir()
     assert call("train", tmp_path / "photos", "--out", tmp_path, *options) == 0
     written, printed = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
-    if (source, kind) == ("photos", "none"):
-        assert seen == [True]
+    if (form, kind) == ("photos", "none"):
+        assert seen == []
         assert written["sfm"] is None
     else:
-        assert seen == [True, np.uint8 if kind == "none" else np.float32]
+        assert seen == [np.uint8 if kind == "none" else np.float32]
         assert written["sfm"] == asdict(report)
         assert "4 of 5 registered" in printed
         assert "lost.png" in printed
@@ -196,9 +195,7 @@ def test_a_run_goes_on_with_resume_only(
     assert call(*command, "--resume") == 0  # nothing there yet: starts
     capsys.readouterr()
     assert call(*command) == 2
-    assert (
-        one_line(capsys) == f"hqgs: {tmp_path} holds a run; continue it with --resume or choose another --out"
-    )
+    assert one_line(capsys).startswith(f"hqgs: {tmp_path} holds a run; continue it with --resume, ")
     assert call(*command, "--resume") == 0
     capsys.readouterr()
     assert call(*command, "--resume", "--seed", "1") == 2
@@ -292,5 +289,48 @@ def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
     def interrupting(**arguments: Any) -> Scene:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "embedded_scene", interrupting)
+    monkeypatch.setattr(source, "embedded_scene", interrupting)
     assert call("train", "embedded", "--out", tmp_path) == 130
+
+
+def test_a_resumed_run_has_the_scene_that_it_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its size, its held-out views and its degradation, without saying them again."""
+    calls: list[dict[str, Any]] = []
+
+    def load(path: str, downscale: float, **more: Any) -> Scene:
+        calls.append({"downscale": downscale, **more})
+        return tiny_scene()
+
+    monkeypatch.setattr(source, "load_scene", load)
+    (tmp_path / "photos").mkdir()
+    command = ["train", tmp_path / "photos", "--out", tmp_path / "run"]
+    options = ["--preset", "quick", "--iterations", "3", "--test-every", "5", "--degrade", "noise:9"]
+    assert call(*command, *options) == 0
+    assert (calls[0]["longest"], calls[0]["test_every"]) == (480, 5)
+    assert call(*command, "--resume") == 0
+    assert {**calls[1], "told": None} == {**calls[0], "told": None}
+    assert call(*command, "--resume", "--iterations", "5") == 0
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["iterations"] == 5
+    assert call(*command, "--resume", "--downscale", "2") == 0
+    assert (calls[3]["longest"], calls[3]["downscale"]) == (None, 2.0)
+
+
+def test_the_last_lines_say_how_good_it_is_and_what_to_do(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call("train", "embedded", "--out", tmp_path, "--iterations", "3") == 0
+    *_, quality, time, now = capsys.readouterr().out.splitlines()
+    assert quality.startswith("quality: poor (below 20 dB ")
+    assert "loading" in time
+    assert "preparing" in time
+    assert now.startswith(f"now open {tmp_path / 'scene.ply'} in SuperSplat")
+    assert call("info", tmp_path) == 0
+    assert "3 of 3 iterations" in capsys.readouterr().out
+    assert call("eval", tmp_path) == 0
+    assert "view0.png" in capsys.readouterr().out
+
+
+def test_a_start_that_fails_leaves_no_folder(asked: list[dict[str, Any]], tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "run"
+    assert call("train", "embedded", "--out", out, "--max-gaussians", "9") == 2
+    assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,6 @@ from reference import sh_basis
 from test_ply import random_gaussians
 from tiny_scene import tiny_scene
 
-from hqgs import pipeline
 from hqgs.cli import main as cli
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.export.export import (
@@ -27,6 +26,7 @@ from hqgs.export.options import ExportOptions
 from hqgs.model.formats.spz import encode_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
+from hqgs.scene import source as scene_source
 from hqgs.scene.scene import Camera
 
 CAMERA = Camera(48, 32, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), np.eye(4))
@@ -213,7 +213,7 @@ def test_the_command_on_a_run_folder(
     g.opacities[0] = -8.0
     run = tmp_path / "run"
     g.save(run / "scene.ply")
-    monkeypatch.setattr(pipeline, "embedded_scene", lambda **_: scene)
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda **_: scene)
     out = tmp_path / "new" / "a.spz"
     assert call(run, "--out", out, "--scene", "embedded", "--downscale", "2") == 0
     text = capsys.readouterr().out

@@ -91,7 +91,7 @@ def test_fine_gaussians_do_not_grow() -> None:
     assert len(coarse.gaussians) < len(everything.gaussians)
     refused = coarse.frugality.memory.refused
     assert refused > 0
-    assert coarse.frugality.left_out()[0].what == f"finer Gaussians, {refused} times"
+    assert coarse.frugality.left_out()[0].what == f"{refused} splits of small Gaussians"
 
 
 def shaded(scene: Scene) -> Scene:
@@ -212,7 +212,7 @@ def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pyte
 
 def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
     result = train(tiny_scene(VIEWS), config=tiny_config(leave_out=("growth",)), out=tmp_path)
-    assert result.left_out[0].what.startswith("finer Gaussians")
+    assert result.left_out[0].what.endswith("splits of small Gaussians")
     assert 0 <= result.report["decision_seconds"] < result.seconds
     assert result.report["scene_bytes"] == (tmp_path / "scene.ply").stat().st_size
 

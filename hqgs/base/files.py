@@ -7,7 +7,8 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ from filelock import FileLock, Timeout
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 EMBEDDED = "embedded"  # in the place of a scene folder: the scene that is built in
-CHECKPOINT, PLY = "checkpoint.safetensors", "scene.ply"
+FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
+ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
+CHECKPOINT, PLY, CONFIG = "checkpoint.safetensors", "scene.ply", "config.json"
+KEPT = "sfm"  # in the folder of a run: what COLMAP found
 
 
 @contextmanager
@@ -46,10 +50,23 @@ def existing_folder(path: str | Path) -> Path:
     """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file."""
     folder = Path(path).resolve()
     if not folder.exists():
-        raise FileNotFoundError(f"there is no scene folder {folder}")
-    if not folder.is_dir():
-        raise ValueError(f"{folder} is a file, a scene is a folder")
-    return folder
+        near = ""
+        if folder.parent.is_dir():
+            names = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()]
+            alike = get_close_matches(folder.name, names, n=1)
+            near = f"; did you mean {folder.parent / alike[0]}?" if alike else ""
+        raise FileNotFoundError(f"there is no scene folder {folder}{near}")
+    if folder.is_dir():
+        return folder
+    if folder.name.lower().endswith(ARCHIVE_SUFFIXES):
+        raise ValueError(f"{folder} is an archive: unpack it, and give the folder with the photos")
+    raise ValueError(f"{folder} is a file, a scene is a folder with photos, or a film")
+
+
+def is_film(path: str | Path) -> bool:
+    """Whether it is a film's file, by its suffix."""
+    path = Path(path)
+    return path.name.lower().endswith(FILM_SUFFIXES) and path.is_file()
 
 
 def check_new_folder(out: Path) -> None:
@@ -96,16 +113,31 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     The system frees the lock when its process ends, however it ends, so a lock never outlives its run.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise FileExistsError(
+            f"{folder} is a file, and cannot be the folder of a run: choose another"
+        ) from None
+    except PermissionError as error:
+        raise PermissionError(f"no right to write into {error.filename}: choose another folder") from None
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)
     except Timeout:
         raise FolderBusyError(f"another run is writing into {folder}") from None
+    except PermissionError:
+        raise PermissionError(f"no right to write into {folder}: choose another folder") from None
     try:
         yield
     finally:
         lock.release()
+        for path in made:  # of a start that failed; what holds anything else stays
+            with suppress(OSError):
+                if {entry.name for entry in path.iterdir()} <= {LOCK}:
+                    (path / LOCK).unlink(missing_ok=True)
+                    path.rmdir()
 
 
 def remove_leftovers(path: str | Path) -> None:

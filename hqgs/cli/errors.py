@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 
 from hqgs.base.files import FolderBusyError
@@ -17,7 +18,21 @@ BAD_INPUT = (
 )  # exit code 2; any other OSError, such as a full disk, is 1
 
 
-def fail(code: int, message: str) -> int:
+_WORDS = {
+    errno.EEXIST: "is there already: choose another name",
+    errno.EACCES: "cannot be read or written: you have no right to",
+    errno.EPERM: "cannot be read or written: you have no right to",
+    errno.ENOENT: "is not there",
+    errno.ENOTDIR: "lies below a file, not a folder",
+    errno.EISDIR: "is a folder, wanted a file",
+    errno.ENOSPC: "cannot be written: the disk is full",
+    errno.EROFS: "cannot be written: the disk is read-only",
+}
+
+
+def fail(code: int, message: str | Exception) -> int:
     """Print the message as one line; return the exit code."""
-    print(f"hqgs: {' '.join(message.split())}", file=sys.stderr)
+    if isinstance(message, OSError) and message.errno in _WORDS and message.filename is not None:
+        message = f"{message.filename} {_WORDS[message.errno]}"
+    print(f"hqgs: {' '.join(str(message).split())}", file=sys.stderr)
     return code

@@ -2,60 +2,61 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import Factor, Photos, load, ready
 from hqgs.export.options import ExportOptions
 from hqgs.model.formats.files import READERS, format_of, scene_file
 
 if TYPE_CHECKING:
     from hqgs.export.export import Export
     from hqgs.model.gaussians import Gaussians
-    from hqgs.scene.scene import Scene
 
 DEFAULTS = ExportOptions("ply")
 
 
-def add_parser(commands: argparse._SubParsersAction[Any], run: Callable[[argparse.Namespace], int]) -> None:
-    """Add `export` to the subcommands of a parser."""
-    parser = commands.add_parser("export", help="write a scene file with what the scene needs alone")
-    parser.set_defaults(run=run)
-    add = parser.add_argument
-    add("source", type=Path, metavar="SOURCE", help="a .ply or .spz file, or the folder of a run")
-    add("--out", type=Path, required=True, metavar="FILE", help="the file to write")
-    add("--format", choices=READERS, help="(what the suffix of FILE says)")
-    add("--sh-degree", type=int, default=DEFAULTS.sh_degree, metavar="D", help="at most (%(default)s)")
-    add(
-        "--sh-bits",
-        type=int,
-        nargs=2,
-        default=DEFAULTS.sh_bits,
-        metavar="B",
-        help="spz: of the harmonics of degree 1, and of degrees 2 and 3 (8 8)",
-    )
-    add(
-        "--band-tolerance",
-        type=float,
-        default=DEFAULTS.band_tolerance,
-        metavar="T",
-        help="harmonics that change a colour by no more are left out; white is 1 (%(default)s)",
-    )
-    add("--scene", metavar="SCENE", help="measure the file on the held-out views of this scene")
-    add("--downscale", type=float, default=1.0, metavar="F", help="of those views (%(default)s)")
+@dataclass(frozen=True, kw_only=True)
+class ExportScene:
+    """Options of `hqgs export`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """A .ply or .spz file, or the folder of a run."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """The file to write."""
+    format: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(READERS)} (as FILE ends)."),
+    ] = None
+    sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
+    """Of the harmonics, at most."""
+    sh_bits: Annotated[tuple[int, int], tyro.conf.arg(metavar="B B")] = DEFAULTS.sh_bits
+    """SPZ: of the harmonics of degree 1, and of degrees 2 and 3."""
+    band_tolerance: Annotated[float, tyro.conf.arg(metavar="T")] = DEFAULTS.band_tolerance
+    """Harmonics that change a colour by no more are left out; white is 1."""
+    scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
+    """Measure the file on the held-out photos of this scene."""
+    downscale: Factor = None
+    """Divide the sides of those photos by F."""
 
 
-def run_export(args: argparse.Namespace, load_scene: Callable[[], Scene | None]) -> int:
+OPTIONS = ExportScene
+
+
+def run(args: ExportScene) -> int:
     """Export what `args` say and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
     try:
         options = ExportOptions(
             format=format_of(args.out, args.format),
             sh_degree=args.sh_degree,
             band_tolerance=args.band_tolerance,
-            sh_bits=tuple(args.sh_bits),
+            sh_bits=args.sh_bits,
         )
         source = scene_file(args.source)
         if args.out.exists() and args.out.samefile(source):
@@ -65,7 +66,11 @@ def run_export(args: argparse.Namespace, load_scene: Callable[[], Scene | None])
         from hqgs.model.gaussians import Gaussians
 
         gaussians = Gaussians.load(source)
-        scene = load_scene()
+        scene = None
+        if args.scene is not None:
+            ready(args.scene)
+            with LoadingScreen() as screen:
+                scene = load(Photos(scene=args.scene, downscale=args.downscale), screen)
         before = None if scene is None else held_out_psnr(scene, held_out_renders(scene, gaussians))
         written = export(gaussians, args.out, options)
         after = None
@@ -73,7 +78,7 @@ def run_export(args: argparse.Namespace, load_scene: Callable[[], Scene | None])
             back = Gaussians.load(args.out, options.format)
             after = held_out_psnr(scene, held_out_renders(scene, back))
     except BAD_INPUT as error:
-        return fail(2, str(error))
+        return fail(2, error)
     except OSError as error:
         return fail(1, f"{args.out}: {error}")
     print(_table(source, gaussians, before, written, after), end="\n\n")

@@ -1,53 +1,138 @@
-"""What the screen shows while a run trains."""
+"""What the screen shows while something takes long: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
-import math
-import sys
+import time
 from types import TracebackType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, TypeVar
 
-from tqdm import tqdm
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
 
 if TYPE_CHECKING:
+    from hqgs.base.stages import Stage
     from hqgs.pipeline import Progress
 
-_NUMBERS_EVERY = 10  # steps between updates of the numbers beside the bar
+_NUMBERS_EVERY = 10  # steps between updates of the bar
+_LINES_EVERY = 5.0  # s between lines without a terminal
+_WARM_UP, _MEASURED = 5, 30  # steps: before any are timed, and until the time that is left is told
+_SLOWER = 3.0  # times as long a step may take when the scene has grown
+Self = TypeVar("Self", bound="Screen")
 
 
-class ProgressBar:
-    """A bar on a terminal, with a smoothed PSNR of the training views; a line for each evaluation."""
+class Screen:
+    """Bars on stderr; nothing is left of them when it closes."""
 
     def __init__(self) -> None:
-        self._bar: tqdm[NoReturn] | None = None
-        self._psnr: float | None = None
+        self.console: Console = Console(stderr=True, highlight=False, soft_wrap=True)
+        self.live: bool = self.console.is_terminal
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[more]}"),
+        )
+        self._bars = Bars(*columns, console=self.console, transient=True, disable=not self.live)
+        self._task: TaskID | None = None
 
-    def __call__(self, now: Progress) -> None:
-        """Show a step."""
-        bar = self._bar
-        if bar is None:
-            bar = self._bar = tqdm(total=now.length, initial=now.iteration - 1, disable=None)
-        if not bar.disable and now.iteration % _NUMBERS_EVERY == 0:
-            bar.set_postfix_str(self._numbers(now), refresh=False)
-        bar.total = now.length
-        bar.update()
-        if now.evaluated is not None:
-            bar.write(_evaluated(now), file=sys.stderr)
-
-    def __enter__(self) -> ProgressBar:
+    def __enter__(self: Self) -> Self:
+        self._bars.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        self._bars.stop()
 
-    def _numbers(self, now: Progress) -> str:
-        if math.isfinite(now.loss) and (psnr := now.psnr()) is not None:
-            self._psnr = psnr if self._psnr is None else 0.9 * self._psnr + 0.1 * psnr
-        shown = "-" if self._psnr is None else f"{self._psnr:.2f} dB"
-        return f"loss {now.loss:.4f}, PSNR {shown}, {now.gaussians} Gaussians"
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        self.console.print(text, markup=False)
+
+    def show(self, what: str, done: int, total: int, more: str = "") -> None:
+        """Where the work is; other words begin another bar."""
+        if self._task is None or self._bars.tasks[-1].description != what:
+            if self._task is not None:
+                self._bars.remove_task(self._task)
+            self._task = self._bars.add_task(what, total=total or None, more=more)
+        self._bars.update(self._task, completed=done, total=total or None, more=more)
+
+
+class LoadingScreen(Screen):
+    """What happens before a run trains; `seconds` tells how long each stage took."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seconds: dict[str, float] = {}
+        self._now = ""
+        self._since = self._said = time.perf_counter()
+
+    def __call__(self, stage: Stage) -> None:
+        """Show a stage."""
+        now = time.perf_counter()
+        self.seconds[stage.what] = self.seconds.get(stage.what, 0.0) + now - self._since
+        self._since = now
+        self.show(stage.what, stage.done, stage.total)
+        if not self.live and (stage.what != self._now or now - self._said > _LINES_EVERY):
+            self._said = now
+            self.say(f"{stage.what}: {stage.done}" + (f" of {stage.total}" if stage.total else ""))
+        self._now = stage.what
+
+    @property
+    def colmap_seconds(self) -> float:
+        """Of all stages of COLMAP."""
+        return sum(seconds for what, seconds in self.seconds.items() if what.startswith("COLMAP"))
+
+
+class TrainingScreen(Screen):
+    """The run: iterations, held-out error, Gaussians, time left; a line for each evaluation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._held_out = "not measured yet"
+        self._first: tuple[int, float] | None = None  # iteration and seconds from which on steps are timed
+        self._told = False
+        self.began: float | None = None  # `time.perf_counter` after the first step
+        self.ended: float | None = None  # and after the last one
+
+    def __call__(self, now: Progress) -> None:
+        """Show a step."""
+        self.ended = time.perf_counter()
+        self.began = self.began or self.ended
+        if now.evaluated is not None:
+            psnr = now.evaluated["psnr"]
+            self._held_out = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
+            self.say(_evaluated(now))
+        if now.iteration % _NUMBERS_EVERY == 0 or now.evaluated is not None:
+            more = f"held-out {self._held_out}, {now.gaussians:,} Gaussians, loss {now.loss:.3f}"
+            self.show("training", now.iteration, now.length, more)
+        self._estimate(now)
+
+    def _estimate(self, now: Progress) -> None:
+        """Once, in the first seconds: how long the run will take here."""
+        if self._told:
+            return
+        if self._first is None:
+            self._first = now.iteration + _WARM_UP, 0.0
+        start, seconds = self._first
+        if now.iteration == start:
+            self._first = start, now.seconds
+        elif now.iteration >= start + _MEASURED:
+            self._told = True
+            step, left = (now.seconds - seconds) / (now.iteration - start), now.length - now.iteration
+            self.say(
+                f"{now.length:,} iterations, {1 / step:.1f} a second now: about {duration(left * step)} to "
+                f"{duration(_SLOWER * left * step)}, as steps get slower while the scene grows, and the "
+                "evaluations. Ctrl-C ends it at any time with a whole scene"
+            )
+
+
+def duration(seconds: float) -> str:
+    """For people: 40 s, 3 min, 2.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _evaluated(now: Progress) -> str:

@@ -53,7 +53,7 @@ class Diagnosis:
         ]
         lines += ["", f"{self.scene}: {self.formation}"]
         for name, needed, reason in self.needs():
-            lines.append(f"  {name:8}{'needed   ' if needed else 'left out '} {reason}")
+            lines.append(f"  {name:8}{'needed   ' if needed else 'not seen '} {reason}")
         return "\n".join(lines)
 
 

@@ -27,6 +27,7 @@ class RenderedView:
     render: NDArray[np.float32]  # [H, W, 3], clamped to [0, 1] by the report, never rounded for the metrics
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts
     culled: int | None = None  # Gaussians that this view does not show
+    turn: int = 0  # quarter turns clockwise that show it upright
 
 
 def held_out_renders(
@@ -42,7 +43,7 @@ def held_out_renders(
         for view in scene.test:
             render, meta = render_view(gaussians, view.camera, degree, background)
             culled = int((meta["radii"][0] == 0).any(dim=1).sum())
-            views.append(RenderedView(view.name, view.image, render.numpy(), view.mask, culled))
+            views.append(RenderedView(view.name, view.image, render.numpy(), view.mask, culled, view.turn))
     return views
 
 

@@ -70,16 +70,19 @@ class SfmRecord(TypedDict):
     photos: int
     not_registered: list[str]
     outliers: list[str]
-    rotation_error_deg: dict[str, float]
-    translation_error: dict[str, float]
-    own_cameras_px: float
+    rotation_error_deg: dict[str, float] | None
+    translation_error: dict[str, float] | None
+    own_cameras_px: float | None
     points: int
-    point_distance: float
+    point_distance: float | None
     track_length: float
     reprojection_error_px: float
-    own_points: int
+    own_points: int | None
     own_track_length: float | None
     own_reprojection_error_px: float | None
+    unreadable: dict[str, str]
+    first_pass: int | None
+    advice: str | None
 
 
 class RunRecord(TypedDict):

@@ -129,7 +129,7 @@ def read_report(path: str | Path) -> Report:
 def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     """Photo, render and absolute difference (times 4, cut at white) side by side, a caption above each.
 
-    The size is 3 W + 16 by H plus the height of the caption.
+    The size is 3 W + 16 by H plus the height of the caption, of the view as it is shown upright.
     """
     photo = view.photo / 255.0 if view.photo.dtype == np.uint8 else view.photo.clip(0, 1)
     render = np.clip(view.render.astype(np.float64), 0.0, 1.0)
@@ -143,11 +143,14 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     numbers += [] if metrics.ssim is None else [f"SSIM {metrics.ssim:.3f}"]
     captions = [f"photo  {_printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]
 
-    height, width = photo.shape[:2]
+    panels = [np.ascontiguousarray(np.rot90(panel, -view.turn)) for panel in panels]
+    height, width = panels[0].shape[:2]
     font, line = _caption_font(captions, width, height)
     picture = Image.new("RGB", (3 * width + 2 * GAP, height + line), "white")
     for i, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
         strip = Image.new("RGB", (width, line), "white")  # a caption never runs into the next panel
+        while len(caption) > 4 and font.getlength(caption) > width - 4:  # cut where it shows
+            caption = f"{caption[:-4]}..."
         ImageDraw.Draw(strip).text((2, line // 2), caption, fill=(25, 25, 25), font=font, anchor="lm")
         picture.paste(strip, (i * (width + GAP), 0))
         picture.paste(Image.fromarray(panel), (i * (width + GAP), line))

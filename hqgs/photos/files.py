@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
-PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-_DECODE_ERRORS = (
+HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
+PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC_SUFFIXES)
+DECODE_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError),
     MemoryError,  # Pillow reads as many bytes as a chunk says it has
 )
@@ -20,15 +21,40 @@ class UnreadableError(ValueError):
     """A photo or mask that cannot be decoded; the message names the file."""
 
 
+def open_photo(path: Path) -> Image.Image:
+    """Pillow's picture of the file, not decoded yet. One of DECODE_ERRORS where there is none."""
+    if path.suffix.lower() in HEIC_SUFFIXES:
+        try:
+            import pillow_heif  # here: only such photos need it
+        except ImportError as error:
+            raise OSError("HEIC photos need the extra 'heic': pip install 'hqgs[heic]'") from error
+        pillow_heif.register_heif_opener()
+    return Image.open(path)
+
+
+def check_whole(path: Path) -> tuple[int, int]:
+    """Width and height of a photo that can be decoded to its end. UnreadableError: it cannot."""
+    try:
+        with open_photo(path) as photo:
+            size = photo.size
+            photo.draft("L", (size[0] // 8, size[1] // 8))  # a JPEG is quickly read like this
+            photo.load()
+            return size
+    except UnidentifiedImageError as error:
+        raise UnreadableError("no picture") from error
+    except DECODE_ERRORS as error:
+        raise UnreadableError(str(error) or type(error).__name__) from error
+
+
 def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
     """Width and height that the photo's header promises, for a look before memory is taken for the pixels.
 
     Pillow refuses more than 179 million of them. Raises UnreadableError.
     """
     try:
-        with Image.open(path) as photo:
+        with open_photo(path) as photo:
             return photo.size
-    except _DECODE_ERRORS as e:
+    except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
 
 
@@ -40,7 +66,7 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     pixels as stored, and a turned photo would no longer fit them. Raises UnreadableError.
     """
     try:
-        with Image.open(path) as photo:
+        with open_photo(path) as photo:
             if photo.mode == "F":
                 raise ValueError("floating-point pixels have no agreed white")
             if photo.mode.startswith("I"):
@@ -53,7 +79,7 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
                 opaque = bool((rgba[..., 3] == 255).all())
                 return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
             return np.array(photo.convert("RGB")), None
-    except _DECODE_ERRORS as e:
+    except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the photo {path}: {e}") from e
 
 
@@ -63,9 +89,9 @@ def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     if abs(w * height - h * width) > width + height:
         raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
     try:
-        with Image.open(path) as file:
+        with open_photo(path) as file:
             pixels = np.asarray(file.convert("RGB") if file.mode == "P" else file)
-    except _DECODE_ERRORS as e:
+    except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the mask {path}: {e}") from e
     if pixels.ndim == 3:
         pixels = pixels[..., :3].max(-1)  # without alpha, which says nothing here

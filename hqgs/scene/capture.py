@@ -11,7 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.scene.scene import Tracks
+from hqgs.scene.scene import SfmReport, Tracks
 
 MAX_SIDE = 65_535  # the largest side a JPEG can have; larger ones come from damaged files
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
@@ -45,6 +45,7 @@ class Capture:
     notes: list[str] = field(default_factory=list)
     tracks: Tracks | None = None  # px of the cameras' own size
     seen: dict[str, NDArray[np.intp]] | None = None  # by photo, rows of the points that it shows
+    sfm: SfmReport | None = None  # where cameras and points come from the photos
 
 
 def no_points() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -7,27 +7,35 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 
-from hqgs.base.files import existing_folder
-from hqgs.photos.files import UnreadableError
-from hqgs.scene.capture import Capture, list_photos, photo_folder
-from hqgs.scene.formats.colmap import find_models, read_colmap
+from hqgs.base.files import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
+from hqgs.base.stages import OnStage, untold
+from hqgs.base.text import some
+from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
+from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
+from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
-from hqgs.scene.sfm.bare_photos import bare_photos, read_photos
+from hqgs.scene.sfm.bare_photos import bare_photos, readable
+from hqgs.scene.sfm.photos_alone import read_photos
 from hqgs.scene.views import load_views
+
+COLMAP = "colmap"
 
 
 def load_scene(
     path: str | Path,
     downscale: float = 1.0,
     test_every: int = 8,
-    reconstruct: bool = False,
     skip_unreadable: bool = False,
     keep_sfm: Path | None = None,
+    longest: int | None = None,
+    told: OnStage = untold,
+    sfm: bool = False,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
@@ -43,8 +51,11 @@ def load_scene(
     A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
     at downscale 1, the only one at which they stand for `View.image`.
 
-    With `reconstruct` a folder that holds photos alone gets its cameras and points from them (`read_photos`).
-    `keep_sfm` is a folder for that reconstruction, which the next call takes from there.
+    A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is a
+    folder for that reconstruction, which the next call takes from there. `told` hears what takes long. Half
+    a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
+
+    `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger.
 
     With `skip_unreadable` training photos that cannot be decoded (or whose mask or small photo cannot) are
     left out, as long as at least half of the training photos remain; `Scene.notes` names them. The other
@@ -58,7 +69,9 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    capture = _read(root, downscale, reconstruct, keep_sfm)
+    capture = _read(root, downscale, keep_sfm, told, sfm)
+    if longest is not None:
+        capture = _bounded(capture, longest)
     degraded = read_degraded_folder(root)
     if degraded is not None:
         notes = [*degraded.notes, *capture.notes]
@@ -85,13 +98,51 @@ def load_scene(
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)
     tracks = _tracks(capture, views)
-    return Scene(root.name, train, test, points, colors, capture.source, notes, tracks, capture.seen)
+    return Scene(
+        root.name, train, test, points, colors, capture.source, notes, tracks, capture.seen, capture.sfm
+    )
 
 
-def _read(root: Path, downscale: float, reconstruct: bool, keep_sfm: Path | None) -> Capture:
+def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> Scene | None:
+    """Some photos of a folder that holds photos alone, spread over it, as a scene that has no poses.
+
+    Each camera is a placeholder: a plausible one at the origin. None where the folder has cameras of its own.
+    ValueError where it holds neither.
+    """
+    root = existing_folder(path)
+    if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
+        return None
+    photos = readable(found)
+    chosen = sorted({round(k) for k in np.linspace(0, len(photos.names) - 1, most)})
+    cameras = [
+        pycolmap.Camera.create_from_model_name(
+            1, "SIMPLE_PINHOLE", 1.2 * max(photos.sizes[k]), *photos.sizes[k]
+        )
+        for k in chosen
+    ]
+    views, _ = load_views(
+        [
+            Photo(photos.names[k], photos.folder / photos.names[k], camera, np.eye(4))
+            for k, camera in zip(chosen, cameras, strict=True)
+        ],
+        photos.downscale,
+    )
+    notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
+    nothing = no_points()
+    return Scene(root.name, views, [], *nothing, "photos", notes if photos.unreadable else [])
+
+
+def formats_of(root: Path, downscale: float) -> list[str]:
+    """Names of the formats that a folder is in."""
     has_model, has_photos = bool(find_models(root)), photo_folder(root, downscale) is not None
     others = [name for name in (SINGLE, TRAIN, POSES) if (root / name).is_file()]
-    if has_model and (has_photos or not others):
+    return [COLMAP, *others] if has_model and (has_photos or not others) else others
+
+
+def _read(root: Path, downscale: float, keep_sfm: Path | None, told: OnStage, sfm: bool) -> Capture:
+    formats = formats_of(root, downscale)
+    others = [name for name in formats if name != COLMAP]
+    if COLMAP in formats:
         capture = read_colmap(root, downscale)
         if others:
             note = (
@@ -103,16 +154,50 @@ def _read(root: Path, downscale: float, reconstruct: bool, keep_sfm: Path | None
         return read_transforms(root, downscale)
     if POSES in others:
         return read_llff(root, downscale)
-    bare = bare_photos(root, downscale) is not None
-    if bare and reconstruct:
-        return read_photos(root, downscale, keep_sfm)
-    entries = sorted(p.name for p in root.iterdir())
-    found = ", ".join(entries[:12]) + (" ..." if len(entries) > 12 else "") if entries else "nothing"
-    raise ValueError(
-        f"{root} is no scene: looked for a COLMAP model (cameras, images and points3D as .bin or .txt in "
-        f"sparse/0, sparse or the folder), {SINGLE}, {TRAIN}, {POSES}; found {found}"
-        + ("; --sfm makes a scene of photos alone" if bare else "")
+    if not sfm and (broken := _broken(root)) is not None:
+        raise ValueError(f"{broken}; `--sfm` takes cameras and points from the photos alone")
+    if (photos := bare_photos(root, downscale)) is not None:
+        return read_photos(root, photos, keep_sfm, told)
+    raise ValueError(_nothing(root))
+
+
+def _broken(root: Path) -> str | None:
+    """What is there of a scene that is not whole; None: nothing."""
+    if (folder := half_model(root)) is not None:
+        return f"{folder} holds half a COLMAP model: cameras, images and points3D are wanted, as .bin or .txt"
+    names = [name for name in (SINGLE, TRAIN, POSES) if (root / name).exists()]
+    return f"{root / names[0]} is no file" if names else None
+
+
+def _nothing(root: Path) -> str:
+    """What is wrong with a folder in which no format is recognised."""
+    entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
+    if not entries:
+        return f"{root} is empty: give a folder with photos"
+    for suffixes, advice in (
+        (ARCHIVE_SUFFIXES, "unpack it, and give the folder with the photos"),
+        (FILM_SUFFIXES, "give the film itself in place of the folder"),
+    ):
+        if found := [name for name in entries if name.lower().endswith(suffixes)]:
+            return f"{root} holds no photos, but {found[0]}: {advice}"
+    return (
+        f"{root} holds no photos ({', '.join(PHOTO_SUFFIXES)}), here or one folder further down, and no "
+        f"scene (a COLMAP model, {SINGLE}, {TRAIN} or {POSES}); it holds {some(entries)}"
     )
+
+
+def _bounded(capture: Capture, longest: int) -> Capture:
+    """The capture with its photos scaled down until no side is longer."""
+    sizes = [stored_size(photo.path) for photo in capture.photos if photo.path.is_file()]
+    largest = max((max(size) for size in sizes), default=0) / capture.downscale
+    if largest <= longest:
+        return capture
+    downscale = largest / longest * capture.downscale
+    note = (
+        f"photos of up to {largest:.0f} px a side were scaled down to {longest} px (by {downscale:.3g}); "
+        "`--downscale 1` trains them at their full size, which takes far longer"
+    )
+    return replace(capture, downscale=downscale, notes=[*capture.notes, note])
 
 
 def _with_lows(

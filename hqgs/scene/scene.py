@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ class View:
     image: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3] sRGB, the camera's size
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts; None: everywhere
     low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
+    turn: int = 0  # quarter turns clockwise that show `image` upright, as the photo's EXIF has it: 0..3
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,14 @@ class Scene:
     test: list[View]
     points: NDArray[np.float32]  # [P, 3], world
     point_colors: NDArray[np.uint8]  # [P, 3]
-    source: str  # the format it was read from: "colmap", "llff", "transforms", "embedded"
+    source: str  # the format it was read from: "colmap", "llff", "transforms", "photos", "embedded"
     notes: list[str] = field(default_factory=list)  # what a reader of the report should know
     tracks: Tracks | None = None  # of the points, px of the views; None: its files do not tell
     seen: dict[str, NDArray[np.intp]] | None = None  # rows of the points that each photo shows; None as above
-    sfm: SfmReport | None = None  # how poses and points differ from its files'; None: they are those
+    sfm: SfmReport | None = None  # of poses and points from the photos; None: they are its files'
+    origin: dict[str, Any] | None = (
+        None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
+    )
 
     @property
     def extent(self) -> float:
@@ -84,29 +89,63 @@ class Scene:
 
 @dataclass(frozen=True)
 class SfmReport:
-    """How poses and points from the photos differ from the scene's own. JSON values only.
+    """Poses and points from the photos, and how they differ from the scene's own. JSON values only.
 
-    Distances are in units of the scene's extent, after the alignment of the two frames.
+    Distances are in units of the scene's extent, after the alignment of the two frames. What compares the two
+    is None where the scene has no poses but these.
     """
 
     photos: int  # that were given
     not_registered: list[str]  # those that COLMAP found no place for
     outliers: list[str]  # those that the alignment of the two frames left out
-    rotation_error_deg: dict[str, float]  # of the cameras: "median", "max"
-    translation_error: dict[str, float]
+    rotation_error_deg: dict[str, float] | None  # of the cameras: "median", "max"
+    translation_error: dict[str, float] | None
     own_cameras_px: (
-        float  # median distance from where the scene's own cameras see the new points to the photos
+        float | None  # median distance from where the scene's own cameras see the new points to the photos
     )
     points: int
-    point_distance: float  # median over the new points to the nearest of the scene's own, which may be random
+    point_distance: (
+        float | None  # median over the new points to the nearest of the scene's own, which may be random
+    )
     track_length: float  # photos that see a point, mean
     reprojection_error_px: float  # mean
-    own_points: int  # the scene's, and of them
+    own_points: int | None  # the scene's, and of them
     own_track_length: float | None  # None: its files do not tell
     own_reprojection_error_px: float | None
+    unreadable: dict[str, str] = field(default_factory=dict)  # files that were left out before, and why
+    first_pass: int | None = None  # photos that the first pass registered, where it took a second one
+    advice: str | None = None  # where photos are missing: what was found, and what to do
 
     def __str__(self) -> str:
+        text = self._found() if self.rotation_error_deg is None else self._compared()
+        if self.first_pass is not None:
+            text += (
+                f"; a first pass had registered {self.first_pass}, a second and more tolerant one the rest"
+            )
+        if self.not_registered:
+            text += (
+                f"; {len(self.not_registered)} left out, as COLMAP found no place for them: "
+                f"{', '.join(self.not_registered)}"
+            )
+        if self.unreadable:
+            files = ", ".join(f"{name} ({why})" for name, why in self.unreadable.items())
+            text += f"; left out, as they cannot be read ({len(self.unreadable)}): {files}"
+        if self.advice is not None:
+            text += f". {self.advice}"
+        return text
+
+    def _found(self) -> str:
+        registered = self.photos - len(self.not_registered)
+        return (
+            f"cameras and points by COLMAP from all photos ({registered} of {self.photos} registered), the "
+            f"held-out views among them; {self.points} points, {self.track_length:.1f} photos a point, "
+            f"{self.reprojection_error_px:.2f} px of the stored photos off (mean)"
+        )
+
+    def _compared(self) -> str:
         rotation, translation = self.rotation_error_deg, self.translation_error
+        assert rotation is not None
+        assert translation is not None
         found = self.photos - len(self.not_registered)
         text = (
             f"poses and points by COLMAP from the training photos: {found} of {self.photos} registered; "
@@ -119,6 +158,4 @@ class SfmReport:
         )
         if self.own_track_length is not None:
             text += f", its own {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px"
-        if self.not_registered:
-            text += f"; left out, as COLMAP found no place for them: {', '.join(self.not_registered)}"
         return text

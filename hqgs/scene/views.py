@@ -13,6 +13,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
+from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, stored_size
 from hqgs.photos.resize import area_downscale
 from hqgs.scene.capture import MAX_SIDE, Photo
@@ -95,7 +96,8 @@ def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], P
     K = np.diag([width / flat.width, height / flat.height, 1.0]) @ flat.K
     if mask is not None and mask.all():
         mask = None
-    return View(photo.name, Camera(width, height, K, photo.viewmat), image, mask)
+    camera_now = Camera(width, height, K, photo.viewmat)
+    return View(photo.name, camera_now, image, mask, turn=read_exif(photo.path).turn)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from hqgs.scene.scene import Scene
 
 FORMAT = 4  # raised when a newer reader could not use an older file
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
+LENGTH_FIELDS = ("iterations", "sh_interval", "start", "stop", "every", "leave_out")  # in a longer run too
 
 
 def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -72,15 +73,21 @@ def part(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 
-def check_same(path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any]) -> None:
-    """ValueError for the first field that differs; nested fields are named with dots."""
+def check_same(
+    path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any], longer: bool = False
+) -> None:
+    """ValueError for the first field that differs; nested fields are named with dots.
+
+    `longer`: this run goes on where the saved one ended, so that the fields of its length may differ.
+    """
+    free = (*FREE_FIELDS, *LENGTH_FIELDS) if longer else FREE_FIELDS
     if not isinstance(saved, dict):
         raise ValueError(f"{path} is damaged: {prefix or 'config'} is {saved!r:.80}")
     for name in here | saved:
         old, new = saved.get(name), here.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            check_same(path, f"{prefix}{name}.", old, new)
-        elif old != new and name not in FREE_FIELDS:
+            check_same(path, f"{prefix}{name}.", old, new, longer)
+        elif old != new and name not in free:
             raise ValueError(
                 f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
                 "use the same one, or another folder"

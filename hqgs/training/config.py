@@ -27,6 +27,7 @@ ITEMS = {
 ASKED_FOR = ("resolution", "iterations")  # not automatic: the first costs, a number of iterations means it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
+CLOSEST = 50  # iterations between evaluations, unless asked for: each one takes as long as some steps
 Loss = Literal["l1", "l1+dssim", "l1+scs"]
 
 
@@ -203,10 +204,10 @@ class TrainConfig:
     configuration of a run as a user asks for it.
     """
 
-    iterations: int = 30_000
-    method: str = AUTO
-    seed: int = 0
-    sh_degree: int = MAX_SH_DEGREE
+    iterations: int = 30_000  # training steps
+    method: str = AUTO  # one of METHODS
+    seed: int = 0  # of everything random
+    sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
     lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
     lr_means_final: float = 1.6e-6  # this at the end of the run
@@ -276,7 +277,7 @@ def run_config(
         max_gaussians: bounds the memory.
         guidance: of the method hqgs, one of GUIDANCES.
         formation: what happened to the photos, as `parse_formation` reads it; "auto": hqgs looks.
-        eval_every: iterations between evaluations; None: a tenth of the run.
+        eval_every: iterations between evaluations; None: a tenth of the run, and at least CLOSEST.
 
     Raises ValueError for a name that there is not, or a number out of range.
     """
@@ -291,4 +292,4 @@ def run_config(
         densify=DensifyConfig(max_gaussians=max_gaussians),
         hqgs=HQGSConfig(guidance=guidance, formation=formation),
     ).scaled()
-    return config if eval_every is None else replace(config, eval_every=eval_every)
+    return replace(config, eval_every=max(config.eval_every, CLOSEST) if eval_every is None else eval_every)

@@ -122,8 +122,8 @@ class Frugality:
             what = f"full resolution in the first {end} iterations"
             found.insert(0, LeftOut(what, f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"))
         if self.memory.refused:
-            why = f"they had at most {FINEST:g} px of the photo that sees them best (1 standard deviation)"
-            found.insert(0, LeftOut(f"finer Gaussians, {self.memory.refused} times", why))
+            why = f"they were no wider than {FINEST:g} pixels of the sharpest photo, so no photo shows more"
+            found.insert(0, LeftOut(f"{self.memory.refused} splits of small Gaussians", why))
         return found
 
     def state_dict(self) -> dict[str, Any]:
@@ -132,6 +132,11 @@ class Frugality:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.memory = Memory(**state)
         self._open = []
+
+    def forget_end(self) -> None:
+        """The run goes on after its end: no iterations are left out."""
+        records = self.memory.records
+        self.memory.records = [one for one in records if not one["what"].startswith("iterations ")]
 
     def _of_held_photos(self, state: TrainState) -> Verdict:
         """What the held-back photos say, and whether they come back."""

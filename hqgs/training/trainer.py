@@ -70,6 +70,7 @@ class Trainer:
         with one_torch_thread():
             self._targets = [self.method.prepare(view) for view in scene.train]
             start = self.method.start(scene, self._targets, config)
+        self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
         self._small: dict[int, tuple[View, Target]] = {}
         self.config: TrainConfig = start.config
         config = start.config
@@ -188,16 +189,26 @@ class Trainer:
     def restore(self, path: str | Path) -> None:
         """Go on from a checkpoint, bit for bit.
 
-        ValueError for a damaged one, or one of another run; it names the field in which that differs.
+        A run that has come to its end may be trained longer: from there on the schedule is that of the longer
+        run, so that learning rates rise again, and the scene may grow again. `lengthened` tells. ValueError
+        for a damaged checkpoint, or one of another run; it names the field in which that differs.
         """
         tensors, meta = load_checkpoint(path)
         lists = {name: list(getattr(self.config, name)) for name in ("background", "leave_out")}
         try:
             # The scene first: methods fit the configuration to it.
             check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
-            check_same(path, "", meta["config"], asdict(self.config) | lists)
+            done, total = meta["iteration"], self.config.iterations
+            longer = done == meta["decisions"]["length"] < total != meta["config"]["iterations"]
+            check_same(path, "", meta["config"], asdict(self.config) | lists, longer)
+            if longer:
+                released = meta["decisions"]["released"] or done  # what was held back has come back
+                meta["decisions"] |= {"length": total, "released": released}
+                self.lengthened = done
             state = self.state.restored(path, tensors, meta, self._optimizer)
             self.frugality.load_state_dict(meta["frugality"])
+            if longer:
+                self.frugality.forget_end()
             self.method.load_state_dict(part("method.", tensors))
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error

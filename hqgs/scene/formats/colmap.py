@@ -23,8 +23,6 @@ from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_mod
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Camera, Tracks
 
-LEAST_PHOTOS = 3  # of a reconstruction
-LEAST_SHARE = 0.5  # of the photos must find their place in it
 _FILES = ("cameras", "images", "points3D")
 
 
@@ -33,6 +31,17 @@ def find_models(root: Path) -> list[Path]:
     sparse = root / "sparse"
     fragments = sorted(p for p in sparse.iterdir() if _kind(p)) if sparse.is_dir() else []
     return fragments or [p for p in (sparse, root) if _kind(p)][:1]
+
+
+def half_model(root: Path) -> Path | None:
+    """A folder that holds some files of a COLMAP model, but not all."""
+    sparse = root / "sparse"
+    folders = [*(sorted(p for p in sparse.iterdir() if p.is_dir()) if sparse.is_dir() else []), sparse, root]
+    for folder in folders:
+        for kind in ("bin", "txt"):
+            if any((folder / f"{name}.{kind}").exists() for name in _FILES) and not _kind(folder):
+                return folder
+    return None
 
 
 def read_colmap(root: Path, downscale: float) -> Capture:
@@ -191,17 +200,12 @@ def seen_points(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.intp]]:
     }
 
 
-def registered(model: pycolmap.Reconstruction, photos: int) -> dict[str, NDArray[np.float64]]:
-    """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few of the `photos` have one."""
+def registered(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.float64]]:
+    """World-to-camera matrices [4, 4] by photo, sorted; those that have a place."""
     poses = {}
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             poses[image.name] = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-    if len(poses) < max(LEAST_PHOTOS, LEAST_SHARE * photos):
-        raise ValueError(
-            f"COLMAP registered only {len(poses)} of {photos} photos, wanted at least {LEAST_PHOTOS} and "
-            f"{LEAST_SHARE:.0%}; the others do not match them well enough"
-        )
     return poses
 
 

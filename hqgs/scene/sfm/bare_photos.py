@@ -1,63 +1,144 @@
-"""Folders that hold photos and nothing else: the cameras come from the photos."""
+"""Folders that hold photos and nothing else: which of them can be read, and what their cameras may be."""
 
 from __future__ import annotations
 
-import tempfile
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
+from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite, photo_folder
-from hqgs.scene.formats.colmap import model_points, registered, seen_points
-from hqgs.scene.scene import Tracks
-from hqgs.scene.sfm.run import run_colmap
+from hqgs.photos.exif import Exif, read_exif
+from hqgs.photos.files import HEIC_SUFFIXES, PHOTO_SUFFIXES, UnreadableError, check_whole, decode
+from hqgs.scene.capture import photo_folder
+from hqgs.scene.sfm.run import Guess
+
+FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
+QUALITY = 95  # of JPEG, of a converted photo
+WORKERS = 2
 
 
-def bare_photos(root: Path, downscale: float) -> tuple[Path, float, list[str], list[str]] | None:
-    """The folder of the photos, the downscale left to do, notes and the photos' names; None without photos.
+@dataclass(frozen=True)
+class BarePhotos:
+    """The photos of a folder that has no cameras."""
 
-    The folder is that of `photo_folder`, or `root` itself; folders inside it are not looked into.
+    folder: Path
+    downscale: float  # what is left to do
+    names: list[str]  # relative to the folder, sorted
+    sizes: list[tuple[int, int]] = field(default_factory=list)  # width and height of each
+    exif: list[Exif] = field(default_factory=list)  # of each
+    unreadable: dict[str, str] = field(default_factory=dict)  # others, and why
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def colmap_names(self) -> dict[str, str]:
+        """Each photo's name by the one that COLMAP sees."""
+        return {n if n.lower().endswith(FOR_COLMAP) else f"{n}.jpg": n for n in self.names}
+
+    def contents(self) -> Iterator[bytes]:
+        """The files' bytes."""
+        return ((self.folder / name).read_bytes() for name in self.names)
+
+    def guess(self) -> Guess:
+        """Photos of one size by the same make, model and zoom share a camera; EXIF gives its focal length."""
+        keys = [(*size, *exif.camera) for size, exif in zip(self.sizes, self.exif, strict=True)]
+        cameras = list(dict.fromkeys(keys))
+        first = [keys.index(camera) for camera in cameras]
+        return Guess(
+            [self.sizes[k] for k in first],
+            [self.exif[k].focal for k in first],
+            [cameras.index(k) for k in keys],
+        )
+
+    def write(self, folder: Path) -> None:
+        """The photos under COLMAP's names into a folder, as links where COLMAP can read them."""
+        for target, name in self.colmap_names.items():
+            path = folder / target
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if target != name:
+                Image.fromarray(decode(self.folder / name)[0]).save(path, quality=QUALITY, subsampling=0)
+                continue
+            try:
+                path.symlink_to(self.folder / name)
+            except OSError:  # the file system has no links
+                shutil.copyfile(self.folder / name, path)
+
+
+def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
+    """The photos of a folder, not looked into yet; None without photos.
+
+    Those of `photo_folder`, or in `root` itself, or, where there are none, in the folders of `root`.
     """
     folder, left, notes = photo_folder(root, downscale) or (root, downscale, [])
-    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
-    names = [name for name in names if not name.startswith(".")]
-    return (folder, left, notes, names) if names else None
+    names = _photos_in(folder)
+    if not names:
+        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "masks" and p.name[0] != ".")
+        found = {path.name: _photos_in(path) for path in below}
+        names = [f"{inner}/{name}" for inner, inside in found.items() for name in inside]
+        inner = [name for name, inside in found.items() if inside]
+        if len(inner) == 1:
+            folder, names = folder / inner[0], found[inner[0]]
+        if inner:
+            notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
+    return BarePhotos(folder, left, names, notes=notes) if names else None
 
 
-def read_photos(root: Path, downscale: float, keep: Path | None = None) -> Capture:
-    """Cameras and points of a folder of photos, from all of them, by COLMAP.
+def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
+    """The photos that can be decoded, with their sizes and EXIF data; the others are in `unreadable`.
 
-    Photos of one size share a camera (SIMPLE_RADIAL), which is found as well. Held-out views are among the
-    photos: without them they would have no pose. The notes say so, and name the photos that have no place.
-    `keep`: a folder for the reconstruction, see `run_colmap`. ValueError where there is no photo, or COLMAP
-    cannot make a model of half of them.
+    ValueError where HEIC photos lack the extra that reads them, or less than half can be read.
     """
-    found = bare_photos(root, downscale)
-    if found is None:
-        raise ValueError(f"{root} holds no photos")
-    folder, left, notes, names = found
-    with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as directory:
-        model = run_colmap(Path(directory), folder, names, None, keep)
-    poses = registered(model, len(names))
-    cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
-    photos = [
-        Photo(name, folder / name, cameras[name], np.asarray(viewmat), find_mask(root, name))
-        for name, viewmat in poses.items()
-    ]
-    tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
-    notes.append(
-        f"cameras and points by COLMAP from all photos ({len(poses)} of {len(names)} registered), the "
-        f"held-out views among them; {tracks.length:.1f} photos a point, {tracks.error:.2f} px of the stored "
-        "photos off (mean)"
-    )
-    if missing := [name for name in names if name not in poses]:
-        notes.append(
-            f"{len(missing)} photos were left out, as COLMAP found no place for them: {some(missing)}"
+    heic = [name for name in photos.names if name.lower().endswith(HEIC_SUFFIXES)]
+    if heic:
+        try:
+            import pillow_heif  # noqa: F401
+        except ImportError:
+            raise ValueError(
+                f"{photos.folder}: {len(heic)} of {len(photos.names)} photos are HEIC ({some(heic)}), which "
+                "needs the extra 'heic': pip install 'hqgs[heic]'"
+            ) from None
+    sizes: dict[str, tuple[int, int]] = {}
+    unreadable: dict[str, str] = {}
+
+    def look(name: str) -> tuple[int, int] | str:
+        try:
+            return check_whole(photos.folder / name)
+        except UnreadableError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(min(WORKERS, os.cpu_count() or 1)) as pool:
+        for k, (name, found) in enumerate(zip(photos.names, pool.map(look, photos.names), strict=True)):
+            if isinstance(found, str):
+                unreadable[name] = found
+            else:
+                sizes[name] = found
+            told(Stage("photos looked at", k + 1, len(photos.names)))
+    if len(sizes) < len(unreadable):
+        reasons = some([f"{name} ({why})" for name, why in unreadable.items()])
+        raise ValueError(
+            f"{photos.folder}: {len(unreadable)} of {len(photos.names)} photos cannot be read: {reasons}"
         )
-    points, colors = keep_finite(*model_points(model), notes)
-    seen = seen_points(model) if len(points) == model.num_points3D() else None
-    return Capture(
-        "photos", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks, seen=seen
+    names = list(sizes)
+    exif = [read_exif(photos.folder / name) for name in names]
+    return BarePhotos(
+        photos.folder, photos.downscale, names, list(sizes.values()), exif, unreadable, photos.notes
+    )
+
+
+def ups(turns: Sequence[int]) -> np.ndarray:
+    """Unit vectors [V, 3] that point up in each photo's camera frame, for quarter turns clockwise [V]."""
+    return np.array([[0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]], np.float64)[np.asarray(turns)]
+
+
+def _photos_in(folder: Path) -> list[str]:
+    return sorted(
+        p.name
+        for p in folder.iterdir()
+        if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file() and not p.name.startswith(".")
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,16 +11,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import KDTree
 
+from hqgs.base.stages import OnStage, untold
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.formats.colmap import model_points, registered, seen_points
+from hqgs.scene.formats.colmap import model_points, seen_points
 from hqgs.scene.scene import Scene, SfmReport, Tracks, View
 from hqgs.scene.sfm.align import Observations, align, camera_centers, refine, rotation_angles
 from hqgs.scene.sfm.run import run_colmap
 
-KEPT = "sfm"  # in the folder of a run: its reconstructions
 
-
-def sfm_scene(scene: Scene, keep: Path | None = None) -> Scene:
+def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
 
     COLMAP (SIFT, exhaustive matching, incremental mapping) sees the training photos alone, clipped and
@@ -30,17 +28,16 @@ def sfm_scene(scene: Scene, keep: Path | None = None) -> Scene:
     held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.
     `Scene.sfm` and `Scene.notes` compare the two. The same photos give the same bits, whatever the number of
     threads. `keep` is a folder for the reconstruction, which the next call with the same photos takes from
-    there.
+    there; `told` hears what is being done.
 
     ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
     """
     views = {f"{k:05d}.png": view for k, view in enumerate(scene.train)}
-    with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
-        directory = Path(name)
-        _write_photos(directory, views)
-        cameras = [view.camera for view in scene.train]
-        model = run_colmap(directory, directory / "photos", list(views), cameras, keep)
-    poses = registered(model, len(views))
+    cameras = [view.camera for view in scene.train]
+    contents = map(_content, views.values())
+    ran = run_colmap(list(views), contents, cameras, lambda folder: _write_photos(folder, views), keep, told)
+    model = ran.found
+    poses = ran.poses()
     kept = [views[file] for file in poses]
     viewmats, own = np.stack(list(poses.values())), np.stack([view.camera.viewmat for view in kept])
     points, colors = model_points(model)
@@ -71,6 +68,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None) -> Scene:
         own_points=len(scene.points),
         own_track_length=None if scene.tracks is None else scene.tracks.length,
         own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
+        first_pass=ran.first_pass,
     )
     return replace(
         scene,
@@ -98,16 +96,23 @@ def _observations(model: pycolmap.Reconstruction, names: list[str]) -> Observati
     return Observations(table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), table[:, 2:])
 
 
-def _write_photos(directory: Path, views: dict[str, View]) -> None:
-    """The photos as PNG files in `photos`, and masks in `masks` where a view has one."""
+def _content(view: View) -> bytes:
+    """What tells a photo and its mask from others."""
+    mask = b"" if view.mask is None else view.mask.tobytes()
+    return to_uint8(as_floats(view.image)).tobytes() + mask
+
+
+def _write_photos(folder: Path, views: dict[str, View]) -> None:
+    """The photos as PNG files, and masks in `masks` beside the folder where a view has one."""
     masked = any(view.mask is not None for view in views.values())
-    for folder in ("photos", "masks") if masked else ("photos",):
-        (directory / folder).mkdir()
+    masks = folder.with_name("masks")
+    if masked:
+        masks.mkdir()
     for file, view in views.items():
-        Image.fromarray(to_uint8(as_floats(view.image))).save(directory / "photos" / file, compress_level=1)
+        Image.fromarray(to_uint8(as_floats(view.image))).save(folder / file, compress_level=1)
         if masked:
             counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
-            Image.fromarray(counts.astype(np.uint8) * 255).save(directory / "masks" / f"{file}.png")
+            Image.fromarray(counts.astype(np.uint8) * 255).save(masks / f"{file}.png")
 
 
 def _median_and_max(values: NDArray[np.float64]) -> dict[str, float]:

@@ -3,71 +3,203 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
 from hqgs._rust import get_num_threads
-from hqgs.base.files import keep_folder
-from hqgs.scene.formats.colmap import LEAST_PHOTOS
+from hqgs.base.files import keep_folder, lock_folder
+from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
+from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
+LEAST_PHOTOS = 3  # of a reconstruction
+LEAST_SHARE = 0.5  # of the photos must find their place in it
+LISTEN = 0.25  # s between looks at what COLMAP is doing
+STAGES = {
+    "features": "COLMAP: features",
+    "matches": "COLMAP: pairs of photos matched",
+    "verify": "COLMAP: matches checked",
+    "place": "COLMAP: photos placed",
+}
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What is known of the cameras of photos before COLMAP looks for them."""
+
+    sizes: list[tuple[int, int]]  # width and height of each camera
+    focals: list[float]  # px; 0: not known
+    camera_of: list[int]  # of each photo, the number of its camera
+
+
+@dataclass(frozen=True)
+class Model:
+    """COLMAP's largest model, and what its passes came to: one, or a second, more tolerant one."""
+
+    found: pycolmap.Reconstruction
+    passes: list[Pass]
+
+    def poses(self) -> dict[str, NDArray[np.float64]]:
+        """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few photos have one."""
+        poses, photos = registered(self.found), len(self.passes[0].features)
+        if len(poses) < max(LEAST_PHOTOS, LEAST_SHARE * photos):
+            raise ValueError(
+                f"COLMAP registered only {len(poses)} of {photos} photos, wanted at least {LEAST_PHOTOS} and "
+                f"{LEAST_SHARE:.0%}. {why_few(photos, self.passes)}"
+            )
+        return poses
+
+    def advice(self) -> str | None:
+        """What to do about photos that have no place; None: there is none."""
+        photos = len(self.passes[0].features)
+        return why_few(photos, self.passes) if len(registered(self.found)) < photos else None
+
+    @property
+    def first_pass(self) -> int | None:
+        """Photos that the first pass registered, where a second one was made. None: one was enough."""
+        return self.passes[0].registered if len(self.passes) > 1 else None
 
 
 def run_colmap(
-    directory: Path,
-    photos: Path,
     names: Sequence[str],
-    cameras: Sequence[Camera] | None,
+    contents: Iterable[bytes],
+    cameras: Sequence[Camera] | Guess,
+    write: Callable[[Path], None],
     keep: Path | None = None,
-) -> pycolmap.Reconstruction:
-    """COLMAP's largest model of the photos `names` in the folder `photos`; `directory` gets its files.
+    told: OnStage = untold,
+) -> Model:
+    """COLMAP's largest model of photos.
 
-    `cameras`: pinhole intrinsics that stay as they are; None: COLMAP finds them. `directory / "masks"`, if it
-    is there, holds a mask for every photo. Models are kept in the folder `keep`: COLMAP does not run again
-    for the same photos, masks, cameras and version. ValueError for fewer than 3 photos, where COLMAP fails,
-    or where the photos do not match.
+    Args:
+        names: of the photos, as COLMAP shall know them.
+        contents: bytes that tell each photo, with its mask, from all others.
+        cameras: pinhole intrinsics that stay as they are, or what is known of cameras that COLMAP finds.
+        write: puts the photos under their names into a folder that is there and empty, and below `masks`
+            beside it either no mask, or `NAME.png` for every photo.
+        keep: a folder for models: COLMAP does not run again for the same photos, masks, cameras and version,
+            and goes on with the features and matches of a call that was interrupted.
+        told: hears what is being done.
+
+    Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
     if len(names) < LEAST_PHOTOS:
-        raise ValueError(f"structure from motion needs at least {LEAST_PHOTOS} photos, got {len(names)}")
-    given: dict[str, NDArray[np.generic]] = {"names": np.array(names), "photos": np.array(str(photos))}
-    if cameras is not None:
+        raise ValueError(
+            f"structure from motion needs at least {LEAST_PHOTOS} photos, got {len(names)}: 20 to 100 that "
+            "overlap make a good scene"
+        )
+    given: dict[str, NDArray[np.generic]] = {"names": np.array(names)}
+    if isinstance(cameras, Guess):
+        given["sizes"] = np.array(cameras.sizes)
+        given["focals"] = np.array(cameras.focals, np.float64)
+        given["camera_of"] = np.array(cameras.camera_of)
+    else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
-    kept = None if keep is None else keep / _key(directory / "masks", given)
+    kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
-        return pycolmap.Reconstruction(kept)
-    np.savez(directory / "input.npz", **given)  # pyright: ignore[reportArgumentType]
+        return _read(kept)
+    with _workplace(kept) as directory:
+        photos = directory / "photos"
+        if not photos.is_dir():
+            new = directory / "new"
+            shutil.rmtree(new, ignore_errors=True)
+            (new / "photos").mkdir(parents=True)
+            write(new / "photos")
+            if (new / "masks").is_dir():
+                (new / "masks").rename(directory / "masks")
+            (new / "photos").rename(photos)
+        given["photos"] = np.array(str(photos))
+        np.savez(directory / "input.npz", **given)  # pyright: ignore[reportArgumentType]
+        _run_program(directory, told)
+        facts = directory / "facts.json"
+        if not (directory / "model" / "images.bin").is_file():
+            raise ValueError(why_no_model(len(names), _passes(facts)))
+        if kept is not None:
+            keep_folder(directory / "model", kept)
+        return _read(directory / "model")
+
+
+@contextmanager
+def _workplace(kept: Path | None) -> Iterator[Path]:
+    """A folder for COLMAP's files: beside `kept`, where it stays until the work is done, or a new one."""
+    if kept is None:
+        with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
+            yield Path(name)
+        return
+    directory = kept.with_name(f".{kept.name}")
+    with lock_folder(directory):
+        try:
+            yield directory
+        except KeyboardInterrupt:
+            raise  # the next call goes on from here
+        except BaseException:
+            shutil.rmtree(directory, ignore_errors=True)
+            raise
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+def _run_program(directory: Path, told: OnStage) -> None:
+    """Run `reconstruct` in `directory` to its end. Whatever ends this process ends it too."""
     program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
-    done = subprocess.run(program, capture_output=True, stdin=subprocess.DEVNULL, check=False)
-    if done.returncode != 0:
-        last = done.stderr.decode(errors="replace").strip().splitlines()[-1:]
-        raise ValueError(f"COLMAP ended with status {done.returncode} {' '.join(last)}".strip())
-    if not (directory / "model" / "images.bin").is_file():
-        raise ValueError(
-            f"COLMAP could start from no two of the {len(names)} photos: they need texture and overlap, and "
-            "places to be taken from that lie apart"
+    with (directory / "log.txt").open("wb") as log:
+        process = subprocess.Popen(
+            program, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
         )
-    if kept is not None:
-        keep_folder(directory / "model", kept)
-    return pycolmap.Reconstruction(directory / "model")
+        try:
+            while True:
+                try:
+                    status = process.wait(LISTEN)
+                    break
+                except subprocess.TimeoutExpired:
+                    _tell(directory / "stage.json", told)
+        finally:
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+    if status != 0:
+        lines = (directory / "log.txt").read_text(errors="replace").strip().splitlines()
+        last = [line for line in lines if not line.startswith((" ", "***"))][-1:]  # not of its stack trace
+        raise ValueError(f"COLMAP ended with status {status} {' '.join(last)}".strip())
 
 
-def _key(masks: Path, given: dict[str, NDArray[np.generic]]) -> str:
+def _tell(file: Path, told: OnStage) -> None:
+    try:
+        now: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:  # it has only begun
+        return
+    again = ", second and more tolerant pass" if now["tolerant"] else ""
+    told(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
+
+
+def _read(folder: Path) -> Model:
+    return Model(pycolmap.Reconstruction(folder), _passes(folder / "facts.json"))
+
+
+def _passes(facts: Path) -> list[Pass]:
+    return [Pass(**one) for one in json.loads(facts.read_text(encoding="utf-8"))["passes"]]
+
+
+def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArray[np.generic]]) -> str:
     """A name for everything that the model depends on; where the photos lie is not part of it."""
     digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode() + PROGRAM.read_bytes())
-    photos = Path(str(given["photos"]))
-    for name in given["names"].tolist():
-        for file in (photos / name, masks / f"{name}.png"):
-            content = file.read_bytes() if file.is_file() else b""
-            digest.update(f"{name} {len(content)} ".encode() + content)
-    for part in ("sizes", "Ks"):
+    for name, content in zip(names, contents, strict=True):
+        digest.update(f"{name} {len(content)} ".encode() + content)
+    for part in ("sizes", "Ks", "focals", "camera_of"):
         if part in given:
             digest.update(given[part].tobytes())
     return digest.hexdigest()[:16]

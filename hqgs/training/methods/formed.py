@@ -94,7 +94,11 @@ def find_formation(scene: Scene, text: str, inspector: Inspector) -> tuple[Forma
         diagnosis = inspector.diagnose(scene)
         text = diagnosis.formation
         needs = diagnosis.needs()
-        left_out += [LeftOut(f"{part} in the loss", why) for part, needed, why in needs if not needed]
+        left_out += [
+            LeftOut(f"a correction for {part}", f"not needed: {why}")
+            for part, needed, why in needs
+            if not needed
+        ]
     degradation = parse_degradation(text)
     directions: dict[str, float] = {}
     if any(step.kind == "motion" for step in degradation.steps):

@@ -1,0 +1,22 @@
+"""What takes long before a run trains, told while it happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where some work has come to."""
+
+    what: str  # "features", "matches", ...: the same words as long as it is the same work
+    done: int
+    total: int  # 0: not known
+
+
+OnStage = Callable[[Stage], None]
+
+
+def untold(stage: Stage) -> None:
+    """Nobody listens."""

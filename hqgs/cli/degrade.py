@@ -1,0 +1,48 @@
+"""`hqgs degrade SCENE --kind KIND --out DIR`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from hqgs.base.files import check_new_folder
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import Folder, Kind, Photos, load, ready
+from hqgs.photos.formula import parse_degradation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Degrade(Photos):
+    """Options of `hqgs degrade`."""
+
+    out: Folder
+    """Folder for the new scene; missing or empty."""
+    kind: Kind
+    seed: Annotated[int, tyro.conf.arg(metavar="S")] = 0
+    """Of everything random."""
+
+
+OPTIONS = Degrade
+
+
+def run(options: Degrade) -> int:
+    """Write the scene; return the exit code (0 done, 1 failed, 2 bad input)."""
+    try:
+        degradation = parse_degradation(options.kind)
+        check_new_folder(options.out)
+        ready(options.scene)
+        with LoadingScreen() as screen:
+            scene = load(options, screen)
+        from hqgs.scene.degrade import write_degraded_scene  # here: it loads torch
+
+        write_degraded_scene(scene, options.out, degradation, options.seed)
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out}: {error}")
+    photos = f"{len(scene.train)} training photos with {degradation}, {len(scene.test)} held out"
+    print(f"{options.out}: {photos}")
+    return 0

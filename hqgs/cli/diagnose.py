@@ -1,0 +1,45 @@
+"""`hqgs diagnose PHOTOS`: what degraded photos. It needs no cameras."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import hqgs
+from hqgs.base.files import write_json
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.scenes import Photos, ready
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnose(Photos):
+    """Options of `hqgs diagnose`."""
+
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write the diagnosis as JSON."""
+
+
+OPTIONS = Diagnose
+
+
+def run(options: Diagnose) -> int:
+    """Print the diagnosis; return the exit code (0 done, 1 failed, 2 bad input)."""
+    try:
+        ready(options.scene)
+        from hqgs.scene.source import pictures  # here: it loads torch
+
+        scene = pictures(options.scene, downscale=1.0 if options.downscale is None else options.downscale)
+        diagnosis = hqgs.diagnose(scene)
+        if options.out is not None:
+            write_json(options.out, asdict(diagnosis))
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out}: {error}")
+    print(diagnosis)
+    for note in scene.notes:
+        print(f"  {note}")
+    return 0

@@ -1,0 +1,101 @@
+"""`hqgs info PATH`: what a run, a scene file or a folder of photos holds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from hqgs.base.files import CONFIG, existing_folder
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.progress import duration
+from hqgs.evaluation.verdict import verdict
+from hqgs.model.formats.files import READERS, scene_file
+
+
+@dataclass(frozen=True, kw_only=True)
+class Info:
+    """Options of `hqgs info`."""
+
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """The folder of a run, a .ply or .spz file, or a folder with photos."""
+
+
+OPTIONS = Info
+
+
+def run(options: Info) -> int:
+    """Print what is there; return the exit code (0 done, 1 failed, 2 bad input)."""
+    path = options.path
+    try:
+        if path.is_file() and path.suffix[1:] in READERS:
+            lines = _file(path)
+        elif (path / "report.json").is_file():
+            lines = _run(path)
+        else:
+            lines = _photos(path)
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{path}: {error}")
+    print("\n".join(lines))
+    return 0
+
+
+def _file(path: Path) -> list[str]:
+    from hqgs.model.gaussians import Gaussians  # here: it loads torch
+
+    gaussians = Gaussians.load(path)
+    lowest, highest = (gaussians.means.quantile(q, dim=0).tolist() for q in (0.05, 0.95))
+    box = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(lowest, highest, strict=True))
+    return [
+        f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
+        f"{path.stat().st_size / 1e6:.1f} MB",
+        f"nine tenths of them lie in x, y, z: {box}",
+    ]
+
+
+def _run(path: Path) -> list[str]:
+    report: dict[str, Any] = json.loads((path / "report.json").read_text(encoding="utf-8"))
+    mean, steps = report["metrics"]["mean"], f"{report['iterations']:,} of {report['length']:,} iterations"
+    word, why = verdict(mean["psnr"])
+    numbers = ", ".join(f"{name} {value:.4g}" for name, value in mean.items() if value is not None)
+    lines = [
+        f"{path}: {report['scene']}, {report['method']}, {steps} in {duration(report['seconds'])}, "
+        f"{report['gaussians']:,} Gaussians",
+        f"held-out photos: {numbers or 'not measured'}; {word} ({why})",
+    ]
+    lines += [f"  {note}" for note in report["notes"]]
+    if (path / CONFIG).is_file():
+        origin = json.loads((path / CONFIG).read_text(encoding="utf-8"))["scene"]
+        lines.append(f"trained on {'a scene made in Python' if origin is None else origin['path']}")
+    lines.append(f"the scene: {scene_file(path)}; the configuration: {path / CONFIG}")
+    return lines
+
+
+def _photos(path: Path) -> list[str]:
+    root = existing_folder(path)
+    from hqgs.scene.load import formats_of  # here: it loads torch
+    from hqgs.scene.sfm.bare_photos import bare_photos, readable
+
+    formats = formats_of(root, 1.0)
+    found = bare_photos(root, 1.0)
+    if found is None:
+        raise ValueError(f"{root} holds no photos, no run and no scene file ({', '.join(READERS)})")
+    photos = readable(found)
+    sizes = sorted(set(photos.sizes))
+    guess = photos.guess()
+    focal = sum(value > 0 for value in guess.focals)
+    poses = ", ".join(formats) if formats else "none yet: hqgs train and hqgs sfm find them"
+    lines = [
+        f"{root}: {len(photos.names)} photos of {', '.join(f'{w} x {h}' for w, h in sizes[:4])} px"
+        + (" and other sizes" if len(sizes) > 4 else ""),
+        f"cameras: {len(guess.sizes)}, the focal length of {focal} is in EXIF; "
+        f"{sum(exif.turn > 0 for exif in photos.exif)} photos lie on their side",
+        f"poses: {poses}",
+    ]
+    lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
+    return lines

@@ -1,0 +1,71 @@
+"""From arguments to the options of a command, which are a dataclass; by tyro."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import tyro
+
+from hqgs.cli.errors import fail
+
+T = TypeVar("T")
+MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
+DEEP = 8  # columns from the border of tyro's boxes on which an option is explained
+WORDS = {  # tyro's, and ours
+    r"Unrecognized options?:": "there is no option",
+    r"Missing from hqgs \w+:": "missing:",
+    r"Perhaps you meant:": "- did you mean",
+    r"Error parsing (\S+): no type matching (\S+) could be .*? from \['?(.*?)'?\]\.": r"\1 is \3, wanted \2",
+    r"Error parsing \S+: (?!no type)": "",
+}
+GPU = ("--device", "--cuda", "--gpu", "--gpus")
+
+
+def parse(options: type[T], command: str, about: str, arguments: Sequence[str], default: Any = None) -> T:
+    """The options that the arguments give. Help and mistakes end the program, mistakes with one sentence."""
+    if asked := [a for a in arguments if a.split("=")[0] in GPU]:
+        raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs trains on the CPU, leave it out"))
+    more = {} if default is None else {"default": default}
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.cli(
+                options,
+                prog=f"hqgs {command}",
+                description=f"{about[0].upper()}{about[1:]}.",
+                args=list(arguments),
+                config=MARKERS,
+                **more,
+            )
+    except SystemExit as end:
+        if not end.code:  # help
+            raise
+        raise SystemExit(fail(2, f"{_sentence(told.getvalue())} (hqgs {command} --help)")) from None
+    finally:
+        if sys.exc_info()[0] is None:
+            sys.stderr.write(told.getvalue())
+
+
+def _sentence(box: str) -> str:
+    """What tyro draws as a box, as one line without the options' help."""
+    kept = []
+    for line in (line.strip("│╭╮╰╯─ \n").rstrip() for line in _shallow(box)):
+        if line.startswith(("Got errors", "Argument helptext")):
+            break
+        if line and not line.startswith(("For full helptext", "hqgs ")):
+            kept.append(line)
+    text = " ".join(kept).replace("{None}|", "")
+    for said, meant in WORDS.items():
+        text = re.sub(said, meant, text)
+    return text
+
+
+def _shallow(box: str) -> list[str]:
+    """The lines inside a box, but for those far from its border, which explain an option."""
+    lines = [line.strip("│") for line in box.splitlines()[1:]]
+    return [line for line in lines if len(line) - len(line.lstrip()) < DEEP]

@@ -1,0 +1,89 @@
+"""What several commands share: the options that name a scene, and the reading of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import warnings
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from hqgs.base.files import EMBEDDED, existing_folder, is_film
+from hqgs.cli.errors import fail
+
+if TYPE_CHECKING:
+    from hqgs.base.stages import OnStage
+    from hqgs.scene.scene import Scene
+
+SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+Factor = Annotated["float | None", tyro.conf.arg(metavar="F", help_behavior_hint="")]
+Number = Annotated["int | None", tyro.conf.arg(metavar="N", help_behavior_hint="")]
+Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+KINDS = (
+    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
+    "exposure[:EV], phone[:EV], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), several "
+    "joined by + in their order, mixed, or none"
+)
+Kind = Annotated[str, tyro.conf.arg(metavar="KIND", help=f"what happens to the training photos: {KINDS}")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photos:
+    """Which photos, and at which size."""
+
+    scene: SceneName
+    """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
+    'embedded', the room that is built in."""
+    downscale: Factor = None
+    """Divide the photos' sides by F."""
+
+
+def ready(scene: str) -> None:
+    """Tell a wrong path at once; then load what takes seconds, after which SIGTERM counts as Ctrl-C."""
+    if scene != EMBEDDED and not is_film(scene):
+        existing_folder(scene)
+    warnings.filterwarnings(
+        "ignore", category=FutureWarning, message=".*torch.jit"
+    )  # of libraries, not of us
+    on_main = threading.current_thread() is threading.main_thread()
+    if on_main:
+        signal.signal(signal.SIGINT, _stop)  # packages that are half loaded take an exception for their own
+    import_module("hqgs.pipeline")
+    import_module("hqgs.scene.source")
+    if on_main:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # instead of pycolmap's, with a stack trace
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _stop(number: int, frame: object) -> None:
+    """End at once: nothing has been written yet."""
+    fail(130, "stopped")
+    os._exit(130)
+
+
+def tell_notes(scene: Scene) -> None:
+    """What a user must know of the photos before anything is done with them."""
+    sizes = sorted({(view.camera.width, view.camera.height) for view in [*scene.train, *scene.test]})
+    size = " and others".join([f"{sizes[-1][0]} x {sizes[-1][1]} px", ""][: len(sizes)])
+    print(
+        f"{scene.name}: {len(scene.train)} photos to train on, {len(scene.test)} held out to measure with, "
+        f"{size}, {len(scene.points):,} points"
+    )
+    for note in scene.notes:
+        print(f"  {note}")
+    sys.stdout.flush()
+
+
+def load(photos: Photos, told: OnStage) -> Scene:
+    """The scene of a command that takes no more than the photos."""
+    from hqgs.scene.source import load as load_source  # here: it loads torch
+
+    downscale = 1.0 if photos.downscale is None else photos.downscale
+    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, told=told)

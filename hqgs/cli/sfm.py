@@ -1,0 +1,50 @@
+"""`hqgs sfm PHOTOS --out DIR`: a COLMAP folder of photos alone, or of a film."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hqgs.base.files import check_new_folder
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.progress import LoadingScreen, duration
+from hqgs.cli.scenes import Folder, Number, SceneName, ready
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sfm:
+    """Options of `hqgs sfm`."""
+
+    scene: SceneName
+    """A folder with photos, or a film."""
+    out: Folder
+    """Folder for the scene; missing or empty. It gets images and sparse/0, as COLMAP names them."""
+    frames: Number = None
+    """Frames to take from a film (two a second, 30 to 90)."""
+
+
+WORK = ".sfm"  # in the new folder, while COLMAP works
+OPTIONS = Sfm
+
+
+def run(options: Sfm) -> int:
+    """Write the scene; return the exit code (0 done, 1 failed, 2 bad input)."""
+    try:
+        if not (options.out / WORK).is_dir():  # of a call that was stopped
+            check_new_folder(options.out)
+        ready(options.scene)
+        from hqgs.scene.sfm.folder import write_colmap_folder  # here: it loads torch
+
+        with LoadingScreen() as screen:
+            report = write_colmap_folder(
+                options.scene, options.out, options.out / WORK, options.frames, screen
+            )
+    except KeyboardInterrupt:
+        return fail(130, "stopped; the same command goes on with what COLMAP has found")
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out}: {error}")
+    print(report)
+    print(f"{options.out}: images and sparse/0, by COLMAP in {duration(screen.colmap_seconds)}")
+    print(f"now: hqgs train {options.out} --out RUN")
+    return 0

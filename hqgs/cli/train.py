@@ -1,0 +1,265 @@
+"""`hqgs train SCENE --out DIR`."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+import hqgs
+from hqgs.base.files import CHECKPOINT, CONFIG, KEPT
+from hqgs.base.left_out import format_left_out
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.parse import parse
+from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
+from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.evaluation.verdict import verdict
+from hqgs.photos.formula import parse_degradation
+from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
+from hqgs.training.settings import PRESETS, read_config, with_iterations
+
+if TYPE_CHECKING:
+    from hqgs.pipeline import Run
+    from hqgs.scene.scene import Scene
+
+EXPERT = "--config."
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames")  # options that shape the scene
+VIEWERS = "SuperSplat (superspl.at/editor) or any other viewer of 3DGS files"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Photos):
+    """Options of `hqgs train`. None: as the preset, the file of --config or the resumed run says."""
+
+    out: Folder
+    """Folder for the scene, the report and what is needed to go on."""
+    preset: Literal["quick", "standard", "best"] = "standard"
+    """quick: 1,000 iterations on small photos, a first look. standard: until the scene has stopped improving,
+    photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
+    iterations: Number = None
+    """Training steps (standard: at most 30,000, fewer where the scene has stopped improving)."""
+    method: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="NAME", help_behavior_hint="", help=f"One of {', '.join(METHODS)} (auto)."),
+    ] = None
+    downscale: Factor = None
+    """Divide the photos' sides by F (as the preset says)."""
+    test_every: Annotated[int, tyro.conf.arg(metavar="N")] = 8
+    """Hold out every Nth photo to measure with; 0: train on all photos."""
+    resume: Flag = False
+    """Go on with the run in DIR; with a larger --iterations also where it has come to its end."""
+    overwrite: Flag = False
+    """Begin anew in a folder that holds a run."""
+    sfm: Flag = False
+    """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
+    frames: Number = None
+    """Frames to take from a film (two a second, 30 to 90)."""
+    degrade: Kind = "none"
+    restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="")] = None
+    """Send the training photos through this restoration network first."""
+    formation: Annotated[str | None, tyro.conf.arg(metavar="KIND", help_behavior_hint="")] = None
+    """What hqgs takes for the photos' degradation (auto: it looks)."""
+    guidance: Annotated[
+        Literal["formation", "paper"] | None,
+        tyro.conf.arg(help="Of hqgs: formation, or paper, its published form.", help_behavior_hint=""),
+    ] = None
+    leave_out: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="LIST",
+            help_behavior_hint="",
+            help=f"What the run may do without where the scene does not need it: {AUTO}, {NONE}, or some of "
+            f"{','.join(ITEMS)} ({AUTO}).",
+        ),
+    ] = None
+    max_gaussians: Number = None
+    """Bounds the memory (1,000,000)."""
+    eval_every: Number = None
+    """Iterations between evaluations (a tenth of the run)."""
+    threads: Number = None
+    """CPU threads (all cores; the result does not depend on it)."""
+    seed: Annotated[int | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
+    """Another seed gives another run of the same quality (0)."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """Train with the configuration in this file: config.json of another run."""
+    help_all: Flag = False
+    """Show every number of the training too: --config.densify.grad-threshold and so on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Whole(Train):
+    """With every number of the configuration."""
+
+    expert: Annotated[TrainConfig, tyro.conf.arg(name="config")] = field(default_factory=TrainConfig)
+
+
+OPTIONS = Train
+
+
+@dataclass(frozen=True)
+class Times:
+    """When the parts of a command began, s."""
+
+    start: float
+    loaded: float
+    trained_from: float
+    trained_to: float
+    end: float
+
+    def told(self, colmap: float) -> str:
+        """How long each part took; `colmap`: s, of the loading."""
+        of_it = f" (COLMAP {duration(colmap)})" if colmap >= 1 else ""
+        return (
+            f"{duration(self.end - self.start)}: loading {duration(self.loaded - self.start)}{of_it}, "
+            f"preparing {duration(self.trained_from - self.loaded)}, "
+            f"training {duration(self.trained_to - self.trained_from)}, "
+            f"report {duration(self.end - self.trained_to)}"
+        )
+
+
+def read(options: type[Train], command: str, about: str, arguments: Sequence[str]) -> Train:
+    """As `parse`; options of the configuration change what the other options come to."""
+    if "--help-all" in arguments:
+        return parse(Whole, command, about, ["--help"])
+    if not any(argument.startswith(EXPERT) for argument in arguments):
+        return parse(options, command, about, arguments)
+    first = parse(Whole, command, about, arguments)
+    try:
+        base = replace(first, expert=config_of(first))
+    except BAD_INPUT as error:
+        raise SystemExit(fail(2, error)) from None
+    return parse(Whole, command, about, arguments, base)
+
+
+def config_of(options: Train) -> TrainConfig:
+    """The configuration that the options ask for. ValueError for a bad one."""
+    preset = PRESETS[options.preset]
+    kept = options.out / CONFIG
+    file = options.config
+    if file is None and options.resume and kept.is_file() and (options.out / CHECKPOINT).exists():
+        file = kept
+    iterations = options.iterations
+    if file is not None:
+        config = read_config(file)
+        if iterations is not None and iterations != config.iterations:
+            config = with_iterations(config, iterations)
+    else:
+        length = preset.iterations if iterations is None else iterations
+        config = run_config(iterations=length, leave_out=options.leave_out or AUTO)
+    asked = run_config(iterations=config.iterations, leave_out=options.leave_out or AUTO)
+    changes: dict[str, Any] = {
+        name: value
+        for name in ("method", "seed", "eval_every")
+        if (value := getattr(options, name)) is not None
+    }
+    if options.leave_out is not None and file is not None:
+        changes["leave_out"] = asked.leave_out
+    if options.max_gaussians is not None:
+        changes["densify"] = replace(config.densify, max_gaussians=options.max_gaussians)
+    of_hqgs = {
+        name: value for name in ("guidance", "formation") if (value := getattr(options, name)) is not None
+    }
+    return replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
+
+
+def scene_of_run(out: Path) -> dict[str, Any]:
+    """What the run in a folder asked `hqgs.load` for; empty where nothing tells."""
+    if not ((out / CONFIG).is_file() and (out / CHECKPOINT).is_file()):
+        return {}
+    try:
+        origin = json.loads((out / CONFIG).read_text(encoding="utf-8")).get("scene") or {}
+    except (ValueError, AttributeError):
+        return {}
+    return {name: value for name, value in origin.items() if name in (*LOADING, "longest")}
+
+
+def run(options: Train) -> int:
+    """Train what the options say; return the exit code."""
+    started = time.perf_counter()
+    try:
+        config = options.expert if isinstance(options, Whole) else config_of(options)
+        parse_degradation(options.degrade)
+        if (options.out / CHECKPOINT).exists() and not (options.resume or options.overwrite):
+            raise FileExistsError(
+                f"{options.out} holds a run; continue it with --resume, begin anew with --overwrite, or "
+                "choose another --out"
+            )
+        if options.out.exists() and not options.out.is_dir():
+            raise ValueError(f"--out {options.out} is a file: name a folder for the run")
+        if options.threads is not None:
+            hqgs.set_num_threads(options.threads)
+        ready(options.scene)
+        with LoadingScreen() as screen:
+            scene = _load(options, config, screen)
+        tell_notes(scene)
+        loaded = time.perf_counter()
+        print(f"looking at the photos, then at most {config.iterations:,} iterations", flush=True)
+        with TrainingScreen() as bar:
+            done = hqgs.train(
+                scene,
+                out=options.out,
+                config=config,
+                resume=options.resume,
+                overwrite=options.overwrite,
+                progress=bar,
+            )
+    except KeyboardInterrupt:
+        if (options.out / CHECKPOINT).exists():
+            return fail(130, "stopped at once; --resume goes on from the last checkpoint")
+        found = (
+            " The same command goes on with what COLMAP has found" if (options.out / KEPT).exists() else ""
+        )
+        return fail(130, f"stopped before the first checkpoint.{found}")
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out}: {error}")
+    except hqgs.TrainingError as error:
+        return fail(1, str(error))
+    times = Times(started, loaded, bar.began or loaded, bar.ended or loaded, time.perf_counter())
+    _summary(options, done, screen.colmap_seconds, times)
+    if not done.finished:
+        command = shlex.join(["hqgs", "train", options.scene, "--out", str(options.out), "--resume"])
+        print(
+            f"stopped at iteration {done.iterations} of {done.length}; go on with: {command}", file=sys.stderr
+        )
+    return 0 if done.finished else 130
+
+
+def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
+    """The scene; where a run goes on, as it was, but for what the options say otherwise."""
+    asked: dict[str, Any] = {
+        name: value for name in LOADING if (value := getattr(options, name)) != getattr(Train, name)
+    }
+    sized = options.downscale is not None or options.preset != Train.preset
+    before = scene_of_run(options.out) if options.resume else {}
+    if sized or not before:
+        asked["longest"] = PRESETS[options.preset].longest if options.downscale is None else None
+        before.pop("downscale", None)
+    return hqgs.load(
+        **(before | asked | {"path": options.scene, "seed": config.seed}),
+        skip_unreadable="photos" in config.leave_out,
+        cache=options.out,
+        told=screen,
+    )
+
+
+def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
+    out, last = options.out, done.history[-1]
+    numbers = [f"{done.iterations} iterations", f"{len(done.model)} Gaussians", f"{done.seconds:.0f} s"]
+    numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
+    numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
+    print(f"{out}: {', '.join(numbers)}")
+    if table := format_left_out(done.left_out):
+        print(table)
+    word, why = verdict(last["psnr"])
+    print(f"quality: {word} ({why})")
+    print(f"time: {times.told(colmap)}")
+    print(f"now open {out / 'scene.ply'} in {VIEWERS}; the numbers are in {out / 'report.json'}")

@@ -1,0 +1,21 @@
+"""What a held-out PSNR means, in words."""
+
+from __future__ import annotations
+
+_LEVELS = (
+    (
+        20.0,
+        "poor",
+        "below 20 dB the scene is hardly recognisable: wrong poses, too few photos, or too short a run",
+    ),
+    (25.0, "fair", "20 to 25 dB: the scene is recognisable and soft; a longer run or more photos help"),
+    (30.0, "good", "25 to 30 dB: details are there"),
+)
+_BEST = ("very good", "above 30 dB: hard to tell from the photo at a glance")
+
+
+def verdict(psnr: float | None) -> tuple[str, str]:
+    """A word, and why, for the mean PSNR of views that were held out, dB; None: nothing was measured."""
+    if psnr is None:
+        return "not measured", "no photo was held out: look at the scene"
+    return next(((word, why) for limit, word, why in _LEVELS if psnr < limit), _BEST)

@@ -1,0 +1,63 @@
+"""What cameras write beside the pixels: how a photo was held, by which camera, how far it was zoomed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hqgs.photos.files import DECODE_ERRORS, open_photo
+
+_ORIENTATION, _MAKE, _MODEL, _MORE = 274, 271, 272, 0x8769  # tags; the last one is a table of its own:
+_FOCAL, _FOCAL_35MM, _WIDTH, _X_RESOLUTION, _RESOLUTION_UNIT = 37386, 41989, 40962, 41486, 41488
+_MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
+_DIAGONAL = math.hypot(36, 24)  # mm, of 35 mm film
+_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}  # quarter turns clockwise that show a photo upright
+_SHORTEST, _LONGEST = 0.2, 20.0  # focal length in longer sides; what lies beyond is a mistake
+
+
+@dataclass(frozen=True)
+class Exif:
+    """Of a photo. What nothing is known of is 0, or empty."""
+
+    turn: int = 0  # quarter turns clockwise that show the stored pixels upright: 0..3
+    camera: tuple[str, ...] = ()  # make, model and focal length: photos with the same ones share a camera
+    focal: float = 0.0  # px of the stored photo
+
+
+def read_exif(path: Path) -> Exif:
+    """The EXIF data of a photo; nothing where there is none, or where it is damaged."""
+    try:
+        with open_photo(path) as photo:
+            width, height = photo.size
+            found = photo.getexif()
+            more = found.get_ifd(_MORE)
+    except DECODE_ERRORS:
+        return Exif()
+    turn = _TURNS.get(found.get(_ORIENTATION, 1), 0)
+    focal = _focal(more, width, height)
+    if not _SHORTEST < focal / max(width, height) < _LONGEST:
+        focal = 0.0
+    names = tuple(str(found.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL))
+    lens = f"{_number(more, _FOCAL):g} {_number(more, _FOCAL_35MM):g}"
+    known = any(names) or focal > 0
+    return Exif(turn, (*names, lens) if known else (), focal)
+
+
+def _focal(more: dict[int, Any], width: int, height: int) -> float:
+    """In px; 0 where it is not told."""
+    if (equivalent := _number(more, _FOCAL_35MM)) > 0:
+        return equivalent / _DIAGONAL * math.hypot(width, height)
+    stored = _number(more, _WIDTH) or max(width, height)  # the sensor's side, if the photo was shrunk since
+    per_mm = _number(more, _X_RESOLUTION) / _MM.get(int(_number(more, _RESOLUTION_UNIT)), 25.4)
+    return _number(more, _FOCAL) * per_mm * max(width, height) / stored
+
+
+def _number(tags: dict[int, Any], tag: int) -> float:
+    """A tag's value; 0 where it is missing, no number or not finite."""
+    try:
+        value = float(tags.get(tag, 0))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return 0.0
+    return value if math.isfinite(value) and value > 0 else 0.0

@@ -1,0 +1,113 @@
+"""Photos from a film: the sharpest frame of each interval."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.stages import OnStage, Stage, untold
+
+PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
+LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
+QUALITY = 95  # of the JPEG files
+
+
+def film_frames(
+    path: Path, folder: Path, count: int | None = None, told: OnStage = untold
+) -> tuple[Path, str]:
+    """The sharpest frame of each of `count` intervals of a film, as JPEG files, upright.
+
+    `count` None: two a second, at least 30 and at most 90, as far as the film has them. The files lie in a
+    folder below `folder`, where the next call finds them. Returns their folder and what was done, in words.
+    ValueError where PyAV (the extra `video`) is missing, or the film cannot be read.
+    """
+    if count is not None and count < 3:
+        raise ValueError(f"frames is {count}, wanted at least 3")
+    av = _pyav(path)
+    state = path.stat()
+    name = f"{path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
+    target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
+    if not target.is_dir():
+        new = folder / f".{target.name}"
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir(parents=True)
+        try:
+            for number, frame in _sharpest(av, path, count, told):
+                Image.fromarray(frame).save(new / f"{number:06d}.jpg", quality=QUALITY, subsampling=0)
+            new.rename(target)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+    return target, f"the sharpest {len(list(target.iterdir()))} frames of {path.name}, one for each interval"
+
+
+def _sharpest(
+    av: Any, path: Path, count: int | None, told: OnStage
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Number and pixels [H, W, 3] of the sharpest frame of each interval, as the film is to be shown."""
+    try:
+        with av.open(str(path)) as film:
+            if not film.streams.video:
+                raise ValueError(f"{path} holds no pictures, only sound")
+            stream = film.streams.video[0]
+            stream.thread_type = "AUTO"
+            seconds = _seconds(film, stream)
+            wanted = count or int(np.clip(round(PER_SECOND * seconds), FEWEST, MOST))
+            interval = seconds / wanted if seconds > 0 else 1 / PER_SECOND
+            best, at, best_sharpness = None, 0, -1.0
+            number, start = -1, None
+            for number, frame in enumerate(film.decode(stream)):
+                time = frame.time if frame.time is not None else number / 30
+                start = time if start is None else start
+                now = int((time - start) / interval)
+                if now > at and best is not None:
+                    yield best
+                    best, best_sharpness = None, -1.0
+                at = max(at, now)
+                if (sharpness := _sharpness(frame)) > best_sharpness:
+                    best_sharpness = sharpness
+                    turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
+                    best = number, np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
+                told(Stage("frames of the film looked at", number + 1, stream.frames or 0))
+    except (av.error.FFmpegError, OSError) as error:
+        raise ValueError(f"the film {path} cannot be read: {error}") from error
+    if best is None:
+        raise ValueError(f"the film {path} holds no frame that can be read")
+    yield best
+
+
+def _seconds(film: Any, stream: Any) -> float:
+    """Of the film; 0 where it does not tell."""
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    return film.duration / 1e6 if film.duration else 0.0
+
+
+def _sharpness(frame: Any) -> float:
+    """Mean square of the Laplacian of the luma, at a size that any film has."""
+    scale = min(1.0, LOOKED_AT / max(frame.width, frame.height))
+    small = frame.reformat(
+        width=max(8, round(frame.width * scale)), height=max(8, round(frame.height * scale)), format="gray"
+    )
+    luma = small.to_ndarray().astype(np.float32)
+    inner = luma[1:-1, 1:-1]
+    laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4 * inner
+    return float(np.square(laplacian).mean())
+
+
+def _pyav(path: Path) -> Any:
+    """The module, which is imported when it is used: only films need it."""
+    try:
+        import av
+        import av.error
+    except ImportError as error:
+        raise ValueError(
+            f"{path} is a film, which needs the extra 'video': pip install 'hqgs[video]'"
+        ) from error
+    return av

@@ -1,0 +1,52 @@
+"""Photos alone, or a film, as a folder that COLMAP's own tools and any trainer read."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pycolmap
+from PIL import Image
+
+from hqgs.base.files import existing_folder, is_film
+from hqgs.base.stages import OnStage, untold
+from hqgs.photos.files import decode
+from hqgs.scene.film import film_frames
+from hqgs.scene.scene import SfmReport
+from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos
+from hqgs.scene.sfm.photos_alone import find_cameras
+
+
+def write_colmap_folder(
+    source: str | Path, out: Path, work: Path, frames: int | None = None, told: OnStage = untold
+) -> SfmReport:
+    """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
+
+    `images` has every photo with a place: those of WebP or HEIC as JPEG, the others as they are. `work` is a
+    folder for what the next call goes on with if this one is stopped; it is removed at the end. ValueError
+    where there are no photos, or COLMAP finds no scene in them.
+    """
+    with TemporaryDirectory(prefix="hqgs-film-") as name:
+        if is_film(source):
+            source, _ = film_frames(Path(source), Path(name), frames, told)
+        root = existing_folder(source)
+        photos = bare_photos(root, 1.0)
+        if photos is None:
+            raise ValueError(f"{root} holds no photos")
+        found = find_cameras(root, photos, work, told)
+        images = out / "images"
+        for image in found.model.images.values():
+            original = found.photos.colmap_names[image.name]
+            target = images / image.name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if original.lower().endswith(FOR_COLMAP):
+                shutil.copyfile(found.photos.folder / original, target)
+            else:
+                pixels = decode(found.photos.folder / original)[0]
+                Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
+        (out / "sparse" / "0").mkdir(parents=True)
+        model: pycolmap.Reconstruction = found.model
+        model.write_binary(out / "sparse" / "0")
+        shutil.rmtree(work, ignore_errors=True)
+        return found.report

@@ -1,0 +1,108 @@
+"""Cameras and points for a folder of photos alone, by COLMAP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hqgs.base.stages import OnStage, untold
+from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
+from hqgs.scene.formats.colmap import model_points, registered, seen_points
+from hqgs.scene.scene import SfmReport, Tracks
+from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
+from hqgs.scene.sfm.run import run_colmap
+
+UP = np.array([0.0, -1.0, 0.0])  # in the world of photos alone, as in an upright camera's frame
+LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
+
+
+@dataclass(frozen=True)
+class Found:
+    """What COLMAP found in photos alone, upright."""
+
+    photos: BarePhotos  # those that can be read
+    model: pycolmap.Reconstruction
+    report: SfmReport
+
+
+def find_cameras(root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold) -> Found:
+    """Cameras and points of photos alone, by COLMAP, as `read_photos` has them."""
+    photos = readable(photos, told)
+    names = photos.colmap_names
+    try:
+        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, told)
+        poses = ran.poses()
+    except ValueError as error:
+        raise ValueError(f"{root}: {error}") from error
+    model = ran.found
+    turns = {name: exif.turn for name, exif in zip(photos.names, photos.exif, strict=True)}
+    upright = _upright(np.stack(list(poses.values())), [turns[names[name]] for name in poses])
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
+    report = SfmReport(
+        photos=len(names),
+        not_registered=[name for own, name in names.items() if own not in poses],
+        outliers=[],
+        rotation_error_deg=None,
+        translation_error=None,
+        own_cameras_px=None,
+        points=model.num_points3D(),
+        point_distance=None,
+        track_length=model.compute_mean_track_length(),
+        reprojection_error_px=model.compute_mean_reprojection_error(),
+        own_points=None,
+        own_track_length=None,
+        own_reprojection_error_px=None,
+        unreadable=photos.unreadable,
+        first_pass=ran.first_pass,
+        advice=ran.advice(),
+    )
+    return Found(photos, model, report)
+
+
+def read_photos(root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold) -> Capture:
+    """Cameras and points of a folder of photos, from all of them, by COLMAP.
+
+    Photos of one size share a camera (SIMPLE_RADIAL), unless EXIF tells cameras or zooms apart; it is found
+    as well, from the focal length in EXIF where that has one. Held-out views are among the photos: without
+    them they would have no pose. The report says so, and names the photos that have no place. The world is
+    turned so that the photos' mean up is -y; up is what EXIF says of how each was held. `keep`: a folder for
+    the reconstruction, see `run_colmap`. ValueError where COLMAP cannot make a model of half of the photos.
+    """
+    cameras = find_cameras(root, photos, keep, told)
+    model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
+    of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    found = [
+        Photo(names[name], folder / names[name], of_image[name], viewmat, find_mask(root, names[name]))
+        for name, viewmat in registered(model).items()
+    ]
+    notes = [str(cameras.report), *cameras.photos.notes]
+    points, colors = keep_finite(*model_points(model), notes)
+    seen = None
+    if len(points) == model.num_points3D():
+        seen = {names[name]: rows for name, rows in seen_points(model).items()}
+    return Capture(
+        "photos",
+        found,
+        cameras.photos.downscale,
+        points,
+        colors,
+        folder=folder,
+        notes=notes,
+        tracks=Tracks(cameras.report.track_length, cameras.report.reprojection_error_px),
+        seen=seen,
+        sfm=cameras.report,
+    )
+
+
+def _upright(viewmats: NDArray[np.float64], turns: list[int]) -> NDArray[np.float64]:
+    """The rotation [3, 3] that takes the cameras' mean up to UP; the unit where they agree on none."""
+    mean = np.einsum("nji,nj->ni", viewmats[:, :3, :3], ups(turns)).mean(0)
+    length = float(np.linalg.norm(mean))
+    if length < LEAST_AGREED:
+        return np.eye(3)
+    return Rotation.align_vectors(UP[None], (mean / length)[None])[0].as_matrix()

@@ -1,0 +1,164 @@
+"""Scenes as users name them: a folder, a film or the built-in room.
+
+The command line and `import hqgs` both call what is here, so that both have one set of defaults.
+"""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hqgs.base.files import CONFIG, EMBEDDED, KEPT, is_film
+from hqgs.base.stages import OnStage, untold
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.degrade import degrade_scene
+from hqgs.scene.film import film_frames
+from hqgs.scene.load import load_pictures, load_scene
+from hqgs.scene.restore import restore_scene
+from hqgs.scene.scene import Scene
+from hqgs.scene.sfm.reconstruct import sfm_scene
+
+EMBEDDED_SIZE = (504, 378)  # pixels
+EMBEDDED_TEST_EVERY = 8
+
+
+def load(
+    path: str | Path,
+    *,
+    downscale: float = 1.0,
+    test_every: int = 8,
+    sfm: bool = False,
+    degrade: str = "none",
+    seed: int = 0,
+    restore: str | Path | None = None,
+    skip_unreadable: bool = True,
+    cache: str | Path | None = None,
+    longest: int | None = None,
+    frames: int | None = None,
+    told: OnStage = untold,
+) -> Scene:
+    """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
+
+    Args:
+        path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
+            Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or "embedded", the room that is built in
+            (504 x 378 px, 24 views).
+        downscale: divide the photos' sides by this, at least 1.
+        test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
+            folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
+        sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
+        degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
+        seed: of the degradation.
+        restore: weights of an image network that the training photos go through at last.
+        skip_unreadable: leave out training photos that cannot be read, as long as at least half of them can;
+            `Scene.notes` names them. False: an error.
+        cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film,
+            the embedded scene.
+        longest: px; scale the photos down further where a side is longer.
+        frames: how many of a film; None: two a second, 30 to 90.
+        told: hears what is being done, and how far it is.
+
+    Returns:
+        Photos [H, W, 3], sRGB, uint8 (float32 where they were degraded or restored from that); world units
+        and frame are those of the files, cameras are in the OpenCV frame.
+
+    Raises:
+        FileNotFoundError: a folder, photo or file of weights that is not there.
+        ValueError: anything else that is wrong; the message names the file or the photo.
+    """
+    origin = {
+        "path": EMBEDDED if str(path) == EMBEDDED else str(Path(path).resolve()),
+        "downscale": downscale,
+        "test_every": test_every,
+        "sfm": sfm,
+        "degrade": degrade,
+        "seed": seed,
+        "restore": None if restore is None else str(Path(restore).resolve()),
+        "skip_unreadable": skip_unreadable,
+        "longest": longest,
+        "frames": frames,
+    }
+    degradation = parse_degradation(degrade)
+    kept = None if cache is None else Path(cache)
+    models = None if kept is None else kept / KEPT
+    if str(path) == EMBEDDED:
+        if not downscale >= 1:
+            raise ValueError(f"downscale must be at least 1, got {downscale}")
+        if test_every != EMBEDDED_TEST_EVERY:
+            raise ValueError(
+                f"test_every is {test_every}, but the embedded scene holds out every {EMBEDDED_TEST_EVERY}th"
+            )
+        width, height = (round(size / downscale) for size in EMBEDDED_SIZE)
+        scene = embedded_scene(cache=None if kept is None else kept / "scene", width=width, height=height)
+    else:
+        with ExitStack() as stack:
+            notes, name = list[str](), None
+            if is_film(path):
+                name = Path(path).stem
+                folder = kept or Path(stack.enter_context(TemporaryDirectory(prefix="hqgs-film-")))
+                path, note = film_frames(Path(path), folder / "frames", frames, told)
+                notes.append(note)
+            scene = load_scene(
+                path,
+                downscale,
+                test_every=test_every,
+                skip_unreadable=skip_unreadable,
+                keep_sfm=models,
+                longest=longest,
+                told=told,
+                sfm=sfm,
+            )
+            scene = replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
+    if degradation.steps:
+        scene = degrade_scene(scene, degradation, seed)
+    if sfm and (scene.source != "photos" or degradation.steps):
+        scene = sfm_scene(scene, models, told)
+    scene = scene if restore is None else restore_scene(scene, restore)
+    return replace(scene, origin=origin)
+
+
+def load_again(run: str | Path, told: OnStage = untold) -> Scene:
+    """The scene that the run in a folder was trained on, from the photos, where they still lie.
+
+    ValueError where its config.json does not tell, FileNotFoundError where the photos are gone.
+    """
+    path = Path(run) / CONFIG
+    try:
+        origin = json.loads(path.read_text(encoding="utf-8"))["scene"]
+        return load(**origin, cache=run, told=told)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"the photos of the run {run} are not known: {error}") from error
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} does not tell which scene was trained: {error!r}") from error
+
+
+def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = None) -> Scene:
+    """What `hqgs.diagnose` needs of a folder: as `load`, but photos alone, or a film, are given no poses.
+
+    Of photos alone some are read, spread over the folder.
+    """
+    if str(path) != EMBEDDED:
+        with TemporaryDirectory(prefix="hqgs-film-") as name:
+            source = film_frames(Path(path), Path(name))[0] if is_film(path) else path
+            if (scene := load_pictures(source, downscale)) is not None:
+                return scene
+    return load(path, downscale=downscale, longest=longest, skip_unreadable=False)
+
+
+def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
+    """The scene with degraded training photos (float32, 1 is white); held-out ones stay as they are.
+
+    Args:
+        kind: jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH] (white
+            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], chat[:SIDE] (each photo in its
+            own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND (half of the
+            photos only); several joined by + in their order, mixed, or none.
+        seed: of everything random. Each photo has its own numbers, whatever the others are.
+
+    Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.
+    """
+    return degrade_scene(scene, parse_degradation(kind), seed)

@@ -1,0 +1,241 @@
+"""Folders of photos as people have them: what is read, what is converted, what is left out and said."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
+
+from hqgs.base.stages import Stage
+from hqgs.photos.exif import read_exif
+from hqgs.photos.files import UnreadableError, check_whole, decode
+from hqgs.scene.load import load_pictures, load_scene
+from hqgs.scene.scene import Scene
+from hqgs.scene.sfm import run as colmap_run
+from hqgs.scene.sfm.bare_photos import bare_photos, readable
+from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
+from hqgs.scene.sfm.program import _Pass
+
+ROOT = Path(__file__).parent.parent
+
+
+def exif(orientation: int = 1, focal_35mm: int = 0, model: str = "") -> Image.Exif:
+    tags = Image.Exif()
+    tags[274] = orientation
+    if model:
+        tags[272] = model
+    if focal_35mm:
+        tags.get_ifd(0x8769)[41989] = focal_35mm
+    return tags
+
+
+def picture(seed: int, size: tuple[int, int] = (40, 30)) -> Image.Image:
+    rng = np.random.default_rng(seed)
+    return Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8))
+
+
+@pytest.fixture
+def photos(cards: Scene) -> list[np.ndarray]:  # noqa: F811
+    """The nine photos of the cards, in their order."""
+    views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
+    return [view.image.astype(np.uint8) for view in views]
+
+
+def test_exif_tells_orientation_camera_and_focal_length(tmp_path: Path) -> None:
+    for orientation, turn in ((1, 0), (3, 2), (6, 1), (8, 3)):
+        picture(0).save(tmp_path / "a.jpg", exif=exif(orientation, 28, "Phone"))
+        found = read_exif(tmp_path / "a.jpg")
+        assert found.turn == turn
+        assert found.camera == ("", "Phone", "0 28")
+        assert found.focal == pytest.approx(28 / 43.27 * 50, rel=1e-3)  # the photo's diagonal is 50 px
+    picture(0).save(tmp_path / "a.jpg", exif=exif(6, 9999))
+    assert read_exif(tmp_path / "a.jpg").focal == 0  # no such lens
+    picture(0).save(tmp_path / "a.png")
+    (tmp_path / "b.jpg").write_text("no photo")
+    for name in ("a.png", "b.jpg"):
+        assert (read_exif(tmp_path / name).turn, read_exif(tmp_path / name).camera) == (0, ())
+
+
+def test_photos_share_a_camera_by_size_make_and_zoom(tmp_path: Path) -> None:
+    for name, size, focal in (
+        ("a", (40, 30), 28),
+        ("b", (40, 30), 28),
+        ("c", (40, 30), 56),
+        ("d", (30, 40), 28),
+        ("e", (40, 30), 0),
+    ):
+        picture(0, size).save(tmp_path / f"{name}.jpg", exif=exif(1, focal, "Phone"))
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    guess = readable(found).guess()
+    assert guess.camera_of == [0, 0, 1, 2, 3]
+    assert guess.sizes == [(40, 30), (40, 30), (30, 40), (40, 30)]
+    assert guess.focals == pytest.approx([32.36, 64.71, 32.36, 0], rel=1e-3)
+
+
+def test_photos_one_level_down_are_found_and_others_are_named(tmp_path: Path) -> None:
+    inner = tmp_path / "holiday"
+    inner.mkdir()
+    for k in range(4):
+        picture(k).save(inner / f"{k}.webp")
+    (inner / "notes.png").write_text("milk, eggs")
+    (inner / "cut.jpg").write_bytes(b"")
+    picture(5).save(inner / "cut.jpg")
+    (inner / "cut.jpg").write_bytes((inner / "cut.jpg").read_bytes()[:400])
+    (tmp_path / "masks").mkdir()
+    picture(6).save(tmp_path / "masks" / "0.png")
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    assert found.folder == inner
+    assert "holiday" in found.notes[0]
+    whole = readable(found)
+    assert whole.names == [f"{k}.webp" for k in range(4)]
+    assert list(whole.unreadable) == ["cut.jpg", "notes.png"]
+    assert whole.unreadable["notes.png"] == "no picture"
+    assert "truncated" in whole.unreadable["cut.jpg"].lower()
+    (tmp_path / ".colmap").mkdir()
+    whole.write(tmp_path / ".colmap")
+    assert sorted(p.name for p in (tmp_path / ".colmap").iterdir()) == [f"{k}.webp.jpg" for k in range(4)]
+    for k in range(5):
+        (inner / f"x{k}.png").write_text("no photo")
+    again = bare_photos(tmp_path, 1)
+    assert again is not None
+    with pytest.raises(
+        ValueError, match=r"7 of 11 photos cannot be read: cut.jpg \(.*notes.png \(no picture\)"
+    ):
+        readable(again)
+
+
+def test_heic_photos_are_read_or_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    image = Image.fromarray(np.full((64, 96, 3), (200, 60, 90), np.uint8))
+    for k in range(3):
+        image.save(tmp_path / f"{k}.HEIC")
+    assert check_whole(tmp_path / "0.HEIC") == (96, 64)
+    assert np.abs(decode(tmp_path / "0.HEIC")[0].mean((0, 1)) - (200, 60, 90)).max() < 4
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    assert readable(found).names == ["0.HEIC", "1.HEIC", "2.HEIC"]
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(ValueError, match=r"3 of 3 photos are HEIC .*pip install 'hqgs\[heic\]'"):
+        readable(found)
+    with pytest.raises(UnreadableError, match="extra 'heic'"):
+        decode(tmp_path / "0.HEIC")
+
+
+def test_the_world_stands_upright_and_every_photo_is_named(photos: list[np.ndarray], tmp_path: Path) -> None:
+    """Photos that lie on their side, some as WebP, with a text file among them and one that fits nowhere."""
+    for k, image in enumerate(photos):
+        turned = Image.fromarray(np.ascontiguousarray(np.rot90(image)))
+        turned.save(tmp_path / f"{k}.{'webp' if k % 2 else 'jpg'}", exif=exif(6), quality=98)
+    picture(7, (HEIGHT, WIDTH)).save(tmp_path / "foreign.png")
+    (tmp_path / "zz.png").write_text("a text")
+    stages: list[Stage] = []
+    scene = load_scene(tmp_path, keep_sfm=tmp_path / "kept", told=stages.append)
+    report = scene.sfm
+    assert report is not None
+    assert (report.photos, report.not_registered) == (10, ["foreign.png"])
+    assert report.unreadable == {"zz.png": "no picture"}
+    assert "foreign.png" in str(report)
+    assert "zz.png (no picture)" in str(report)
+    views = [*scene.train, *scene.test]
+    assert {view.turn for view in views} == {1}
+    assert {view.image.shape for view in views} == {views[0].image.shape}
+    ups = np.stack([-view.camera.viewmat[0, :3] for view in views])  # of the stored pixels up is to the left
+    mean = ups.mean(0) / np.linalg.norm(ups.mean(0))
+    np.testing.assert_allclose(mean, [0, -1, 0], atol=1e-6)
+    assert {stage.what for stage in stages} >= {
+        "photos looked at",
+        "COLMAP: features",
+        "COLMAP: photos placed",
+    }
+    assert scene.seen is not None
+    assert set(scene.seen) == {view.name for view in views}
+    pictures = load_pictures(tmp_path, most=4)
+    assert pictures is not None
+    assert len(pictures.train) == 4
+    assert pictures.notes == ["cannot be read (1): zz.png"]
+
+
+def test_a_stopped_reconstruction_goes_on_where_it_was(photos: list[np.ndarray], tmp_path: Path) -> None:
+    """Stopped by Ctrl-C while it matches; features that are there are not looked for again."""
+    folder, keep = tmp_path / "photos", tmp_path / "run" / "sfm"
+    folder.mkdir()
+    for k, image in enumerate(photos):
+        Image.fromarray(image).save(folder / f"{k}.png")
+    code = f"""
+from pathlib import Path
+from hqgs.scene.load import load_scene
+def told(stage):
+    if "matched" in stage.what or "checked" in stage.what or "placed" in stage.what:
+        print("now", flush=True)
+load_scene(Path({str(folder)!r}), keep_sfm=Path({str(keep)!r}), told=told)
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"now\n"
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    (left,) = keep.iterdir()
+    log = (left / "log.txt").read_text()
+    assert log.count("Processed file [") >= 9
+    assert (left / "colmap.db").is_file()
+    fresh = load_scene(folder)
+    scene = load_scene(folder, keep_sfm=keep)
+    assert [path.name for path in keep.iterdir()] == [left.name[1:]]
+    assert scene.points.tobytes() == fresh.points.tobytes()
+
+
+def passes(features: int, inliers: list[int], photos: int = 20, registered: int = 0) -> list[Pass]:
+    first = Pass(False, registered, {f"{k}.jpg": features for k in range(photos)}, inliers, inliers)
+    return [first, Pass(True, registered, first.features, inliers, inliers)]
+
+
+def test_a_failure_tells_blur_no_overlap_and_too_few_photos_apart() -> None:
+    blurred = why_no_model(20, passes(40, []))
+    assert "40 features" in blurred
+    assert "blurred or dark" in blurred
+    apart = why_no_model(20, passes(3000, [12, 9]))
+    assert "0 of 190 pairs" in apart
+    assert "no overlap" in apart
+    assert "too few photos" in why_no_model(4, passes(3000, [120, 90], 4))
+    assert "taken from one place" in why_no_model(20, passes(3000, [900] * 100))
+    assert "20 photos show few" not in why_few(20, passes(3000, [900] * 100, registered=8))
+    assert "overlap too little" in why_few(20, passes(3000, [900] * 100, registered=8))
+
+
+def test_the_second_pass_takes_more() -> None:
+    """A few photos of the first pass lead to a second one, whose thresholds are all lower."""
+    first, second = (_Pass.__new__(_Pass) for _ in range(2))
+    first.tolerant, second.tolerant = False, True
+    assert second._geometry().min_num_inliers < first._geometry().min_num_inliers
+    mild, strict = second._mapping(False), first._mapping(False)
+    assert mild.min_num_matches < strict.min_num_matches
+    for name in ("init_min_num_inliers", "init_min_tri_angle", "abs_pose_min_num_inliers"):
+        assert getattr(mild.mapper, name) < getattr(strict.mapper, name)
+
+
+def test_few_photos_and_a_colmap_that_fails_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture(0).save(tmp_path / "one.jpg")
+    with pytest.raises(ValueError, match="at least 3 photos, got 1: 20 to 100 that overlap"):
+        load_scene(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="is empty: give a folder with photos"):
+        load_scene(tmp_path / "empty")
+    (tmp_path / "empty" / "all.zip").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"holds no photos, but all.zip: unpack it"):
+        load_scene(tmp_path / "empty")
+    for k in range(4):
+        picture(k).save(tmp_path / f"{k}.jpg")
+    monkeypatch.setattr(colmap_run, "PROGRAM", tmp_path / "no such program.py")
+    with pytest.raises(ValueError, match=r"COLMAP ended with status 2 .*no such program"):
+        load_scene(tmp_path)

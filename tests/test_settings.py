@@ -1,0 +1,147 @@
+"""Configurations in files, of another length, and from the command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_scene import tiny_config, tiny_scene
+
+from hqgs.cli.main import COMMANDS, main
+from hqgs.cli.train import Train, Whole, config_of, read
+from hqgs.evaluation.verdict import verdict
+from hqgs.pipeline import train
+from hqgs.training.config import TrainConfig, run_config
+from hqgs.training.settings import PRESETS, config_values, read_config, with_iterations
+
+
+def options(*arguments: str | Path) -> Train:
+    return read(Train, "train", "train", ["photos", "--out", "nowhere", *map(str, arguments)])
+
+
+def test_a_configuration_comes_back_from_its_file(tmp_path: Path) -> None:
+    config = replace(run_config(iterations=700, seed=3, formation="blur:2"), background=(0.0, 0.5, 1.0))
+    for values in (config_values(config), {"train": config_values(config), "scene": None}):
+        (tmp_path / "config.json").write_text(json.dumps(values))
+        assert read_config(tmp_path / "config.json") == read_config(tmp_path) == config
+    paper = config_values(config)
+    paper["hqgs"]["paper"]["esfg"] = None
+    (tmp_path / "config.json").write_text(json.dumps(paper))
+    assert read_config(tmp_path).hqgs.paper.esfg is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"iteration": 3}, "there is no field 'iteration'; there are: iterations, method"),
+        ({"iterations": "many"}, "iterations is 'many', wanted int"),
+        ({"iterations": True}, "iterations is True, wanted int"),
+        ({"densify": {"every": 0}}, "every is 0, wanted at least 1"),
+        ({"densify": 3}, "wanted an object with fields, got 3"),
+        ({"method": "4dgs"}, "unknown method '4dgs'"),
+        ([], r"wanted an object with fields, got \[\]"),
+    ],
+)
+def test_a_bad_file_is_told_by_field(values: Any, message: str, tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=message):
+        read_config(tmp_path / "c.json")
+
+
+def test_another_length_moves_the_schedule_but_not_what_was_set() -> None:
+    short = run_config(iterations=600)
+    assert with_iterations(short, 6000) == run_config(iterations=6000)
+    own = replace(short, densify=replace(short.densify, every=7), sh_interval=11)
+    longer = with_iterations(own, 6000)
+    assert (longer.densify.every, longer.sh_interval) == (7, 11)
+    assert longer.densify.stop == run_config(iterations=6000).densify.stop
+    assert "iterations" in run_config().leave_out
+    assert "iterations" not in with_iterations(run_config(), 900).leave_out
+
+
+def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: Path) -> None:
+    chosen = options("--iterations", "600", "--config.densify.grad-threshold", "3e-4", "--seed", "5")
+    assert isinstance(chosen, Whole)
+    wanted = run_config(iterations=600, seed=5)
+    assert chosen.expert == replace(wanted, densify=replace(wanted.densify, grad_threshold=3e-4))
+    assert config_of(options()) == run_config()
+    assert config_of(options("--preset", "quick")) == run_config(iterations=PRESETS["quick"].iterations)
+    assert config_of(options("--preset", "quick", "--iterations", "50")) == run_config(iterations=50)
+    file = tmp_path / "mine.json"
+    file.write_text(json.dumps(config_values(wanted)))
+    assert config_of(options("--config", file)) == wanted
+    assert config_of(options("--config", file, "--iterations", "900")) == run_config(iterations=900, seed=5)
+    assert config_of(options("--config", file, "--leave-out", "none")) == replace(wanted, leave_out=())
+    assert config_of(options("--leave-out", "photos,growth")) == run_config(leave_out="photos,growth")
+
+
+def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["train", "--help-all"])
+    shown = capsys.readouterr().out.replace("_", "-")
+
+    def check(values: dict[str, Any], prefix: str) -> None:
+        for name, value in values.items():
+            option = f"{prefix}{name.replace('_', '-')}"
+            if isinstance(value, dict):
+                check(value, f"{option}.")
+            else:
+                assert (f"{prefix}no-{name.replace('_', '-')}" if value is True else option) in shown
+
+    check(config_values(TrainConfig()), "--config.")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "x", "--out", "y", "--device", "cuda"], "there is no --device: hqgs trains on the CPU"),
+        (["train", "x", "--out", "y", "--iterations", "many"], "--iterations is many, wanted INT"),
+        (["train", "x"], "missing: --out DIR"),
+        (["train", "x", "--out", "y", "--preset", "fast"], "invalid choice 'fast' for argument '--preset'"),
+        (["--iterations", "3"], "there is no option '--iterations'"),
+        (["diagnose", "x.zip"], "there is no scene folder"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert "│" not in line
+
+
+def test_each_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in COMMANDS:
+        with pytest.raises(SystemExit, match="0"):
+            main([name, "--help"])
+        assert f"usage: hqgs {name}" in capsys.readouterr().out
+
+
+def test_a_finished_run_trains_on_and_says_so(tmp_path: Path) -> None:
+    scene, config = tiny_scene(), tiny_config(method="3dgs")
+    first = train(scene, out=tmp_path, config=config)
+    longer = replace(config, iterations=45)
+    run = train(scene, out=tmp_path, config=longer, resume=True)
+    assert (first.iterations, run.iterations, run.length) == (30, 45, 45)
+    assert any("had ended at iteration 30" in note for note in run.report["notes"])
+    with pytest.raises(ValueError, match="another seed"):
+        train(scene, out=tmp_path, config=replace(longer, iterations=60, seed=1), resume=True)
+    again = train(scene, out=tmp_path, config=longer, resume=True)
+    assert again.model.means.equal(run.model.means)
+    kept = json.loads((tmp_path / "config.json").read_text())
+    assert read_config(tmp_path) == longer
+    assert kept["scene"] is None
+
+
+def test_the_verdict_rises_with_the_psnr() -> None:
+    words = [verdict(psnr)[0] for psnr in (None, 14.7, 22.0, 27.0, 33.0)]
+    assert words == ["not measured", "poor", "fair", "good", "very good"]
+    assert "below 20 dB" in verdict(14.7)[1]
