@@ -21,7 +21,8 @@ DARK, BRIGHT = 0.02, 0.9  # of white in linear light: beyond them noise and the 
 FEWEST = 20  # points that a photo must share with others
 ROUNDS = 30
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
-SHARES = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
+SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
+CLEARLY = 3.0  # of the log-likelihood: less does not tell neighbours that go together from chance
 
 
 def log_gains(scene: Scene) -> Floats | None:
@@ -72,7 +73,8 @@ def _apart(views: Sequence[View], gains: Floats) -> Floats:
     reach = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
     squares = np.square((centers[:, None] - centers) / reach).sum(-1)
     squares += np.square(ahead[:, None] - ahead).sum(-1)
-    best, shared = -np.inf, np.zeros_like(gains)
+    apart = -0.5 * (len(views) * np.log(np.square(gains).mean(0) + 1e-12)).sum()
+    best, shared = apart + CLEARLY, np.zeros_like(gains)
     for length in LENGTHS:
         together = np.exp(-squares / (2 * length**2))
         for share in SHARES:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hqgs.diagnosis.differences import UNLIKE, UNLIKE_GAINS, gain_spread, sharpness_spread
+from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import NONE, parse_degradation
@@ -132,13 +132,16 @@ def _exposure(scene: Scene) -> Part:
 
 
 def _shake(scene: Scene) -> Part:
-    spread = sharpness_spread(scene)
-    if spread is None:
+    unlike = unlike_sharpness(scene)
+    if unlike is None:
         return Part("shake", False, None, None, None, "the photos are too few or too small to tell")
-    reason = f"the power of fine details differs by a factor of e^{spread:.2f} from photo to photo"
-    if spread < UNLIKE:
-        return Part("shake", False, spread, None, None, f"{reason} (needed from {UNLIKE:g})")
-    return Part("shake", True, spread, None, "shake", reason)
+    reason = (
+        f"photos differ in sharpness by {unlike.sharpness:.2f}, in its direction by {unlike.direction:.2f}"
+    )
+    if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
+        reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
+        return Part("shake", False, unlike.sharpness, None, None, reason)
+    return Part("shake", True, unlike.sharpness, None, "shake", reason)
 
 
 def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:

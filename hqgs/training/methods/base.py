@@ -88,7 +88,7 @@ class Method(Protocol[T]):
         ...
 
     def compare(self, render: Tensor, target: T) -> Tensor:
-        """What of a developed render [H, W, 3] (not clamped) is compared with the target's photo, [h, w, 3]."""
+        """What of a developed render [H, W, 3], not clamped, is compared with the photo, [h, w, 3]."""
         ...
 
     def loss(self, image: Tensor, target: T) -> Tensor:

@@ -23,12 +23,14 @@ from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
 
-BEGIN = 0.2  # of the run: before, short ways would only hide what the scene does not show yet
-LOOKS = (1 / 3, 2 / 3)  # of the run: when short ways are given up
+BEGIN = 0.1  # of the run: before, ways would only hide what the scene does not show yet
+LOOKS = (0.5, 0.75)  # of the run: when short ways are given up
 SHORTEST = 0.7  # px, of the way of the picture's middle: less than that a photo stands still
-FIRST = 1e-3  # of the photo's width, standard deviation: ways grow from nothing only in some direction
+FIRST = 1e-3  # of the photo's width, standard deviation: from 0 a way has no direction to grow in
 PATH_RATE, GAIN_RATE = 8e-4, 0.005  # learning rates: of the photo's width, and of the log gains
+NARROW = 200  # px: narrower photos count as that wide
 LAST = 0.1  # of the rates, at the end of the run
+WAY = 9  # points that stand for a way
 SPACING, MOST = 1.5, 17  # px of a way from one sample of the exposure to the next, and the most samples
 MOST_MARGIN = 48  # px around a render
 REFRESH = 8  # visits of a photo until its depths are looked at again
@@ -48,8 +50,14 @@ class Shot:
 class Found:
     """What was found of a photo's camera."""
 
-    path: float  # px: how far the picture's middle went during the exposure
-    gains: tuple[float, float, float]  # of red, green and blue in linear light
+    name: str
+    way: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
+    gains: NDArray[np.float64]  # [3], of red, green and blue in linear light
+
+    @property
+    def extent(self) -> float:
+        """The longest distance of two points of the way, px."""
+        return float(np.linalg.norm(self.way[:, None] - self.way, axis=-1).max())
 
 
 class LearnedCameras:
@@ -63,7 +71,7 @@ class LearnedCameras:
         """`log_gains` [N, 3]: to start from; None: all gains are 1 and stay so."""
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
         self._depths = [median_depth(scene, view) for view in scene.train]
-        self._widths = [view.camera.width for view in scene.train]
+        self._widths = [max(view.camera.width, NARROW) for view in scene.train]
         self._sizes = [(view.camera.height, view.camera.width) for view in scene.train]
         rng, count = np.random.default_rng([seed, 6]), len(scene.train)
         first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
@@ -136,20 +144,18 @@ class LearnedCameras:
             self._visits[number] += 1
         if iteration in self._looks:
             for k, path in enumerate(self._paths):
-                if _middle_extent(path) < SHORTEST:
+                if _longest(_middle(path)) < SHORTEST:
                     self._still[k], self._nearness[k] = True, None
 
     def found(self) -> list[Found]:
         """For each photo."""
-        paths = [0.0] * len(self._still)
-        for k, path in enumerate(self._paths):
-            if not self._still[k]:
-                paths[k] = _middle_extent(path)
-        gains = [torch.ones(3)] * len(self._still)
-        if self._gains:
-            gains = [log.detach().exp() for log in self._gains]
         return [
-            Found(path, (float(g[0]), float(g[1]), float(g[2]))) for path, g in zip(paths, gains, strict=True)
+            Found(
+                name,
+                np.zeros((WAY, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
+                self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
+            )
+            for name, k in self._numbers.items()
         ]
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -188,8 +194,8 @@ class LearnedCameras:
     def _extent(self, number: int, camera: Camera) -> float:
         """The longest way in px of the picture's corners and middle."""
         with torch.no_grad():
-            moved = _moved(self._warps(number, camera, 9), camera, nearness=1.0)
-        return float((moved[:, None] - moved).norm(dim=-1).max())
+            moved = _moved(self._warps(number, camera, WAY), camera, nearness=1.0)
+        return max(_longest(moved[:, k]) for k in range(moved.shape[1]))
 
     def _warps(self, number: int, camera: Camera, count: int) -> Tensor:
         """As `take_photo` takes them, [count, 3, 4]; nearness is 1 at the median depth."""
@@ -212,11 +218,15 @@ def _steps(path: Tensor, count: int) -> Tensor:
     return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
 
 
-def _middle_extent(path: Tensor) -> float:
-    """How far the picture's middle goes at the median depth, px."""
-    steps = _steps(path.detach(), 9)
-    middle = torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
-    return float((middle[:, None] - middle).norm(dim=-1).max())
+def _middle(path: Tensor) -> Tensor:
+    """The way of the picture's middle at the median depth, px, [9, 2]."""
+    steps = _steps(path.detach(), WAY)
+    return torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
+
+
+def _longest(points: Tensor) -> float:
+    """Distance of two of the points [K, 2]."""
+    return float((points[:, None] - points).norm(dim=-1).max())
 
 
 def _turns(vectors: Tensor) -> Tensor:
