@@ -12,19 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs import __version__
-from hqgs.base.files import CHECKPOINT, CONFIG, PLY, lock_folder, remove_leftovers, write_json
+from hqgs.base.files import CHECKPOINT, CONFIG, PLY, atomic_path, lock_folder, remove_leftovers, write_json
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
 from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.metrics import psnr
-from hqgs.evaluation.records import HistoryEntry, Report, SfmRecord
+from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
+from hqgs.training.methods.cameras import Found
 from hqgs.training.settings import config_values
 from hqgs.training.trainer import Step, Trainer
+
+LEARNED = "learned.png"  # what was learned of the photos' cameras
 
 
 @dataclass(frozen=True)
@@ -236,7 +240,11 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
         guard=guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
         views=views,
+        learned=[_learned(found) for found in trainer.method.found()],
     )
+    if out is not None and result.learned:
+        with atomic_path(out / LEARNED) as tmp:
+            learned_picture([view.image for view in scene.train], result.learned).save(tmp)
     return Run(
         model=model,
         report=measure(result) if out is None else write_report(out, result),
@@ -248,6 +256,15 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
         views=views,
         out=out,
     )
+
+
+def _learned(found: Found) -> LearnedRecord:
+    return {
+        "name": found.name,
+        "shake_px": found.extent,
+        "way_px": found.way.tolist(),
+        "gains": found.gains.tolist(),
+    }
 
 
 def _notes(trainer: Trainer) -> list[str]:
@@ -262,4 +279,14 @@ def _notes(trainer: Trainer) -> list[str]:
     if left < 1:
         why = "pixels held back from the noisy photos showed no gain any more"
         notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
+    if found := trainer.method.found():
+        ways = sorted(photo.extent for photo in found)
+        if moved := sum(way > 0 for way in ways):
+            notes.append(
+                f"{moved} of {len(ways)} photos are shaken, by {ways[len(ways) // 2]:.1f} px in the median "
+                f"and {ways[-1]:.1f} px at most"
+            )
+        gains = np.log2([photo.gains for photo in found])
+        if gains.any():
+            notes.append(f"photos are up to {np.abs(gains).max():.2f} stops brighter or darker than the mean")
     return notes

@@ -103,6 +103,9 @@ pub mod internals {
 
     pub mod training {
         pub use crate::training::{adam, loss};
+        pub mod exposure {
+            pub use crate::training::exposure::*;
+        }
         pub mod jpeg_cells {
             pub use crate::training::jpeg_cells::*;
         }

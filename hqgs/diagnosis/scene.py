@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import NONE, parse_degradation
@@ -22,7 +23,7 @@ VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
 class Part:
     """One step of how the photos were made, and whether the method must undo it."""
 
-    name: str  # "blur", "lowres", "noise" or "jpeg"
+    name: str  # "exposure", "shake", "blur", "lowres", "noise" or "jpeg"
     needed: bool
     value: float | None  # median over photos: px, factor, levels or quality; None: not told
     spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
@@ -67,6 +68,7 @@ class Inspector:
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
+        self._differences: dict[tuple[int, ...], tuple[Part, Part]] = {}
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
         """`inspect_photo` of a view; `enlargement` where it is known."""
@@ -97,7 +99,14 @@ class Inspector:
         if key not in self._concluded:
             self._concluded[key] = tuple(conclude(found))
         photos = self._concluded[key]
-        parts = (_blur(photos), _lowres(photos), _noise(photos), _jpeg(photos))
+        everyone = tuple(map(id, scene.train))
+        if everyone not in self._differences:
+            self._differences[everyone] = _exposure(scene), _shake(scene)
+        exposure, shake = self._differences[everyone]
+        blur = _blur(photos)
+        if shake.needed:
+            blur = replace(blur, needed=False, step=None, reason="each photo has its own, see shake")
+        parts = (exposure, shake, blur, _lowres(photos), _noise(photos), _jpeg(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
         return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
 
@@ -110,6 +119,29 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     of all photos together. ValueError for `max_photos` below 1, or a bad photo, which is named.
     """
     return Inspector().diagnose(scene, max_photos)
+
+
+def _exposure(scene: Scene) -> Part:
+    spread = gain_spread(scene)
+    if spread is None:
+        return Part("exposure", False, None, None, None, "the photos share too few points to tell")
+    reason = f"gains differ by {spread:.1%} from photo to photo"
+    if spread < UNLIKE_GAINS:
+        return Part("exposure", False, spread, None, None, f"{reason} (needed from {UNLIKE_GAINS:.0%})")
+    return Part("exposure", True, spread, None, "exposure", reason)
+
+
+def _shake(scene: Scene) -> Part:
+    unlike = unlike_sharpness(scene)
+    if unlike is None:
+        return Part("shake", False, None, None, None, "the photos are too few or too small to tell")
+    reason = (
+        f"photos differ in sharpness by {unlike.sharpness:.2f}, in its direction by {unlike.direction:.2f}"
+    )
+    if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
+        reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
+        return Part("shake", False, unlike.sharpness, None, None, reason)
+    return Part("shake", True, unlike.sharpness, None, "shake", reason)
 
 
 def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:

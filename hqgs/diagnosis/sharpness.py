@@ -93,6 +93,10 @@ class Sharpness:
         """[N]: the log power of the finer half of the details."""
         return np.asarray(self._log_power[:, self._log_power.shape[1] // 2 :].mean(1))
 
+    def quarters(self) -> NDArray[np.float64]:
+        """[4, N]: the log power of a quarter of the details each, from the coarsest to the finest."""
+        return np.stack([part.mean(1) for part in np.array_split(self._log_power, 4, axis=1)])
+
     def extra_blur(self, photo: int, others: NDArray[np.int64]) -> float:
         """Signed sigma (px) of the Gaussian that makes the median spectrum of `others` that of `photo`.
 

@@ -85,6 +85,15 @@ class SfmRecord(TypedDict):
     advice: str | None
 
 
+class LearnedRecord(TypedDict):
+    """What was learned of a training photo's camera."""
+
+    name: str
+    shake_px: float  # how far the picture's middle went during the exposure
+    way_px: list[list[float]]  # its way, [9, 2], x to the right and y down; of mean 0
+    gains: list[float]  # of red, green and blue in linear light; their logarithms' mean over photos is 0
+
+
 class RunRecord(TypedDict):
     """A run without its metrics."""
 
@@ -105,6 +114,7 @@ class RunRecord(TypedDict):
     left_out: list[LeftOutRecord]
     guard: GuardRecord
     sfm: SfmRecord | None  # None: poses and points are the scene's own
+    learned: list[LearnedRecord]  # of the photos' cameras; empty where nothing of them is learned
     config: dict[str, Json]  # `TrainConfig`, as the method has fitted it to the scene
 
 

@@ -22,6 +22,7 @@ from hqgs.evaluation.records import (
     GuardRecord,
     HistoryEntry,
     Json,
+    LearnedRecord,
     MetricsRecord,
     MetricValues,
     Report,
@@ -67,6 +68,7 @@ class RunResult:
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
     views: list[RenderedView] = field(repr=False)
     sfm: SfmRecord | None = None
+    learned: list[LearnedRecord] = field(default_factory=list)
 
 
 def measure(result: RunResult) -> Report:

@@ -43,6 +43,32 @@ def render_view(
     return images[0], meta
 
 
+@torch.no_grad()
+def nearness_map(gaussians: Gaussians, camera: Camera, coarser: int) -> Tensor:
+    """1 / expected depth in pixels `coarser` times as large, [ceil(H / coarser), ceil(W / coarser)].
+
+    Where little is in the way of the light, the median of the rest; 0 where nothing is anywhere.
+    """
+    width, height = -(-camera.width // coarser), -(-camera.height // coarser)
+    K = camera.K.copy()
+    K[0] *= width / camera.width
+    K[1] *= height / camera.height
+    depths, alphas, _ = rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.activated_scales(),
+        gaussians.activated_opacities(),
+        gaussians.sh0[:, 0],
+        torch.tensor(camera.viewmat[None]),
+        torch.tensor(K[None]),
+        width,
+        height,
+        render_mode="ED",
+    )
+    near, solid = 1 / depths[0, ..., 0].clamp(min=_rust.NEAR_PLANE), alphas[0, ..., 0] > 0.5
+    return torch.where(solid, near, near[solid].median() if solid.any() else 0.0)
+
+
 def blending_weights(gaussians: Gaussians, camera: Camera) -> Tensor:
     """The largest blending weight T alpha of each Gaussian over the pixels of one view, [N].
 

@@ -16,7 +16,7 @@ class Kind:
     integer: bool = False
     at_504: float | None = None  # the value where none is written, in px of a photo 504 px wide
     default: float | None = None  # the same, for a value that does not depend on the photo's size
-    formation: bool = True  # whether a method can be told of it: the same in all photos, or known from them
+    formation: bool = True  # whether a method can be told of it
     some: bool = True  # whether it may happen to some of the photos only
 
 
@@ -27,8 +27,8 @@ KINDS = {
     "blur": Kind(0.1, 50, "sigma in px", at_504=2.5),
     "defocus": Kind(0.5, 50, "a radius in px", at_504=5.0),
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
-    "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0, formation=False),
-    "exposure": Kind(0.01, 4, "the most stops to either side", default=1, formation=False),
+    "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0),
+    "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
     "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
     "video": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
@@ -37,6 +37,7 @@ KINDS = {
 NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
 VIDEOS = ("video", "video265")
+LEARNED = ("shake", "exposure")  # of each photo its own, which is learned with the scene
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,10 @@ def parse_degradation(text: str) -> Degradation:
 
 
 def parse_formation(text: str) -> Degradation:
-    """Read what a method is told of the photos: as `parse_degradation`, and ValueError for other kinds."""
+    """Read what a method is told of the photos: as `parse_degradation`, and ValueError for other kinds.
+
+    `shake` and `exposure` stand without a value: what each photo's camera did is learned with the scene.
+    """
     return check_formation(parse_degradation(text))
 
 
@@ -163,6 +167,8 @@ def check_formation(degradation: Degradation) -> Degradation:
                 f"{step} differs from photo to photo and has no operator in the loss; a formation is made of "
                 f"{known}"
             )
+        if step.kind in LEARNED and step.value is not None:
+            raise ValueError(f"{step}: a formation learns what each photo has of it; write {step.kind}")
     return degradation
 
 

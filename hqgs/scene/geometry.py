@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs._rust import NEAR_PLANE
-from hqgs.scene.scene import Camera, View
+from hqgs.scene.scene import Camera, Scene, View
 
 MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
 
@@ -31,6 +31,15 @@ def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.flo
     depths = inside[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         return (inside @ camera.K.T)[:, :2] * (1 / depths)[:, None], depths
+
+
+def median_depth(scene: Scene, view: View) -> float:
+    """Of the points that the view sees, or of all in front of it where the scene does not tell; else 1."""
+    rows = None if scene.seen is None else scene.seen.get(view.name)
+    points = scene.points if rows is None or not len(rows) else scene.points[rows]
+    depths = project(view.camera, points.astype(np.float64))[1]
+    front = depths[depths > NEAR_PLANE]
+    return float(np.median(front)) if front.size else 1.0
 
 
 def photo_pixels(means: Tensor, views: list[View]) -> Tensor:

@@ -127,9 +127,11 @@ class Trainer:
 
         with one_torch_thread():
             gaussians = method.modulate(state.gaussians)
-            render, meta = render_view(gaussians, view.camera, plan.degree, self.config.background)
+            shot = method.shot(view, target)
+            render, meta = render_view(gaussians, shot.camera, plan.degree, self.config.background)
             meta["means2d"].retain_grad()  # [1, N, 2]
-            image = method.compare(render, target)
+            photo = shot.develop(render)
+            image = method.compare(photo, target)
             loss = method.loss(image, target)
             state.optimizer.zero_grad()
             if self._backward(loss, render, view):
@@ -142,11 +144,11 @@ class Trainer:
                     f"too large (scene's reach {state.densifier.reach:.3g}) or not finite "
                     f"({state.guard.culled}); are the cameras and points in one frame?"
                 )
-            method.after_step(state, image, target)
+            method.after_step(state, view, image, target)
             self._leave_out(growth, time.perf_counter() - started)
 
         state.seconds += time.perf_counter() - started
-        return Step(float(loss.detach()), render.detach(), view)
+        return Step(float(loss.detach()), photo.detach(), view)
 
     def shown(self) -> Gaussians:
         """The Gaussians that are rasterized, without a gradient history."""
@@ -240,6 +242,8 @@ class Trainer:
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
         for name, rate in learning_rates(self.config, self.extent, plan.part).items():
             groups[name]["lr"] = self.method.rate_left * rate
+        for name, rate in self.method.rates(plan.part).items():
+            groups[name]["lr"] = rate
         groups["shN"]["used"] = (plan.degree + 1) ** 2 - 1
 
     def _update(self, plan: Plan, meta: RasterizationMeta, view: View) -> None:
@@ -286,8 +290,10 @@ class Trainer:
         with torch.no_grad():
             for number in numbers:
                 view, target = self._seen(number, self.schedule.is_coarse(state.iteration))
-                render, _ = render_view(gaussians, view.camera, degree, self.config.background)
-                difference = (self.method.compare(render, target) - floats(target.photo)).square()
+                shot = self.method.shot(view, target)
+                render, _ = render_view(gaussians, shot.camera, degree, self.config.background)
+                image = self.method.compare(shot.develop(render), target)
+                difference = (image - floats(target.photo)).square()
                 if target.mask is not None:
                     difference = difference[target.mask]
                 errors.append(float(difference.double().mean()))

@@ -4,6 +4,7 @@
 mod arrays;
 mod composite;
 mod error;
+mod exposure;
 mod max_weights;
 mod pictures;
 mod project;
@@ -103,5 +104,6 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     composite::register(m)?;
     training::register(m)?;
     pictures::register(m)?;
+    exposure::register(m)?;
     max_weights::register(m)
 }

@@ -18,7 +18,7 @@ def make_hqgs(scene: Scene, config: TrainConfig, inspector: Inspector) -> Method
     """HQGS with the guidance that the configuration names."""
     if config.hqgs.guidance == PAPER:
         return PaperHQGS(scene, config.seed, config.hqgs.paper)
-    return HQGS(scene, config.hqgs, inspector)
+    return HQGS(scene, config.hqgs, inspector, config.seed)
 
 
 # By the names of `METHODS`: scene, configuration, and what inspects photos, of which each knows the others'.

@@ -20,6 +20,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import AUTO, TrainConfig
+from hqgs.training.methods.cameras import Found, Shot, no_shot
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.state import TrainState
 
@@ -47,9 +48,9 @@ T = TypeVar("T", bound=Target)
 class Method(Protocol[T]):
     """The replaceable part of a training step.
 
-    The trainer calls `prepare` for each training view and then `start`, once. A step is `modulate`,
-    rasterization, `compare`, `loss`, which change nothing; then Adam, `rows_changed` where Gaussians came or
-    went, and `after_step`.
+    The trainer calls `prepare` for each training view and then `start`, once. A step is `modulate`, `shot`,
+    rasterization, the shot's `develop`, `compare`, `loss`, which change nothing; then Adam, `rows_changed`
+    where Gaussians came or went, and `after_step`.
     """
 
     @property
@@ -82,8 +83,12 @@ class Method(Protocol[T]):
         """
         ...
 
+    def shot(self, view: View, target: T) -> Shot:
+        """The camera to rasterize for, and what makes the render a photo of the view's size."""
+        ...
+
     def compare(self, render: Tensor, target: T) -> Tensor:
-        """What of a render [H, W, 3] (float, not clamped) is compared with the target's photo, [h, w, 3]."""
+        """What of a developed render [H, W, 3], not clamped, is compared with the photo, [h, w, 3]."""
         ...
 
     def loss(self, image: Tensor, target: T) -> Tensor:
@@ -94,12 +99,20 @@ class Method(Protocol[T]):
         """Gaussians were added or removed: row i stems from row `parents[i]` of those before, [N]."""
         ...
 
-    def after_step(self, state: TrainState, image: Tensor, target: T) -> None:
+    def after_step(self, state: TrainState, view: View, image: Tensor, target: T) -> None:
         """What ages, and what is decided for the next step; `image` is what the loss was computed of."""
+        ...
+
+    def found(self) -> list[Found]:
+        """What was learned of each training photo's camera; empty where nothing is learned of any."""
         ...
 
     def param_groups(self) -> list[dict[str, Any]]:
         """The method's own trained tensors as Adam groups: {"name", "params", "lr"}; names are unique."""
+        ...
+
+    def rates(self, part: float) -> dict[str, float]:
+        """Learning rates of its groups, by name, where they change: `part` of the run is done, 0..1."""
         ...
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -139,17 +152,26 @@ class Plain:
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         return gaussians
 
+    def shot(self, view: View, target: Any) -> Shot:
+        return no_shot(view)
+
     def compare(self, render: Tensor, target: Any) -> Tensor:
         return render
 
     def rows_changed(self, state: TrainState, parents: Tensor) -> None:
         pass
 
-    def after_step(self, state: TrainState, image: Tensor, target: Any) -> None:
+    def after_step(self, state: TrainState, view: View, image: Tensor, target: Any) -> None:
         pass
+
+    def found(self) -> list[Found]:
+        return []
 
     def param_groups(self) -> list[dict[str, Any]]:
         return []
+
+    def rates(self, part: float) -> dict[str, float]:
+        return {}
 
     def state_dict(self) -> dict[str, Tensor]:
         return {}

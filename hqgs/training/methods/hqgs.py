@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
+from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.smoothing import enlarge
+from hqgs.photos.formula import LEARNED
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
@@ -19,6 +23,7 @@ from hqgs.training.checkpoint import part
 from hqgs.training.config import AUTO, HQGSConfig, TrainConfig
 from hqgs.training.methods.base import Plain, Start
 from hqgs.training.methods.budget import first_points, with_budget
+from hqgs.training.methods.cameras import Found, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
@@ -27,6 +32,7 @@ from hqgs.training.state import TrainState
 LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
+ENOUGH = 7_000  # iterations where cameras are learned and no number is given
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -40,6 +46,8 @@ class HQGS(Plain):
       parts.
     - Noise: differences count by their square up to two standard deviations of the noise (Huber's function).
       The mean of Gaussian noise over the views is nearer to the truth than their median, which L1 asks for.
+    - Shake and exposure, each photo its own: what its camera did is learned with the scene
+      (`LearnedCameras`), and the render is taken like that. With nothing else, the rest is 3DGS's.
     - None of them: the loss of 3DGS.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
@@ -51,7 +59,9 @@ class HQGS(Plain):
 
     name = "hqgs"
 
-    def __init__(self, scene: Scene, config: HQGSConfig, inspector: Inspector | None = None) -> None:
+    def __init__(
+        self, scene: Scene, config: HQGSConfig, inspector: Inspector | None = None, seed: int = 0
+    ) -> None:
         """`inspector`: what diagnoses the scene's photos where the formation is not given."""
         self.config = config
         found = find_formation(scene, config.formation, inspector or Inspector())
@@ -64,6 +74,13 @@ class HQGS(Plain):
         self._dssim = 0.0 if "noise" in kinds or jpeg else LAMBDA_DSSIM
         self._views = scene.train
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
+        self._cameras: LearnedCameras | None = None
+        if kinds & set(LEARNED):
+            gains = None
+            if "exposure" in kinds:
+                gains = log_gains(scene)
+                gains = np.zeros((len(scene.train), 3)) if gains is None else gains
+            self._cameras = LearnedCameras(scene, "shake" in kinds, gains, seed)
         self._plateau = Plateau(len(scene.train)) if self._knee else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
         self._since = 0  # the iteration after which they were computed
@@ -86,9 +103,13 @@ class HQGS(Plain):
             what = f"1/{1 / SHARE:.0f} of each photo's pixels in the loss"
             left_out.append(LeftOut(what, "they tell when the scene would start to learn the noise"))
         config = replace(config, hqgs=replace(config.hqgs, formation=str(degradation)))
-        if self.as_photographed:
-            method = "3dgs" if config.method == AUTO else config.method
-            start = super().start(scene, targets, replace(config, method=method))
+        if self._cameras is not None:
+            config, why = _without_held_photos(config)
+            left_out += why
+            self._cameras.schedule(config.iterations)
+        if self.formation.kinds <= set(LEARNED):
+            plain = self.as_photographed and config.method == AUTO
+            start = super().start(scene, targets, replace(config, method="3dgs") if plain else config)
             return replace(start, left_out=left_out)
         least, densify = len(scene.points), config.densify
         budget = with_budget(densify, self.formation, targets, self.config.gaussians_per_pixel, least)
@@ -102,6 +123,9 @@ class HQGS(Plain):
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         return gaussians if self._smallest is None else enlarge(gaussians, self._smallest)
+
+    def shot(self, view: View, target: FormedTarget) -> Shot:
+        return no_shot(view) if self._cameras is None else self._cameras.shot(view, target.photo)
 
     def compare(self, render: Tensor, target: FormedTarget) -> Tensor:
         return render if target.operator is None else target.operator(render)
@@ -118,12 +142,23 @@ class HQGS(Plain):
         if self._smallest is not None:
             self._measure(state.gaussians, state.iteration)
 
-    def after_step(self, state: TrainState, image: Tensor, target: FormedTarget) -> None:
-        """The smallest sizes age, and the held pixels decide on the rates."""
+    def after_step(self, state: TrainState, view: View, image: Tensor, target: FormedTarget) -> None:
+        """The smallest sizes and the cameras' depths age, and the held pixels decide on the rates."""
         if self._smallest is not None and state.iteration - self._since >= REFRESH:
             self._measure(state.gaussians, state.iteration)
         if self._plateau is not None and target.held is not None:
             self._plateau.see(target.held.photo, target.held.error(image))
+        if self._cameras is not None:
+            self._cameras.after_step(state.iteration, view, self.modulate(state.gaussians))
+
+    def found(self) -> list[Found]:
+        return [] if self._cameras is None else self._cameras.found()
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        return [] if self._cameras is None else self._cameras.param_groups()
+
+    def rates(self, part: float) -> dict[str, float]:
+        return {} if self._cameras is None else self._cameras.rates(part)
 
     def state_dict(self) -> dict[str, Tensor]:
         state = {}
@@ -131,6 +166,8 @@ class HQGS(Plain):
             state = {f"held.{name}": tensor for name, tensor in self._plateau.state_dict().items()}
         if self._smallest is not None:
             state |= {"smallest": self._smallest, "since": torch.tensor(self._since)}
+        if self._cameras is not None:
+            state |= {f"camera.{name}": tensor for name, tensor in self._cameras.state_dict().items()}
         return state
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -138,9 +175,22 @@ class HQGS(Plain):
             self._smallest, self._since = state["smallest"], int(state["since"])
         if self._plateau is not None:
             self._plateau.load_state_dict(part("held.", state))
+        if self._cameras is not None:
+            self._cameras.load_state_dict(part("camera.", state))
 
     def _measure(self, gaussians: Gaussians, iteration: int) -> None:
         """Half a pixel of the photos where each Gaussian is now."""
         if self.config.smallest:
             pixels = photo_pixels(gaussians.means, self._views) * self.formation.factor
             self._smallest, self._since = (self.config.smallest * pixels).float(), iteration
+
+
+def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
+    """The same where no photo can be held back: what its camera did would not be learned."""
+    kept = tuple(item for item in config.leave_out if item == "photos")
+    if "iterations" not in config.leave_out or config.iterations <= ENOUGH:
+        return replace(config, leave_out=kept), []
+    short = replace(config, iterations=ENOUGH, leave_out=kept).scaled()
+    what = f"iterations {ENOUGH + 1} to {config.iterations}"
+    why = "no photo can be held back to tell when to end: its camera would not be learned"
+    return short, [LeftOut(what, why)]

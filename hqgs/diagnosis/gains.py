@@ -1,0 +1,88 @@
+"""The gain of each photo, from the colours in which the photos show the same points."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from hqgs.photos.light import to_linear
+from hqgs.photos.pixels import as_floats
+from hqgs.scene.geometry import project
+from hqgs.scene.scene import Scene, View
+
+Floats = NDArray[np.float64]
+
+WINDOW = 5  # px around a point, whose mean is its colour there
+DARK, BRIGHT = 0.02, 0.9  # of white in linear light: beyond them noise and the sensor's white tell nothing
+FEWEST = 20  # points that a photo must share with others
+ROUNDS = 30
+LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
+SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
+CLEARLY = 3.0  # of the log-likelihood: less does not tell neighbours that go together from chance
+
+
+def log_gains(scene: Scene) -> Floats | None:
+    """The logarithms of the training photos' gains of red, green and blue in linear light, [N, 3], of mean 0.
+
+    Only what a photo does not share with those taken beside it: where the light changes along the way, or a
+    film's exposure follows the picture, neighbours go together, and colours that depend on the direction
+    hold that. It is told apart by the likelihood of a Gaussian process over places and directions with
+    independent gains on top. None where the scene does not tell which photos show which points, or a photo
+    shares fewer than 20 points with others (dark and saturated ones do not count).
+    """
+    if scene.seen is None or len(scene.train) < 3:
+        return None
+    colors = np.full((len(scene.train), len(scene.points), 3), np.nan)
+    for k, view in enumerate(scene.train):
+        if (rows := scene.seen.get(view.name)) is not None and len(rows):
+            _note_colors(view, scene.points[rows].astype(np.float64), rows, colors[k])
+    told = np.isfinite(colors).all(2)
+    told &= told.sum(0) >= 2
+    if told.sum(1).min() < FEWEST:
+        return None
+    logs = np.log(np.where(told[..., None], colors, np.nan))
+    gains: Floats = np.zeros((len(scene.train), 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of points that no photo tells
+        for _ in range(ROUNDS):
+            own = np.nanmean(logs - gains[:, None], axis=0)
+            gains = np.nanmedian(logs - own, axis=1)
+            gains -= gains.mean(0)
+    return _apart(scene.train, gains)
+
+
+def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Floats) -> None:
+    """Write the light of a photo at `points`, which have these `rows`; NaN where it does not tell."""
+    where, depths = project(view.camera, points)
+    rows, where = rows[depths > 0], where[depths > 0]
+    light = to_linear(np.clip(as_floats(view.image), 0, 1).astype(np.float64))
+    for c in range(3):
+        smooth = uniform_filter(light[..., c], WINDOW, mode="nearest")
+        found = map_coordinates(smooth, (where - 0.5).T[::-1], order=1, mode="nearest")
+        colors[rows, c] = np.where((found > DARK) & (found < BRIGHT), found, np.nan)
+
+
+def _apart(views: Sequence[View], gains: Floats) -> Floats:
+    """`gains` [N, 3] of mean 0 without what neighbours share."""
+    centers = np.stack([view.camera.center for view in views])
+    ahead = np.stack([view.camera.viewmat[2, :3] for view in views])
+    reach = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
+    squares = np.square((centers[:, None] - centers) / reach).sum(-1)
+    squares += np.square(ahead[:, None] - ahead).sum(-1)
+    apart = -0.5 * (len(views) * np.log(np.square(gains).mean(0) + 1e-12)).sum()
+    best, shared = apart + CLEARLY, np.zeros_like(gains)
+    for length in LENGTHS:
+        together = np.exp(-squares / (2 * length**2))
+        for share in SHARES:
+            covariance = share * together + (1 - share + 1e-4) * np.eye(len(views))
+            values, vectors = np.linalg.eigh(covariance)
+            energy = np.square(vectors.T @ gains) / values[:, None]
+            likelihood = -0.5 * (len(views) * np.log(energy.mean(0) + 1e-12) + np.log(values).sum()).sum()
+            if likelihood > best:
+                best, shared = likelihood, share * together @ np.linalg.solve(covariance, gains)
+    rest = gains - shared
+    return rest - rest.mean(0)

@@ -1,0 +1,53 @@
+"""What was learned of the photos' cameras, drawn over the photos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from hqgs.evaluation.records import LearnedRecord
+from hqgs.photos.pixels import as_floats, to_uint8
+
+MOST, COLUMNS = 12, 4  # photos of a picture, and side by side
+SIDE, LINE, GAP = 260, 18, 6  # px: of a photo, a caption, and between photos
+LARGER = 4  # times: ways are drawn so much larger than the photo
+
+
+def learned_picture(
+    photos: Sequence[NDArray[np.uint8] | NDArray[np.float32]], learned: Sequence[LearnedRecord]
+) -> Image.Image:
+    """Up to 12 photos [H, W, 3], from the most to the least shaken, each with its camera's way (four times as
+    large) in its middle and its gain in the caption."""
+    order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"])
+    chosen = [order[k] for k in np.linspace(0, len(order) - 1, min(MOST, len(order))).round().astype(int)]
+    tiles = [_tile(photos[k], learned[k]) for k in chosen]
+    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
+    columns = min(COLUMNS, len(tiles))
+    sheet = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
+    for k, tile in enumerate(tiles):
+        sheet.paste(tile, (k % columns * width, k // columns * height))
+    return sheet
+
+
+def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord) -> Image.Image:
+    picture = Image.fromarray(to_uint8(as_floats(photo)))
+    scale = SIDE / max(picture.size)
+    picture = picture.resize((max(round(picture.width * scale), 1), max(round(picture.height * scale), 1)))
+    tile = Image.new("RGB", (picture.width, picture.height + LINE), "white")
+    tile.paste(picture, (0, LINE))
+    draw = ImageDraw.Draw(tile)
+    stops = float(np.log2(record["gains"]).mean())
+    facts = [f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"]
+    facts += [f"{stops:+.2f} stops"] if np.ptp(record["gains"]) or stops else []
+    draw.text((2, 3), f"{Path(record['name']).stem[-16:]}  {', '.join(facts)}", fill=(25, 25, 25))
+    middle = np.array([picture.width / 2, LINE + picture.height / 2])
+    way = [tuple(middle + LARGER * scale * np.array(point)) for point in record["way_px"]]
+    if record["shake_px"]:
+        draw.line(way, fill=(0, 0, 0), width=5, joint="curve")
+        draw.line(way, fill=(255, 210, 0), width=3, joint="curve")
+    return tile

@@ -1,0 +1,252 @@
+"""What each photo's camera did, learned with the scene: its way during the exposure, and its gains.
+
+One render, warped along the way (`hqgs/photos/exposure.py`), stands for the whole exposure. What photos
+cannot tell is fixed by construction: the mean of a way is the photo's pose, the mean of the log gains is 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import nearness_map
+from hqgs.photos.exposure import take_photo
+from hqgs.photos.pixels import floats
+from hqgs.scene.geometry import median_depth
+from hqgs.scene.scene import Camera, Scene, View
+
+BEGIN = 0.1  # of the run: before, ways would only hide what the scene does not show yet
+LOOKS = (0.5, 0.75)  # of the run: when short ways are given up
+SHORTEST = 0.7  # px, of the way of the picture's middle: less than that a photo stands still
+FIRST = 1e-3  # of the photo's width, standard deviation: from 0 a way has no direction to grow in
+PATH_RATE, GAIN_RATE = 8e-4, 0.005  # learning rates: of the photo's width, and of the log gains
+NARROW = 200  # px: narrower photos count as that wide
+LAST = 0.1  # of the rates, at the end of the run
+WAY = 9  # points that stand for a way
+SPACING, MOST = 1.5, 17  # px of a way from one sample of the exposure to the next, and the most samples
+MOST_MARGIN = 48  # px around a render
+REFRESH = 8  # visits of a photo until its depths are looked at again
+COARSER = 4  # times the photo's pixels: of the map of depths
+SATURATED = 254 / 255  # of white
+
+
+@dataclass(frozen=True)
+class Shot:
+    """How a view is rendered, and what makes the render a photo."""
+
+    camera: Camera
+    develop: Callable[[Tensor], Tensor]  # [H + 2 margin, W + 2 margin, 3] to [H, W, 3]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found of a photo's camera."""
+
+    name: str
+    way: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
+    gains: NDArray[np.float64]  # [3], of red, green and blue in linear light
+
+    @property
+    def extent(self) -> float:
+        """The longest distance of two points of the way, px."""
+        return float(np.linalg.norm(self.way[:, None] - self.way, axis=-1).max())
+
+
+class LearnedCameras:
+    """The cameras of a scene's training photos.
+
+    A way is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and move in
+    all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median depth.
+    """
+
+    def __init__(self, scene: Scene, shake: bool, log_gains: NDArray[np.float64] | None, seed: int) -> None:
+        """`log_gains` [N, 3]: to start from; None: all gains are 1 and stay so."""
+        self._numbers = {view.name: k for k, view in enumerate(scene.train)}
+        self._depths = [median_depth(scene, view) for view in scene.train]
+        self._widths = [max(view.camera.width, NARROW) for view in scene.train]
+        self._sizes = [(view.camera.height, view.camera.width) for view in scene.train]
+        rng, count = np.random.default_rng([seed, 6]), len(scene.train)
+        first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
+        self._paths = [
+            torch.from_numpy(path * width).requires_grad_()
+            for path, width in zip(first if shake else [], self._widths, strict=False)
+        ]
+        self._gains = [
+            torch.from_numpy(gains.copy()).requires_grad_()
+            for gains in (log_gains if log_gains is not None else [])
+        ]
+        self._nearness: list[Tensor | None] = [None] * count
+        self._visits = torch.zeros(count, dtype=torch.int64)
+        self._still = torch.full((count,), not shake)
+        self._active = False
+        self._begin, self._looks = 0, (0, 0)
+
+    def schedule(self, iterations: int) -> None:
+        """Of a run of this length."""
+        self._begin = round(BEGIN * iterations)
+        self._looks = (round(LOOKS[0] * iterations), round(LOOKS[1] * iterations))
+
+    def shot(self, view: View, photo: Tensor) -> Shot:
+        """Of a training view."""
+        number, camera = self._numbers[view.name], view.camera
+        size = camera.height, camera.width
+        moves = self._active and not self._still[number] and self._sizes[number] == size
+        if not moves and not self._gains:
+            return Shot(camera, lambda render: render)
+        warps, margin = torch.zeros(0, 3, 4, dtype=torch.float64), 0
+        if moves:
+            count = min(max(3, math.ceil(self._extent(number, camera) / SPACING) + 1), MOST)
+            warps = self._warps(number, camera, count)
+            reach = float(_moved(warps.detach(), camera, nearness=2.0).abs().max())
+            margin = min(4 * math.ceil((reach + 1) / 4), MOST_MARGIN)
+        K = camera.K.copy()
+        K[:2, 2] += margin
+        wide = Camera(camera.width + 2 * margin, camera.height + 2 * margin, K, camera.viewmat)
+        near = self._nearness[number] if moves else None
+
+        def develop(render: Tensor) -> Tensor:
+            gains = torch.ones(3, dtype=torch.float64)
+            if self._gains:
+                gains = self._gains[number].exp()
+            full = None if near is None else _enlarged(near, size).to(render)
+            taken = take_photo(render, size, full, warps, gains)
+            if self._gains:  # what the sensor could not hold may be brighter than the photo
+                taken = torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
+            return taken
+
+        return Shot(wide, develop)
+
+    def after_step(self, iteration: int, view: View, gaussians: Gaussians) -> None:
+        """What ages, and which photos stand still from now on."""
+        number = self._numbers[view.name]
+        if self._gains:
+            with torch.no_grad():
+                mean = torch.stack(self._gains).mean(0)
+                for gains in self._gains:
+                    gains -= mean
+        if not self._paths:
+            return
+        self._active = iteration >= self._begin
+        if not self._active:
+            return
+        if not self._still[number]:
+            if self._visits[number] % REFRESH == 0:
+                near = nearness_map(gaussians, view.camera, COARSER) * self._depths[number]
+                self._nearness[number] = near.clamp(0.05, 10).to(torch.float16)
+            self._visits[number] += 1
+        if iteration in self._looks:
+            for k, path in enumerate(self._paths):
+                if _longest(_middle(path)) < SHORTEST:
+                    self._still[k], self._nearness[k] = True, None
+
+    def found(self) -> list[Found]:
+        """For each photo."""
+        return [
+            Found(
+                name,
+                np.zeros((WAY, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
+                self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
+            )
+            for name, k in self._numbers.items()
+        ]
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        groups: list[dict[str, Any]] = []
+        if self._paths:
+            groups.append({"name": "paths", "params": self._paths, "lr": 0.0, "betas": (0.9, 0.99)})
+        if self._gains:
+            groups.append({"name": "gains", "params": self._gains, "lr": 0.0, "betas": (0.9, 0.99)})
+        return groups
+
+    def rates(self, part: float) -> dict[str, float]:
+        """Learning rates after this part of the run."""
+        rates = {}
+        if self._paths:
+            rates["paths"] = PATH_RATE * float(np.mean(self._widths)) * LAST**part
+        if self._gains:
+            rates["gains"] = GAIN_RATE * LAST**part
+        return rates
+
+    def state_dict(self) -> dict[str, Tensor]:
+        state = {"visits": self._visits, "still": self._still, "active": torch.tensor(self._active)}
+        state |= {f"path.{k}": path.detach() for k, path in enumerate(self._paths)}
+        state |= {f"gains.{k}": gains.detach() for k, gains in enumerate(self._gains)}
+        return state | {f"near.{k}": near for k, near in enumerate(self._nearness) if near is not None}
+
+    @torch.no_grad()
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self._visits, self._still = state["visits"].clone(), state["still"].clone()
+        self._active = bool(state["active"])
+        for k, path in enumerate(self._paths):
+            path.copy_(state[f"path.{k}"])
+        for k, gains in enumerate(self._gains):
+            gains.copy_(state[f"gains.{k}"])
+        self._nearness = [state.get(f"near.{k}") for k in range(len(self._nearness))]
+
+    def _extent(self, number: int, camera: Camera) -> float:
+        """The longest way in px of the picture's corners and middle."""
+        with torch.no_grad():
+            moved = _moved(self._warps(number, camera, WAY), camera, nearness=1.0)
+        return max(_longest(moved[:, k]) for k in range(moved.shape[1]))
+
+    def _warps(self, number: int, camera: Camera, count: int) -> Tensor:
+        """As `take_photo` takes them, [count, 3, 4]; nearness is 1 at the median depth."""
+        steps, focal = _steps(self._paths[number], count), float(camera.K[0, 0])
+        K = torch.from_numpy(camera.K)
+        turned = K @ _turns(steps[:, :3] / focal) @ torch.linalg.inv(K)
+        moved = steps[:, 3:] @ (K / focal).T
+        return torch.cat([turned, moved[:, :, None]], dim=2)
+
+
+def no_shot(view: View) -> Shot:
+    """That of a still camera with gains of 1."""
+    return Shot(view.camera, lambda render: render)
+
+
+def _steps(path: Tensor, count: int) -> Tensor:
+    """Where a way is in the middles of `count` equal parts of the exposure, [count, 6]; of mean 0."""
+    t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
+    square = t.square()
+    return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+
+
+def _middle(path: Tensor) -> Tensor:
+    """The way of the picture's middle at the median depth, px, [9, 2]."""
+    steps = _steps(path.detach(), WAY)
+    return torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
+
+
+def _longest(points: Tensor) -> float:
+    """Distance of two of the points [K, 2]."""
+    return float((points[:, None] - points).norm(dim=-1).max())
+
+
+def _turns(vectors: Tensor) -> Tensor:
+    """Rotations less the identity by small vectors [K, 3], to third order, [K, 3, 3]."""
+    x, y, z = vectors.unbind(1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
+    square = cross @ cross
+    return cross + square / 2 + square @ cross / 6
+
+
+def _moved(warps: Tensor, camera: Camera, nearness: float) -> Tensor:
+    """How far warps take the corners and the middle of a picture, px, [K, 5, 2]."""
+    w, h = camera.width, camera.height
+    corners = [[x, y, 1.0, nearness] for x, y in ((0, 0), (w, 0), (0, h), (w, h), (w / 2, h / 2))]
+    points = torch.tensor(corners, dtype=torch.float64)
+    e = points @ warps.transpose(1, 2)  # [K, 5, 3]
+    return (e[..., :2] - points[:, :2] * e[..., 2:]) / (1 + e[..., 2:])
+
+
+def _enlarged(near: Tensor, size: tuple[int, int]) -> Tensor:
+    """A map [h, w] at the photo's size."""
+    return torch.nn.functional.interpolate(near.float()[None, None], size, mode="bilinear")[0, 0]
