@@ -14,9 +14,13 @@ if TYPE_CHECKING:
     from hqgs.base.files import FolderBusyError
     from hqgs.diagnosis.scene import Diagnosis
     from hqgs.diagnosis.scene import diagnose_scene as diagnose
+    from hqgs.export.frames import render_frames
     from hqgs.model.gaussians import Gaussians
+    from hqgs.model.orbit import orbit
     from hqgs.model.rasterization import RasterizationMeta, rasterization
     from hqgs.pipeline import Progress, Run, degrade, load, train
+    from hqgs.scene.camera_files import load_cameras
+    from hqgs.scene.paths import camera_path, look_at
     from hqgs.scene.scene import Camera, Scene, View
     from hqgs.training.config import TrainConfig
     from hqgs.training.trainer import TrainingError
@@ -36,11 +40,16 @@ __all__ = [
     "TrainingError",
     "View",
     "__version__",
+    "camera_path",
     "degrade",
     "diagnose",
     "get_num_threads",
     "load",
+    "load_cameras",
+    "look_at",
+    "orbit",
     "rasterization",
+    "render_frames",
     "set_num_threads",
     "train",
 ]
@@ -58,11 +67,16 @@ _HOMES = {
     "TrainConfig": "hqgs.training.config",
     "TrainingError": "hqgs.training.trainer",
     "View": "hqgs.scene.scene",
+    "camera_path": "hqgs.scene.paths",
     "degrade": "hqgs.pipeline",
     "diagnose": "hqgs.diagnosis.scene:diagnose_scene",
     "get_num_threads": "hqgs._rust",
     "load": "hqgs.pipeline",
+    "load_cameras": "hqgs.scene.camera_files",
+    "look_at": "hqgs.scene.paths",
+    "orbit": "hqgs.model.orbit",
     "rasterization": "hqgs.model.rasterization",
+    "render_frames": "hqgs.export.frames",
     "set_num_threads": "hqgs._rust",
     "train": "hqgs.pipeline",
 }

@@ -25,6 +25,7 @@ from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.load import load_scene
 from hqgs.scene.restore import restore_scene
@@ -184,8 +185,8 @@ def train(
 
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
-        out: a folder for checkpoint.safetensors, scene.ply, report.json, `comparison/*.png`
-            and error_vs_time.png; None: nothing is written.
+        out: a folder for checkpoint.safetensors, scene.ply, report.json, `comparison/*.png`,
+            error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
             "srgs" or "hqgs".
@@ -254,6 +255,8 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     out = None if out is None else Path(out)
     config = trainer.config
     with deferred_interrupt() as interrupted:
+        if out is not None:
+            save_cameras(out, trainer.scene)
         while trainer.iteration < trainer.length and not interrupted.is_set():
             step = trainer.step()
             evaluate = trainer.iteration % config.eval_every == 0

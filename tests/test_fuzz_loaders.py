@@ -30,6 +30,7 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.report import read_report
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
@@ -55,6 +56,20 @@ def load_folder(root: Path) -> None:
 def load_gaussians(root: Path) -> None:
     gaussians = Gaussians.load(root / "scene.ply")
     assert all(bool(torch.isfinite(t).all()) for t in gaussians.named().values())
+
+
+def load_views(root: Path) -> None:
+    known = load_cameras(root)
+    for view in known.views:
+        assert np.isfinite(view.camera.viewmat).all()
+        assert view.photo is None or root in view.photo.parents
+    assert np.isfinite(known.up).all()
+
+
+def load_frames(root: Path) -> None:
+    cameras, fps = load_path(root / "path.json")
+    assert all(np.isfinite(c.viewmat).all() and np.isfinite(c.K).all() for c in cameras)
+    assert fps > 0
 
 
 def load_run(root: Path) -> None:
@@ -122,6 +137,10 @@ def as_ply(root: Path, text: bool = False) -> None:
         ply.write(str(root / "scene.ply"))
 
 
+def as_path(root: Path) -> None:
+    save_path(root / "path.json", [view.camera for view in tiny_scene().train])
+
+
 def as_checkpoint(root: Path) -> None:
     trainer = Trainer(tiny_scene(), tiny_config())
     trainer.step()
@@ -143,6 +162,8 @@ TARGETS: dict[str, tuple[Callable[[Path], None], str, Callable[[Path], None], bo
        for s in SUFFIXES},
     "ply": (as_ply, "scene.ply", load_gaussians, False),
     "ply text": (lambda root: as_ply(root, True), "scene.ply", load_gaussians, True),
+    "cameras": (lambda root: save_cameras(root, tiny_scene()), "cameras.json", load_views, True),
+    "path": (as_path, "path.json", load_frames, True),
     "checkpoint": (as_checkpoint, "checkpoint.safetensors", load_run, False),
 }  # fmt: skip
 

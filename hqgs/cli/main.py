@@ -22,6 +22,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.export import add_parser as add_export_parser
 from hqgs.cli.export import run_export
 from hqgs.cli.progress import ProgressBar
+from hqgs.cli.render import add_parser as add_render_parser
 from hqgs.photos.formula import parse_degradation
 from hqgs.training.config import AUTO, GUIDANCES, ITEMS, METHODS, NONE, TrainConfig, run_config
 
@@ -107,6 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_photos(diagnose)
     diagnose.add_argument("--out", type=Path, metavar="FILE", help="also write the diagnosis as JSON")
 
+    add_render_parser(commands)
     add_export_parser(commands, _export)
     return parser
 
