@@ -23,6 +23,7 @@ from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
+from hqgs.page.page import PAGE, Page, write_page
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.camera_files import save_cameras
@@ -81,9 +82,8 @@ def load(
         if not downscale >= 1:
             raise ValueError(f"downscale must be at least 1, got {downscale}")
         if test_every != EMBEDDED_TEST_EVERY:
-            raise ValueError(
-                f"test_every is {test_every}, but the embedded scene holds out every {EMBEDDED_TEST_EVERY}th"
-            )
+            why = f"the embedded scene holds out every {EMBEDDED_TEST_EVERY}th"
+            raise ValueError(f"test_every is {test_every}, but {why}")
         width, height = (round(size / downscale) for size in EMBEDDED_SIZE)
         scene = embedded_scene(cache=None if kept is None else kept / "scene", width=width, height=height)
     else:
@@ -185,7 +185,7 @@ def train(
 
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
-        out: a folder for checkpoint.safetensors, scene.ply, report.json, `comparison/*.png`,
+        out: a folder for checkpoint.safetensors, scene.ply, report.json, report.html, `comparison/*.png`,
             error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
@@ -296,15 +296,13 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
     if guard.skipped:
         left_out.append(LeftOut(f"{guard.skipped} training steps", "the loss or a gradient was not finite"))
     if guard.culled:
-        why = "a value or a gradient of theirs was not finite"
-        left_out.append(LeftOut(f"{guard.culled} Gaussians", why))
+        left_out.append(LeftOut(f"{guard.culled} Gaussians", "a value or a gradient was not finite"))
     if trainer.iteration < trainer.length:
-        what = f"iterations {trainer.iteration + 1} to {trainer.length}"
-        left_out.append(LeftOut(what, "the run was stopped"))
-    if not scene.test:
+        rest = f"iterations {trainer.iteration + 1} to {trainer.length}"
+        left_out.append(LeftOut(rest, "the run was stopped"))
+    if not (views := trainer.render_test_views()):
         left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
-    views = trainer.render_test_views()
-    culled = [view.culled for view in views if view.culled is not None]
+    culled = [v.culled for v in views if v.culled is not None]
     result = RunResult(
         scene=scene.name,
         source=scene.source,
@@ -326,9 +324,12 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
         views=views,
     )
+    report = measure(result) if out is None else write_report(out, result)
+    if out is not None:
+        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis))
     return Run(
         model=model,
-        report=measure(result) if out is None else write_report(out, result),
+        report=report,
         history=trainer.history,
         left_out=left_out,
         iterations=trainer.iteration,

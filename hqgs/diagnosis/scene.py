@@ -67,6 +67,7 @@ class Inspector:
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
+        self.last: Diagnosis | None = None  # that was made
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
         """`inspect_photo` of a view; `enlargement` where it is known."""
@@ -99,7 +100,8 @@ class Inspector:
         photos = self._concluded[key]
         parts = (_blur(photos), _lowres(photos), _noise(photos), _jpeg(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
-        return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+        self.last = Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+        return self.last
 
 
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:

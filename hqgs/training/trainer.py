@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
+from hqgs.base.machine import peak_rss_mb
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
-from hqgs.diagnosis.scene import Inspector
+from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import RenderedView, held_out_mean, held_out_renders
 from hqgs.evaluation.metrics import psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
@@ -67,6 +68,7 @@ class Trainer:
         self.scene = scene
         self.extent: float = scene.extent
         self.method: Method[Any] = make_method(scene, config, inspector)
+        self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
         with one_torch_thread():
             self._targets = [self.method.prepare(view) for view in scene.train]
             start = self.method.start(scene, self._targets, config)
@@ -172,6 +174,8 @@ class Trainer:
             "seconds": self.seconds,
             "psnr": means["psnr"],
             "ssim": means["ssim"],
+            "gaussians": len(self.gaussians),
+            "memory_mb": peak_rss_mb(),
         }
         self.history.append(entry)
 
