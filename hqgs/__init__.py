@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
     from hqgs.model.orbit import orbit
     from hqgs.model.rasterization import RasterizationMeta, rasterization
-    from hqgs.pipeline import Progress, Run, degrade, load, train
+    from hqgs.pipeline import Run, degrade, load, train
     from hqgs.scene.camera_files import load_cameras
     from hqgs.scene.paths import camera_path, look_at
     from hqgs.scene.scene import Camera, Scene, View
     from hqgs.training.config import TrainConfig
+    from hqgs.training.progress import Progress
     from hqgs.training.trainer import TrainingError
 
 __version__ = "0.1.0"
@@ -60,7 +61,7 @@ _HOMES = {
     "Diagnosis": "hqgs.diagnosis.scene",
     "FolderBusyError": "hqgs.base.files",
     "Gaussians": "hqgs.model.gaussians",
-    "Progress": "hqgs.pipeline",
+    "Progress": "hqgs.training.progress",
     "RasterizationMeta": "hqgs.model.rasterization",
     "Run": "hqgs.pipeline",
     "Scene": "hqgs.scene.scene",

@@ -5,21 +5,17 @@ The command line and `import hqgs` both call what is here, so that both have one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import cast
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hqgs.base.files import CHECKPOINT, EMBEDDED, PLY, lock_folder, remove_leftovers
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
 from hqgs.evaluation.held_out import RenderedView
-from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
@@ -33,7 +29,8 @@ from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
-from hqgs.training.trainer import Step, Trainer
+from hqgs.training.progress import OnProgress, progress_of
+from hqgs.training.trainer import Trainer
 
 EMBEDDED_SIZE = (504, 378)  # pixels
 EMBEDDED_TEST_EVERY = 8
@@ -115,29 +112,6 @@ def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
     Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.
     """
     return degrade_scene(scene, parse_degradation(kind), seed)
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a run has just done: one step."""
-
-    iteration: int  # steps done, those before a `resume` among them
-    length: int  # steps of the whole run, as far as it is known; it may get less
-    seconds: float  # of training so far
-    gaussians: int
-    loss: float
-    view: str  # the training view of the step
-    render: NDArray[np.float32]  # of that view, [H, W, 3], not clamped; may be smaller than the photo
-    evaluated: HistoryEntry | None  # where the held-out views were measured after this step
-    _step: Step = field(repr=False)
-
-    def psnr(self) -> float | None:
-        """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
-        step = self._step
-        return psnr(self.render, step.view.image, step.view.mask)
-
-
-OnProgress = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
@@ -263,27 +237,13 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
             if evaluate:
                 trainer.evaluate()
             if progress is not None:
-                progress(_progress(trainer, step, trainer.history[-1] if evaluate else None))
+                progress(progress_of(trainer, step, trainer.history[-1] if evaluate else None))
             if out is not None and trainer.iteration % config.checkpoint_every == 0:
                 trainer.save(out / CHECKPOINT)
         trainer.evaluate()
         if out is not None:
             trainer.save(out / CHECKPOINT)
         return _results(trainer, out)
-
-
-def _progress(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) -> Progress:
-    return Progress(
-        iteration=trainer.iteration,
-        length=trainer.length,
-        seconds=trainer.seconds,
-        gaussians=len(trainer.gaussians),
-        loss=step.loss,
-        view=step.view.name,
-        render=step.render.numpy(),
-        evaluated=evaluated,
-        _step=step,
-    )
 
 
 def _results(trainer: Trainer, out: Path | None) -> Run:

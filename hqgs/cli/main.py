@@ -23,12 +23,16 @@ from hqgs.cli.export import add_parser as add_export_parser
 from hqgs.cli.export import run_export
 from hqgs.cli.progress import ProgressBar
 from hqgs.cli.render import add_parser as add_render_parser
+from hqgs.cli.view import LiveView
+from hqgs.cli.view import add_options as add_view_options
+from hqgs.cli.view import add_parser as add_view_parser
 from hqgs.photos.formula import parse_degradation
 from hqgs.training.config import AUTO, GUIDANCES, ITEMS, METHODS, NONE, TrainConfig, run_config
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run
     from hqgs.scene.scene import Scene
+    from hqgs.training.progress import Progress
 
 KINDS_HELP = (
     "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
@@ -96,6 +100,8 @@ def _parser() -> argparse.ArgumentParser:
         help="bounds the memory (%(default)s)",
     )
     add("--eval-every", type=int, metavar="N", help="iterations between evaluations (a tenth of the run)")
+    add("--view", action="store_true", help="show the scene in a browser while it trains")
+    add_view_options(train)
     add("--resume", action="store_true", help="go on from the checkpoint in DIR, if there is one")
 
     degrade = commands.add_parser("degrade", help="write a scene with degraded training photos")
@@ -109,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnose.add_argument("--out", type=Path, metavar="FILE", help="also write the diagnosis as JSON")
 
     add_render_parser(commands)
+    add_view_parser(commands)
     add_export_parser(commands, _export)
     return parser
 
@@ -165,8 +172,15 @@ def _train(args: argparse.Namespace) -> int:
         )
         if scene.sfm is not None:
             print(scene.sfm)
+        live = LiveView(scene, args.out, port=args.port, open_browser=args.open) if args.view else None
         with ProgressBar() as bar:
-            done = hqgs.train(scene, out=args.out, config=config, resume=args.resume, progress=bar)
+
+            def show(now: Progress) -> None:
+                bar(now)
+                if live is not None:
+                    live(now)
+
+            done = hqgs.train(scene, out=args.out, config=config, resume=args.resume, progress=show)
     except BAD_INPUT as error:
         return fail(2, str(error))
     except OSError as error:
@@ -174,6 +188,8 @@ def _train(args: argparse.Namespace) -> int:
     except hqgs.TrainingError as error:
         return fail(1, str(error))
     _print_summary(args.out, done)
+    if live is not None and done.finished:
+        live.stay()
     return 0 if done.finished else 130
 
 

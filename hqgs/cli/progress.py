@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NoReturn
 from tqdm import tqdm
 
 if TYPE_CHECKING:
-    from hqgs.pipeline import Progress
+    from hqgs.training.progress import Progress
 
 _NUMBERS_EVERY = 10  # steps between updates of the numbers beside the bar
 
