@@ -14,6 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,8 @@ def load_folder(root: Path) -> None:
     check_scene(load_scene(root))
 
 
-def load_gaussians(root: Path) -> None:
-    gaussians = Gaussians.load(root / "scene.ply")
+def load_gaussians(root: Path, name: str = "scene.ply") -> None:
+    gaussians = Gaussians.load(root / name)
     assert all(bool(torch.isfinite(t).all()) for t in gaussians.named().values())
 
 
@@ -137,6 +138,10 @@ def as_ply(root: Path, text: bool = False) -> None:
         ply.write(str(root / "scene.ply"))
 
 
+def as_format(root: Path, name: str) -> None:
+    some_gaussians().save(root / f"scene.{name}")
+
+
 def as_path(root: Path) -> None:
     save_path(root / "path.json", [view.camera for view in tiny_scene().train])
 
@@ -160,6 +165,9 @@ TARGETS: dict[str, tuple[Callable[[Path], None], str, Callable[[Path], None], bo
     "degradation": (as_degraded, "degradation.json", load_folder, True),
     **{f"photo {s}": (lambda root, s=s: as_photo(root, s), f"images/view_01{s}", load_folder, False)
        for s in SUFFIXES},
+    **{name: (lambda root, name=name: as_format(root, name), f"scene.{name}",
+              partial(load_gaussians, name=f"scene.{name}"), False)
+       for name in ("spz", "splat", "compressed.ply", "glb")},
     "ply": (as_ply, "scene.ply", load_gaussians, False),
     "ply text": (lambda root: as_ply(root, True), "scene.ply", load_gaussians, True),
     "cameras": (lambda root: save_cameras(root, tiny_scene()), "cameras.json", load_views, True),

@@ -25,7 +25,7 @@ def add_parser(commands: argparse._SubParsersAction[Any], run: Callable[[argpars
     parser = commands.add_parser("export", help="write a scene file with what the scene needs alone")
     parser.set_defaults(run=run)
     add = parser.add_argument
-    add("source", type=Path, metavar="SOURCE", help="a .ply or .spz file, or the folder of a run")
+    add("source", type=Path, metavar="SOURCE", help="a scene file, or the folder of a run")
     add("--out", type=Path, required=True, metavar="FILE", help="the file to write")
     add("--format", choices=READERS, help="(what the suffix of FILE says)")
     add("--sh-degree", type=int, default=DEFAULTS.sh_degree, metavar="D", help="at most (%(default)s)")

@@ -116,9 +116,9 @@ class Gaussians:
         """Write a scene file atomically; return how many Gaussians were left out as NaN or Inf.
 
         Args:
-            path: ends in .ply (the layout of 3DGS, exact) or .spz (a tenth as large, with the errors that
-                docs/export.md states).
-            format: "ply" or "spz" for a file with another suffix.
+            path: ends in .ply (the layout of 3DGS, exact), .spz (a tenth as large), .compressed.ply
+                (SuperSplat), .splat (no harmonics) or .glb (glTF); docs/export.md states the errors.
+            format: that suffix without its first dot, for a file with another one.
 
         Raises:
             ValueError: another suffix or format, or a scene that does not fit the ranges of SPZ.
@@ -129,11 +129,11 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: str | Path, format: str | None = None) -> Gaussians:
-        """Read a scene file, float32: ours, or a PLY file of 3DGS, gsplat or Brush.
+        """Read a scene file, float32: ours, or one of 3DGS, gsplat, Brush, SuperSplat.
 
         Args:
-            path: a .ply or .spz file, or the folder of a run.
-            format: "ply" or "spz" for a file with another suffix.
+            path: a .ply (compressed or not), .spz, .splat or .glb file, or the folder of a run.
+            format: as in `save`, for a file with another suffix.
 
         Raises:
             FileNotFoundError: there is no such file.
