@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
     from hqgs.model.orbit import orbit
     from hqgs.model.rasterization import RasterizationMeta, rasterization
+    from hqgs.photos.pixels import picture
     from hqgs.pipeline import Run, degrade, load, train
     from hqgs.scene.camera_files import load_cameras
     from hqgs.scene.paths import camera_path, look_at
@@ -49,6 +50,7 @@ __all__ = [
     "load_cameras",
     "look_at",
     "orbit",
+    "picture",
     "rasterization",
     "render_frames",
     "set_num_threads",
@@ -76,6 +78,7 @@ _HOMES = {
     "load_cameras": "hqgs.scene.camera_files",
     "look_at": "hqgs.scene.paths",
     "orbit": "hqgs.model.orbit",
+    "picture": "hqgs.photos.pixels",
     "rasterization": "hqgs.model.rasterization",
     "render_frames": "hqgs.export.frames",
     "set_num_threads": "hqgs._rust",

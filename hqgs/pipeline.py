@@ -19,7 +19,7 @@ from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.records import HistoryEntry, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
-from hqgs.page.page import PAGE, Page, write_page
+from hqgs.page.page import PAGE, Page, summary_html, write_page
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.camera_files import save_cameras
@@ -127,6 +127,10 @@ class Run:
     seconds: float  # of training, without loading and the report
     views: list[RenderedView] = field(repr=False)  # the held-out views
     out: Path | None  # the folder with the files; None: nothing was written
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the verdict, and a held-out photo beside its render."""
+        return summary_html(self.report, self.views)
 
     @property
     def finished(self) -> bool:
@@ -249,8 +253,8 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
 def _results(trainer: Trainer, out: Path | None) -> Run:
     """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
     scene, config, guard = trainer.scene, trainer.config, trainer.guard
-    model = trainer.shown()
-    left_out = trainer.left_out()
+    model, left_out = trainer.shown(), trainer.left_out()
+    model.look = (scene.test or scene.train)[0].camera
     if out is not None and (rows := model.save(out / PLY)):
         left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
     if guard.skipped:

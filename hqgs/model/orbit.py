@@ -4,36 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hqgs.model.content import around
 from hqgs.model.gaussians import Gaussians
-from hqgs.scene.paths import UP, circle, orbit_cameras
+from hqgs.scene.paths import UP, orbit_cameras
 from hqgs.scene.scene import Camera
-
-SHARE = 0.8  # of what there is to see, which lies within the radius of `content`
-DISTANCE = 2.2  # from the middle, in such radii: they fill the picture then
-RAISED = 0.35  # of the distance
-
-
-def content(gaussians: Gaussians) -> tuple[NDArray[np.float64], float]:
-    """Where most of a scene is: the middle [3] and a radius, world units.
-
-    Each Gaussian counts by its opacity. The middle is the median along each axis, and 80 % lie within the
-    radius, so that a few that are far away do not matter.
-
-    Raises ValueError where there is no Gaussian that is finite and can be seen.
-    """
-    means = gaussians.means.detach().double().numpy()
-    weights = torch.sigmoid(gaussians.opacities.detach().double()).numpy()
-    seen = np.isfinite(means).all(axis=1) & (weights > 0)
-    if not seen.any():
-        raise ValueError("the scene is empty: it has no Gaussian that can be seen")
-    means, weights = means[seen], weights[seen]
-    middle = np.array([_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
-    radius = _quantile(np.linalg.norm(means - middle, axis=1), weights, SHARE)
-    return middle, radius or 1.0
 
 
 def orbit(
@@ -58,12 +34,4 @@ def orbit(
     """
     if not isinstance(about, Gaussians):
         return orbit_cameras(about, frames)
-    middle, radius = content(about)
-    away = DISTANCE * radius
-    return circle(middle, away, height=RAISED * away, frames=frames, up=up, like=like)
-
-
-def _quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: float) -> float:
-    order = values.argsort()
-    total = weights[order].cumsum()
-    return float(values[order][np.searchsorted(total, share * total[-1])])
+    return around(about.means, about.opacities, frames, up, like)

@@ -69,6 +69,24 @@ def verdict(report: Report) -> str:
     return f"{words} ({psnr:.1f} dB PSNR on {len(report['metrics']['views'])} photos)"
 
 
+def summary_html(report: Report, views: Sequence[RenderedView]) -> str:
+    """The verdict, and the first held-out photo beside its render, as HTML for a notebook."""
+    parts = [
+        Markup("<p>{}: {} iterations, {} Gaussians, {}. {}</p>").format(
+            report["scene"],
+            report["iterations"],
+            report["gaussians"],
+            _time(report["seconds"]),
+            verdict(report),
+        )
+    ]
+    for view in views[:1]:
+        pair = _pair(view, None)
+        shown = Markup('<img src="{}" alt="photo" width="45%"> <img src="{}" alt="render" width="45%">')
+        parts.append(shown.format(pair["photo"], pair["render"]))
+    return str(Markup("").join(parts))
+
+
 def write_page(path: str | Path, page: Page) -> None:
     """Write the page atomically. OSError where it cannot be written."""
     write_text(path, page_text(page))

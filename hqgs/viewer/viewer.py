@@ -14,8 +14,9 @@ import numpy as np
 from PIL import Image
 
 from hqgs.export.frames import Activated
+from hqgs.model.content import content
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.orbit import content, orbit
+from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
@@ -133,7 +134,9 @@ class Viewer:
             self._reach = max(float(start.viewmat[2, :3] @ (middle - start.center)), 1e-6)
         else:
             start = orbit(gaussians, 1, up=self._up)[0]
-            self._reach = float(np.linalg.norm(start.center - content(gaussians)[0]))
+            self._reach = float(
+                np.linalg.norm(start.center - content(gaussians.means, gaussians.opacities)[0])
+            )
         first = self._server.initial_camera
         first.position = start.center
         first.look_at = start.center + self._reach * start.viewmat[2, :3]
