@@ -29,6 +29,7 @@ from hqgs.scene.scene import Camera, Scene
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"
+SCRIPTS = ("splat_shaders.js", "splats.js")
 PAIRS = 8  # pictures of photo and render: the best, the worst, and some between
 PAIR_SIDE = 720  # px
 QUALITY = 82  # of JPEG
@@ -113,7 +114,7 @@ def page_text(page: Page) -> str:
         facts=_facts(report, page.scene),
         report=report,
         scene=None if page.gaussians is None else _scene(page.scene, page.gaussians),
-        splats=Markup((TEMPLATES / "splats.js").read_text(encoding="utf-8")),
+        splats=Markup("\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)),
         pairs=[_pair(view, measured.get(view.name)) for view in chosen],
         pairs_left=len(page.views) - len(chosen),
         charts=charts,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 import time
+import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -112,7 +113,9 @@ class Viewer:
             picture = self._compared(picture, camera)
         except ValueError:  # a camera that no scene can be seen from, such as 1e300 away
             return
-        client.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=90 if sharp else 70)
+        with warnings.catch_warnings():  # of viser, where the page was closed meanwhile
+            warnings.simplefilter("ignore", UserWarning)
+            client.handle.scene.set_background_image(picture, format="jpeg", jpeg_quality=90 if sharp else 70)
 
     def _compared(self, picture: Any, camera: Camera) -> Any:
         view = self._views.get(self._photo.value)
