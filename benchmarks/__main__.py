@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks.cli import main
-
 if __name__ == "__main__":
+    from benchmarks.cli import main  # here: a process that is started from this one need not load all of it
+
     sys.exit(main())

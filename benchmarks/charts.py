@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -33,3 +34,14 @@ def panels(
 def title(axes: Axes, text: str) -> None:
     """Above the panel, to the left; a $ in a name of a scene is no formula."""
     axes.set_title(text, fontsize=10, loc="left", parse_math=False)
+
+
+def unbeaten(points: Sequence[tuple[float, float]]) -> list[int]:
+    """The indices of the points that no other one beats, with less of one and no more of the other: a Pareto
+    front by rising first coordinate."""
+
+    def beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
+        return a != b and a[0] <= b[0] and a[1] <= b[1]
+
+    front = [k for k, point in enumerate(points) if not any(beats(other, point) for other in points)]
+    return sorted(front, key=lambda k: points[k])

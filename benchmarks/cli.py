@@ -13,6 +13,7 @@ from benchmarks import endurance, export, frugality
 from benchmarks.accuracy import run as accuracy
 from benchmarks.features import run as features
 from benchmarks.output import Benchmark, command_line, write_results
+from benchmarks.protocol import add_options
 from benchmarks.quality import run as quality
 from benchmarks.speed import run as speed
 from benchmarks.stability import run as stability
@@ -36,7 +37,10 @@ def make_parser() -> argparse.ArgumentParser:
         add("--out", type=Path, default=out, metavar="DIR", help=f"for {name}.json (%(default)s)")
         add("--threads", type=int, metavar="T", help="(all cores)")
         add("--quick", action="store_true", help="tiny sizes, seconds: only a test")
-        benchmark.add_options(parser_of_one)
+        if benchmark.protocols is not None:
+            add_options(parser_of_one, benchmark.protocols["standard"])
+        for flag, how in benchmark.options.items():
+            add(flag, **how)
     return parser
 
 

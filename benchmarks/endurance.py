@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,15 +15,13 @@ from matplotlib.figure import Figure
 
 from benchmarks.charts import LEGEND, color, panels
 from benchmarks.data import read_toml
-from benchmarks.measure import Run, record
-from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import Protocol, Row, add_options, narrowed, read_protocols
-from benchmarks.scenes import load_scenes
-from benchmarks.study import Cell, grid, open_study
-from hqgs.base.machine import peak_rss_mb, reset_peak_rss
+from benchmarks.measure import Run, Training
+from benchmarks.output import NOTHING, Benchmark, Report, table
+from benchmarks.protocol import Protocol, Row, read_protocols
+from benchmarks.study import Cell, begin
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
-from hqgs.training.trainer import Trainer, TrainingError
+from hqgs.training.trainer import Step, TrainingError
 
 RECORDS = 20  # in the course of a run
 NOISE_SHARE = 0.3  # of the training photos
@@ -61,12 +59,11 @@ PHOTOS: dict[str, Callable[[Scene], Scene]] = {
 class Case(Row):
     """What is done to the scene and to the configuration."""
 
-    photos: str = ""
+    photos: Literal["", "noise", "one", "twins"] = ""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.photos not in PHOTOS:
-            raise ValueError(f"photos is {self.photos!r}, wanted one of: {', '.join(filter(None, PHOTOS))}")
+    @property
+    def more(self) -> dict[str, Any]:
+        return {"photos": self.photos}
 
     def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
         """Growth ends after half of the run, so that the memory can be judged in the other half.
@@ -86,45 +83,42 @@ PROTOCOLS = read_protocols(FILE, Case)
 
 def measure(cell: Cell, scene: Scene) -> Run:
     """Train the case of a cell on what it makes of the scene, which the cases share."""
-    assert isinstance(cell.row, Case)
-    return run_case(PHOTOS[cell.row.photos](scene), cell.config)
+    return run_case(PHOTOS[cell.row.more["photos"]](scene), cell.config)
 
 
 def run_case(scene: Scene, config: TrainConfig) -> Run:
     """Train one case; what it went through, as plain JSON values."""
-    trainer = Trainer(scene, config)
-    first_points, interval = len(trainer.gaussians), max(1, config.iterations // RECORDS)
+    done = Training(scene, config)
+    trainer, interval = done.trainer, max(1, config.iterations // RECORDS)
     records: list[dict[str, Any]] = []
+    losses: list[float] = []
     failure = None
-    losses, steps = list[float](), list[float]()
-    resets = reset_peak_rss()
+
+    def after(step: Step) -> None:
+        losses.append(step.loss)
+        if trainer.iteration % interval == 0 or trainer.iteration == config.iterations:
+            records.append(_so_far(done, losses))
+            losses.clear()
+            done.peak_rss_mb()  # what the evaluation needed is no part of the next one
+
     try:
-        while trainer.iteration < config.iterations:
-            before = trainer.seconds
-            losses.append(trainer.step().loss)
-            steps.append(trainer.seconds - before)
-            if trainer.iteration % interval == 0 or trainer.iteration == config.iterations:
-                records.append(_so_far(trainer, losses, resets))
-                losses = []
-                resets = reset_peak_rss()
+        done.steps(config.iterations, after)
     except TrainingError as error:
         failure = str(error)
-    result = record(trainer, first_points, steps) | {"records": records, "failure": failure}
-    result["guard"] = trainer.guard.summary()
+    result = done.record() | {"records": records, "failure": failure, "guard": trainer.guard.summary()}
     return result | verdict(result, config)
 
 
-def _so_far(trainer: Trainer, losses: Sequence[float], resets: bool) -> dict[str, Any]:
-    peak = peak_rss_mb() if resets else None  # before the evaluation, which needs memory of its own
+def _so_far(done: Training, losses: Sequence[float]) -> dict[str, Any]:
+    trainer, peak = done.trainer, done.peak_rss_mb()
     trainer.evaluate()
-    tensors = trainer.gaussians.named().values()
     finite = [loss for loss in losses if math.isfinite(loss)]
     return {
         "iteration": trainer.iteration,
         "seconds": trainer.seconds,
         "loss": float(np.mean(finite)) if finite else None,  # mean over the steps since the last record
         "losses_not_finite": len(losses) - len(finite),
-        "values_not_finite": sum(int((~torch.isfinite(t)).sum()) for t in tensors),
+        "values_not_finite": sum(int((~torch.isfinite(t)).sum()) for t in trainer.gaussians.named().values()),
         "events": trainer.guard.num_events,
         "gaussians": len(trainer.gaussians),
         "peak_rss_mb": peak,  # since the last record
@@ -154,18 +148,14 @@ def verdict(result: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
 
 def cases_table(results: Sequence[dict[str, Any]], protocol: Protocol) -> str:
     """One line for each case, with the last record's numbers."""
-    shown = {True: "yes", False: "NO", None: "–"}
+    shown = {True: "yes", False: "NO", None: NOTHING}
     lines = []
     for result in results:
-        records = result["records"] or [dict.fromkeys(("loss", "psnr", "peak_rss_mb", "gaussians"))]
         most = max((r["gaussians"] for r in result["records"]), default=None)
-        lines.append(
-            result
-            | records[-1]
-            | {name: shown[result[name]] for name in ("finite", "memory_flat", "within_budget")}
-            | {"most": most, "events": result["guard"]["num_events"]}
-            | {"verdict": "pass" if result["passed"] else "FAIL"}
-        )
+        line = dict.fromkeys(("loss", "psnr", "peak_rss_mb")) | result | (result["records"] or [{}])[-1]
+        line |= {name: shown[result[name]] for name in ("finite", "memory_flat", "within_budget")}
+        line |= {"most": most, "events": result["guard"]["num_events"]}
+        lines.append(line | {"verdict": "pass" if result["passed"] else "FAIL"})
     title = (
         f"Photos at 1/{protocol.downscale:g}, {protocol.iterations:,} iterations, at most "
         f"{protocol.config['densify']['max_gaussians']:,} Gaussians; memory may grow by {LIMIT_MB:g} MB per "
@@ -194,31 +184,20 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
 
 def run(args: argparse.Namespace) -> Report:
     """Run the cases that are not finished, in their order; each is written as soon as it is done."""
-    protocol = PROTOCOLS["quick" if args.quick else "standard"]
-    protocol = narrowed(protocol, None, args.rows, args.seeds, args.iterations, args.downscale)
-    scenes = load_scenes(args.scenes, protocol.downscale, protocol.embedded, args.out / "scenes", False)
-    more = {row.label: {"photos": row.photos} for row in protocol.rows if isinstance(row, Case)}
-    cells = grid(protocol, scenes, lambda row: (row.label,), lambda row: more[row.label])
-    study = open_study(args, "endurance", cells)
-    if not args.finished:
-        study.train(measure)
-    alone = len(scenes) == len(protocol.seeds) == 1
-    names = {cell: cell.row.label if alone else str(cell) for cell in cells}
+    study = begin(args, "endurance", PROTOCOLS["quick" if args.quick else "standard"])
+    study.train(measure)
+    alone = len(study.scenes) == len(study.protocol.seeds) == 1
+    names = {cell: cell.row.label if alone else str(cell) for cell in study.cells}
     results = [{"case": name, **study.runs[c]} for c, name in names.items() if c in study.runs]
-    passed = len(results) == len(cells) and all(result["passed"] for result in results)
-    return Report(
-        settings=asdict(protocol) | {"limit_mb": LIMIT_MB} | study.circumstances(),
-        results={"passed": passed, "cases": results},
-        tables=[cases_table(results, protocol), "All passed." if passed else "NOT all passed."],
-        figures={"runs": chart(results)},
-        left_out=study.left_out(),
-    )
-
-
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
+    passed = len(results) == len(study.cells) and all(result["passed"] for result in results)
+    report = study.report()
+    report.settings["limit_mb"] = LIMIT_MB
+    report.results = {"passed": passed, "cases": results}
+    report.tables = [cases_table(results, study.protocol), "All passed." if passed else "NOT all passed."]
+    report.figures["runs"] = chart(results)
+    return report
 
 
 BENCHMARK = Benchmark(
-    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size", options, run
+    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size", run, PROTOCOLS
 )

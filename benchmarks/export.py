@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.charts import GREY, LEGEND, color, panels, title
+from benchmarks.charts import GREY, LEGEND, color, panels, title, unbeaten
 from benchmarks.data import build, read_toml
-from benchmarks.measure import Run, exported, train
+from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import add_options, narrowed, read_protocols
-from benchmarks.scenes import load_scenes
-from benchmarks.study import Cell, Store, grid, open_study
+from benchmarks.protocol import read_protocols
+from benchmarks.study import Cell, begin
 from hqgs.base.files import PLY
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.evaluation.metrics import psnr
@@ -47,38 +45,13 @@ def measure(scene: Scene, gaussians: Gaussians, folder: Path) -> list[dict[str, 
         written = export(gaussians, folder / f"scene.{options.format}", options)
         renders = held_out_renders(scene, Gaussians.load(written.path))
         after = held_out_psnr(scene, renders)
-        pairs = [(a.render.clip(0, 1), b.render.clip(0, 1)) for a, b in zip(renders, original, strict=True)]
-        rows.append(
-            {
-                "name": name,
-                "options": asdict(options),
-                "bytes": written.bytes,
-                "gaussians": written.gaussians,
-                "sh_degree": written.sh_degree,
-                "psnr": after,
-                "cost_db": before - after,
-                "psnr_to_original": psnr(*(np.concatenate([p[k] for p in pairs]) for k in (0, 1))),
-                "largest_change": max(float(np.abs(a - b).max()) for a, b in pairs),
-                "left_out": [asdict(entry) for entry in written.left_out],
-                "clipped": written.clipped,
-            }
-        )
-    for row, better in zip(rows, pareto(rows), strict=True):
-        row["pareto"] = better
-    return rows
-
-
-def pareto(rows: Sequence[dict[str, Any]]) -> list[bool]:
-    """Of each row, whether no other is smaller or as small and better, or better and as small."""
-    return [
-        not any(
-            o["bytes"] <= r["bytes"]
-            and o["psnr"] >= r["psnr"]
-            and (o["bytes"] < r["bytes"] or o["psnr"] > r["psnr"])
-            for o in rows
-        )
-        for r in rows
-    ]
+        a, b = (np.concatenate([view.render.clip(0, 1) for view in views]) for views in (renders, original))
+        row = {"name": name, "options": asdict(options), "psnr": after, "cost_db": before - after}
+        row |= {"psnr_to_original": psnr(a, b), "largest_change": float(np.abs(a - b).max())}
+        rows.append(asdict(written) | row)
+        del rows[-1]["path"]
+    best = unbeaten([(row["bytes"], -row["psnr"]) for row in rows])
+    return [row | {"pareto": k in best} for k, row in enumerate(rows)]
 
 
 def files_table(result: dict[str, Any]) -> str:
@@ -117,35 +90,33 @@ def chart(result: dict[str, Any]) -> Figure:
     return figure
 
 
-def run_cell(cell: Cell, photos: Scene, store: Store, key: str) -> Run:
-    """Train the Gaussians and keep them beside the run."""
-    done = train(photos, cell.config)
-    path = store.beside(key, PLY)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    exported(done.trainer).save(path)
-    return done.record()
+def trained(args: argparse.Namespace) -> tuple[Scene, Path, dict[str, Any]]:
+    """The scene, the folder that keeps its Gaussians, and the settings: trained, or of a given run."""
+    protocol = PROTOCOLS["quick" if args.quick else "standard"]
+    if len(args.scenes) > 1 or len(args.seeds or ()) > 1:
+        raise ValueError("one scene and one seed are written")
+    if args.run_folder is not None:
+        downscale = args.downscale or protocol.downscale
+        return load_scene(args.scenes[0], downscale), args.run_folder, {"downscale": downscale}
+    study = begin(args, "export", protocol, labelled=False)
+    (cell,) = study.cells
+
+    def run_cell(cell: Cell, photos: Scene) -> Run:
+        done = train(photos, cell.config)
+        done.trainer.shown().save(study.beside(cell, PLY))
+        return done.record()
+
+    study.train(run_cell)
+    for failure in study.failures.values():
+        raise ValueError(f"{cell}: {failure}")
+    return cell.scene, study.beside(cell, PLY).parent, study.report().settings
 
 
 def run(args: argparse.Namespace) -> Report:
     """Train, or read a run, and write its Gaussians in every way."""
-    protocol = PROTOCOLS["quick" if args.quick else "standard"]
-    protocol = narrowed(protocol, None, args.rows, args.seeds, args.iterations, args.downscale)
-    if len(args.scenes) > 1 or len(protocol.seeds) > 1:
-        raise ValueError("one scene and one seed are written")
-    if args.run_folder is None:
-        cache = args.out / "scenes"
-        (scene,) = load_scenes(args.scenes, protocol.downscale, protocol.embedded, cache, False)
-        study = open_study(args, "export", grid(protocol, [scene]))
-        study.train(lambda cell, photos: run_cell(cell, photos, study.store, study.keys[cell]))
-        for cell, failure in study.failures.items():
-            raise ValueError(f"{cell}: {failure}")
-        folder = study.store.beside(study.keys[study.cells[0]], PLY).parent
-        settings = asdict(protocol) | study.circumstances()
-    else:
-        scene, folder = load_scene(args.scenes[0], protocol.downscale), args.run_folder
-        settings = {"downscale": protocol.downscale}
+    scene, folder, settings = trained(args)
     gaussians = Gaussians.load(folder)
-    camera = scene.test[0].camera if scene.test else scene.train[0].camera
+    camera = (scene.test or scene.train)[0].camera
     with tempfile.TemporaryDirectory(dir=args.out) as name:
         files = measure(scene, gaussians, Path(name))
     result = {
@@ -161,10 +132,6 @@ def run(args: argparse.Namespace) -> Report:
     return Report(settings, results=result, tables=[files_table(result)], figures={"size": chart(result)})
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
-    text = "write the Gaussians of this run of the scene instead"
-    parser.add_argument("--run-folder", type=Path, metavar="DIR", help=text)
-
-
-BENCHMARK = Benchmark("the size of a scene file against its cost in held-out error", options, run)
+HELP = "write the Gaussians of this run of the scene instead"
+OPTIONS = {"--run-folder": {"type": Path, "metavar": "DIR", "help": HELP}}
+BENCHMARK = Benchmark("the size of a scene file against its cost in held-out error", run, PROTOCOLS, OPTIONS)

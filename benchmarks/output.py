@@ -8,16 +8,23 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 import hqgs
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.base.text import markdown_table
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from benchmarks.protocol import Protocol
+
 NOTHING = "–"  # in the place of a number that there is not
+
+
+class UnavailableError(RuntimeError):
+    """What cannot be measured here, and why."""
 
 
 @dataclass
@@ -42,8 +49,25 @@ class Benchmark:
     """A subcommand of `python -m benchmarks`."""
 
     help: str
-    add_options: Callable[[argparse.ArgumentParser], None]  # beyond --out, --threads and --quick
     run: Callable[[argparse.Namespace], Report]  # raises ValueError or FileNotFoundError for bad options
+    protocols: dict[str, Protocol] | None = None  # of a study
+    options: Mapping[str, dict[str, Any]] = field(default_factory=dict)  # beyond those of all, for argparse
+
+
+def repeats_and_seed(sizes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The options of what is timed: `sizes` has a table for `--quick` and one for `full`."""
+    default, quick = (sizes[name]["repeats"] for name in ("full", "quick"))
+    rounds = f"rounds of each measurement ({default}, with --quick {quick})"
+    seed = {"type": int, "default": 2026, "metavar": "S", "help": "of the Gaussians (%(default)s)"}
+    return {"--repeats": {"type": int, "metavar": "N", "help": rounds}, "--seed": seed}
+
+
+def with_repeats(sizes: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """The sizes with what the options of `repeats_and_seed` ask for."""
+    repeats = sizes["repeats"] if args.repeats is None else args.repeats
+    if repeats < 1:
+        raise ValueError(f"repeats is {repeats}, wanted at least 1")
+    return sizes | {"repeats": repeats, "seed": args.seed}
 
 
 def write_results(out: Path, name: str, command: str, report: Report) -> list[Path]:
@@ -90,6 +114,11 @@ def number(value: Any, form: str) -> str:
     if form == "ms":
         return f"{1000 * value:.3g}" if value < 0.1 else f"{1000 * value:.0f}"
     return format(value, form)
+
+
+def span(values: Iterable[float], form: str) -> str:
+    """`1.02 to 1.05`: quartiles, in a format of `number`."""
+    return " to ".join(number(value, form) for value in values)
 
 
 def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from hqgs import _rust
+from hqgs.model import render
 from hqgs.training import trainer
 from hqgs.training.methods import base
 from hqgs.training.trainer import Trainer
@@ -15,6 +16,7 @@ Place = tuple[Any, str]  # a module or class, and the name that its users look u
 
 # Replaced by benchmarks/features.
 RENDER_VIEW: Place = (trainer, "render_view")
+RASTERIZATION: Place = (render, "rasterization")
 ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
 ADAM: Place = (trainer, "Adam")
 LOSS: Place = (base, "photometric_loss")

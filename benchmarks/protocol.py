@@ -6,12 +6,13 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
-from benchmarks.data import build, overridden, read_toml
+from benchmarks.data import build, read_toml
 from benchmarks.scenes import BUILT_IN, EMBEDDED
 from hqgs.photos.formula import parse_degradation
 from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_leave_out
+from hqgs.training.frugality import RULES
 from hqgs.training.methods.paper import VARIANTS
 
 T = TypeVar("T")
@@ -24,12 +25,13 @@ class Row:
     label: str
     method: str = "3dgs"
     leave_out: str = NONE  # as the command line has it
-    paper: str = ""  # one of the variants of the paper's method
+    paper: Literal["", "V1", "V2", "V3", "V4", "V5", "V6", "V7"] = ""  # variant of the paper's method
     config: dict[str, Any] = field(default_factory=dict)  # further changes of the `TrainConfig`
 
-    def __post_init__(self) -> None:
-        if self.paper and self.paper not in VARIANTS:
-            raise ValueError(f"paper is {self.paper!r}, wanted one of: {', '.join(VARIANTS)}")
+    @property
+    def more(self) -> dict[str, Any]:
+        """What the result depends on, beside configuration and photos."""
+        return {} if self.leave_out == NONE else {"rules": RULES}
 
     def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
         """The run, its schedule fitted to its length. `changes`: of the protocol, before those of the row."""
@@ -38,8 +40,8 @@ class Row:
             iterations=iterations, method=self.method, seed=seed, hqgs=hqgs,
             leave_out=parse_leave_out(self.leave_out),
         ).scaled()  # fmt: skip
-        config = overridden(config, changes or {}, "the protocol's config")
-        return overridden(config, self.config, f"row {self.label!r}, config")
+        config = build(TrainConfig, changes or {}, "the protocol's config", config)
+        return build(TrainConfig, self.config, f"row {self.label!r}, config", config)
 
 
 @dataclass(frozen=True)
@@ -97,29 +99,19 @@ def chosen_from(rows: dict[str, T], labels: Sequence[str], where: str = "rows") 
     return [row for label, row in rows.items() if label in labels]
 
 
-def narrowed(
-    protocol: Protocol,
-    degradations: Sequence[str] | None = None,
-    rows: Sequence[str] | None = None,
-    seeds: Sequence[int] | None = None,
-    iterations: int | None = None,
-    downscale: float | None = None,
-    repeats: int | None = None,
-) -> Protocol:
-    """The protocol with other values, or with some of its rows only.
+def narrowed(protocol: Protocol, **given: Any) -> Protocol:
+    """The protocol with other values where they are not None; of `rows` the labels.
 
     ValueError names what is unknown, given twice, or out of range.
     """
-    given = {"seeds": seeds, "iterations": iterations, "downscale": downscale, "repeats": repeats}
-    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if seeds is not None:
-        changes["seeds"] = _distinct("seeds", seeds)
-    if rows is not None:
-        changes["rows"] = tuple(chosen_from({row.label: row for row in protocol.rows}, rows))
+    changes = {name: value for name, value in given.items() if value is not None}
+    if "seeds" in changes:
+        changes["seeds"] = _distinct("seeds", changes["seeds"])
+    if "rows" in changes:
+        changes["rows"] = tuple(chosen_from({row.label: row for row in protocol.rows}, changes["rows"]))
     # The parser's own spelling, so that `noise:25.0` is no other run than `noise:25`.
-    kinds = protocol.degradations if degradations is None else degradations
-    changes["degradations"] = _distinct("degradations", [str(parse_degradation(kind)) for kind in kinds])
-    protocol = replace(protocol, **changes)
+    kinds = [str(parse_degradation(kind)) for kind in changes.get("degradations", protocol.degradations)]
+    protocol = replace(protocol, **changes | {"degradations": _distinct("degradations", kinds)})
     if not protocol.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {protocol.downscale}")
     if protocol.repeats < 1:
@@ -138,6 +130,7 @@ def _distinct(name: str, values: Sequence[T]) -> tuple[T, ...]:
 
 def add_options(parser: argparse.ArgumentParser, protocol: Protocol) -> None:
     """The options that narrow a protocol, and those about finished runs."""
+    parser.set_defaults(validate=False, sfm=False)
     add: Any = parser.add_argument
     built_in = ", ".join(map(str, BUILT_IN))
     add(
@@ -150,7 +143,6 @@ def add_options(parser: argparse.ArgumentParser, protocol: Protocol) -> None:
     add("--iterations", type=int, metavar="N", help=f"training steps of each run ({protocol.iterations})")
     add("--downscale", type=float, metavar="F", help=f"divide the photos' sides ({protocol.downscale:g})")
     add("--finished", action="store_true", help="train nothing: tables of the runs that are finished")
-    add("--any-sources", action="store_true", help="runs of other sources of hqgs count as finished, too")
     add(
         "--known", nargs="+", type=Path, metavar="JSON",
         help="results of this benchmark from elsewhere: their runs count as finished",

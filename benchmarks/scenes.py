@@ -13,7 +13,6 @@ from hqgs.scene.formats.degradation_json import FILE
 from hqgs.scene.formats.llff import hold_marker
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, View
-from hqgs.scene.sfm.reconstruct import sfm_scene
 
 EMBEDDED = Path("embedded")  # stands for the built-in scene
 BUILT_IN = {EMBEDDED: None, Path("embedded-matte"): 0.0, Path("embedded-glossy"): 1.0}  # gloss
@@ -75,23 +74,13 @@ def validation_split(scene: Scene) -> Scene:
     return replace(scene, train=train, test=held, notes=[*scene.notes, note])
 
 
-def trained(scene: Scene, degradation: str, seed: int, sfm: Path | None) -> Scene:
-    """The scene that a cell trains: `degraded`, with `sfm` with poses and points from its training photos.
-
-    `sfm` is the folder that keeps the reconstructions.
-    """
-    scene = degraded(scene, degradation, seed)
-    return scene if sfm is None else sfm_scene(scene, sfm)
-
-
 def degraded(scene: Scene, degradation: str, seed: int) -> Scene:
     """Degraded training photos, clean held-out ones."""
     kind = parse_degradation(degradation)
     return degrade_scene(scene, kind, seed) if kind.steps else scene
 
 
-def degraded_views(scene: Scene, views: Sequence[View], degradation: str, seed: int) -> list[View]:
-    """Some views of the scene with the photos that `degraded` gives them, or would if it trained on them."""
-    names = {view.name for view in views}
-    others = [view for view in (*scene.train, *scene.test) if view.name not in names]
-    return degraded(replace(scene, train=list(views), test=others), degradation, seed).train
+def degraded_view(scene: Scene, view: View, degradation: str, seed: int) -> View:
+    """A view with the photo that `degraded` would give it if the scene trained on it and no other."""
+    others = [other for other in (*scene.train, *scene.test) if other.name != view.name]
+    return degraded(replace(scene, train=[view], test=others), degradation, seed).train[0]

@@ -2,8 +2,8 @@
 
 A run is taken up again where a file has its key and was made by the same sources. The key is a digest of what
 a result follows from: configuration, photos, cameras and points, what is done to the photos, version. The
-sources are a digest of the package's files (but for the command line) and of the crate's; with `any_sources`
-runs of others count too. Each run also says its commit, machine and number of threads.
+sources are a digest of the package's files (but for the command line) and of the crate's. Each run also says
+its commit, machine and number of threads.
 """
 
 from __future__ import annotations
@@ -19,17 +19,20 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import hqgs
-from benchmarks.estimate import Estimate, duration
-from benchmarks.measure import Run
-from benchmarks.protocol import Protocol, Row
+from benchmarks.measure import Estimate, Run, duration
+from benchmarks.output import Report
+from benchmarks.protocol import Protocol, Row, narrowed
+from benchmarks.scenes import degraded, load_scenes
 from hqgs.base.files import write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
+from hqgs.scene.sfm.reconstruct import KEPT, sfm_scene
 from hqgs.training.checkpoint import scene_fingerprint
 from hqgs.training.config import METHODS, PAPER, TrainConfig
 from hqgs.training.trainer import TrainingError
@@ -57,6 +60,11 @@ class Cell:
         return self.config.seed
 
     @property
+    def kind(self) -> tuple[str, str]:
+        """What its speed depends on most: scene, row."""
+        return self.scene.name, self.row.label
+
+    @property
     def group(self) -> tuple[str, str, int]:
         """What it shares with the other rows: scene, degradation, seed."""
         return self.scene.name, self.degradation, self.seed
@@ -66,45 +74,49 @@ class Cell:
         return ", ".join([*parts, f"seed {self.seed}"])
 
 
-def grid(
-    protocol: Protocol,
-    scenes: Sequence[Scene],
-    tags: Callable[[Row], tuple[str, ...]] = lambda row: (),
-    more: Callable[[Row], Mapping[str, Any]] = lambda row: {},
-) -> list[Cell]:
-    """All cells of these scenes, the seeds outermost: whole tables come early. The rows are innermost."""
-    return [
-        Cell(scene, row, protocol.train_config(row, seed), kind, protocol.downscale, tags(row), more(row))
-        for seed in protocol.seeds
-        for scene in scenes
-        for kind in protocol.degradations
-        for row in protocol.rows
-    ]
+def grid(protocol: Protocol, scenes: Sequence[Scene], labelled: bool = False, *tags: str) -> list[Cell]:
+    """All cells of these scenes, the seeds outermost: whole tables come early. The rows are innermost.
+
+    The files' names hold the tags, and the labels of the rows where they are `labelled`.
+    """
+    more = {"sfm": True} if "sfm" in tags else {}
+    cells = []
+    for seed, scene, kind, row in product(protocol.seeds, scenes, protocol.degradations, protocol.rows):
+        names = (*([row.label] if labelled else []), *tags)
+        config = protocol.train_config(row, seed)
+        cells.append(Cell(scene, row, config, kind, protocol.downscale, names, row.more | more))
+    return cells
 
 
 class Store:
-    """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside."""
+    """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside.
 
-    def __init__(self, root: Path, any_sources: bool = False) -> None:
+    A run that failed holds `error`, and is to be tried again.
+    """
+
+    def __init__(self, root: Path) -> None:
         self.root = root / "runs"
         self.here = self.root / f"{hqgs.__version__}-{sources()}"
-        self.any_sources = any_sources
 
     def read(self, key: str) -> Run | None:
-        """The finished run, None where there is none; ValueError for a damaged file."""
-        others = sorted(self.root.iterdir()) if self.any_sources and self.root.is_dir() else []
-        for folder in dict.fromkeys([self.here, self.root / KNOWN, *others]):
-            path = folder / f"{key}.json"
-            run = kept(path)
-            if run is not None:
-                if run.get("key") != key:
-                    raise ValueError(f"{path} is not the run of that name; remove it")
-                return run
-        return None
+        """The finished run, else the failed one, else None; ValueError for a damaged file."""
+        failed = None
+        for path in (self.here / f"{key}.json", self.root / KNOWN / f"{key}.json"):
+            if path.is_file():
+                try:
+                    run = json.loads(path.read_text(encoding="utf-8"))
+                    if run["key"] != key:
+                        raise ValueError(f"it holds the run {run['key']}")
+                except (ValueError, KeyError, TypeError) as error:
+                    why = f"{path} is damaged: {error!r}"
+                    raise ValueError(f"{why}; remove it, and the run is repeated") from error
+                if "error" not in run:
+                    return run
+                failed = run
+        return failed
 
     def write(self, run: Run) -> None:
         write_json(self.here / f"{run['key']}.json", run)
-        self.failure_path(run["key"]).unlink(missing_ok=True)
 
     def take(self, path: Path) -> None:
         """Keep the runs of a result file of this benchmark that are not there yet, without what lies beside.
@@ -125,23 +137,6 @@ class Store:
     def beside(self, key: str, name: str) -> Path:
         """Where a run keeps a file: to be written before the run is, which vouches for it."""
         return self.here / key / name
-
-    def failure_path(self, key: str) -> Path:
-        """The reason why there is no run of that key."""
-        return self.here / f"{key}.failed.json"
-
-
-def kept(path: Path) -> Run | None:
-    """What an earlier call kept in this file; None where there is none, ValueError where it is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError("it holds no object")
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}; remove it, and the run is repeated") from error
-    return found
 
 
 @cache
@@ -180,40 +175,37 @@ class Study:
     """Runs what is not finished, and knows what is: `runs` and `failures` by cell."""
 
     def __init__(
-        self,
-        name: str,
-        cells: Sequence[Cell],
-        store: Store,
-        photos: Callable[[Cell], Scene] = lambda cell: cell.scene,
+        self, args: argparse.Namespace, name: str, protocol: Protocol, scenes: list[Scene], labelled: bool
     ) -> None:
-        """`photos` gives what a cell trains on; cells of one group that follow each other share it."""
-        self.name, self.cells, self.store = name, list(cells), store
-        self._photos = photos
+        """`labelled`: see `grid`. The store is in `args.out`, with the runs that `args.known` holds."""
+        self.args, self.name, self.protocol, self.scenes = args, name, protocol, scenes
+        self.tags = [tag for tag, on in (("validation", args.validate), ("sfm", args.sfm)) if on]
+        self.cells = grid(protocol, scenes, labelled, *self.tags)
+        self.store = Store(args.out)
+        for path in args.known or ():
+            self.store.take(path)
         self._last: tuple[tuple[str, str, int], Scene] | None = None
-        scenes = {cell.scene.name: cell.scene for cell in cells}
-        prints = {name: scene_fingerprint(scene) for name, scene in scenes.items()}
-        self.keys = {cell: key_of(cell, prints[cell.scene.name]) for cell in cells}
-        found = {cell: store.read(key) for cell, key in self.keys.items()}
-        self.runs: dict[Cell, Run] = {cell: run for cell, run in found.items() if run is not None}
-        self.failures: dict[Cell, str] = {}
-        for cell, key in self.keys.items():
-            if cell not in self.runs and (failed := kept(store.failure_path(key))) is not None:
-                self.failures[cell] = failed["error"]
+        prints = {scene.name: scene_fingerprint(scene) for scene in scenes}
+        self.keys = {cell: key_of(cell, prints[cell.scene.name]) for cell in self.cells}
+        found = {cell: self.store.read(key) for cell, key in self.keys.items()}
+        self.runs: dict[Cell, Run] = {cell: run for cell, run in found.items() if run and "error" not in run}
+        self.failures = {cell: run["error"] for cell, run in found.items() if run and "error" in run}
 
     def train(self, measure: Callable[[Cell, Scene], Run]) -> None:
         """Run the cells that are not finished, in their order; each is written as soon as it is done.
 
         `measure` trains a cell on the photos that it gets. A ValueError or TrainingError of one cell is kept
-        and does not end the others; it is tried again by the next call.
+        and does not end the others; it is tried again by the next call. With `--finished` nothing is run.
         """
+        if self.args.finished:
+            return
         pending = [cell for cell in self.cells if cell not in self.runs]
         estimate = Estimate()
         for cell, run in self.runs.items():
             estimate.add(cell, run)
         for cell in pending:
-            if not estimate.knows(cell):
-                with suppress(ValueError, TrainingError):  # the run itself will say it
-                    estimate.probe(cell, self.photos(cell))
+            with suppress(ValueError, TrainingError):  # the run itself will say it
+                estimate.probe(cell, self.photos)
         self.say(f"{len(self.cells)} runs, {len(pending)} left{_about(estimate.seconds(pending))}")
         facts = {"sources": sources(), "machine": machine_facts(), "versions": version_facts()}
         for k, cell in enumerate(pending, 1):
@@ -222,7 +214,7 @@ class Study:
                 run = measure(cell, self.photos(cell))
             except (ValueError, TrainingError) as error:
                 self.failures[cell] = str(error)
-                write_json(self.store.failure_path(key), {"key": key, "error": str(error), **facts})
+                self.store.write({"key": key, "error": str(error), **facts})
                 self.say(f"[{k}/{len(pending)}] {cell} failed: {error}")
                 continue
             wall = time.perf_counter() - started
@@ -239,10 +231,23 @@ class Study:
             )
 
     def photos(self, cell: Cell) -> Scene:
-        """What a cell trains on."""
+        """What a cell trains on, the same for all rows: degraded photos, with `--sfm` poses from them."""
         if self._last is None or self._last[0] != cell.group:
-            self._last = (cell.group, self._photos(cell))
+            scene = degraded(cell.scene, cell.degradation, cell.seed)
+            self._last = (cell.group, sfm_scene(scene, self.args.out / KEPT) if self.args.sfm else scene)
         return self._last[1]
+
+    def beside(self, cell: Cell, name: str) -> Path:
+        """Where a cell's run keeps a file, in a folder that is there."""
+        path = self.store.beside(self.keys[cell], name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def report(self, part: str = "") -> Report:
+        """A report that holds nothing yet but what was run."""
+        settings = asdict(self.protocol) | {"scenes": [scene.name for scene in self.scenes]}
+        settings |= {"validation": self.args.validate, "sfm": self.args.sfm, **self.circumstances()}
+        return Report(settings, part, left_out=self.left_out())
 
     def left_out(self) -> list[dict[str, str]]:
         """The runs that are not there, with the reasons."""
@@ -267,17 +272,16 @@ class Study:
         print(f"{self.name}: {text}", file=sys.stderr, flush=True)
 
 
-def open_study(
-    args: argparse.Namespace,
-    name: str,
-    cells: Sequence[Cell],
-    photos: Callable[[Cell], Scene] = lambda cell: cell.scene,
+def begin(
+    args: argparse.Namespace, name: str, protocol: Protocol, labelled: bool = True, **changes: Any
 ) -> Study:
-    """The study with the runs that `args.out` and `args.known` hold, and its store."""
-    store = Store(args.out, args.any_sources)
-    for path in args.known or ():
-        store.take(path)
-    return Study(name, cells, store, photos)
+    """The study of a protocol that the options of `add_options`, and then `changes`, narrow."""
+    options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats")
+    protocol = narrowed(protocol, **{option: vars(args).get(option) for option in options} | changes)
+    sources = args.scenes[:1] if protocol.one_scene else args.scenes
+    cache = args.out / "scenes"
+    scenes = load_scenes(sources, protocol.downscale, protocol.embedded, cache, args.validate)
+    return Study(args, name, protocol, scenes, labelled)
 
 
 def _about(seconds: float) -> str:

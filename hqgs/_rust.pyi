@@ -93,7 +93,7 @@ def adam_step(
     used: int | None,
 ) -> None: ...
 def set_num_threads(threads: int) -> None:
-    """Use this many threads from now on; results do not depend on it. ValueError for 0."""
+    """Use this many threads from now on, 1 to 1024; results do not depend on it. ValueError for others."""
 
 def get_num_threads() -> int:
     """Number of threads in use."""

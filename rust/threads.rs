@@ -8,7 +8,7 @@
 use crate::error::Error;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::{
-    process, ptr,
+    fmt, process, ptr,
     sync::{
         Arc, PoisonError, RwLock,
         atomic::{AtomicPtr, AtomicUsize, Ordering},
@@ -81,13 +81,22 @@ fn start(threads: usize) -> Result<ThreadPool, Error> {
         })
 }
 
+/// The most threads that [`set`] takes: beyond it they only cost memory, and a mistyped number may stop the machine.
+pub const MAX_THREADS: usize = 1024;
+
+/// The error for a number of threads that [`set`] does not take.
+pub fn out_of_range(threads: impl fmt::Display) -> Error {
+    let message = format!("must be 1 to {MAX_THREADS}, got {threads}");
+    Error::new("threads", message)
+}
+
 /// Use `threads` threads from now on.
 ///
 /// # Errors
-/// When `threads` is 0, or the system refuses to start them.
+/// When there are none or more than [`MAX_THREADS`], or the system refuses to start them.
 pub fn set(threads: usize) -> Result<(), Error> {
-    if threads == 0 {
-        return Err(Error::new("threads", "must be at least 1, got 0"));
+    if !(1..=MAX_THREADS).contains(&threads) {
+        return Err(out_of_range(threads));
     }
     let pool = Pool::of_this_process(Some(threads))?;
     if pool.threads.load(Ordering::Relaxed) != threads {

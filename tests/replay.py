@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.speed.ewa import project
+from benchmarks.speed.inputs import project
 from hqgs._rust import ALPHA_MAX, ALPHA_MIN, EPS2D, NEAR_PLANE, TRANSMITTANCE_MIN
 
 if TYPE_CHECKING:
@@ -24,9 +24,7 @@ def random_pixels(inputs: RasterInputs, count: int, seed: int) -> NDArray[np.int
 
 def blended_counts(inputs: RasterInputs, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
     """How many Gaussians blend in each of the pixels [P, 2] (column, row), [P]."""
-    means2d, depths, cov = project(
-        inputs.means, inputs.quats, inputs.scales, inputs.viewmat, inputs.K, inputs.width, inputs.height
-    )
+    means2d, depths, cov = project(inputs)
     opacities = inputs.opacities.astype(np.float64)
     kept = np.flatnonzero((depths >= NEAR_PLANE) & (opacities >= ALPHA_MIN))
     kept = kept[np.argsort(depths[kept], kind="stable")]

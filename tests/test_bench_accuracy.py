@@ -19,9 +19,9 @@ from scenes import random_scene
 
 import hqgs
 from benchmarks import cli
-from benchmarks.accuracy.errors import errors_against, pareto_front
 from benchmarks.accuracy.knobs import CASES, ORACLES, Knobs, TunedPass
-from benchmarks.accuracy.run import beats
+from benchmarks.accuracy.run import beats, errors_against
+from benchmarks.charts import unbeaten
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust
@@ -216,7 +216,7 @@ def test_errors_of_a_hand_made_case() -> None:
 def test_pareto_front_of_a_hand_made_case() -> None:
     times = [1.0, 2.0, 2.0, 3.0, 4.0, 0.5]
     errors = [5.0, 3.0, 4.0, 3.0, 1.0, 9.0]
-    assert pareto_front(times, errors) == [5, 0, 1, 4]
+    assert unbeaten(list(zip(times, errors, strict=True))) == [5, 0, 1, 4]
 
 
 def test_the_default_is_beaten_only_by_what_is_clearly_faster_and_nowhere_worse() -> None:

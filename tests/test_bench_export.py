@@ -11,6 +11,7 @@ from tiny_scene import tiny_scene
 
 from benchmarks import cli, scenes
 from benchmarks import export as bench
+from benchmarks.charts import unbeaten
 from benchmarks.study import Store
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.model.gaussians import Gaussians
@@ -57,8 +58,7 @@ def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
 
 def test_the_front_holds_what_no_other_beats_in_both() -> None:
     pairs = [(10, 30.0), (5, 29.0), (5, 28.0), (7, 28.5), (1, 20.0), (1, 20.0), (12, 30.0)]
-    rows = [{"bytes": size, "psnr": value} for size, value in pairs]
-    assert bench.pareto(rows) == [True, True, False, False, True, True, False]
+    assert unbeaten([(size, -psnr) for size, psnr in pairs]) == [4, 5, 1, 0]
 
 
 @pytest.mark.parametrize(

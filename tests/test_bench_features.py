@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pandas import DataFrame
 from PIL import Image
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from benchmarks import cli, places
-from benchmarks.features import report
 from benchmarks.features import run as features
 from benchmarks.features.run import still_trainer
 from benchmarks.features.switches import DEFAULT, FEATURES, PROTOCOLS, TorchAdam, torch_loss
@@ -173,7 +173,7 @@ def test_the_loss_in_torch_is_the_loss(masked: bool, shape: tuple[int, int, int]
 
 def test_switches_are_undone() -> None:
     before = hqgs.get_num_threads(), torch.get_num_threads()
-    watched = places.PROJECT, places.RENDER_VIEW, places.ADAM, places.ONE_TORCH_THREAD, places.LOSS
+    watched = places.PROJECT, places.RASTERIZATION, places.ADAM, places.ONE_TORCH_THREAD, places.LOSS
     found = [getattr(*place) for place in watched]
     default = PROTOCOLS["quick"].train_config(DEFAULT, 0)
     changed: set[str] = set()
@@ -220,12 +220,16 @@ def run_of(psnr: float, seconds: float, refined: float = 31.0) -> dict[str, Any]
     return run | {"history": []}
 
 
+def rounds(seconds: float) -> DataFrame:
+    return DataFrame({"total": [seconds] * 3})
+
+
 def compare(*arguments: Any) -> list[dict[str, Any]]:
-    return report.compare(FEATURES, *arguments)
+    return features.compare(FEATURES, *arguments)
 
 
 def verdicts(scenes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return report.verdicts(FEATURES, scenes)
+    return features.verdicts(FEATURES, scenes)
 
 
 def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:
@@ -238,7 +242,7 @@ def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:
 def test_costs_and_verdicts_of_a_hand_made_case() -> None:
     runs = runs_of(30.06, 30.06)
     runs[DEFAULT.label] = [run_of(30.0, 10.0), run_of(30.02, 10.0)]
-    steps = {name: [{"total": 3.0}] * 3 for name in runs} | {DEFAULT.label: [{"total": 1.0}] * 3}
+    steps = {name: rounds(3.0) for name in runs} | {DEFAULT.label: rounds(1.0)}
     rows = {row["feature"]: row for row in compare(runs, steps)}
     slower, selective = rows["fused loss"], rows["selective Adam"]
     assert slower["costs_db"] == pytest.approx([0.06, 0.04])
@@ -262,7 +266,7 @@ def test_whole_runs_must_be_sure_to_cost_too_much_and_the_refined_ones_only_do()
     def passes(other: list[dict[str, Any]]) -> bool:
         runs = runs_of(30.0, 30.0)
         runs["fused loss"] = other
-        steps = {name: [{"total": 1.0}] for name in runs}
+        steps = {name: rounds(1.0) for name in runs}
         found = {row["feature"]: row for row in verdicts([{"features": compare(runs, steps)}])}
         return found["fused loss"]["passed"]
 

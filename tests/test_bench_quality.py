@@ -18,18 +18,16 @@ from scipy import ndimage
 
 import hqgs
 from benchmarks import cli, study
-from benchmarks import scenes as bench_scenes
-from benchmarks.estimate import GROWTH, Estimate, duration
-from benchmarks.output import Report
+from benchmarks.measure import Estimate, duration
 from benchmarks.protocol import Protocol, narrowed
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality
-from benchmarks.quality.regions import count_regions, edge_robustness
+from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
-from benchmarks.quality.summary import equal_time_gain, means, psnr_at, spread, with_degraded
-from benchmarks.quality.tables import courses, metrics
-from benchmarks.scenes import degraded, degraded_views, load_scenes, validation_split
-from benchmarks.study import Cell, Store, grid, key_of
+from benchmarks.quality.tables import courses, equal_time_gain, means, metrics, psnr_at, spread, with_degraded
+from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
+from benchmarks.study import Cell, Store, Study, grid, key_of
+from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.scene import Camera, Scene, SfmReport, View
 from hqgs.training.checkpoint import scene_fingerprint
@@ -86,10 +84,8 @@ def stamps(out: Path) -> dict[str, int]:
 def bench_of(
     out: Path, protocol: Protocol, scenes: list[Scene], sfm: bool = False, pictures: int = 0
 ) -> quality.Quality:
-    args = argparse.Namespace(
-        out=out, validate=False, sfm=sfm, pictures=pictures, any_sources=False, known=None
-    )
-    return quality.Quality(args, protocol, scenes, Report(settings={}))
+    args = argparse.Namespace(out=out, validate=False, sfm=sfm, pictures=pictures, known=None, finished=False)
+    return quality.Quality(Study(args, "quality", protocol, scenes, labelled=False))
 
 
 def test_each_cell_is_one_file_with_its_numbers(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
@@ -128,9 +124,8 @@ def test_methods_of_a_cell_see_the_same_photos(runs: dict[Any, dict[str, Any]]) 
             assert kind == "none" or f"degradation {kind}, seed {seed}" in notes[0][-1]
     scene = tiny_scene()
     first = degraded(scene, "noise:25", 3)
-    some = degraded_views(scene, scene.train[1:3], "noise:25", 3)
-    for a, b in zip(first.train[1:3], some, strict=True):
-        assert np.array_equal(a.image, b.image)  # of a few photos as of all of them
+    alone = degraded_view(scene, scene.train[1], "noise:25", 3)
+    assert np.array_equal(first.train[1].image, alone.image)  # of one photo as of all of them
     assert not np.array_equal(first.train[0].image, degraded(scene, "noise:25", 4).train[0].image)
 
 
@@ -306,11 +301,10 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
         report = SfmReport(5, ["lost"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, 0.3)
         return replace(scene, sfm=report, points=scene.points + np.float32(0.01))
 
-    monkeypatch.setattr(bench_scenes, "sfm_scene", sfm)
-    protocol = narrowed(PROTOCOLS["smoke"], ["noise:25"], ["3dgs", "hqgs"], iterations=2)
+    monkeypatch.setattr(study, "sfm_scene", sfm)
+    protocol = narrowed(PROTOCOLS["smoke"], degradations=["noise:25"], rows=["3dgs", "hqgs"], iterations=2)
     scene = tiny_scene()
     bench = bench_of(tmp_path, protocol, [scene], sfm=True)
-    bench.train()
     bench.tables()
     report = bench.report
     assert len(seen) == 1
@@ -329,7 +323,9 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
 
 def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene()
-    protocol = narrowed(PROTOCOLS["smoke"], ["none", "noise:25"], ["3dgs", "srgs"], iterations=2)
+    protocol = narrowed(
+        PROTOCOLS["smoke"], degradations=["none", "noise:25"], rows=["3dgs", "srgs"], iterations=2
+    )
     real = quality_cell.run_cell
 
     def make() -> quality.Quality:
@@ -345,12 +341,11 @@ def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.
 
     raising(KeyboardInterrupt(), "tiny, noise:25, 3dgs, seed 0")
     with pytest.raises(KeyboardInterrupt):
-        make().train()
+        make()
     assert len(stamps(tmp_path)) == 2
 
     raising(TrainingError("it blew up"), "tiny, noise:25, 3dgs, seed 0")
     bench = make()
-    bench.train()
     assert [len(bench.study.runs), len(stamps(tmp_path))] == [3, 4]  # and the reason of the other
     for later in (bench, make()):  # which the next call still knows
         later.tables()
@@ -358,8 +353,7 @@ def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.
         assert [cells[0].degradation for cells in later.groups()] == ["none"]  # srgs alone is not compared
 
     monkeypatch.setattr(quality, "run_cell", real)
-    bench = make()
-    bench.train()  # it is tried again
+    bench = make()  # it is tried again
     assert (bench.study.failures, len(bench.study.runs), len(stamps(tmp_path))) == ({}, 4, 4)
     assert make().study.failures == {}
 
@@ -397,7 +391,7 @@ def test_the_key_covers_what_a_result_depends_on(monkeypatch: pytest.MonkeyPatch
     assert len({first, *others}) == 10
 
 
-def test_runs_of_other_sources_count_only_when_asked(
+def test_runs_of_other_sources_do_not_count(
     out: Path, runs: dict[Any, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert {run["sources"] for run in runs.values()} == {Store(out).here.name.split("-")[-1]}
@@ -405,12 +399,10 @@ def test_runs_of_other_sources_count_only_when_asked(
     first = Store(tmp_path)
     first.write(run)
     monkeypatch.setattr(study, "sources", lambda: "other")
-    second, both = Store(tmp_path), Store(tmp_path, any_sources=True)
+    second = Store(tmp_path)
     assert second.read(run["key"]) is None
-    assert both.read(run["key"]) == run
     second.write(run | {"seconds": 0.0})
-    for store in (second, both):  # its own come first
-        assert store.read(run["key"]) == run | {"seconds": 0.0}
+    assert second.read(run["key"]) == run | {"seconds": 0.0}
     assert first.read(run["key"]) == run
 
 
@@ -437,7 +429,9 @@ def test_protocols() -> None:
     for protocol in PROTOCOLS.values():
         assert protocol.baseline in protocol.labels
         assert len(set(protocol.labels)) == len(protocol.rows)
-        assert narrowed(protocol, protocol.degradations) == protocol  # spelled as the parser spells them
+        assert (
+            narrowed(protocol, degradations=protocol.degradations) == protocol
+        )  # spelled as the parser spells them
     scene = tiny_scene()
     standard = grid(PROTOCOLS["standard"], [scene, replace(scene, name="b")])
     assert len(standard) == 2 * 6 * 2 * 3
@@ -531,6 +525,17 @@ def test_edge_maps_against_another_sobel() -> None:
     assert edge_robustness(scene, kinds[:1], 0)["edge_variance"] is None
 
 
+def test_edge_maps_are_those_of_the_photos_that_are_trained_on() -> None:
+    scene, kind = tiny_scene(), "some:noise:25"
+    trained = degraded(scene, kind, 2).train
+    hit = [k for k, (a, b) in enumerate(zip(trained, scene.train, strict=True)) if a.image.dtype != np.uint8
+           and np.abs(a.image - b.image / np.float32(255)).max() > 1e-6]  # fmt: skip
+    assert 0 < len(hit) < len(trained)
+    values = [psnr(trained[k].image, scene.train[k].image) for k in hit]
+    found = edge_robustness(scene, [kind], seed=2)["degradations"][kind]["photo_psnr"]
+    assert found == pytest.approx(np.mean([value for value in values if value is not None]))
+
+
 def fake(*points: tuple[float, float], **fields: Any) -> dict[str, Any]:
     history = [{"iteration": k, "seconds": t, "psnr": v, "ssim": None} for k, (t, v) in enumerate(points)]
     return {"history": history, "metrics": {"psnr": points[-1][1]}, **fields}
@@ -586,21 +591,17 @@ def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
     assert courses(frame.loc[frame["row"] == "x"]).count("–, 8 s") == 1
 
 
-def test_estimates_learn_from_finished_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimates_learn_from_finished_runs() -> None:
     scene = replace(tiny_scene(), name="a")
     first, second, third = grid(replace(PROTOCOLS["smoke"], iterations=100), [scene])[:3]
     estimate = Estimate()
-    estimate.probe(replace(first, config=replace(first.config, iterations=2)), scene)
-    assert estimate.knows(first)
-    assert not estimate.knows(second)
-    monkeypatch.setattr(estimate, "_first", {("a", "3dgs"): (0.1, 99.0), ("a", "srgs"): (0.2, 99.0)})
-    assert estimate.seconds([first, first]) == pytest.approx(2 * 100 * 0.1 * GROWTH)
-    run = {"iterations": 100, "first_step_seconds": 0.15, "config": {"densify": {"max_gaussians": 2000}}}
-    estimate.add(third, {**run, "initial_points": 1900, "wall_seconds": 15.0})  # no room: tells no growth
-    assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * GROWTH)
-    estimate.add(third, {**run, "initial_points": 100, "wall_seconds": 60.0})  # four times slower
-    assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * 4)
-    assert estimate.seconds([third]) == pytest.approx((15 + 60) / 2)
-    monkeypatch.setattr(estimate, "_first", {("a", "srgs"): (0.2, 1.5)})
-    assert estimate.seconds([second]) == pytest.approx(100 * 0.2 * 1.5)
+    estimate.probe(first, lambda cell: cell.scene)
+    probed = estimate.seconds([first])
+    assert probed > 0
+    assert estimate.seconds([first, first]) == pytest.approx(2 * probed)
+    assert estimate.seconds([second]) == 0  # nothing is known
+    estimate.add(first, {"iterations": 100, "wall_seconds": 15.0})
+    estimate.add(first, {"iterations": 100, "wall_seconds": 60.0})
+    assert estimate.seconds([first, third]) == pytest.approx((15 + 60) / 2)
+    estimate.probe(first, lambda cell: pytest.fail("it is known"))
     assert [duration(s) for s in (59.6, 125, 11_100)] == ["60 s", "2 min", "3 h 05 min"]

@@ -105,13 +105,16 @@ def test_freed_buffers_are_kept_for_the_next_iteration() -> None:
     assert max(waited, after) < first / 4
 
 
-def test_threads_can_be_set_and_zero_is_refused() -> None:
+def test_threads_can_be_set_and_a_number_out_of_range_is_refused() -> None:
     before = hqgs.get_num_threads()
     try:
         hqgs.set_num_threads(3)
         assert hqgs.get_num_threads() == 3
-        with pytest.raises(ValueError, match="threads: must be at least 1, got 0"):
-            hqgs.set_num_threads(0)
+        for wrong in (0, -1, -(2**70), 1025, 2**31, 2**64, 10**30):
+            with pytest.raises(ValueError, match=f"threads: must be 1 to 1024, got {wrong}$"):
+                hqgs.set_num_threads(wrong)
+        with pytest.raises(TypeError):
+            hqgs.set_num_threads(2.0)  # type: ignore[arg-type]
         assert hqgs.get_num_threads() == 3
     finally:
         hqgs.set_num_threads(before)

@@ -362,7 +362,7 @@ def test_a_benchmark_on_a_full_disk_is_one_line(
         write_json(args.out / "run.json", "x" * 9_000)
         return Report({})
 
-    monkeypatch.setitem(benchmarks.BENCHMARKS, "stability", Benchmark("full", lambda parser: None, full))
+    monkeypatch.setitem(benchmarks.BENCHMARKS, "stability", Benchmark("full", full))
     with small_files(4_000):
         assert benchmarks.main(["stability", "--quick", "--out", str(tmp_path)]) == 1
     assert last_line(capsys) == f"hqgs: {tmp_path}: [Errno 27] File too large"

@@ -13,9 +13,9 @@ import torch
 
 from benchmarks import places
 from benchmarks.data import build, read_toml
-from benchmarks.speed.ewa import ALPHA_MIN, TRANSMITTANCE_MIN
-from benchmarks.speed.inputs import RasterInputs
+from benchmarks.speed.inputs import LEAVES, RasterInputs
 from benchmarks.speed.rasterizer import RasterPass
+from hqgs._rust import ALPHA_MIN, TRANSMITTANCE_MIN
 
 FILE = Path(__file__).with_name("accuracy.toml")
 
@@ -66,7 +66,6 @@ class TunedPass(RasterPass):
     def outputs(self) -> dict[str, torch.Tensor]:
         """The image, and the gradient of each input by its name, all in float64."""
         image = self.run()
-        names = ("means", "quats", "scales", "opacities", "sh")
-        grads = {n: leaf.grad for n, leaf in zip(names, self.leaves, strict=True) if leaf.grad is not None}
+        grads = {n: leaf.grad for n, leaf in zip(LEAVES, self.leaves, strict=True) if leaf.grad is not None}
         self.clear()
         return {name: tensor.double() for name, tensor in ({"image": image} | grads).items()}

@@ -3,47 +3,42 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
-import hqgs
-from benchmarks.accuracy.errors import errors_against, pareto_front
 from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
-from benchmarks.accuracy.trained import trained_inputs
-from benchmarks.charts import LEGEND, color, panels
-from benchmarks.data import build, read_toml
-from benchmarks.output import Benchmark, Report, table
+from benchmarks.charts import LEGEND, color, panels, unbeaten
+from benchmarks.data import read_toml
+from benchmarks.measure import Training
+from benchmarks.output import Benchmark, Report, repeats_and_seed, span, table, with_repeats
+from benchmarks.protocol import Row
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import measure_threads, thread_counts
-from benchmarks.speed.timing import interleaved, median, quartiles
+from benchmarks.speed.timing import interleaved, quartiles, using_threads, whole
+from hqgs.base.threads import one_torch_thread
+from hqgs.model.render import render_view
+from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.scene import Scene
+from hqgs.training.methods.base import photo_tensors
+from hqgs.training.methods.photometric import photometric_loss
 
-Row = dict[str, Any]
 DATA = read_toml(FILE)
 COLUMNS = DATA["columns"]
-ERRORS: dict[str, Callable[[Row], float]] = {  # of a row and an oracle's name; what the panels show
+IMAGE = "image"
+Errors = dict[str, Any]  # of a row against an oracle
+ERRORS: dict[str, Callable[[Errors], float]] = {  # what the panels show
     "image": lambda errors: errors["image"]["rms"],
     "gradients": lambda errors: errors["gradients"]["all"]["relative"],
 }
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """The sizes at which things are measured."""
-
-    repeats: int  # rounds of everything that is timed
-    size: tuple[int, int]  # width, height
-    gaussians: tuple[int, ...]
-    trained_views: int  # of the built-in scene
-    trained_steps: int
-    trained_gaussians: int  # at most
-    seed: int = 2026
 
 
 def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
@@ -57,32 +52,16 @@ def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
     measured = list(interleaved({str(k): p for k, p in enumerate(passes)}, repeats).values())
     rows = []
     for (knob, value, knobs), case, errors, rounds in zip(CASES, passes, found, measured, strict=True):
-        ratios = [a["total"] / b["total"] for a, b in zip(rounds, measured[0], strict=True)]
-        rows.append(
-            {
-                "knob": knob,
-                "value": value,
-                "settings": asdict(knobs),
-                "seconds": median(rounds),
-                "seconds_quartiles": quartiles(rounds),
-                "ratio": float(np.median(ratios)),  # to the default, in the same round
-                "ratio_quartiles": [float(q) for q in np.quantile(ratios, [0.25, 0.75])],
-                "tile_pairs": case.work[0],
-                "blocks": case.work[1],
-                "errors": errors,
-            }
-        )
-    return {
-        "inputs": name,
-        "gaussians": len(inputs),
-        "width": inputs.width,
-        "height": inputs.height,
-        "rows": rows,
-        "beaten_by": [f"{row['knob']} {row['value']}" for row in rows[1:] if beats(row, rows[0])],
-    }
+        ratios = rounds["total"] / measured[0]["total"]  # to the default, in the same round
+        row = {"knob": knob, "value": value, "settings": asdict(knobs), **whole(rounds), "errors": errors}
+        row |= {"ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
+        rows.append(row | {"tile_pairs": case.work[0], "blocks": case.work[1]})
+    beaten = [f"{row['knob']} {row['value']}" for row in rows[1:] if beats(row, rows[0])]
+    size = {"inputs": name, "gaussians": len(inputs), "width": inputs.width, "height": inputs.height}
+    return size | {"rows": rows, "beaten_by": beaten}
 
 
-def beats(row: Row, other: Row) -> bool:
+def beats(row: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether `row` has no larger error than the default, whatever it is held against, in clearly less time:
     three rounds of four were faster."""
     no_worse = all(
@@ -93,21 +72,17 @@ def beats(row: Row, other: Row) -> bool:
     return no_worse and row["ratio_quartiles"][1] < 1
 
 
-def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[Row]:
+def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[dict[str, Any]]:
     """Seconds with each number of threads, and the largest difference to one thread in any output."""
     case = TunedPass(inputs, Knobs())
     rows = measure_threads({"default": case}, repeats)
-    before = hqgs.get_num_threads()
-    try:
-        hqgs.set_num_threads(1)
+    with using_threads(1):
         one = case.outputs()
-        for row in rows:
-            hqgs.set_num_threads(row["threads"])
+    for row in rows:
+        with using_threads(row["threads"]):
             several = case.outputs()
-            row["difference"] = max(float((several[name] - one[name]).abs().max()) for name in one)
-            row["same_bits"] = all(torch.equal(several[name], one[name]) for name in one)
-    finally:
-        hqgs.set_num_threads(before)
+        row["difference"] = max(float((several[name] - one[name]).abs().max()) for name in one)
+        row["same_bits"] = all(torch.equal(several[name], one[name]) for name in one)
     return rows
 
 
@@ -117,18 +92,10 @@ def errors_table(result: dict[str, Any]) -> str:
     for row in result["rows"]:
         exact, defined = row["errors"]["exact"], row["errors"]["defined"]
         every = exact["gradients"]["all"]
-        lines.append(
-            row
-            | exact["image"]
-            | {
-                "quartiles": " to ".join(f"{q:.3f}" for q in row["ratio_quartiles"]),
-                "more_blocks": row["blocks"] / max(first["blocks"], 1),
-                "gradients": every["relative"],
-                "turn": None if every["cosine"] is None else 1 - every["cosine"],
-                "rms_defined": defined["image"]["rms"],
-                "gradients_defined": defined["gradients"]["all"]["relative"],
-            }
-        )
+        line = row | exact["image"] | {"quartiles": span(row["ratio_quartiles"], ".3f")}
+        line |= {"more_blocks": row["blocks"] / max(first["blocks"], 1), "gradients": every["relative"]}
+        line |= {"turn": None if every["cosine"] is None else 1 - every["cosine"]}
+        lines.append(line | {f"{name}_defined": error(defined) for name, error in ERRORS.items()})
     size = f"{result['gaussians']:,} Gaussians, {result['width']} x {result['height']}"
     return table(f"{result['inputs']}: {size}, forward and backward", lines, COLUMNS["errors"])
 
@@ -165,12 +132,9 @@ def chart(result: dict[str, Any]) -> Figure:
 
 
 def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
-    times, errors = [p[0] for p in points], [p[1] for p in points]
-    front = pareto_front(times, errors)
-    axes.plot(
-        [times[k] for k in front], [errors[k] for k in front], color="#888888", lw=1.2,
-        drawstyle="steps-post", label="no other one is better in both",
-    )  # fmt: skip
+    times, errors = zip(*(points[k][:2] for k in unbeaten([p[:2] for p in points])), strict=True)
+    label = "no other one is better in both"
+    axes.plot(times, errors, color="#888888", lw=1.2, drawstyle="steps-post", label=label)
     for k, knob in enumerate(dict.fromkeys(case[0] for case in CASES)):
         own = [(x, y, value) for x, y, name, value in points if name == knob]
         first = knob == "default"
@@ -183,30 +147,76 @@ def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
     axes.set(xscale="log", yscale="log")
 
 
+def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, Any]:
+    """Image and gradients against `exact`; both hold "image" and the gradients by name, float64.
+
+    The image: largest and root-mean-square error, and PSNR in dB where white is 1 (None: no error). Each
+    gradient, and "all" of them as one vector: |g - exact| / |exact|, and the cosine of the angle between the
+    two (None: one of them is 0).
+    """
+    difference = outputs[IMAGE] - exact[IMAGE]
+    rms = float(difference.square().mean().sqrt())
+    names = [name for name in exact if name != IMAGE]
+    gradients = {name: _direction(outputs[name].flatten(), exact[name].flatten()) for name in names}
+    both = [torch.cat([side[name].flatten() for name in names]) for side in (outputs, exact)]
+    psnr = -20 * math.log10(rms) if rms > 0 else None
+    return {
+        IMAGE: {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
+        "gradients": gradients | {"all": _direction(*both)},
+    }
+
+
+def _direction(found: Tensor, exact: Tensor) -> dict[str, float | None]:
+    length, other = float(exact.norm()), float(found.norm())
+    if length == 0 or other == 0:
+        return {"relative": None, "cosine": None}
+    cosine = float(found @ exact) / (length * other)
+    return {"relative": float((found - exact).norm()) / length, "cosine": min(1.0, cosine)}
+
+
+def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInputs:
+    """At most `most` Gaussians after `steps` of 3DGS; `v_image` is the gradient of the loss there."""
+    config = Row("3dgs").train_config(seed, steps, {"densify": {"max_gaussians": most}, "sh_interval": 1})
+    done = Training(scene, config)
+    done.steps(steps)
+    g, view = done.trainer.gaussians.detached(), scene.train[0]
+    with one_torch_thread():
+        image, _ = render_view(g, view.camera, 3, config.background)
+        image.requires_grad_()
+        photo, mask = photo_tensors(view)
+        photometric_loss(image, photo, mask).backward()
+    assert image.grad is not None
+    return RasterInputs(
+        means=g.means.numpy(),
+        quats=g.quats.numpy(),
+        scales=g.activated_scales().numpy(),
+        opacities=g.activated_opacities().numpy(),
+        sh=torch.cat([g.sh0, g.shN], dim=1).numpy(),
+        v_image=image.grad.numpy(),
+        viewmat=view.camera.viewmat,
+        K=view.camera.K,
+        background=np.array(config.background, np.float32),
+    )
+
+
 def run(args: argparse.Namespace) -> Report:
     """Measure every case on the clouds and on the trained Gaussians."""
-    part = "quick" if args.quick else "full"
-    sizes = replace(build(Sizes, DATA[part], f"{FILE.name}, {part}"), seed=args.seed)
-    if args.repeats is not None:
-        if args.repeats < 1:
-            raise ValueError(f"repeats is {args.repeats}, wanted at least 1")
-        sizes = replace(sizes, repeats=args.repeats)
-    report = Report(settings=asdict(sizes))
-    inputs = {f"cloud of {n:,}": make_inputs(n, *sizes.size, sizes.seed) for n in sizes.gaussians}
+    sizes = with_repeats(DATA["quick" if args.quick else "full"], args)
+    report = Report(settings=sizes)
+    inputs = {f"cloud of {n:,}": make_inputs(n, *sizes["size"], seed=args.seed) for n in sizes["gaussians"]}
     print("accuracy: training the built-in scene", file=sys.stderr)
+    scene = embedded_scene(args.out / "scene", *sizes["size"], num_views=sizes["trained_views"])
     inputs["built-in scene, trained"] = trained_inputs(
-        sizes.size, sizes.trained_views, sizes.trained_steps, sizes.trained_gaussians, sizes.seed,
-        args.out / "scene",
-    )  # fmt: skip
-    results = []
+        scene, sizes["trained_steps"], sizes["trained_gaussians"], args.seed
+    )
+    results = report.results["inputs"] = []
     for name, x in inputs.items():
         print(f"accuracy: {name}", file=sys.stderr)
-        results.append(measure(name, x, sizes.repeats))
+        results.append(measure(name, x, sizes["repeats"]))
         report.tables += [errors_table(results[-1]), gradient_table(results[-1])]
-    report.results["inputs"] = results
     name, largest = max(inputs.items(), key=lambda item: len(item[1]))
     if len(thread_counts()) > 1:
-        rows = report.results["threads"] = measure_by_threads(largest, sizes.repeats)
+        rows = report.results["threads"] = measure_by_threads(largest, sizes["repeats"])
         report.tables.append(table(f"{name}: threads", rows, COLUMNS["threads"]))
     else:
         report.leave_out("threads", "there is one thread")
@@ -219,10 +229,5 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--repeats", type=int, metavar="N", help="rounds of each measurement (15, with --quick 2)")
-    add("--seed", type=int, default=Sizes.seed, metavar="S", help="of the Gaussians (%(default)s)")
-
-
-BENCHMARK = Benchmark("error of the rasterizer against its run time, knob by knob", options, run)
+HELP = "error of the rasterizer against its run time, knob by knob"
+BENCHMARK = Benchmark(HELP, run, options=repeats_and_seed(DATA))

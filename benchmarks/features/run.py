@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from matplotlib.figure import Figure
+from pandas import DataFrame
 
-from benchmarks.features.report import chart, compare, scene_table, verdict_table, verdicts
+from benchmarks.charts import LEGEND, color, panels, title
+from benchmarks.data import read_toml
 from benchmarks.features.switches import DEFAULT, PROTOCOLS, Feature
-from benchmarks.measure import Run, exported, train
-from benchmarks.output import Benchmark, Report
-from benchmarks.protocol import Protocol, add_options, narrowed
-from benchmarks.scenes import load_scenes
-from benchmarks.speed.scene import still_config
-from benchmarks.speed.timing import Seconds, interleaved
-from benchmarks.study import Cell, Study, grid, open_study
+from benchmarks.measure import Run, train
+from benchmarks.output import Benchmark, Report, number, span, table
+from benchmarks.speed.timing import Seconds, interleaved, quartiles
+from benchmarks.speed.training import still_config, trainer_from
+from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
@@ -27,19 +27,20 @@ from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Trainer
 
 REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
+LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
+SURE = 2.0  # standard errors by which whole runs must be over the limit before they fail a feature
+ON = {True: "on", False: "off"}
+COLUMNS = read_toml(Path(__file__).with_name("features.toml"))["columns"]
 SHOWN = ("seed", "seconds", "gaussians", "history", "psnr", "refined_psnr")  # of a run, in the results
 
 
 class Features:
     """The runs of all features, and steps timed on what the default run grew."""
 
-    def __init__(self, args: argparse.Namespace, protocol: Protocol, scenes: list[Scene]) -> None:
-        self.protocol = protocol
-        self.rows = [row for row in protocol.rows if isinstance(row, Feature)]
-        switches = {row.label: row.switch for row in self.rows}
-        cells = grid(protocol, scenes, lambda row: (row.label,), lambda row: {"switch": switches[row.label]})
-        self.study: Study = open_study(args, "features", cells)
-        self.cells = {(cell.scene.name, cell.row.label, cell.seed): cell for cell in cells}
+    def __init__(self, study: Study) -> None:
+        self.study = study
+        self.rows = [row for row in study.protocol.rows if isinstance(row, Feature)]
+        self.cells = {(cell.scene.name, cell.row.label, cell.seed): cell for cell in study.cells}
 
     def measure(self, cell: Cell, photos: Scene) -> Run:
         """Train whole, and train on what the default run grew."""
@@ -47,17 +48,14 @@ class Features:
         with cell.row.switched():
             done = train(photos, cell.config)
         if cell.row == DEFAULT:
-            path = self.grown(cell)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            exported(done.trainer).save(path)
+            done.trainer.shown().save(self.grown(cell))
         psnr = done.trainer.history[-1]["psnr"]
         refined = self.refined(cell, cell.row) if cell.row.refinable else None
         return done.record() | {"psnr": psnr, "refined_psnr": refined}
 
     def grown(self, cell: Cell) -> Path:
         """The final Gaussians of the default run of the same scene and seed."""
-        default = self.cells[cell.scene.name, DEFAULT.label, cell.seed]
-        return self.study.store.beside(self.study.keys[default], PLY)
+        return self.study.beside(self.cells[cell.scene.name, DEFAULT.label, cell.seed], PLY)
 
     def refined(self, cell: Cell, feature: Feature) -> float | None:
         """Held-out PSNR of the default run's final Gaussians when they are trained on, their number fixed."""
@@ -71,41 +69,40 @@ class Features:
             trainer.evaluate()
         return trainer.history[-1]["psnr"]
 
-    def final_steps(self, scene: Scene) -> dict[str, list[Seconds]]:
+    def final_steps(self, scene: Scene) -> dict[str, DataFrame]:
         """Seconds of steps on the final Gaussians of the default run, all features in turn."""
-        cell = self.cells[scene.name, DEFAULT.label, self.protocol.seeds[0]]
+        cell = self.cells[scene.name, DEFAULT.label, self.study.protocol.seeds[0]]
         final = Gaussians.load(self.grown(cell))
-        return interleaved({f.label: self._timed(f, scene, final) for f in self.rows}, self.protocol.repeats)
 
-    def _timed(self, feature: Feature, scene: Scene, final: Gaussians) -> Callable[[], Seconds]:
-        config = self.protocol.train_config(feature, self.protocol.seeds[0])
-        with feature.switched():
-            trainer = still_trainer(scene, config, final)
-
-        def call() -> Seconds:
+        def timed(feature: Feature) -> Callable[[], Seconds]:
+            config = self.study.protocol.train_config(feature, cell.seed)
             with feature.switched():
-                trainer.step()  # a switch may have made new threads, without memory of their own
-                before = trainer.seconds
-                trainer.step()
-            return {"total": trainer.seconds - before}
+                trainer = still_trainer(scene, config, final)
 
-        return call
+            def call() -> Seconds:
+                with feature.switched():
+                    trainer.step()  # a switch may have made new threads, without memory of their own
+                    before = trainer.seconds
+                    trainer.step()
+                return {"total": trainer.seconds - before}
+
+            return call
+
+        return interleaved({f.label: timed(f) for f in self.rows}, self.study.protocol.repeats)
 
     def compare(self, scene: Scene) -> dict[str, Any] | None:
         """The results of a scene; None where a run of it is not finished."""
-        keys = [(scene.name, f.label, seed) for f in self.rows for seed in self.protocol.seeds]
-        if any(self.cells[key] not in self.study.runs for key in keys):
+        seeds, done = self.study.protocol.seeds, self.study.runs
+        cells = {f.label: [self.cells[scene.name, f.label, seed] for seed in seeds] for f in self.rows}
+        if any(cell not in done for same in cells.values() for cell in same):
             return None
-        runs: dict[str, list[Run]] = {f.label: [] for f in self.rows}
-        for key in keys:
-            run = self.study.runs[self.cells[key]]
-            runs[key[1]].append({name: run[name] for name in SHOWN})
+        runs = {label: [{n: done[c][n] for n in SHOWN} for c in same] for label, same in cells.items()}
         camera = scene.train[0].camera
         return {
             "scene": scene.name,
             "width": camera.width,
             "height": camera.height,
-            "iterations": self.protocol.iterations,
+            "iterations": self.study.protocol.iterations,
             "default": runs[DEFAULT.label],
             "features": compare(self.rows[1:], runs, self.final_steps(scene)),
         }
@@ -122,28 +119,120 @@ def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Tr
     return trainer
 
 
-def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
-    """A trainer that starts with these Gaussians in place of the scene's points."""
-    points = gaussians.means.numpy()
-    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
-    with torch.no_grad():
-        for name, tensor in trainer.gaussians.named().items():
-            tensor.copy_(getattr(gaussians, name))
-    return trainer
+def compare(
+    features: Sequence[Feature], runs: dict[str, list[dict[str, Any]]], steps: dict[str, DataFrame]
+) -> list[dict[str, Any]]:
+    """One row for each feature, from runs that hold `psnr`, `refined_psnr` and `seconds`.
+
+    `costs_db`: what the fast choice costs in held-out PSNR, run by run with the same seed, and
+    `refined_costs_db` the same of the Gaussians that were grown once and trained on, empty where they cannot
+    tell; `cost_db` and `refined_cost_db` their means. `speedup`: of the fast choice, over the other one.
+    """
+    rows = []
+    for feature in features:
+        other, sign = runs[feature.label], 1 if feature.by_default else -1
+        pairs = list(zip(runs[DEFAULT.label], other, strict=True))
+        costs, refined = (
+            [sign * (b[name] - a[name]) for a, b in pairs if b[name] is not None]
+            for name in ("psnr", "refined_psnr")
+        )
+        rounds = (steps[feature.label]["total"] / steps[DEFAULT.label]["total"]) ** sign
+        rows.append(
+            _about(feature)
+            | {
+                "psnr": float(np.mean([r["psnr"] for r in other])),
+                "costs_db": costs,
+                "cost_db": float(np.mean(costs)),
+                "refined_costs_db": refined,
+                "refined_cost_db": float(np.mean(refined)) if refined else None,
+                "speedup_run": float(np.mean([(b["seconds"] / a["seconds"]) ** sign for a, b in pairs])),
+                "speedup_step": rounds.median(),
+                "speedup_step_quartiles": quartiles(rounds),
+                "runs": other,
+            }
+        )
+    return rows
+
+
+def _about(feature: Feature) -> dict[str, Any]:
+    return {"feature": feature.label, "other": feature.other, "by_default": feature.by_default}
+
+
+def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Mean costs over the scenes, and whether the feature may be on.
+
+    Growth decides by thresholds, so that a change of one bit makes other Gaussians: whole runs scatter by
+    more than the limit. They fail a feature only where they are sure to be over it; the Gaussians that were
+    grown once and trained on with either choice scatter little, and are held against the limit itself.
+    """
+    found = []
+    for k, feature in enumerate(features):
+        entry = _about(feature) | {"limit_db": LIMIT_DB}
+        for kind in ("", "refined_"):
+            costs = [cost for scene in scenes for cost in scene["features"][k][f"{kind}costs_db"]]
+            error = np.std(costs, ddof=1) / np.sqrt(len(costs)) if costs[1:] else None
+            entry[f"{kind}cost_db"] = float(np.mean(costs)) if costs else None
+            entry[f"{kind}standard_error_db"] = None if error is None else float(error)
+        sure = entry["cost_db"] - SURE * (entry["standard_error_db"] or 0.0)
+        worst = max(sure, -np.inf if entry["refined_cost_db"] is None else entry["refined_cost_db"])
+        found.append(entry | {"passed": not feature.by_default or bool(worst <= LIMIT_DB)})
+    return found
+
+
+def scene_table(scene: dict[str, Any]) -> str:
+    default = scene["default"]
+    psnr, seconds = (float(np.mean([r[name] for r in default])) for name in ("psnr", "seconds"))
+    title = (
+        f"{scene['scene']}, {scene['width']} x {scene['height']}, {scene['iterations']:,} iterations: "
+        f"default {psnr:.2f} dB, {seconds:.0f} s, {default[0]['gaussians']:,} Gaussians"
+    )
+    lines = [
+        row | {"on": ON[row["by_default"]], "quartiles": span(row["speedup_step_quartiles"], ".2f")}
+        for row in scene["features"]
+    ]
+    return table(title, lines, COLUMNS["of_scene"])
+
+
+def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
+    def with_error(row: dict[str, Any], kind: str) -> str:
+        error = row[f"{kind}standard_error_db"]
+        return number(row[f"{kind}cost_db"], "+.3f") + ("" if error is None else f" ± {error:.3f}")
+
+    lines = [
+        row
+        | {"cost": with_error(row, ""), "refined": with_error(row, "refined_")}
+        | {"on": ON[row["by_default"]], "verdict": "pass" if row["passed"] else "FAIL"}
+        for row in rows
+    ]
+    title = f"Mean cost with its standard error; what is on by default may cost {LIMIT_DB} dB"
+    return table(title, lines, COLUMNS["of_all"])
+
+
+def chart(scene: dict[str, Any]) -> Figure:
+    """Held-out PSNR over training seconds, a curve for each run of the first seed."""
+    figure, (axes,) = panels(8, 5)
+    curves = {DEFAULT.label: scene["default"][0]}
+    curves |= {f"{r['feature']}: {r['other']}": r["runs"][0] for r in scene["features"]}
+    for k, (name, run) in enumerate(curves.items()):
+        points = [(h["seconds"], h["psnr"]) for h in run["history"] if h["psnr"] is not None]
+        first = name == DEFAULT.label
+        axes.plot(
+            *zip(*points, strict=True), label=name, lw=2.4 if first else 1.1, zorder=3 if first else 2,
+            color="black" if first else color(k - 1), marker="o", markersize=2.5,
+        )  # fmt: skip
+    axes.set(xlabel="training (s)", ylabel="held-out PSNR (dB)")
+    title(axes, scene["scene"])
+    axes.legend(**LEGEND)
+    return figure
 
 
 def run(args: argparse.Namespace) -> Report:
     """Train every scene with every feature switched, then time steps of all of them in turn."""
-    protocol = PROTOCOLS["quick" if args.quick else "standard"]
     rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
-    protocol = narrowed(protocol, None, rows, args.seeds, args.iterations, args.downscale, args.repeats)
-    scenes = load_scenes(args.scenes, protocol.downscale, protocol.embedded, args.out / "scenes", False)
-    features = Features(args, protocol, scenes)
-    if not args.finished:
-        features.study.train(features.measure)
-    settings = asdict(protocol) | {"scenes": [scene.name for scene in scenes]}
-    report = Report(settings | features.study.circumstances(), left_out=features.study.left_out())
-    results = [result for scene in scenes if (result := features.compare(scene)) is not None]
+    features = Features(begin(args, "features", PROTOCOLS["quick" if args.quick else "standard"], rows=rows))
+    features.study.train(features.measure)
+    report = features.study.report()
+    results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
     for result in results:
         report.tables.append(scene_table(result))
         report.figures[result["scene"]] = chart(result)
@@ -153,9 +242,6 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    add_options(parser, PROTOCOLS["standard"])
-    parser.add_argument("--repeats", type=int, metavar="N", help="rounds of timed steps (15, with --quick 2)")
-
-
-BENCHMARK = Benchmark("what each speed feature saves in time and costs in held-out error", options, run)
+HELP = "what each speed feature saves in time and costs in held-out error"
+OPTIONS = {"--repeats": {"type": int, "metavar": "N", "help": "rounds of timed steps (15, with --quick 2)"}}
+BENCHMARK = Benchmark(HELP, run, PROTOCOLS, OPTIONS)

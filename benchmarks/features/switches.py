@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
@@ -18,21 +18,10 @@ import hqgs
 from benchmarks import places
 from benchmarks.accuracy.knobs import Knobs, tuned
 from benchmarks.protocol import Row, read_protocols
-from hqgs.model.gaussians import Gaussians
+from benchmarks.speed.timing import using_threads
 from hqgs.model.rasterization import RasterizationMeta
-from hqgs.scene.scene import Camera
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    before = hqgs.get_num_threads()
-    hqgs.set_num_threads(count)
-    try:
-        yield
-    finally:
-        hqgs.set_num_threads(before)
 
 
 @contextmanager
@@ -49,24 +38,17 @@ def _in_torch(place: places.Place, function: Any) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def render_in_float64(
-    gaussians: Gaussians, camera: Camera, sh_degree: int, background: tuple[float, float, float]
-) -> tuple[Tensor, RasterizationMeta]:
-    """`hqgs.render.render_view` with a rasterizer in float64; the image is float32 again."""
-    images, _, meta = hqgs.rasterization(
-        gaussians.means.double(),
-        gaussians.quats.double(),
-        gaussians.activated_scales().double(),
-        gaussians.activated_opacities().double(),
-        (gaussians.sh0.double(), gaussians.shN.double()),
-        torch.tensor(camera.viewmat[None]),
-        torch.tensor(camera.K[None]),
-        camera.width,
-        camera.height,
-        sh_degree=sh_degree,
-        backgrounds=torch.tensor([background], dtype=torch.float64),
-    )
-    return images[0].float(), meta
+def in_float64(*args: Any, **options: Any) -> tuple[Tensor, Tensor, RasterizationMeta]:
+    """`hqgs.rasterization` in float64; the image is float32 again."""
+
+    def double(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(double, value))
+        return value.double() if isinstance(value, Tensor) else value
+
+    options = {name: double(value) for name, value in options.items()}
+    images, alphas, meta = hqgs.rasterization(*map(double, args), **options)
+    return images.float(), alphas.float(), meta
 
 
 def torch_loss(
@@ -104,12 +86,12 @@ class TorchAdam(torch.optim.Adam):
 
 SWITCHES: dict[str, Callable[[], Any]] = {  # context managers: inside them the other choice is in place
     "": nullcontext,
-    "float64": partial(patch.object, *places.RENDER_VIEW, render_in_float64),
+    "float64": partial(patch.object, *places.RASTERIZATION, in_float64),
     "boxes": partial(tuned, Knobs(spans="box")),
     "every block": partial(tuned, Knobs(skip_blocks=False)),
     "torch's loss": partial(_in_torch, places.LOSS, torch_loss),
     "torch's Adam": partial(_in_torch, places.ADAM, TorchAdam),
-    "one thread": partial(_threads, 1),
+    "one thread": partial(using_threads, 1),
 }
 
 
@@ -119,21 +101,16 @@ class Feature(Row):
 
     other: str = ""  # what is done instead in the run of this feature
     by_default: bool = True  # whether the product has it on
-    switch: str = ""
+    switch: Literal["", "float64", "boxes", "every block", "torch's loss", "torch's Adam", "one thread"] = ""
     refinable: bool = True  # whether Gaussians that were grown once and trained on can tell
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.switch not in SWITCHES:
-            raise ValueError(f"switch is {self.switch!r}, wanted one of: {', '.join(filter(None, SWITCHES))}")
+    @property
+    def more(self) -> dict[str, Any]:
+        return {"switch": self.switch}
 
     def switched(self) -> Any:
         """A context manager: inside it the other choice is in place, as far as it is none of the config."""
         return SWITCHES[self.switch]()
-
-    @property
-    def name(self) -> str:
-        return f"{self.label}: {self.other}" if self.other else self.label
 
 
 PROTOCOLS = read_protocols(Path(__file__).with_name("features.toml"), Feature)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import root_scalar
 from scipy.spatial.transform import Rotation
 
-from benchmarks.speed.ewa import project
-from hqgs._rust import ALPHA_MIN, EPS2D
+from hqgs._rust import ALPHA_MIN, EPS2D, FOV_MARGIN
 from hqgs.model.constants import SH_C0
 
 Array32 = NDArray[np.float32]
@@ -28,6 +26,7 @@ FOCAL = 400.0  # pixels, at 504
 NEAR, FAR = 2.0, 6.0  # depths of the cloud, world units
 MARGIN = 0.05  # of the image, on each side, that the cloud reaches beyond it
 COVERAGE = 39.0  # supports per pixel; a few pixels are full before their last one
+LEAVES = ("means", "quats", "scales", "opacities", "sh")  # what gets a gradient
 SAMPLE = 20_000  # Gaussians from which the size is computed
 
 
@@ -55,6 +54,10 @@ class RasterInputs:
     @property
     def height(self) -> int:
         return self.v_image.shape[0]
+
+    def first(self, n: int) -> RasterInputs:
+        """With so many Gaussians; the arrays are shared."""
+        return replace(self, **{name: getattr(self, name)[:n] for name in LEAVES})
 
 
 def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int = 2026) -> RasterInputs:
@@ -92,38 +95,10 @@ def make_inputs(n: int, width: int = SIZE[0], height: int = SIZE[1], seed: int =
 def fitted(inputs: RasterInputs, n: int, width: int, height: int) -> RasterInputs:
     """The first `n` Gaussians with the image and the overlap of `make_inputs`; other arrays are shared."""
     focal = FOCAL * width / SIZE[0]
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     v_image = np.random.default_rng(n).standard_normal((height, width, 3), dtype=np.float32)
-    first = replace(
-        inputs,
-        means=inputs.means[:n],
-        quats=inputs.quats[:n],
-        scales=inputs.scales[:n],
-        opacities=inputs.opacities[:n],
-        sh=inputs.sh[:n],
-        v_image=v_image / np.float32(v_image.size),
-        K=K,
-    )
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    first = replace(inputs.first(n), v_image=v_image / np.float32(v_image.size), K=K)
     return replace(first, scales=first.scales * np.float32(_size(first)))
-
-
-def load_inputs(folder: Path, n: int) -> RasterInputs:
-    """Read `inputs_N.npz`; FileNotFoundError or ValueError names what is missing or has the wrong shape."""
-    path = folder / f"inputs_{n}.npz"
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no {path}")
-    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, 16, 3)}
-    shapes |= {"v_output": ("H", "W", 3), "viewmat": (4, 4), "K": (3, 3), "background": (3,)}
-    arrays: dict[str, Any] = {}
-    with np.load(path, allow_pickle=False) as data:
-        if missing := [name for name in shapes if name not in data]:
-            raise ValueError(f"{path} lacks {', '.join(missing)}")
-        for name, wanted in shapes.items():
-            array = data[name].astype(np.float64 if name in ("viewmat", "K") else np.float32)
-            if array.shape != ((*array.shape[:2], 3) if name == "v_output" else wanted):
-                raise ValueError(f"{path}: {name} has shape {list(array.shape)}, wanted {list(wanted)}")
-            arrays[name] = array
-    return RasterInputs(v_image=arrays.pop("v_output"), **arrays)
 
 
 def _size(inputs: RasterInputs) -> float:
@@ -131,13 +106,9 @@ def _size(inputs: RasterInputs) -> float:
 
     A support is the ellipse where alpha >= 1/255: 2 pi ln(255 opacity) sqrt(det(cov2d)) square pixels.
     """
-    part = slice(SAMPLE)
-    opacities = inputs.opacities[part].astype(np.float64)
-    _, _, cov = project(
-        inputs.means[part], inputs.quats[part], inputs.scales[part], inputs.viewmat, inputs.K,
-        inputs.width, inputs.height,
-    )  # fmt: skip
-    reach2 = 2 * np.log(np.maximum(opacities / ALPHA_MIN, 1))
+    sample = inputs.first(SAMPLE)
+    _, _, cov = project(sample)
+    reach2 = 2 * np.log(np.maximum(sample.opacities.astype(np.float64) / ALPHA_MIN, 1))
     area = (1 + 2 * MARGIN) ** 2 * inputs.width * inputs.height
 
     def excess(log_factor: float) -> float:
@@ -155,3 +126,22 @@ def _size(inputs: RasterInputs) -> float:
 
 def _f32(values: Any) -> Array32:
     return np.ascontiguousarray(values, np.float32)
+
+
+def project(inputs: RasterInputs) -> tuple[Array64, Array64, Array64]:
+    """EWA projection in float64, by the formulas of docs/conventions.md with no code of the crate: centres
+    [N, 2] in pixels, depths [N], covariances [N, 2, 2] before the low-pass."""
+    viewmat, K = inputs.viewmat, inputs.K
+    p = inputs.means.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    x, y, z = p.T
+    focal, center = np.diag(K)[:2], K[:2, 2]
+    size = np.array([inputs.width, inputs.height])
+    margin = FOV_MARGIN * size / (2 * focal)
+    low, high = -center / focal - margin, (size - center) / focal + margin
+    slope = np.clip(p[:, :2] / z[:, None], low, high)
+    jacobian = np.zeros((len(p), 2, 3))
+    jacobian[:, 0, 0], jacobian[:, 1, 1] = focal[0] / z, focal[1] / z
+    jacobian[:, :, 2] = -focal * slope / z[:, None]
+    rotation = Rotation.from_quat(inputs.quats[:, [1, 2, 3, 0]].astype(np.float64)).as_matrix()
+    factor = jacobian @ viewmat[:3, :3] @ (rotation * inputs.scales[:, None, :].astype(np.float64))
+    return focal * np.stack([x, y], axis=1) / z[:, None] + center, z, factor @ factor.swapaxes(1, 2)

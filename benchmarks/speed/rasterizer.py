@@ -2,22 +2,40 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import hqgs
+from benchmarks import charts
+from benchmarks.charts import BLUE, LEGEND, ORANGE, panels
+from benchmarks.output import UnavailableError
 from benchmarks.places import COMPOSITE, CRATE
-from benchmarks.speed.inputs import RasterInputs
-from benchmarks.speed.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
+from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
+from benchmarks.speed.timing import (
+    Seconds,
+    StageClock,
+    exponent,
+    interleaved,
+    median_ratio,
+    using_threads,
+    whole,
+)
 from benchmarks.speed.work import count_work
 from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
+Size = tuple[int, int]  # width, height
+TARGET = 1.05  # the largest exponent that is good
 BIN = "bin"  # the part of "bin and composite" before the first pixel
 
 
@@ -33,8 +51,8 @@ class RasterPass:
         device: str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        names = ("means", "quats", "scales", "opacities", "sh")
-        self.leaves = [torch.from_numpy(getattr(inputs, n)).to(device, dtype).requires_grad_() for n in names]
+        tensors = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
+        self.leaves = [tensor.to(device, dtype).requires_grad_() for tensor in tensors]
         viewmat, K = (torch.from_numpy(m[None]).float().to(device) for m in (inputs.viewmat, inputs.K))
         self.view = (viewmat, K, inputs.width, inputs.height)
         self.background = torch.from_numpy(inputs.background[None]).to(device, dtype)
@@ -90,29 +108,24 @@ def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
 
 def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
     """Time and work of each of the inputs."""
-    passes = {str(len(x)): RasterPass(x) for x in inputs}
-    measured = interleaved({name: warmed(case) for name, case in passes.items()}, repeats)
+    passes = [RasterPass(x) for x in inputs]
+    measured = interleaved({str(k): warmed(case) for k, case in enumerate(passes)}, repeats)
     rows = []
-    for x, (name, rounds) in zip(inputs, measured.items(), strict=True):
-        stages = {stage: median(rounds, stage) for stage in [*STAGES, "rest"]}
-        work = count_work(passes[name].blended, x.width * x.height, *passes[name].work)
+    for x, case, rounds in zip(inputs, passes, measured.values(), strict=True):
+        work = count_work(case.blended, x.width * x.height, *case.work)
         limit = work["limit_core_seconds"] / hqgs.get_num_threads()
-        compositing = [r["bin and composite"] - r[BIN] + r["composite backward"] for r in rounds]
+        compositing = (rounds["bin and composite"] - rounds[BIN] + rounds["composite backward"]).median()
         rows.append(
-            {
-                "gaussians": len(x),
-                "width": x.width,
-                "height": x.height,
-                "seconds": median(rounds),
-                "seconds_quartiles": quartiles(rounds),
-                "stages": stages,
+            {"gaussians": len(x), "width": x.width, "height": x.height, **whole(rounds)}
+            | {
+                "stages": rounds[[*STAGES, "rest"]].median().to_dict(),
                 "limit_seconds": limit,
-                "times_limit": median(rounds) / limit,
-                "bin_seconds": median(rounds, BIN),
-                "compositing_seconds": float(np.median(compositing)),
-                "compositing_times_limit": float(np.median(compositing)) / limit,
+                "times_limit": rounds["total"].median() / limit,
+                "bin_seconds": rounds[BIN].median(),
+                "compositing_seconds": compositing,
+                "compositing_times_limit": compositing / limit,
                 "work": work,
-                "rounds": rounds,
+                "rounds": rounds.to_dict("records"),
             }
         )
     return rows
@@ -130,23 +143,105 @@ def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> li
 
     def with_threads(case: Callable[[], Seconds], count: int) -> Callable[[], Seconds]:
         def call() -> Seconds:
-            hqgs.set_num_threads(count)
-            return warmed(case)()  # new threads start with no memory of their own
+            with using_threads(count):
+                return warmed(case)()  # new threads start with no memory of their own
 
         return call
 
-    try:
-        jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
-        measured = interleaved(jobs, repeats)
-    finally:
-        hqgs.set_num_threads(threads[-1])
-    return [
-        {
-            "case": name,
-            "threads": t,
-            "seconds": median(measured[f"{name}/{t}"]),
-            "speedup": median_ratio(measured[f"{name}/1"], measured[f"{name}/{t}"]),
+    jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
+    measured, rows = interleaved(jobs, repeats), []
+    for key, rounds in measured.items():
+        name, count = key.rsplit("/", 1)
+        line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}
+        rows.append(line | {"speedup": median_ratio(measured[f"{name}/1"], rounds)})
+    return rows
+
+
+def find_gsplat() -> Callable[..., Any]:
+    """gsplat's rasterization. UnavailableError says why there is none here."""
+    if importlib.util.find_spec("gsplat") is None:
+        raise UnavailableError("gsplat is not installed")
+    if not torch.cuda.is_available():
+        raise UnavailableError("gsplat rasterizes on CUDA devices only, and torch finds none")
+    return importlib.import_module("gsplat").rasterization
+
+
+def measure_gsplat(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
+    """Forward and backward of gsplat on the GPU beside ours on the CPU; UnavailableError as `find_gsplat`."""
+    rasterization, rows = find_gsplat(), []
+    for x in inputs:
+        cases = {"hqgs": RasterPass(x), "gsplat": _on_cuda(RasterPass(x, rasterization, "cuda"))}
+        ours, theirs = interleaved(cases, repeats).values()
+        line = {
+            "gaussians": len(x),
+            "device": torch.cuda.get_device_name(),
+            "ratio": median_ratio(ours, theirs),
         }
-        for name in cases
-        for t in threads
-    ]
+        rows.append(line | {"seconds": theirs["total"].median(), "hqgs_seconds": ours["total"].median()})
+    return rows
+
+
+def _on_cuda(raster_pass: RasterPass) -> Callable[[], Seconds]:
+    def run() -> None:
+        raster_pass.run()
+        torch.cuda.synchronize()
+
+    def call() -> Seconds:
+        torch.cuda.synchronize()
+        seconds = StageClock().seconds(run, [])
+        raster_pass.clear()
+        return seconds
+
+    return call
+
+
+def measure_scaling(
+    sizes: Sequence[int], image: Size, images: Sequence[Size], gaussians: int, repeats: int, seed: int
+) -> dict[str, Any]:
+    """Time against the number of Gaussians in one image, and of `gaussians` against the size of the image.
+
+    The overlap per pixel is the same everywhere.
+    """
+    cloud = make_inputs(max(sizes), *image, seed)  # the smaller ones share its memory
+    unit = {n: fitted(cloud, n, *image) for n in sizes}
+    by_size = _curve(sizes, [RasterPass(x) for x in unit.values()], repeats)
+    del cloud, unit
+    cloud = make_inputs(gaussians, *images[0], seed)
+    passes = [RasterPass(fitted(cloud, gaussians, *size)) for size in images]
+    by_pixels = _curve([width * height for width, height in images], passes, repeats)
+    return {
+        "gaussians": {"width": image[0], "height": image[1], **by_size},
+        "pixels": {"gaussians": gaussians, **by_pixels},
+        "target_exponent": TARGET,
+    }
+
+
+def _curve(x: Sequence[int], passes: Sequence[RasterPass], repeats: int) -> dict[str, Any]:
+    measured = interleaved({str(v): warmed(p) for v, p in zip(x, passes, strict=True)}, repeats)
+    rows = [whole(rounds) for rounds in measured.values()]
+    curve = {name: [row[name] for row in rows] for name in ("seconds", "seconds_quartiles")}
+    ends = pairwise(zip(x, curve["seconds"], strict=True))
+    steepest = max(exponent(*zip(*two, strict=True)) for two in ends)  # between two neighbours
+    return {"x": list(x), **curve, "exponent": exponent(x, curve["seconds"]), "steepest": steepest}
+
+
+def scaling_chart(scaling: dict[str, Any]) -> Figure:
+    """Two panels: time against Gaussians and against megapixels, with the fitted power."""
+    figure, (left, right) = panels(9, 4, 1, 2, sharey=True)
+    curve = scaling["gaussians"]
+    _panel(left, curve, 1, "Gaussians", f"{curve['width']} x {curve['height']} pixels", BLUE)
+    left.set_ylabel("forward and backward (s)")
+    curve = scaling["pixels"]
+    _panel(right, curve, 1e6, "megapixels", f"{curve['gaussians']} Gaussians", ORANGE)
+    return figure
+
+
+def _panel(axes: Axes, curve: dict[str, Any], unit: float, label: str, title: str, color: str) -> None:
+    x, seconds = np.array(curve["x"]) / unit, np.array(curve["seconds"])
+    low, high = np.array(curve["seconds_quartiles"]).T
+    axes.errorbar(x, seconds, [seconds - low, high - seconds], color=color, marker="o", markersize=4, lw=1.6)
+    center = np.exp(np.log(seconds).mean()) * (x / np.exp(np.log(x).mean())) ** curve["exponent"]
+    axes.plot(x, center, color="#888888", linestyle="--", linewidth=1, label=f"power {curve['exponent']:.2f}")
+    axes.set(xscale="log", yscale="log", xlabel=label)
+    charts.title(axes, title)
+    axes.legend(**LEGEND)

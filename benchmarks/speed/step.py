@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks.places import parts_of_step
-from benchmarks.speed.timing import Seconds, StageClock, interleaved, median, median_ratio, quartiles
+from benchmarks.speed.timing import Seconds, StageClock, interleaved, median_ratio, whole
 from hqgs.training.trainer import Trainer
 
 # In the order of a step. Each is without the others that run inside it.
@@ -26,8 +26,7 @@ PARTS = (
 
 def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
     """A step of which only the whole is timed."""
-    clock = StageClock()
-    return lambda: clock.seconds(trainer.step, [])
+    return lambda: StageClock().seconds(trainer.step, [])
 
 
 def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
@@ -52,29 +51,22 @@ def measure_steps(
     for name, trainer in trainers.items():
         cases |= {f"{name}/whole": whole_step(trainer), f"{name}/parts": step_by_parts(trainer)}
     measured = interleaved(cases, repeats)
-    rows = []
-    first = measured[f"{next(iter(trainers))}/whole"]
+    first, rows = next(iter(measured.values())), []
     for name, trainer in trainers.items():
         camera = trainer.scene.train[0].camera
         method, n = trainer.config.method, len(trainer.gaussians)
-        whole, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
-        stages = {part: median(parts, part) for part in (*PARTS, "rest")}
-        total = sum(stages.values())
+        rounds, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
+        stages = parts[[*PARTS, "rest"]].median()
         rows.append(
-            {
-                "case": name,
-                "method": method,
-                "gaussians": n,
-                "width": camera.width,
-                "height": camera.height,
-                "seconds": median(whole),
-                "seconds_quartiles": quartiles(whole),
-                "over_first": median_ratio(whole, first),
+            {"case": name, "method": method, "gaussians": n, "width": camera.width, "height": camera.height}
+            | whole(rounds)
+            | {
+                "over_first": median_ratio(rounds, first),
                 "target_ms": targets.get(f"{method}, {n}"),
-                "clocked": median_ratio(parts, whole),  # how much the clocks slow the step down
-                "stages": stages,
-                "percent": {stage: 100 * seconds / total for stage, seconds in stages.items()},
-                "rounds": parts,
+                "clocked": median_ratio(parts, rounds),  # how much the clocks slow the step down
+                "stages": stages.to_dict(),
+                "percent": (100 * stages / stages.sum()).to_dict(),
+                "rounds": parts.to_dict("records"),
             }
         )
     return rows

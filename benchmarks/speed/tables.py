@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.data import read_toml
-from benchmarks.output import number, table
+from benchmarks.output import number, span, table
 from hqgs.base.text import markdown_table
 
 Rows = Sequence[dict[str, Any]]
@@ -73,4 +73,4 @@ def gsplat(rows: Rows) -> str:
 
 
 def _quartiles(row: dict[str, Any]) -> str:
-    return " to ".join(number(seconds, "ms") for seconds in row["seconds_quartiles"])
+    return span(row["seconds_quartiles"], "ms")

@@ -11,12 +11,15 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from pandas import DataFrame
+
+import hqgs
 
 Seconds = dict[str, float]  # by stage; "total" is the whole, and what no stage holds is "rest"
 
 
-def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dict[str, list[Seconds]]:
-    """Call each case once to warm up, then all of them in each of `repeats` rounds.
+def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dict[str, DataFrame]:
+    """Call each case once to warm up, then all of them in each of `repeats` rounds, which are the rows.
 
     What disturbs the machine for a while then disturbs all cases alike. Every other round goes backwards.
     """
@@ -32,22 +35,33 @@ def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dic
     finally:
         if collecting:
             gc.enable()
-    return measured
+    return {name: DataFrame(rounds) for name, rounds in measured.items()}
 
 
-def median(rounds: Sequence[Seconds], stage: str = "total") -> float:
-    """Median seconds of a stage."""
-    return float(np.median([r[stage] for r in rounds]))
+@contextmanager
+def using_threads(count: int) -> Iterator[None]:
+    """Inside it the crate has this many threads."""
+    before = hqgs.get_num_threads()
+    hqgs.set_num_threads(count)
+    try:
+        yield
+    finally:
+        hqgs.set_num_threads(before)
 
 
-def quartiles(rounds: Sequence[Seconds], stage: str = "total") -> list[float]:
-    """The seconds below which a quarter and three quarters of the rounds lie."""
-    return [float(q) for q in np.quantile([r[stage] for r in rounds], [0.25, 0.75])]
+def quartiles(values: Any) -> list[float]:
+    """The values below which a quarter and three quarters of them lie."""
+    return np.quantile(values, [0.25, 0.75]).tolist()
 
 
-def median_ratio(rounds: Sequence[Seconds], others: Sequence[Seconds]) -> float:
+def median_ratio(rounds: DataFrame, others: DataFrame) -> float:
     """Median over the rounds of the ratio of two cases: what slows both down in a round cancels."""
-    return float(np.median([a["total"] / b["total"] for a, b in zip(rounds, others, strict=True)]))
+    return float((rounds["total"] / others["total"]).median())
+
+
+def whole(rounds: DataFrame) -> dict[str, Any]:
+    """Median and quartiles of the whole, as the tables have them."""
+    return {"seconds": rounds["total"].median(), "seconds_quartiles": quartiles(rounds["total"])}
 
 
 def exponent(x: Sequence[float], seconds: Sequence[float]) -> float:
@@ -90,7 +104,5 @@ class StageClock:
         """Run `function` and return its total, the stages in it (0 for those not reached) and the rest."""
         self._seconds.clear()
         self.timed("rest", function)()
-        return {
-            "total": sum(self._seconds.values()),
-            **{stage: self._seconds[stage] for stage in [*stages, "rest"]},
-        }
+        found = {stage: self._seconds[stage] for stage in [*stages, "rest"]}
+        return {"total": sum(self._seconds.values()), **found}

@@ -8,6 +8,7 @@ order, floor, cap, stop, clamp) are those of the unperturbed scene.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,9 +18,11 @@ import numpy as np
 DIGITS = 100
 STEP = "1e-30"
 ALPHA_FLOOR = 1.0 / 255.0
+KINDS = {"f32": np.float32, "f64": np.float64}
 GROUPS = ("means", "quats", "scales", "opacities", "colors")
 Array = np.ndarray[Any, Any]
 Pixel = tuple[int, int]  # row, column
+Layer = tuple[int, Any, list[Any], bool]  # Gaussian, alpha, colour, whether its alpha is capped
 
 
 def load_mpmath() -> Any:
@@ -53,27 +56,24 @@ class OracleScene:
 
     def rounded(self, dtype: str) -> OracleScene:
         """The same scene with every number rounded to "f32" or "f64"."""
-        kind = {"f32": np.float32, "f64": np.float64}[dtype]
         names = (*GROUPS, "viewmat", "K", *(["background"] if self.background is not None else []))
         with np.errstate(over="ignore"):  # what is too large for float32 becomes Inf, as for a user
-            arrays = {name: getattr(self, name).astype(kind).astype(np.float64) for name in names}
-        return replace(self, **arrays)
+            return replace(self, **{n: getattr(self, n).astype(KINDS[dtype]).astype(float) for n in names})
 
     def nudged(self, dtype: str, rng: np.random.Generator) -> OracleScene:
         """Each number that is not 0 moved one ulp of "f32" or "f64" up or down, at random."""
-        kind = {"f32": np.float32, "f64": np.float64}[dtype]
         arrays = {}
         for name in (*GROUPS, "viewmat", "K"):
-            values = getattr(self, name).astype(kind)
-            to = np.where(rng.random(values.shape) < 0.5, -np.inf, np.inf).astype(kind)
-            arrays[name] = np.where(values == 0, values, np.nextafter(values, to)).astype(np.float64)
+            values = getattr(self, name).astype(KINDS[dtype])
+            to = np.where(rng.random(values.shape) < 0.5, -np.inf, np.inf).astype(KINDS[dtype])
+            arrays[name] = np.where(values == 0, values, np.nextafter(values, to)).astype(float)
         arrays["viewmat"][3] = self.viewmat[3]
         arrays["K"][2] = self.K[2]
         return replace(self, **arrays)
 
-    def without(self, i: int) -> OracleScene:
-        """The scene without Gaussian `i`."""
-        return replace(self, **{name: np.delete(getattr(self, name), i, axis=0) for name in GROUPS})
+    def without(self, ids: Sequence[int]) -> OracleScene:
+        """The scene without some Gaussians."""
+        return replace(self, **{name: np.delete(getattr(self, name), ids, axis=0) for name in GROUPS})
 
 
 @dataclass(frozen=True)
@@ -95,106 +95,84 @@ class Oracle:
         self.mp.dps = DIGITS
         self.scene = scene
         self.splats: dict[int, Splat | None] = {}
-        mpf = self.mp.mpf
-        self.R = [[mpf(float(v)) for v in row[:3]] for row in scene.viewmat[:3]]
-        self.t = [mpf(float(row[3])) for row in scene.viewmat[:3]]
-        self.background = None if scene.background is None else [mpf(float(v)) for v in scene.background]
+        self.R, self.t = (self.mp.matrix(part.tolist()) for part in np.split(scene.viewmat[:3], [3], axis=1))
 
     @cached_property
-    def center(self) -> list[Any]:
+    def center(self) -> Any:
         """The camera centre -R^-1 t; a rounded R is not exactly a rotation, so it is inverted."""
-        solution = self.mp.lu_solve(self.mp.matrix(self.R), self.mp.matrix(self.t))
-        return [-v for v in solution]
+        return -self.mp.lu_solve(self.R, self.t)
 
     @cached_property
     def order(self) -> list[int]:
         """Gaussians with finite numbers by (depth, index), before culling by anything that costs more."""
         finite = [i for i in range(len(self.scene.means)) if self._finite(i)]
-        depths = {i: self._camera_point(self._numbers("means", i))[2] for i in finite}
-        return sorted(finite, key=lambda i: (depths[i], i))
+        return sorted(finite, key=lambda i: (self._camera_point(self._numbers("means", i))[2], i))
 
     def kept(self, i: int) -> bool:
         """Whether Gaussian `i` is not culled."""
-        if not self._finite(i):
-            return False
-        return self._splat(i) is not None
+        return self._finite(i) and self._splat(i) is not None
 
     def pixel(self, pixel: Pixel) -> list[Any]:
         """Colour channels and alpha of a pixel (row, column)."""
-        layers, _ = self._layers(pixel)
-        return self._blend(layers)
+        return self._blend(self._layers(pixel))
 
     def gradients(self, cotangents: dict[Pixel, Array], ids: list[int]) -> dict[str, list[list[Any]]]:
         """Gradients by group, for Gaussians `ids`, of the sum over pixels of cotangent . (color, alpha)."""
-        plans = [(pixel, v, *self._layers(pixel)) for pixel, v in cotangents.items()]
-        found: dict[str, list[list[Any]]] = {name: [] for name in GROUPS}
-        for i in ids:
-            for name in GROUPS:
-                found[name].append(self._differences(i, name, plans))
-        return found
+        plans = [(pixel, v, self._layers(pixel)) for pixel, v in cotangents.items()]
+        return {name: [self._differences(i, name, plans) for i in ids] for name in GROUPS}
 
     def _differences(self, i: int, name: str, plans: list[Any]) -> list[Any]:
-        mp = self.mp
-        values = self._numbers(name, i)
+        mp, values = self.mp, self._numbers(name, i)
         touched = [plan for plan in plans if any(layer[0] == i for layer in plan[2])]
         if self._splat(i) is None or not touched:
             return [mp.mpf(0)] * len(values)
         largest = max(abs(v) for v in values)
         if name == "means":
             largest = max(largest, abs(self._camera_point(values)[2]))
-        gradient = []
-        for k, value in enumerate(values):
-            h = mp.mpf(STEP) * (abs(value) or largest or mp.mpf(1))
-            sides = []
-            for signed in (h, -h):
-                moved = [v + signed if j == k else v for j, v in enumerate(values)]
-                splat = self._project(i, {name: moved})
-                sides.append(mp.fsum(self._moved_loss(i, splat, *plan) for plan in touched))
-            gradient.append((sides[0] - sides[1]) / (2 * h))
-        return gradient
 
-    def _moved_loss(
-        self, i: int, splat: Splat, pixel: Pixel, v: Array, layers: list[Any], capped: set[int]
-    ) -> Any:
-        moved = []
-        for j, alpha, color in layers:
-            if j == i:
-                alpha = alpha if i in capped else self._alpha(splat, pixel)
-                color = splat.color
-            moved.append((j, alpha, color))
-        return self.mp.fsum(self.mp.mpf(float(a)) * b for a, b in zip(v, self._blend(moved), strict=True))
+        def loss(k: int, step: Any) -> Any:
+            splat = self._project(i, {name: [*values[:k], values[k] + step, *values[k + 1 :]]})
+            return mp.fsum(self._moved_loss(i, splat, *plan) for plan in touched)
 
-    def _layers(self, pixel: Pixel) -> tuple[list[tuple[int, Any, list[Any]]], set[int]]:
-        """What is blended into a pixel, front to back, as (Gaussian, alpha, colour), and who is capped."""
+        steps = [mp.mpf(STEP) * (abs(value) or largest or mp.mpf(1)) for value in values]
+        return [(loss(k, h) - loss(k, -h)) / (2 * h) for k, h in enumerate(steps)]
+
+    def _moved_loss(self, i: int, splat: Splat, pixel: Pixel, v: Array, layers: list[Layer]) -> Any:
+        """The loss of a pixel where Gaussian `i` is another splat; who is capped remains so."""
+        moved = [
+            (j, alpha if capped else self._alpha(splat, pixel), splat.color, capped)
+            if j == i
+            else (j, alpha, color, capped)
+            for j, alpha, color, capped in layers
+        ]
+        return self.mp.fdot(v.tolist(), self._blend(moved))
+
+    def _layers(self, pixel: Pixel) -> list[Layer]:
+        """What is blended into a pixel, front to back."""
         mp = self.mp
-        transmittance, layers, capped = mp.mpf(1), [], set()
+        transmittance, layers = mp.mpf(1), []
         cap, stop = mp.mpf("0.99"), mp.mpf("0.999e-4")
         for i in self.order:
             splat = self._splat(i)
-            if splat is None:
+            if splat is None or (alpha := self._alpha(splat, pixel)) < ALPHA_FLOOR:
                 continue
-            alpha = self._alpha(splat, pixel)
-            if alpha < ALPHA_FLOOR:
-                continue
-            if alpha >= cap:
-                alpha = cap
-                capped.add(i)
+            capped = alpha >= cap
+            alpha = min(alpha, cap)
             if transmittance * (1 - alpha) <= stop:
                 break
             transmittance *= 1 - alpha
-            layers.append((i, alpha, splat.color))
-        return layers, capped
+            layers.append((i, alpha, splat.color, capped))
+        return layers
 
-    def _blend(self, layers: list[tuple[int, Any, list[Any]]]) -> list[Any]:
-        mp = self.mp
+    def _blend(self, layers: list[Layer]) -> list[Any]:
+        mp, background = self.mp, self.scene.background
         channels = 3 if self.scene.sh_degree is not None else self.scene.colors.shape[1]
         transmittance, total = mp.mpf(1), [mp.mpf(0)] * channels
-        for _, alpha, color in layers:
-            weight = transmittance * alpha
-            total = [a + weight * b for a, b in zip(total, color, strict=True)]
+        for _, alpha, color, _ in layers:
+            total = [a + transmittance * alpha * b for a, b in zip(total, color, strict=True)]
             transmittance *= 1 - alpha
-        if self.background is not None:
-            total = [a + transmittance * b for a, b in zip(total, self.background, strict=True)]
+        if background is not None:
+            total = [a + transmittance * b for a, b in zip(total, background.tolist(), strict=True)]
         return [*total, 1 - transmittance]
 
     def _alpha(self, splat: Splat, pixel: Pixel) -> Any:
@@ -214,13 +192,10 @@ class Oracle:
         return np.ravel(values)
 
     def _numbers(self, name: str, i: int) -> list[Any]:
-        return [self.mp.mpf(float(v)) for v in self._used(name, i)]
+        return [self.mp.mpf(v) for v in self._used(name, i).tolist()]
 
-    def _camera_point(self, mean: list[Any]) -> list[Any]:
-        return [
-            sum((a * b for a, b in zip(row, mean, strict=True)), t)
-            for row, t in zip(self.R, self.t, strict=True)
-        ]
+    def _camera_point(self, mean: list[Any]) -> Any:
+        return self.R * self.mp.matrix(mean) + self.t
 
     def _splat(self, i: int) -> Splat | None:
         if i not in self.splats:
@@ -230,11 +205,8 @@ class Oracle:
     def _cull(self, i: int) -> Splat | None:
         mp, s = self.mp, self.scene
         depth = self._camera_point(self._numbers("means", i))[2]
-        if depth < s.near_plane or depth > s.far_plane:
-            return None
-        if sum(v * v for v in self._numbers("quats", i)) < 1e-12:
-            return None
-        if s.opacities[i] < ALPHA_FLOOR:
+        norm2 = sum(v * v for v in self._numbers("quats", i))
+        if not s.near_plane <= depth <= s.far_plane or norm2 < 1e-12 or s.opacities[i] < ALPHA_FLOOR:
             return None
         splat = self._project(i, {})
         if splat.det <= 0 or splat.opacity < ALPHA_FLOOR:
@@ -251,43 +223,35 @@ class Oracle:
     def _project(self, i: int, changed: dict[str, list[Any]]) -> Splat:
         """Gaussian `i`, with the parameters in `changed` instead of its own."""
         mp, s = self.mp, self.scene
-        mean, quat, scale, (opacity,), color = (
-            changed.get(name) or self._numbers(name, i) for name in GROUPS
-        )
+        mean, quat, scale, (opacity,), color = (changed.get(n) or self._numbers(n, i) for n in GROUPS)
         x, y, z = self._camera_point(mean)
-        fx, fy, cx, cy = (mp.mpf(float(s.K[k])) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        rows = []
-        for f, c, ratio, size in ((fx, cx, x / z, s.width), (fy, cy, y / z, s.height)):
+        J, centers = mp.zeros(2, 3), []
+        for k, (v, size) in enumerate(((x, s.width), (y, s.height))):
+            f, c = mp.mpf(float(s.K[k, k])), mp.mpf(float(s.K[k, 2]))
             margin = mp.mpf("0.3") * size / (2 * f)
-            rows.append(f * min(max(ratio, -(c / f + margin)), (size - c) / f + margin) / z)
-        J = [[fx / z, mp.mpf(0), -rows[0]], [mp.mpf(0), fy / z, -rows[1]]]
-        rotation = self._rotation(quat)
-        M = [[rotation[r][k] * scale[k] for k in range(3)] for r in range(3)]
-        A = _product(_product(J, self.R), M)  # [2, 3]
-        xx, xy, yy = (mp.fdot(A[p], A[q]) for p, q in ((0, 0), (0, 1), (1, 1)))
-        plain = xx * yy - xy * xy
-        eps = mp.mpf(s.eps2d)
-        cov = (xx + eps, xy, yy + eps)
-        det = cov[0] * cov[2] - xy * xy
+            J[k, k] = f / z
+            J[k, 2] = -f * min(max(v / z, -(c / f + margin)), (size - c) / f + margin) / z
+            centers.append(f * v / z + c)
+        A = J * self.R * self._rotation(quat) * mp.diag(scale)
+        plain = A * A.T
+        cov = plain[0, 0] + mp.mpf(s.eps2d), plain[0, 1], plain[1, 1] + mp.mpf(s.eps2d)
+        det = cov[0] * cov[2] - cov[1] ** 2
         if s.antialiased:
-            opacity = opacity * mp.sqrt(max(mp.mpf(0), plain / det))
+            area2 = plain[0, 0] * plain[1, 1] - plain[0, 1] ** 2
+            opacity = opacity * mp.sqrt(max(mp.mpf(0), area2 / det))
         if s.sh_degree is not None:
             color = self._harmonics(color, mean, s.sh_degree)
-        return Splat((fx * x / z + cx, fy * y / z + cy), cov, det, opacity, color)
+        return Splat((centers[0], centers[1]), cov, det, opacity, color)
 
-    def _rotation(self, quat: list[Any]) -> list[list[Any]]:
-        """v -> q v q* / |q|^2, column by column with the product of quaternions."""
-        norm2 = sum(v * v for v in quat)
-        conjugate = [quat[0], -quat[1], -quat[2], -quat[3]]
-        columns = []
-        for k in range(3):
-            unit = [self.mp.mpf(int(j == k + 1)) for j in range(4)]
-            columns.append([v / norm2 for v in _hamilton(_hamilton(quat, unit), conjugate)[1:]])
-        return [[columns[k][r] for k in range(3)] for r in range(3)]
+    def _rotation(self, quat: list[Any]) -> Any:
+        """v -> q v q* / |q|^2: with S v = (x, y, z) x v it is 1 + (2 w S + 2 S^2) / |q|^2."""
+        w, x, y, z = quat
+        S = self.mp.matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return self.mp.eye(3) + (w * S + S * S) * (2 / sum(v * v for v in quat))
 
     def _harmonics(self, coefficients: list[Any], mean: list[Any], degree: int) -> list[Any]:
         mp = self.mp
-        offset = [a - b for a, b in zip(mean, self.center, strict=True)]
+        offset = mp.matrix(mean) - self.center
         length = mp.sqrt(sum(v * v for v in offset))
         x, y, z = [v / length for v in offset] if length > 0 else [mp.mpf(0)] * 3
 
@@ -304,19 +268,3 @@ class Oracle:
         used = (degree + 1) ** 2 if length > 0 else 1
         sums = [mp.fsum(basis[j] * coefficients[3 * j + c] for j in range(used)) for c in range(3)]
         return [max(v + mp.mpf("0.5"), mp.mpf(0)) for v in sums]
-
-
-def _product(a: list[list[Any]], b: list[list[Any]]) -> list[list[Any]]:
-    columns = list(zip(*b, strict=True))
-    return [[sum(p * q for p, q in zip(row, column, strict=True)) for column in columns] for row in a]
-
-
-def _hamilton(p: list[Any], q: list[Any]) -> list[Any]:
-    a, b, c, d = p
-    e, f, g, h = q
-    return [
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
-    ]

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.charts import BLUE, ORANGE, panels
+from benchmarks.data import read_toml
 from benchmarks.output import Benchmark, Report, table
 from benchmarks.stability import measure
 from benchmarks.stability.cases import Case, cases
-from benchmarks.stability.measure import VALUE_F32, Condition, Outcome, misses
+from benchmarks.stability.measure import VALUE_F32, Outcome, misses
 from benchmarks.stability.oracle import DIGITS, load_mpmath
 
+COLUMNS = Path(__file__).with_name("columns.toml")
 Rows = list[tuple[Case, list[Outcome]]]  # in float32 and in float64
-ERRORS = {
-    "name": ("case", ""), "why": ("why", ""), "culled": ("culled", ""), "max": ("f32 max", ".1e"),
-    "f32": ("f32 rel", ".1e"), "f32_gradient": ("f32 grad", ".1e"), "turn": ("f32 1-cos", ".1e"),
-    "f64": ("f64 rel", ".1e"), "f64_gradient": ("f64 grad", ".1e"), "targets": ("targets", ""),
-}  # fmt: skip
-MISSED = {
-    "name": ("case", ""), "dtype": ("dtype", ""), "by": ("by", ""),
-    "value_relative": ("1 ulp: values", ".1e"), "gradient": ("1 ulp: gradient", ".1e"),
-    "cosine": ("1 ulp: cosine", ".6f"),
-}  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -43,12 +35,8 @@ def run(args: argparse.Namespace) -> Report:
     for case in cases(args.long):
         print(f"stability: {case.name}", file=sys.stderr)
         rows.append((case, [measure.evaluate(case, dtype) for dtype in ("f32", "f64")]))
-    conditions = {
-        (case.name, o.dtype): measure.condition(case, o.dtype)
-        for case, outcomes in rows
-        for o in outcomes
-        if misses(case, o)
-    }
+    missed = [(case, outcome) for case, outcomes in rows for outcome in outcomes if misses(case, outcome)]
+    conditions = {(case.name, o.dtype): measure.condition(case, o.dtype) for case, o in missed}
     rounding = measure.input_rounding(next(case for case, _ in rows if case.name == "world offset 1e6"))
     report.results = {
         "cases": [
@@ -60,9 +48,7 @@ def run(args: argparse.Namespace) -> Report:
             }
             for case, outcomes in rows
         ],
-        "conditions": [
-            {"name": name, "dtype": dtype, **vars(found)} for (name, dtype), found in conditions.items()
-        ],
+        "conditions": [{"name": name, **vars(found)} for (name, _), found in conditions.items()],
         "world_offset_f32_input_rounding": rounding,
     }
     report.tables = tables(rows, conditions, rounding)
@@ -70,28 +56,24 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-def tables(rows: Rows, conditions: dict[tuple[str, str], Condition], rounding: float) -> list[str]:
+def tables(rows: Rows, conditions: dict[tuple[str, str], Outcome], rounding: float) -> list[str]:
     lines, missed = [], []
-    for case, (single, double) in ((case, outcomes) for case, outcomes in rows if not case.poison):
-        in_f32, in_f64 = (len(case.expected_culled(dtype)) for dtype in ("f32", "f64"))
-        numbers = {
-            "max": single.value_abs, "f32": single.value_relative, "f64": double.value_relative,
-            "f32_gradient": single.gradient, "f64_gradient": double.gradient,
-            "turn": max(0.0, 1 - single.cosine),
-        }  # fmt: skip
-        culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
-        targets = "missed" if misses(case, single) + misses(case, double) else "met"
-        lines.append(numbers | {"name": case.name, "why": case.why, "culled": culled, "targets": targets})
     for case, outcomes in rows:
+        words = {"name": case.name, "why": case.why, "targets": "met"}
         for o in outcomes:
-            if (found := conditions.get((case.name, o.dtype))) is not None:
-                words: dict[str, Any] = {"by": "; ".join(misses(case, o)), "dtype": o.dtype}
-                missed.append({"name": case.name} | words | vars(found))
+            if found := misses(case, o):
+                words["targets"] = "missed"
+                missed.append(vars(conditions[case.name, o.dtype]) | words | {"by": "; ".join(found)})
+            words |= {f"{o.dtype}_{name}": value for name, value in vars(o).items()}
+        if not case.poison:
+            in_f32, in_f64 = (len(case.expected_culled(o.dtype)) for o in outcomes)
+            culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
+            lines.append(words | {"culled": culled, "turn": max(0.0, 1 - outcomes[0].cosine)})
     poison = [misses(case, o) for case, outcomes in rows if case.poison for o in outcomes]
-    good = f"{poison.count([])} of {len(poison)}"
+    good, columns = f"{poison.count([])} of {len(poison)}", read_toml(COLUMNS)
     return [
-        table("Error against the oracle, on the same rounded inputs", lines, ERRORS),
-        table("Targets that are missed, and what one ulp of the inputs changes", missed, MISSED),
+        table("Error against the oracle, on the same rounded inputs", lines, columns["errors"]),
+        table("Targets that are missed, and what one ulp of the inputs changes", missed, columns["missed"]),
         f"Inputs that are not finite: {good} culled, with every other bit unchanged.",
         f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
     ]
@@ -118,8 +100,5 @@ def chart(rows: Rows) -> Figure:
     return figure
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--long", action="store_true", help="also deep stacks and a large image")
-
-
-BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", options, run)
+OPTIONS = {"--long": {"action": "store_true", "help": "also deep stacks and a large image"}}
+BENCHMARK = Benchmark("errors on stiff and extreme cases, against 100 digits", run, options=OPTIONS)

@@ -102,15 +102,26 @@ pub struct Composited<T> {
 
 /// Call a function for the number of channels, of which the common ones are compiled, and with three channels in
 /// f32 also for the degree of 2^x.
+///
+/// Here and below the type decides in a constant of its own, so that the compiler never sees what no call reaches:
+/// each kernel costs it seconds.
 macro_rules! for_alpha {
     ($channels:expr, $degree:expr, $function:ident, $simd:expr, $T:ty, ($($argument:expr),*)) => {
-        match ($channels, if <$T>::SINGLE { $degree } else { EXP2_DEGREE }) {
-            (3, 3) => $function::<_, $T, 3, 3>($simd, $($argument),*),
-            (3, 4) => $function::<_, $T, 3, 4>($simd, $($argument),*),
-            (3, 5) => $function::<_, $T, 3, 5>($simd, $($argument),*),
-            (3, _) => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
-            (4, _) => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
-            _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
+        if const { <$T>::SINGLE } {
+            match ($channels, $degree) {
+                (3, 3) => $function::<_, $T, 3, 3>($simd, $($argument),*),
+                (3, 4) => $function::<_, $T, 3, 4>($simd, $($argument),*),
+                (3, 5) => $function::<_, $T, 3, 5>($simd, $($argument),*),
+                (3, _) => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
+                (4, _) => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
+                _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
+            }
+        } else {
+            match $channels {
+                3 => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
+                4 => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
+                _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
+            }
         }
     };
 }
@@ -118,7 +129,7 @@ macro_rules! for_alpha {
 /// Call a kernel with the constant V: the number of vectors that a block has on this machine.
 macro_rules! for_vectors {
     ($S:ty, $T:ty, $V:ident => $call:expr) => {
-        match BLOCK_PIXELS / crate::composite::kernel::width::<$S, $T>() {
+        match const { BLOCK_PIXELS / crate::composite::kernel::width::<$S, $T>() } {
             1 => for_vectors!(@ $V = 1, $call),
             2 => for_vectors!(@ $V = 2, $call),
             4 => for_vectors!(@ $V = 4, $call),
@@ -135,7 +146,7 @@ macro_rules! for_vectors {
 /// Call a function with the constant P: the number of vectors that a sum needs.
 macro_rules! for_parts {
     ($S:ty, $T:ty, $P:ident => $call:expr) => {
-        match crate::simd::sums::parts::<$S, $T>() {
+        match const { crate::simd::sums::parts::<$S, $T>() } {
             1 => for_parts!(@ $P = 1, $call),
             2 => for_parts!(@ $P = 2, $call),
             4 => for_parts!(@ $P = 4, $call),

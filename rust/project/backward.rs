@@ -1,7 +1,7 @@
 //! Vector-Jacobian product of the projection.
 
 use super::{
-    Inputs, Mask, ProjectOptions, Projection, Shading,
+    Columns, Mask, ProjectOptions, Projection, Shading,
     camera_lanes::{CameraGradLanes, CameraLanes},
     chunks,
     colors::ColorGroup,
@@ -333,7 +333,7 @@ fn backward_chunk<S: Simd, T: Real>(
     );
     let center = splat3(simd, camera.center);
     let mut camera_grads = [CameraGradLanes::zero(simd); MAX_PARTS];
-    let mut inputs = Inputs::ZERO;
+    let mut inputs = Columns::ZERO;
     let mut cotangents = Cotangents::ZERO;
     let geometry_wanted = v.means2d.is_some()
         || v.whitened.is_some()
@@ -343,7 +343,7 @@ fn backward_chunk<S: Simd, T: Real>(
     let shading = shading.filter(|_| v.colors.is_some());
     let mut counts = Counts::default();
     let mut colors = ColorGroup::ZERO;
-    let mut out = GradColumns::<T>::ZERO;
+    let mut out = Columns::<T>::ZERO;
     let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
     let [_, _, _, _, row, rest_row] = chunk.rows;
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
@@ -405,22 +405,8 @@ fn backward_chunk<S: Simd, T: Real>(
     (CameraGradLanes::sum(camera_grads), counts)
 }
 
-/// Gradients of a group in the type of the inputs.
-struct GradColumns<T> {
-    means: [Column<T>; 3],
-    quats: [Column<T>; 4],
-    scales: [Column<T>; 3],
-    opacities: Column<T>,
-}
-
-impl<T: Real> GradColumns<T> {
-    const ZERO: Self = Self {
-        means: [Column::ZERO; 3],
-        quats: [Column::ZERO; 4],
-        scales: [Column::ZERO; 3],
-        opacities: Column::ZERO,
-    };
-
+/// As gradients, in the type of the inputs.
+impl<T: Real> Columns<T> {
     /// Set the Gaussians `at..`; 0 where they are not valid.
     #[inline(always)]
     fn set<S: Simd>(

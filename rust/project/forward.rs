@@ -1,7 +1,7 @@
 //! Projection, forward.
 
 use super::{
-    Inputs, ProjectOptions, Projection, Shading, Splat,
+    Columns, ProjectOptions, Projection, Shading, Splat,
     camera_lanes::CameraLanes,
     chunks,
     colors::{Coefficients, Slopes},
@@ -226,7 +226,7 @@ fn forward_chunk<S: Simd, T: Real>(
         options.far_plane,
         options.eps2d,
     );
-    let mut inputs = Inputs::ZERO;
+    let mut inputs = Columns::ZERO;
     let mut group = SplatGroup::ZERO;
     let mut harmonics = Coefficients::ZERO;
     let directed = matches!(colors, Colors::Harmonics(_));

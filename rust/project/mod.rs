@@ -143,15 +143,15 @@ fn chunks<T: Copy>(array: &mut UninitVec<T>, n: usize, row: usize) -> Vec<Uninit
 /// The lanes of a mask of f64.
 type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
 
-/// The geometry of a group of Gaussians, one column per number.
-struct Inputs<T> {
+/// The geometry of a group of Gaussians, or the gradients of it, one column per number.
+struct Columns<T> {
     means: [Column<T>; 3],
     quats: [Column<T>; 4],
     scales: [Column<T>; 3],
     opacities: Column<T>,
 }
 
-impl<T: Real> Inputs<T> {
+impl<T: Real> Columns<T> {
     const ZERO: Self = Self {
         means: [Column::ZERO; 3],
         quats: [Column::ZERO; 4],

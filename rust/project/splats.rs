@@ -1,7 +1,8 @@
 //! Splats of a group of Gaussians: culling, and what the compositor reads.
 
 use super::{
-    Inputs, ProjectOptions, Splat, camera_lanes::CameraLanes, colors::direction, geometry::Geometry,
+    Columns, ProjectOptions, Splat, camera_lanes::CameraLanes, colors::direction,
+    geometry::Geometry,
 };
 use crate::{
     accuracy_knobs::Spans,
@@ -51,7 +52,7 @@ impl SplatGroup {
     pub fn project<S: Simd, T: Real>(
         &mut self,
         simd: S,
-        inputs: &Inputs<T>,
+        inputs: &Columns<T>,
         camera: &Camera,
         camera_lanes: &CameraLanes<S>,
         options: &ProjectOptions,

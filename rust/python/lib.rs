@@ -13,7 +13,7 @@ use arrays::{Array, by_dtype};
 use error::{BindingError, BindingResult};
 use hqgs::internals::{constants, simd, threads};
 use numpy::Element;
-use pyo3::prelude::*;
+use pyo3::{exceptions::PyOverflowError, prelude::*};
 use std::ffi::{c_int, c_long};
 
 /// The buffers of an iteration are as large as those of the last one: an allocator that keeps them saves the
@@ -36,10 +36,17 @@ fn keep_freed_memory() {
     mi_option_set_default(PURGE_DELAY, KEEP_FREED_MS);
 }
 
-/// Use this many threads from now on; results do not depend on it.
+/// Use this many threads from now on, 1 to 1024; results do not depend on it.
 #[pyfunction]
-fn set_num_threads(threads: usize) -> BindingResult<()> {
-    Ok(threads::set(threads)?)
+fn set_num_threads(threads: &Bound<'_, PyAny>) -> BindingResult<()> {
+    match threads.extract() {
+        Ok(count) => Ok(threads::set(count)?),
+        // Below 0, or beyond what fits.
+        Err(error) if error.is_instance_of::<PyOverflowError>(threads.py()) => {
+            Err(threads::out_of_range(threads).into())
+        }
+        Err(error) => Err(error.into()),
+    }
 }
 
 /// Number of threads in use.

@@ -1,0 +1,120 @@
+"""A trainer at the size that a benchmark asks for, and the memory that its process needs."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+import hqgs
+from benchmarks.output import UnavailableError
+from benchmarks.speed.inputs import FAR, LEAVES, NEAR, RasterInputs, make_inputs
+from hqgs.base.machine import peak_rss_mb
+from hqgs.model.gaussians import Gaussians
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
+from hqgs.training.trainer import Trainer
+
+TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
+WARM_UP = 3  # steps
+TARGET_MB = 3000.0
+
+
+def still_config(config: TrainConfig, n: int) -> TrainConfig:
+    """Steps that do all the work of a step on `n` Gaussians, the statistics for their number included, but
+    change next to nothing. The SH degree rises by one in each of the first."""
+    iterations = 1_000_000
+    return replace(
+        config,
+        iterations=iterations,
+        sh_interval=1,
+        **{name: TINY for name in vars(config) if name.startswith("lr_")},
+        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
+    )
+
+
+def make_trainer(
+    gaussians: int,
+    width: int,
+    height: int,
+    photos: int,
+    method: str,
+    seed: int,
+    options: HQGSConfig | None = None,
+    warm: bool = False,
+) -> Trainer:
+    """A trainer that holds the Gaussians of `make_inputs`. `options`: of method hqgs. `warm`: it has made the
+    steps until harmonics of degree 3 are trained.
+
+    It never changes their number, but gathers the statistics for it in each step. Raises ValueError as
+    `make_inputs` and `Trainer` do.
+    """
+    inputs = make_inputs(gaussians, width, height, seed)
+    rng = np.random.default_rng(seed)
+    views = [
+        View(f"{k:03d}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8))
+        for k, camera in enumerate(_cameras(inputs, photos, rng))
+    ]
+    scene = Scene("cloud", views, [], inputs.means, np.zeros(inputs.means.shape, np.uint8), "benchmark")
+    config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
+    means, quats, scales, opacities, sh = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
+    start = Gaussians(means, scales.log(), quats, opacities.logit(), sh[:, :1], sh[:, 1:])
+    trainer = trainer_from(scene, still_config(config, gaussians), start)
+    for _ in range(WARM_UP if warm else 0):
+        trainer.step()
+    return trainer
+
+
+def trainer_from(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
+    """A trainer that starts with these Gaussians in place of the scene's points."""
+    points = gaussians.means.numpy()
+    trainer = Trainer(replace(scene, points=points, point_colors=np.zeros(points.shape, np.uint8)), config)
+    with torch.no_grad():
+        for name, tensor in trainer.gaussians.named().items():
+            tensor.copy_(getattr(gaussians, name))
+    return trainer
+
+
+def _cameras(inputs: RasterInputs, count: int, rng: np.random.Generator) -> list[Camera]:
+    """Cameras that look at the middle of the cloud from about the same side, a few degrees apart."""
+    middle = np.array([0, 0, (NEAR + FAR) / 2])
+    cameras = []
+    for _ in range(count):
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(rng.uniform(-0.05, 0.05, 3)).as_matrix()
+        turn[:3, 3] = middle - turn[:3, :3] @ middle
+        cameras.append(Camera(inputs.width, inputs.height, inputs.K, turn @ inputs.viewmat))
+    return cameras
+
+
+def measure_memory(settings: dict[str, Any]) -> dict[str, Any]:
+    """Peak resident memory in MB (10^6 bytes) after the imports, with the scene, and of the training.
+
+    `settings`: the arguments of `make_trainer`, and the `steps`. Raises UnavailableError where the process is
+    killed or runs out of memory, or the system does not tell.
+    """
+    settings = settings | {"threads": hqgs.get_num_threads()}
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        try:
+            peaks = pool.submit(_measure, **settings).result()
+        except (BrokenProcessPool, MemoryError) as error:
+            raise UnavailableError(f"the process that measures the memory ended: {error}") from error
+    if None in peaks.values():
+        raise UnavailableError("this system does not tell the peak memory of a process")
+    return {**settings, **peaks, "target_mb": TARGET_MB}
+
+
+def _measure(threads: int, steps: int, **settings: Any) -> dict[str, float | None]:
+    peaks = {"imports_mb": peak_rss_mb()}
+    hqgs.set_num_threads(threads)
+    trainer = make_trainer(**settings)
+    peaks["scene_mb"] = peak_rss_mb()
+    for _ in range(steps):
+        trainer.step()
+    return peaks | {"peak_mb": peak_rss_mb()}
