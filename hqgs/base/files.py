@@ -19,7 +19,7 @@ SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writ
 EMBEDDED = "embedded"  # in the place of a scene folder: the scene that is built in
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
-CHECKPOINT, PLY, CONFIG = "checkpoint.safetensors", "scene.ply", "config.json"
+CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
 KEPT = "sfm"  # in the folder of a run: what COLMAP found
 
 
