@@ -91,7 +91,10 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
 def processes() -> ForkServerContext:
     """Children that start from a process in which everything is imported already."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hqgs.cli.main", "hqgs.pipeline", "tiny_scene", "piq"])
+    commands = [command.module for command in cli.COMMANDS.values()]
+    context.set_forkserver_preload(
+        [*commands, "hqgs.cli.main", "hqgs.pipeline", "hqgs.scene.source", "tiny_scene", "piq"]
+    )
     return context
 
 
