@@ -7,7 +7,7 @@ cannot tell is fixed by construction: the mean of a way is the photo's pose, the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,8 +63,9 @@ class Found:
 class LearnedCameras:
     """The cameras of a scene's training photos.
 
-    A way is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and move in
-    all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median depth.
+    A way is a polynomial: in t from -1/2 to 1/2, p + t v + 4 (t^2 - mean t^2) c, where v and c turn and move
+    in all six freedoms, and p corrects the pose, whose errors are as large as the shake. Turns are in px of
+    the picture's middle, moves in px at the photo's median depth.
     """
 
     def __init__(self, scene: Scene, shake: bool, log_gains: NDArray[np.float64] | None, seed: int) -> None:
@@ -74,7 +75,8 @@ class LearnedCameras:
         self._widths = [max(view.camera.width, NARROW) for view in scene.train]
         self._sizes = [(view.camera.height, view.camera.width) for view in scene.train]
         rng, count = np.random.default_rng([seed, 6]), len(scene.train)
-        first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
+        first = FIRST * rng.normal(size=(count, 3, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
+        first[:, 2] = 0
         self._paths = [
             torch.from_numpy(path * width).requires_grad_()
             for path, width in zip(first if shake else [], self._widths, strict=False)
@@ -128,12 +130,10 @@ class LearnedCameras:
         """What ages, and which photos stand still from now on."""
         number = self._numbers[view.name]
         if self._gains:
-            with torch.no_grad():
-                mean = torch.stack(self._gains).mean(0)
-                for gains in self._gains:
-                    gains -= mean
+            _center(self._gains)
         if not self._paths:
             return
+        _center([path[2] for path in self._paths])
         self._active = iteration >= self._begin
         if not self._active:
             return
@@ -212,15 +212,24 @@ def no_shot(view: View) -> Shot:
 
 
 def _steps(path: Tensor, count: int) -> Tensor:
-    """Where a way is in the middles of `count` equal parts of the exposure, [count, 6]; of mean 0."""
+    """Where a way is in the middles of `count` equal parts of the exposure, [count, 6]."""
     t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
     square = t.square()
-    return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+    return path[2] + t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+
+
+@torch.no_grad()
+def _center(tensors: Sequence[Tensor]) -> None:
+    """Take their mean off each."""
+    mean = torch.stack([*tensors]).mean(0)
+    for tensor in tensors:
+        tensor -= mean
 
 
 def _middle(path: Tensor) -> Tensor:
-    """The way of the picture's middle at the median depth, px, [9, 2]."""
+    """The way of the picture's middle at the median depth, px, [9, 2], around 0."""
     steps = _steps(path.detach(), WAY)
+    steps = steps - steps.mean(0)
     return torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
 
 
