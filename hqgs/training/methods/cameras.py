@@ -63,9 +63,8 @@ class Found:
 class LearnedCameras:
     """The cameras of a scene's training photos.
 
-    A way is a polynomial: in t from -1/2 to 1/2, p + t v + 4 (t^2 - mean t^2) c, where v and c turn and move
-    in all six freedoms, and p corrects the pose, whose errors are as large as the shake. Turns are in px of
-    the picture's middle, moves in px at the photo's median depth.
+    A way is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and move in
+    all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median depth.
     """
 
     def __init__(self, scene: Scene, shake: bool, log_gains: NDArray[np.float64] | None, seed: int) -> None:
@@ -75,8 +74,7 @@ class LearnedCameras:
         self._widths = [max(view.camera.width, NARROW) for view in scene.train]
         self._sizes = [(view.camera.height, view.camera.width) for view in scene.train]
         rng, count = np.random.default_rng([seed, 6]), len(scene.train)
-        first = FIRST * rng.normal(size=(count, 3, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
-        first[:, 2] = 0
+        first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
         self._paths = [
             torch.from_numpy(path * width).requires_grad_()
             for path, width in zip(first if shake else [], self._widths, strict=False)
@@ -133,7 +131,6 @@ class LearnedCameras:
             _center(self._gains)
         if not self._paths:
             return
-        _center([path[2] for path in self._paths])
         self._active = iteration >= self._begin
         if not self._active:
             return
@@ -212,10 +209,10 @@ def no_shot(view: View) -> Shot:
 
 
 def _steps(path: Tensor, count: int) -> Tensor:
-    """Where a way is in the middles of `count` equal parts of the exposure, [count, 6]."""
+    """Where a way is in the middles of `count` equal parts of the exposure, [count, 6]; of mean 0."""
     t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
     square = t.square()
-    return path[2] + t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+    return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
 
 
 @torch.no_grad()
@@ -227,9 +224,8 @@ def _center(tensors: Sequence[Tensor]) -> None:
 
 
 def _middle(path: Tensor) -> Tensor:
-    """The way of the picture's middle at the median depth, px, [9, 2], around 0."""
+    """The way of the picture's middle at the median depth, px, [9, 2]."""
     steps = _steps(path.detach(), WAY)
-    steps = steps - steps.mean(0)
     return torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
 
 
