@@ -14,12 +14,18 @@ if TYPE_CHECKING:
     from hqgs.base.files import FolderBusyError
     from hqgs.diagnosis.scene import Diagnosis
     from hqgs.diagnosis.scene import diagnose_scene as diagnose
+    from hqgs.export.frames import render_frames
     from hqgs.model.gaussians import Gaussians
+    from hqgs.model.orbit import orbit
     from hqgs.model.rasterization import RasterizationMeta, rasterization
-    from hqgs.pipeline import Progress, Run, train
+    from hqgs.photos.pixels import picture
+    from hqgs.pipeline import Run, train
+    from hqgs.scene.camera_files import load_cameras
+    from hqgs.scene.paths import camera_path, look_at
     from hqgs.scene.scene import Camera, Scene, View
     from hqgs.scene.source import degrade, load
     from hqgs.training.config import TrainConfig
+    from hqgs.training.progress import Progress
     from hqgs.training.trainer import TrainingError
 
 __version__ = "0.1.0"
@@ -37,11 +43,17 @@ __all__ = [
     "TrainingError",
     "View",
     "__version__",
+    "camera_path",
     "degrade",
     "diagnose",
     "get_num_threads",
     "load",
+    "load_cameras",
+    "look_at",
+    "orbit",
+    "picture",
     "rasterization",
+    "render_frames",
     "set_num_threads",
     "train",
 ]
@@ -52,18 +64,24 @@ _HOMES = {
     "Diagnosis": "hqgs.diagnosis.scene",
     "FolderBusyError": "hqgs.base.files",
     "Gaussians": "hqgs.model.gaussians",
-    "Progress": "hqgs.pipeline",
+    "Progress": "hqgs.training.progress",
     "RasterizationMeta": "hqgs.model.rasterization",
     "Run": "hqgs.pipeline",
     "Scene": "hqgs.scene.scene",
     "TrainConfig": "hqgs.training.config",
     "TrainingError": "hqgs.training.trainer",
     "View": "hqgs.scene.scene",
+    "camera_path": "hqgs.scene.paths",
     "degrade": "hqgs.scene.source",
     "diagnose": "hqgs.diagnosis.scene:diagnose_scene",
     "get_num_threads": "hqgs._rust",
     "load": "hqgs.scene.source",
+    "load_cameras": "hqgs.scene.camera_files",
+    "look_at": "hqgs.scene.paths",
+    "orbit": "hqgs.model.orbit",
+    "picture": "hqgs.photos.pixels",
     "rasterization": "hqgs.model.rasterization",
+    "render_frames": "hqgs.export.frames",
     "set_num_threads": "hqgs._rust",
     "train": "hqgs.pipeline",
 }

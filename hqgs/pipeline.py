@@ -2,56 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hqgs import __version__
-from hqgs.base.files import CHECKPOINT, CONFIG, PLY, atomic_path, lock_folder, remove_leftovers, write_json
+from hqgs.base.files import (
+    CHECKPOINT,
+    CONFIG,
+    PAGE,
+    PLY,
+    atomic_path,
+    lock_folder,
+    remove_leftovers,
+    write_json,
+)
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.learned import learned_picture
-from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
+from hqgs.page.page import Page, summary_html, write_page
+from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.cameras import Found
+from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values
-from hqgs.training.trainer import Step, Trainer
+from hqgs.training.trainer import Trainer
 
 LEARNED = "learned.png"  # what was learned of the photos' cameras
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a run has just done: one step."""
-
-    iteration: int  # steps done, those before a `resume` among them
-    length: int  # steps of the whole run, as far as it is known; it may get less
-    seconds: float  # of training so far
-    gaussians: int
-    loss: float
-    view: str  # the training view of the step
-    render: NDArray[np.float32]  # of that view, [H, W, 3], not clamped; may be smaller than the photo
-    evaluated: HistoryEntry | None  # where the held-out views were measured after this step
-    _step: Step = field(repr=False)
-
-    def psnr(self) -> float | None:
-        """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
-        step = self._step
-        return psnr(self.render, step.view.image, step.view.mask)
-
-
-OnProgress = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
@@ -67,6 +54,10 @@ class Run:
     seconds: float  # of training, without loading and the report
     views: list[RenderedView] = field(repr=False)  # the held-out views
     out: Path | None  # the folder with the files; None: nothing was written
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: the verdict, and a held-out photo beside its render."""
+        return summary_html(self.report, self.views)
 
     @property
     def finished(self) -> bool:
@@ -99,8 +90,8 @@ def train(
 
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
-        out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, `comparison/*.png`
-            and error_vs_time.png; None: nothing is written.
+        out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, report.html,
+            `comparison/*.png`, error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
             "srgs" or "hqgs".
@@ -172,13 +163,15 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     out = None if out is None else Path(out)
     config = trainer.config
     with deferred_interrupt() as interrupted:
+        if out is not None:
+            save_cameras(out, trainer.scene)
         while trainer.iteration < trainer.length and not interrupted.is_set():
             step = trainer.step()
             evaluate = trainer.iteration % config.eval_every == 0
             if evaluate:
                 trainer.evaluate()
             if progress is not None:
-                progress(_progress(trainer, step, trainer.history[-1] if evaluate else None))
+                progress(progress_of(trainer, step, trainer.history[-1] if evaluate else None))
             if out is not None and trainer.iteration % config.checkpoint_every == 0:
                 trainer.save(out / CHECKPOINT)
         trainer.evaluate()
@@ -187,25 +180,11 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
         return _results(trainer, out)
 
 
-def _progress(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) -> Progress:
-    return Progress(
-        iteration=trainer.iteration,
-        length=trainer.length,
-        seconds=trainer.seconds,
-        gaussians=len(trainer.gaussians),
-        loss=step.loss,
-        view=step.view.name,
-        render=step.render.numpy(),
-        evaluated=evaluated,
-        _step=step,
-    )
-
-
 def _results(trainer: Trainer, out: Path | None) -> Run:
     """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
     scene, config, guard = trainer.scene, trainer.config, trainer.guard
-    model = trainer.shown()
-    left_out = trainer.left_out()
+    model, left_out = trainer.shown(), trainer.left_out()
+    model.look = (scene.test or scene.train)[0].camera
     if out is not None and (rows := model.save(out / PLY)):
         left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
     if guard.skipped:
@@ -216,9 +195,8 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
     if trainer.iteration < trainer.length:
         what = f"iterations {trainer.iteration + 1} to {trainer.length}"
         left_out.append(LeftOut(what, "the run was stopped"))
-    if not scene.test:
+    if not (views := trainer.render_test_views()):
         left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
-    views = trainer.render_test_views()
     culled = [view.culled for view in views if view.culled is not None]
     result = RunResult(
         scene=scene.name,
@@ -242,12 +220,17 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
         views=views,
         learned=[_learned(found) for found in trainer.method.found()],
     )
+    learned = None
     if out is not None and result.learned:
+        learned = learned_picture([view.image for view in scene.train], result.learned)
         with atomic_path(out / LEARNED) as tmp:
-            learned_picture([view.image for view in scene.train], result.learned).save(tmp)
+            learned.save(tmp)
+    report = measure(result) if out is None else write_report(out, result)
+    if out is not None:
+        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, learned))
     return Run(
         model=model,
-        report=measure(result) if out is None else write_report(out, result),
+        report=report,
         history=trainer.history,
         left_out=left_out,
         iterations=trainer.iteration,

@@ -212,5 +212,5 @@ def test_files_by_suffix(tmp_path: Path) -> None:
     for call in (model.save, hqgs.Gaussians.load):
         with pytest.raises((ValueError, FileNotFoundError), match=r"b\.xyz"):
             call("b.xyz")
-    with pytest.raises(ValueError, match="format is 'splat', wanted one of: ply, spz"):
-        model.save("b.splat", "splat")
+    with pytest.raises(ValueError, match="format is 'obj', wanted one of: ply, spz"):
+        model.save("b.splat", "obj")

@@ -328,11 +328,15 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert call("train", "embedded", "--out", tmp_path, "--iterations", "3") == 0
-    *_, quality, time, now = capsys.readouterr().out.splitlines()
+    *_, quality, time, send, now = capsys.readouterr().out.splitlines()
     assert quality.startswith("quality: poor (below 20 dB ")
     assert "loading" in time
     assert "preparing" in time
-    assert now.startswith(f"now open {tmp_path / 'scene.ply'} in SuperSplat")
+    assert str(tmp_path / "report.html") in send
+    assert send.endswith(
+        f"SuperSplat (superspl.at/editor) and other viewers of 3DGS files open {tmp_path / 'scene.ply'}"
+    )
+    assert now == f"now look at it: hqgs view {tmp_path}"
     assert call("info", tmp_path) == 0
     assert "3 of 3 iterations" in capsys.readouterr().out
     assert call("eval", tmp_path) == 0

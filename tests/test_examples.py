@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_scene import tiny_scene
+from tiny_scene import tiny_config, tiny_scene
 
+import hqgs
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 
@@ -75,3 +76,14 @@ def test_fit_picture(tmp_path: Path) -> None:
     assert len(told) == 10
     assert told[-1] > told[0] + 3
     assert Image.open(tmp_path / "a.png").size == (64, 32)
+
+
+def test_look(tmp_path: Path) -> None:
+    hqgs.train(tiny_scene(), out=tmp_path / "run", config=tiny_config())
+    told = run("look.py", tmp_path, tmp_path / "run", "--frames", "5")
+    assert "5 frames: outputs/look" in told
+    names = {file.name for file in (tmp_path / "outputs" / "look").iterdir()}
+    assert names == {"path.mp4", "orbit.gif", "wide.png"}
+    wide = np.asarray(Image.open(tmp_path / "outputs" / "look" / "wide.png"))
+    assert wide.shape == (270, 480, 3)
+    assert wide.std() > 2  # a young scene is thin

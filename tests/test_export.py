@@ -189,7 +189,7 @@ def test_no_gaussian_at_all(tmp_path: Path, name: str) -> None:
 
 def test_options_are_checked() -> None:
     for wrong, message in (
-        ({"format": "splat"}, "format is 'splat', wanted one of: ply, spz"),
+        ({"format": "obj"}, "format is 'obj', wanted one of: ply, spz, splat, compressed.ply, glb"),
         ({"sh_degree": 4}, "sh_degree is 4"),
         ({"band_tolerance": -0.1}, "band_tolerance is -0.1"),
         ({"band_tolerance": math.nan}, "band_tolerance is nan"),

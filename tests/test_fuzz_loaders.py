@@ -14,6 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.report import read_report
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
@@ -52,9 +54,23 @@ def load_folder(root: Path) -> None:
     check_scene(load_scene(root))
 
 
-def load_gaussians(root: Path) -> None:
-    gaussians = Gaussians.load(root / "scene.ply")
+def load_gaussians(root: Path, name: str = "scene.ply") -> None:
+    gaussians = Gaussians.load(root / name)
     assert all(bool(torch.isfinite(t).all()) for t in gaussians.named().values())
+
+
+def load_views(root: Path) -> None:
+    known = load_cameras(root)
+    for view in known.views:
+        assert np.isfinite(view.camera.viewmat).all()
+        assert view.photo is None or root in view.photo.parents
+    assert np.isfinite(known.up).all()
+
+
+def load_frames(root: Path) -> None:
+    cameras, fps = load_path(root / "path.json")
+    assert all(np.isfinite(c.viewmat).all() and np.isfinite(c.K).all() for c in cameras)
+    assert fps > 0
 
 
 def load_run(root: Path) -> None:
@@ -122,6 +138,14 @@ def as_ply(root: Path, text: bool = False) -> None:
         ply.write(str(root / "scene.ply"))
 
 
+def as_format(root: Path, name: str) -> None:
+    some_gaussians().save(root / f"scene.{name}")
+
+
+def as_path(root: Path) -> None:
+    save_path(root / "path.json", [view.camera for view in tiny_scene().train])
+
+
 def as_checkpoint(root: Path) -> None:
     trainer = Trainer(tiny_scene(), tiny_config())
     trainer.step()
@@ -141,8 +165,13 @@ TARGETS: dict[str, tuple[Callable[[Path], None], str, Callable[[Path], None], bo
     "degradation": (as_degraded, "degradation.json", load_folder, True),
     **{f"photo {s}": (lambda root, s=s: as_photo(root, s), f"images/view_01{s}", load_folder, False)
        for s in SUFFIXES},
+    **{name: (lambda root, name=name: as_format(root, name), f"scene.{name}",
+              partial(load_gaussians, name=f"scene.{name}"), False)
+       for name in ("spz", "splat", "compressed.ply", "glb")},
     "ply": (as_ply, "scene.ply", load_gaussians, False),
     "ply text": (lambda root: as_ply(root, True), "scene.ply", load_gaussians, True),
+    "cameras": (lambda root: save_cameras(root, tiny_scene()), "cameras.json", load_views, True),
+    "path": (as_path, "path.json", load_frames, True),
     "checkpoint": (as_checkpoint, "checkpoint.safetensors", load_run, False),
 }  # fmt: skip
 

@@ -53,6 +53,10 @@ def test_to_load_and_to_train_draws_no_chart_yet() -> None:
         (["train", "/no/such", "--out", "x"], 2, "there is no scene folder /no/such"),
         (["diagnose", "/no/such"], 2, "there is no scene folder /no/such"),
         (["degrade", "/no/such", "--kind", "blur", "--out", "x"], 2, "there is no scene folder /no/such"),
+        (["render", "--help"], 0, "--background"),
+        (["view", "--help"], 0, "--port"),
+        (["render", "/no/such", "--out", "x.png"], 2, "there is no /no/such"),
+        (["view", "/no/such"], 2, "there is no /no/such"),
         (["export", "/no/such", "--out", "x.ply"], 2, "there is no /no/such"),
     ],
 )

@@ -50,7 +50,7 @@ def test_signature_is_that_of_gsplat() -> None:
         ("camera_model", "fisheye"),
         ("camera_model", "ortho"),
         ("camera_model", "ftheta"),
-        ("covars", torch.zeros(8, 3, 3)),
+        ("covars", torch.zeros(8, 3, 3).requires_grad_()),
         ("with_ut", True),
         ("with_eval3d", True),
         ("radial_coeffs", torch.zeros(1, 4)),
@@ -85,34 +85,27 @@ def test_unsupported_arguments_may_be_passed_as_absent() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        (
-            "backgrounds",
-            (0, 0, 0),
-            "backgrounds: expected a torch tensor such as torch.zeros(C, D), got (0, 0, 0)",
-        ),
-        ("backgrounds", torch.zeros(1, 3).long(), "backgrounds: must be float32 or float64, got torch.int64"),
-        ("backgrounds", torch.zeros(3), "backgrounds: expected shape [1, 3], got [3]"),
+        ("backgrounds", "red", "backgrounds: expected colours [C, D], or one, got 'red'"),
+        ("backgrounds", (0, 0), "backgrounds: expected shape [1, 3], got [1, 2]"),
+        ("backgrounds", torch.zeros(2, 3), "backgrounds: expected shape [1, 3], got [2, 3]"),
+        ("covars", torch.eye(3).expand(7, 3, 3), "covars: expected shape [8, 3, 3], got [7, 3, 3]"),
         (
             "covars",
-            torch.eye(3).expand(8, 3, 3),
-            "covars: hqgs takes the shape of a Gaussian as quats and scales, got a tensor [8, 3, 3]",
+            torch.zeros(8, 3, 3).requires_grad_(),
+            "covars: no gradient with respect to covariances; train quats and scales",
         ),
+        ("quats", None, "quats: expected a torch tensor, got None"),
         (
             "rolling_shutter",
             torch.zeros(500),
             "rolling_shutter: hqgs renders one image of a pinhole camera at a time, got a tensor [500]",
         ),
-        (
-            "means",
-            torch.zeros(2, 8, 3),
-            "means: expected shape [N, 3], got [2, 8, 3]; hqgs takes no leading batch dimensions, "
-            "call it for each scene",
-        ),
+        ("means", torch.zeros(2, 8, 3), "quats: expected shape [2, ...], as means has, got [8, 4]"),
         (
             "viewmats",
             torch.zeros(2, 1, 4, 4),
-            "viewmats: expected shape [C, 4, 4], got [2, 1, 4, 4]; hqgs takes no leading batch dimensions, "
-            "call it for each scene",
+            "viewmats: expected shape [C, 4, 4], got [2, 1, 4, 4]; leading batch dimensions must be those of "
+            "means",
         ),
         ("means", torch.zeros(8, 4), "means: expected shape [N, 3], got [8, 4]"),
         ("means", torch.zeros(()), "means: expected shape [N, 3], got []"),
@@ -134,7 +127,6 @@ def numbers(shape: tuple[int, ...]) -> str:
     ("name", "shape"),
     [
         ("means", (8, 2)),
-        ("means", (2, 8, 3)),
         ("quats", (8, 3)),
         ("quats", (7, 4)),
         ("scales", (8, 1)),
@@ -147,7 +139,7 @@ def numbers(shape: tuple[int, ...]) -> str:
         ("viewmats", (2, 3, 4)),
         ("Ks", (1, 3, 3)),
         ("Ks", (2, 4, 4)),
-        ("backgrounds", (3,)),
+        ("backgrounds", (2,)),
         ("backgrounds", (2, 4)),
         ("backgrounds", (1, 3)),
     ],

@@ -98,9 +98,9 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
     ("arguments", "message"),
     [
         (["train", "x", "--out", "y", "--device", "cuda"], "there is no --device: hqgs trains on the CPU"),
-        (["train", "x", "--out", "y", "--iterations", "many"], "--iterations is many, wanted INT"),
+        (["train", "x", "--out", "y", "--iterations", "many"], "--iterations is many, wanted a whole number"),
         (["train", "x"], "missing: --out DIR"),
-        (["train", "x", "--out", "y", "--preset", "fast"], "invalid choice 'fast' for argument '--preset'"),
+        (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick',"),
         (["--iterations", "3"], "there is no option '--iterations'"),
         (["diagnose", "x.zip"], "there is no scene folder"),
     ],

@@ -95,7 +95,8 @@ def test_everything_is_written(tmp_path: Path) -> None:
     assert report["left_out"] == []
     names = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert names == {
-        ".lock", CHECKPOINT, PLY, "config.json", "report.json", "error_vs_time.png", "comparison/view0.png"
+        ".lock", CHECKPOINT, PLY, "config.json", "report.json", "error_vs_time.png", "comparison/view0.png",
+        "cameras.json", "report.html", *(f"photos/0000{k}.jpg" for k in range(6)),
     }  # fmt: skip
 
 
@@ -331,7 +332,7 @@ def test_rates_are_those_that_the_method_leaves() -> None:
     trainer = Trainer(tiny_scene(), config)
     for k in range(1, 11):
         left = 1.0 if k < 6 else 0.25
-        trainer.method = SimpleNamespace(rate_left=left)  # type: ignore[assignment]
+        trainer.method = SimpleNamespace(rate_left=left, rates=lambda part: {})  # type: ignore[assignment]
         trainer._set_rates(trainer.schedule.plan(k, trainer.state.decisions))
         rates = {group["name"]: group["lr"] for group in trainer.state.optimizer.param_groups}
         means = config.lr_means * (config.lr_means_final / config.lr_means) ** (k / 10)

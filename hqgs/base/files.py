@@ -21,7 +21,7 @@ EMBEDDED, SPARSE = "embedded", "sparse"
 ROOMS = (EMBEDDED, SPARSE, "true-shake", "true-defocus", "true-rolling", "true-exposure")
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
-CHECKPOINT, PLY, CONFIG = "checkpoint.safetensors", "scene.ply", "config.json"
+CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
 KEPT = "sfm"  # in the folder of a run: what COLMAP found
 
 

@@ -19,15 +19,21 @@ def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
 
     Raises FileNotFoundError, or ValueError that names the file.
     """
+    elements = read_elements(path)
+    if "vertex" not in elements:
+        raise ValueError(f"{path}: a PLY file without the element vertex")
+    return elements["vertex"]
+
+
+def read_elements(path: str | Path) -> dict[str, np.ndarray[Any, np.dtype[np.void]]]:
+    """All elements by name; see `read_vertices`."""
     path = Path(path)
     _check_header(path)
     try:
         ply = PlyData.read(str(path))
     except (PlyParseError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{path}: not a readable PLY file: {error}") from error
-    if "vertex" not in ply:
-        raise ValueError(f"{path}: a PLY file without the element vertex")
-    return ply["vertex"].data
+    return {element.name: element.data for element in ply.elements}
 
 
 def _check_header(path: Path) -> None:

@@ -22,7 +22,7 @@ class Evaluate:
     """Options of `hqgs eval`."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The folder of a run, or a .ply or .spz file."""
+    """The folder of a run, or a scene file."""
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
     """The photos to measure with (those that the run was trained on)."""
     downscale: Factor = None

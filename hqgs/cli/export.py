@@ -27,7 +27,7 @@ class ExportScene:
     """Options of `hqgs export`."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A .ply or .spz file, or the folder of a run."""
+    """A scene file, or the folder of a run."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """The file to write."""
     format: Annotated[

@@ -21,7 +21,7 @@ class Info:
     """Options of `hqgs info`."""
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """The folder of a run, a .ply or .spz file, or a folder with photos."""
+    """The folder of a run, a scene file, or a folder with photos."""
 
 
 OPTIONS = Info

@@ -20,7 +20,19 @@ WORDS = {  # tyro's, and ours
     r"Unrecognized options?:": "there is no option",
     r"Missing from hqgs \w+:": "missing:",
     r"Perhaps you meant:": "- did you mean",
-    r"Error parsing (\S+): no type matching (\S+) could be .*? from \['?(.*?)'?\]\.": r"\1 is \3, wanted \2",
+    r"Error parsing (\S+): no type matching \{?(.+?)\}? could be .*? from \['?(.*?)'?\]\.": (
+        r"\1 is \3, wanted \2"
+    ),
+    r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*?)\)\.": (
+        r"\2 is \1, wanted one of: \3"
+    ),
+    r"Error parsing (\S+): invalid literal for int.*?: '(.*?)'": r"\1 is \2, wanted INT",
+    r"Error parsing (\S+): could not convert string to float: '(.*?)'": r"\1 is \2, wanted FLOAT",
+    r"wanted INT INT": "wanted two whole numbers",
+    r"wanted FLOAT FLOAT FLOAT": "wanted three numbers",
+    r"wanted INT": "wanted a whole number",
+    r"wanted FLOAT": "wanted a number",
+    r"(\d)', '(?=[\d.-])": r"\1 ",  # between numbers that were given
     r"Error parsing \S+: (?!no type)": "",
 }
 GPU = ("--device", "--cuda", "--gpu", "--gpus")
@@ -57,7 +69,7 @@ def _sentence(box: str) -> str:
     for line in (line.strip("│╭╮╰╯─ \n").rstrip() for line in _shallow(box)):
         if line.startswith(("Got errors", "Argument helptext")):
             break
-        if line and not line.startswith(("For full helptext", "hqgs ")):
+        if line.strip("-") and not line.startswith(("For full helptext", "hqgs ")):
             kept.append(line)
     text = " ".join(kept).replace("{None}|", "")
     for said, meant in WORDS.items():

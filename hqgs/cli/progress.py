@@ -12,7 +12,7 @@ from rich.progress import Progress as Bars
 
 if TYPE_CHECKING:
     from hqgs.base.stages import Stage
-    from hqgs.pipeline import Progress
+    from hqgs.training.progress import Progress
 
 _NUMBERS_EVERY = 10  # steps between updates of the bar
 _LINES_EVERY = 5.0  # s between lines without a terminal

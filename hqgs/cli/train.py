@@ -14,24 +14,27 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 import hqgs
-from hqgs.base.files import CHECKPOINT, CONFIG, KEPT
+from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, PAGE, PLY
 from hqgs.base.left_out import format_left_out
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
 from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
 from hqgs.training.settings import PRESETS, read_config, with_iterations
+from hqgs.viewer.guard import PORT, check
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run
     from hqgs.scene.scene import Scene
+    from hqgs.training.progress import Progress
 
 EXPERT = "--config."
 LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames")  # options that shape the scene
-VIEWERS = "SuperSplat (superspl.at/editor) or any other viewer of 3DGS files"
+VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +86,10 @@ class Train(Photos):
     """Bounds the memory (1,000,000)."""
     eval_every: Number = None
     """Iterations between evaluations (a tenth of the run)."""
+    view: Flag = False
+    """Show the scene in a browser while it trains, and afterwards until Ctrl-C."""
+    port: Port = PORT
+    open: Open = False
     threads: Number = None
     """CPU threads (all cores; the result does not depend on it)."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
@@ -195,20 +202,33 @@ def run(options: Train) -> int:
             raise ValueError(f"--out {options.out} is a file: name a folder for the run")
         if options.threads is not None:
             hqgs.set_num_threads(options.threads)
+        if options.view:
+            check(options.port)
         ready(options.scene)
         with LoadingScreen() as screen:
             scene = _load(options, config, screen)
         tell_notes(scene)
         loaded = time.perf_counter()
         print(f"looking at the photos, then at most {config.iterations:,} iterations", flush=True)
+        live = (
+            LiveView(scene, options.out, port=options.port, open_browser=options.open)
+            if options.view
+            else None
+        )
         with TrainingScreen() as bar:
+
+            def show(now: Progress) -> None:
+                bar(now)
+                if live is not None:
+                    live(now)
+
             done = hqgs.train(
                 scene,
                 out=options.out,
                 config=config,
                 resume=options.resume,
                 overwrite=options.overwrite,
-                progress=bar,
+                progress=show,
             )
     except KeyboardInterrupt:
         if (options.out / CHECKPOINT).exists():
@@ -230,6 +250,8 @@ def run(options: Train) -> int:
         print(
             f"stopped at iteration {done.iterations} of {done.length}; go on with: {command}", file=sys.stderr
         )
+    elif live is not None:
+        live.stay()
     return 0 if done.finished else 130
 
 
@@ -262,4 +284,6 @@ def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     word, why = verdict(last["psnr"])
     print(f"quality: {word} ({why})")
     print(f"time: {times.told(colmap)}")
-    print(f"now open {out / 'scene.ply'} in {VIEWERS}; the numbers are in {out / 'report.json'}")
+    print(f"to send: {out / PAGE}, which any browser opens; {VIEWERS} open {out / PLY}")
+    if not options.view:
+        print(f"now look at it: {shlex.join(['hqgs', 'view', str(out)])}")

@@ -69,6 +69,7 @@ class Inspector:
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
         self._differences: dict[tuple[int, ...], tuple[Part, Part]] = {}
+        self.last: Diagnosis | None = None  # that was made
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
         """`inspect_photo` of a view; `enlargement` where it is known."""
@@ -108,7 +109,8 @@ class Inspector:
             blur = replace(blur, needed=False, step=None, reason="each photo has its own, see shake")
         parts = (exposure, shake, blur, _lowres(photos), _noise(photos), _jpeg(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
-        return Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+        self.last = Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+        return self.last
 
 
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:

@@ -10,7 +10,12 @@ from hqgs.base.machine import MachineFacts
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
 
-class HistoryEntry(TypedDict):
+class _Resources(TypedDict, total=False):
+    gaussians: int  # older runs do not tell
+    memory_mb: float | None  # the most that the process has held so far
+
+
+class HistoryEntry(_Resources):
     """Means over the held-out views at one moment of a run. None: no such value."""
 
     iteration: int

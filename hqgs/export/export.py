@@ -14,18 +14,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
 from hqgs.export.options import ExportOptions
+from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.spz import encode_spz, write_spz
 from hqgs.model.gaussians import Gaussians
 
 BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
-CURVE_BITS = 10  # of a cell along each axis
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,13 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     steps = reduce_gaussians(gaussians, options)
     reduced = steps[-1].gaussians if steps else gaussians
     clipped: dict[str, int] = {}
-    if options.format == "ply":
+    if options.format != "spz":
         reduced.save(path, options.format)
     else:
         clipped = write_spz(path, along_a_curve(reduced).arrays(), options.sh_bits).clipped
     written = path.stat().st_size
     sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
-    sizes.append(_size(reduced, options) if options.format == "ply" else written)
+    sizes.append(written if options.format == "spz" else _size(reduced, options))
     left_out = []
     for step, (before, after) in zip(steps, pairwise(sizes), strict=True):
         saved = None if before is None or after is None else before - after
@@ -93,12 +92,17 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]
     g = steps[-1].gaussians if steps else g
 
     degrees = needed_degrees(g, options.band_tolerance)
-    degree = file_degree(degrees, min(options.sh_degree, g.sh_degree))
+    most = min(options.sh_degree, g.sh_degree) if options.format != "splat" else 0
+    degree = file_degree(degrees, most)
     if degree < g.sh_degree:
         cut = int((degrees > degree).sum())
         asked = degree == options.sh_degree
         why = (
-            "--sh-degree asks for it" if asked else f"at most 1 in {1 / BAND_SHARE:,.0f} Gaussians needs them"
+            "a .splat file holds none"
+            if options.format == "splat"
+            else "--sh-degree asks for it"
+            if asked
+            else f"at most 1 in {1 / BAND_SHARE:,.0f} Gaussians needs them"
         )
         evidence = f"{cut:,} of {len(g):,} Gaussians change a colour by over {options.band_tolerance:g} there"
         bands = (
@@ -140,17 +144,8 @@ def file_degree(degrees: Tensor, most: int) -> int:
 
 def along_a_curve(gaussians: Gaussians) -> Gaussians:
     """The Gaussians along a Morton curve: neighbours in the file are neighbours in space, and pack better."""
-    means = gaussians.means.double().numpy()
-    if not len(means):
-        return gaussians
-    low, high = np.quantile(means, [0.01, 0.99], axis=0)  # a few far ones must not make the cells large
-    cells = (means - low) / np.maximum(high - low, np.finfo(np.float64).tiny) * (2**CURVE_BITS - 1)
-    cells = cells.clip(0, 2**CURVE_BITS - 1).astype(np.int64)
-    code = np.zeros(len(means), np.int64)
-    for bit in range(CURVE_BITS):
-        for axis in range(3):
-            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return _select(gaussians, torch.from_numpy(np.argsort(code, kind="stable")))
+    order = curve_order(gaussians.means.detach().numpy())
+    return _select(gaussians, torch.from_numpy(order))
 
 
 def _select(gaussians: Gaussians, rows: Tensor) -> Gaussians:
@@ -169,9 +164,14 @@ def _without_bands(gaussians: Gaussians, degrees: Tensor) -> Gaussians:
 
 
 def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
-    """Bytes of the file without the text of a PLY header; None where SPZ cannot hold them."""
-    if options.format == "ply":
-        return 4 * len(gaussians) * (3 + 3 + gaussians.shN.shape[1] * 3 + 1 + 3 + 4)
+    """Bytes of the file without the text of a header; None where SPZ cannot hold them."""
+    n, higher = len(gaussians), 3 * gaussians.shN.shape[1]
+    if options.format in ("ply", "glb"):
+        return 4 * n * (3 + 3 + higher + 1 + 3 + 4)
+    if options.format == "splat":
+        return 32 * n
+    if options.format == "compressed.ply":
+        return n * (16 + higher) + -(-n // 256) * 72
     try:
         return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits).data)
     except ValueError:

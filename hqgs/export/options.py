@@ -14,7 +14,7 @@ from hqgs.model.formats.spz import SH_BITS
 class ExportOptions:
     """What is written of a scene."""
 
-    format: str  # "ply" or "spz"
+    format: str  # one of `READERS`
     sh_degree: int = MAX_SH_DEGREE  # at most
     band_tolerance: float = 0.004  # of a colour, white at 1: a level of an 8-bit picture; 0: every band stays
     sh_bits: tuple[int, int] = SH_BITS  # SPZ: of the coefficients of degree 1, and of degrees 2 and 3

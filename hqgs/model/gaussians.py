@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE, SH_C0
+from hqgs.model.content import around
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.files import READERS, WRITERS, format_of, scene_file
 from hqgs.model.render import render_view
+from hqgs.photos.pixels import png
+from hqgs.scene.camera_files import CAMERAS, load_cameras
+from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 
 MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
@@ -38,6 +43,7 @@ class Gaussians:
     opacities: Tensor  # [N], logits
     sh0: Tensor  # [N, 1, 3], the SH coefficient of degree 0
     shN: Tensor  # noqa: N815  [N, K - 1, 3], the higher coefficients; K = (sh_degree + 1)^2
+    look: Camera | None = field(default=None, init=False, compare=False)  # for notebooks; in no file
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -52,6 +58,15 @@ class Gaussians:
     def __repr__(self) -> str:
         return f"Gaussians({len(self)}, sh_degree={self.sh_degree})"
 
+    def _repr_png_(self) -> bytes | None:
+        """The picture that a notebook shows: from `look`, or of the whole scene; None where it is empty."""
+        try:
+            camera = self.look or around(self.means, self.opacities, 4, UP, None)[0]
+        except ValueError:
+            return None
+        with torch.no_grad():
+            return png(self.render(camera))
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
@@ -62,7 +77,7 @@ class Gaussians:
 
     def named(self) -> dict[str, Tensor]:
         """The tensors by name, in the order of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "look"}
 
     def detached(self) -> Gaussians:
         """The same values (shared memory) without a gradient history."""
@@ -116,9 +131,9 @@ class Gaussians:
         """Write a scene file atomically; return how many Gaussians were left out as NaN or Inf.
 
         Args:
-            path: ends in .ply (the layout of 3DGS, exact) or .spz (a tenth as large, with the errors that
-                docs/export.md states).
-            format: "ply" or "spz" for a file with another suffix.
+            path: ends in .ply (the layout of 3DGS, exact), .spz (a tenth as large), .compressed.ply
+                (SuperSplat), .splat (no harmonics) or .glb (glTF); docs/export.md states the errors.
+            format: that suffix without its first dot, for a file with another one.
 
         Raises:
             ValueError: another suffix or format, or a scene that does not fit the ranges of SPZ.
@@ -129,11 +144,11 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: str | Path, format: str | None = None) -> Gaussians:
-        """Read a scene file, float32: ours, or a PLY file of 3DGS, gsplat or Brush.
+        """Read a scene file, float32: ours, or one of 3DGS, gsplat, Brush, SuperSplat.
 
         Args:
-            path: a .ply or .spz file, or the folder of a run.
-            format: "ply" or "spz" for a file with another suffix.
+            path: a .ply (compressed or not), .spz, .splat or .glb file, or the folder of a run.
+            format: as in `save`, for a file with another suffix.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -141,7 +156,11 @@ class Gaussians:
         """
         file = scene_file(path)
         arrays = READERS[format_of(file, format)](file)
-        return cls(
+        look = None
+        if file.name == PLY and (file.parent / CAMERAS).is_file():
+            known = load_cameras(file.parent)
+            look = next(iter([*known.test, *known.train]), None)
+        made = cls(
             means=torch.from_numpy(arrays["means"]),
             scales=torch.from_numpy(arrays["scales"]),
             quats=torch.from_numpy(arrays["quats"]),
@@ -149,6 +168,8 @@ class Gaussians:
             sh0=torch.from_numpy(arrays["sh0"]),
             shN=torch.from_numpy(arrays["shN"]),
         )
+        made.look = look
+        return made
 
     @classmethod
     def from_points(

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TypedDict
+from collections.abc import Sequence
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hqgs._rust import EPS2D, FAR_PLANE, NEAR_PLANE, TILE
+from hqgs.model.arguments import (
+    as_backgrounds,
+    batch_of,
+    check_colors,
+    check_tensors,
+    refuse,
+    shape_of,
+    short,
+)
 from hqgs.model.autograd import _Composite, _Project
+from hqgs.model.covariances import quats_and_scales
 
 __all__ = ["RasterizationMeta", "rasterization"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -35,8 +46,8 @@ class RasterizationMeta(TypedDict):
 
 def rasterization(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
     opacities: Tensor,
     colors: Tensor | tuple[Tensor, Tensor],
     viewmats: Tensor,
@@ -50,7 +61,7 @@ def rasterization(
     sh_degree: int | None = None,
     packed: bool = True,
     tile_size: int = TILE,
-    backgrounds: Tensor | None = None,
+    backgrounds: Tensor | Sequence[float] | Sequence[Sequence[float]] | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
@@ -58,6 +69,8 @@ def rasterization(
     channel_chunk: int = 32,
     distributed: bool = False,
     camera_model: str = "pinhole",
+    *,
+    covars: Tensor | None = None,
     **unsupported: object,
 ) -> tuple[Tensor, Tensor, RasterizationMeta]:
     """Render N Gaussians into C pinhole cameras; code written for `gsplat.rasterization` runs unchanged.
@@ -80,12 +93,17 @@ def rasterization(
         radius_clip: Gaussians whose radii are at most this many pixels are culled.
         eps2d: low-pass filter added to the projected covariance, px^2.
         sh_degree: highest degree of the harmonics in use, 0..3; None: `colors` are channels.
-        backgrounds: colour behind everything, [C, D]; None is 0.
+        backgrounds: colour behind everything, [C, D], or [D] for all cameras, numbers of any kind; None is 0.
         render_mode: "RGB", "D" (accumulated depth), "ED" (expected depth), "RGB+D" or "RGB+ED"; depth is
             the last channel.
         absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
+        covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then; they get
+            no gradient.
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
+
+    Any number of leading batch dimensions, the same for all tensors (but a `backgrounds` [D]), gives as many
+    scenes, one after the other: outputs and the tensors of the meta data have them too.
 
     Returns:
         render_colors [C, height, width, X], not clamped; render_alphas [C, height, width, 1]; and
@@ -94,47 +112,116 @@ def rasterization(
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
         NotImplementedError: an argument of gsplat that hqgs leaves out (other camera models, distortion,
-            rolling shutter, distributed rendering, gradients of Ks).
+            rolling shutter, distributed rendering, gradients of Ks and covars, absgrad of a batch).
     """
-    _refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
+    refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
     colors, rest = colors if isinstance(colors, tuple) else (colors, None)
-    tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    if backgrounds is not None:
-        tensors["backgrounds"] = backgrounds
+    if covars is not None:
+        quats, scales = quats_and_scales(covars, means)
+    tensors: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    tensors["colors"] = colors
     if rest is not None:
         tensors["colors[1]"] = rest
-    _check_tensors(tensors, viewmats, Ks)
-    n, c = means.shape[0], viewmats.shape[0]
+    batch = batch_of({**tensors, "viewmats": viewmats, "Ks": Ks})
+    if backgrounds is not None:
+        c = viewmats.shape[len(batch)] if viewmats.dim() > len(batch) else 0
+        tensors["backgrounds"] = as_backgrounds(backgrounds, means, batch, c)
+        batch_of(tensors)
+    if batch and absgrad:
+        raise NotImplementedError("absgrad: not with leading batch dimensions; call hqgs for each scene")
+    scenes = _each_scene({**tensors, "viewmats": viewmats, "Ks": Ks}, len(batch))
+    one = scenes[0]
+    check_tensors({name: one[name] for name in tensors}, one["viewmats"], one["Ks"])
+    n, c = one["means"].shape[0], one["viewmats"].shape[0]
     if render_mode not in RENDER_MODES:
         raise ValueError(f"render_mode: must be one of {RENDER_MODES}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode: must be one of {RASTERIZE_MODES}, got {rasterize_mode!r}")
-    for name, value, low in (("width", width, 1), ("height", height, 1)):
-        if int(value) != value or value < low:
-            raise ValueError(f"{name}: must be an integer of at least {low}, got {_short(value)}")
+    for name, value in (("width", width), ("height", height)):
+        if int(value) != value or value < 1:
+            raise ValueError(f"{name}: must be an integer of at least 1, got {short(value)}")
     for name, value in (("eps2d", eps2d), ("near_plane", near_plane), ("radius_clip", radius_clip)):
         if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name}: must be finite and not negative, got {_short(value)}")
+            raise ValueError(f"{name}: must be finite and not negative, got {short(value)}")
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
-    _check_colors(colors, rest, n, c, sh_degree)
+    check_colors(one["colors"], one.get("colors[1]"), n, c, sh_degree)
 
-    options = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
-    frame, means2d, link, depths, conics, radii, alphas_in, sh_colors = _Project.apply(
-        means,
-        quats,
-        scales,
-        opacities,
+    numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
+    config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), sh_degree)
+    projected = [_project(scene, config) for scene in scenes]
+    joined = projected[0]["means2d"]
+    if batch:  # what is composited are slices of the one tensor that the caller gets, with its gradient
+        joined = torch.stack([splats["means2d"] for splats in projected]).unflatten(0, batch)
+        for splats, means2d in zip(projected, joined.flatten(0, len(batch) - 1).unbind(0), strict=True):
+            splats["means2d"] = means2d
+    pairs = zip(scenes, projected, strict=True)
+    images, alphas, works = zip(*(_composite(a, b, render_mode, absgrad) for a, b in pairs), strict=True)
+
+    def together(values: Sequence[Tensor]) -> Tensor:
+        return torch.stack([*values]).unflatten(0, batch) if batch else values[0]
+
+    meta: RasterizationMeta = {
+        "means2d": joined,
+        "radii": together([splats["radii"] for splats in projected]),
+        "depths": together([splats["depths"] for splats in projected]),
+        "conics": together([splats["conics"] for splats in projected]),
+        "opacities": together([splats["opacities"] for splats in projected]),
+        "width": int(width),
+        "height": int(height),
+        "tile_size": tile_size,
+        "n_cameras": c,
+        "camera_ids": None,
+        "gaussian_ids": None,
+        "work": (sum(w[0] for w in works), sum(w[1] for w in works), sum(w[2] for w in works)),
+    }
+    return together(images), together(alphas), meta
+
+
+def _each_scene(tensors: dict[str, Tensor], dims: int) -> list[dict[str, Tensor]]:
+    """The tensors of each scene of a batch with that many leading dimensions."""
+    if not dims:
+        return [tensors]
+    parts = {name: tensor.flatten(0, dims - 1).unbind(0) for name, tensor in tensors.items()}
+    return [dict(zip(parts, values, strict=True)) for values in zip(*parts.values(), strict=True)]
+
+
+def _project(scene: dict[str, Tensor], config: tuple[Any, ...]) -> dict[str, Any]:
+    """The splats of one scene."""
+    colors, sh_degree = scene["colors"], config[-1]
+    frame, means2d, link, depths, conics, radii, alphas, sh_colors = _Project.apply(
+        scene["means"],
+        scene["quats"],
+        scene["scales"],
+        scene["opacities"],
         colors if sh_degree is not None else colors.detach(),
-        rest,
-        viewmats.to(torch.float64),
-        Ks.detach().to(torch.float64),
-        (int(width), int(height), (*options, rasterize_mode == "antialiased"), sh_degree),
+        scene.get("colors[1]"),
+        scene["viewmats"].to(torch.float64),
+        scene["Ks"].detach().to(torch.float64),
+        config,
         torch.is_grad_enabled(),
     )
-    channels: Tensor = sh_colors if sh_degree is not None else colors
+    return {
+        "frame": frame,
+        "means2d": means2d,
+        "link": link,
+        "depths": depths,
+        "conics": conics,
+        "radii": radii,
+        "opacities": alphas,
+        "channels": sh_colors if sh_degree is not None else colors,
+    }
+
+
+def _composite(
+    scene: dict[str, Tensor], splats: dict[str, Any], render_mode: str, absgrad: bool
+) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+    """Images and alphas of one scene's splats, and the work that it was."""
+    channels, depths, backgrounds = splats["channels"], splats["depths"], scene.get("backgrounds")
+    c = len(depths)
     if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
-        raise ValueError(f"backgrounds: expected shape {[c, channels.shape[-1]]}, got {_shape(backgrounds)}")
+        wanted = [c, channels.shape[-1]]
+        raise ValueError(f"backgrounds: expected shape {wanted}, got {shape_of(backgrounds)}")
     if render_mode in ("D", "ED"):
         channels, backgrounds = depths[..., None], None
     elif render_mode != "RGB":
@@ -143,123 +230,15 @@ def rasterization(
         channels = torch.cat([channels, depths[..., None]], dim=-1)
         if backgrounds is not None:
             backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
-    image, alphas, work = _Composite.apply(frame, means2d, link, alphas_in, channels, backgrounds, absgrad)
+    image, alphas, work = _Composite.apply(
+        splats["frame"],
+        splats["means2d"],
+        splats["link"],
+        splats["opacities"],
+        channels,
+        backgrounds,
+        absgrad,
+    )
     if render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    meta: RasterizationMeta = {
-        "means2d": means2d,
-        "radii": radii,
-        "depths": depths,
-        "conics": conics,
-        "opacities": alphas_in,
-        "width": int(width),
-        "height": int(height),
-        "tile_size": tile_size,
-        "n_cameras": c,
-        "camera_ids": None,
-        "gaussian_ids": None,
-        "work": work,
-    }
-    return image, alphas, meta
-
-
-# What gsplat's function takes beyond the above, with the value that asks for nothing.
-_NEUTRAL = {
-    "distributed": (False,),
-    "camera_model": ("pinhole",),
-    "segmented": (False,),
-    "with_ut": (False,),
-    "with_eval3d": (False,),
-    "rolling_shutter": (None, 0),
-}
-_REASONS = {
-    "covars": "hqgs takes the shape of a Gaussian as quats and scales",
-    "distributed": "hqgs renders in one process",
-    "extra_signals": "hqgs renders what is in colors; append the signals to them",
-}
-
-
-def _refuse(unsupported: dict[str, object]) -> None:
-    known = {
-        *_NEUTRAL, "covars", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
-        "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs", "extra_signals", "rays",
-    }  # fmt: skip
-    for name, value in unsupported.items():
-        if name not in known:
-            raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
-        neutral = _NEUTRAL.get(name, (None,))
-        absent = not isinstance(value, Tensor) and (
-            value in neutral or getattr(value, "name", "") == "GLOBAL"
-        )
-        if not absent:
-            why = _REASONS.get(name, "hqgs renders one image of a pinhole camera at a time")
-            raise NotImplementedError(f"{name}: {why}, got {_short(value)}")
-
-
-def _short(value: object) -> str:
-    """A value for a message of one line: of a tensor its shape alone."""
-    return f"a tensor {_shape(value)}" if isinstance(value, Tensor) else repr(value)[:60]
-
-
-def _shape(tensor: Tensor) -> str:
-    return str(list(tensor.shape))
-
-
-def _check_tensors(tensors: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> None:
-    for name, value in {**tensors, "viewmats": viewmats, "Ks": Ks}.items():
-        if not isinstance(value, Tensor):
-            like = " such as torch.zeros(C, D)" if name == "backgrounds" else ""
-            raise ValueError(f"{name}: expected a torch tensor{like}, got {_short(value)}")
-        if value.device.type != "cpu":
-            raise ValueError(f"{name}: must be on the CPU, got a tensor on {value.device}")
-        if value.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"{name}: must be float32 or float64, got {value.dtype}")
-    means = tensors["means"]
-    for name, value in tensors.items():
-        if value.dtype != means.dtype:
-            raise ValueError(f"{name}: must have the dtype of means, {means.dtype}, got {value.dtype}")
-    _check_shape("means", means, "N", 3)
-    n = len(means)
-    for name, shape in (("quats", [n, 4]), ("scales", [n, 3]), ("opacities", [n])):
-        if list(tensors[name].shape) != shape:
-            raise ValueError(f"{name}: expected shape {shape}, got {_shape(tensors[name])}")
-    _check_shape("viewmats", viewmats, "C", 4, 4)
-    c = len(viewmats)
-    if c == 0:
-        raise ValueError(f"viewmats: expected shape [C >= 1, 4, 4], got {_shape(viewmats)}")
-    if list(Ks.shape) != [c, 3, 3]:
-        raise ValueError(f"Ks: expected shape {[c, 3, 3]}, got {_shape(Ks)}")
-    if Ks.requires_grad:
-        raise NotImplementedError("Ks: no gradient with respect to the intrinsics; pass Ks.detach()")
-
-
-def _check_shape(name: str, value: Tensor, size: str, *fixed: int) -> None:
-    """Check that `value` is [any, *fixed]; its first `size` is what the other shapes are held against."""
-    if value.shape[1:] != fixed or value.dim() == 0:
-        batched = value.dim() > len(fixed) + 1 and value.shape[-len(fixed) :] == fixed
-        hint = "; hqgs takes no leading batch dimensions, call it for each scene" if batched else ""
-        expected = f"[{', '.join(map(str, (size, *fixed)))}]"
-        raise ValueError(f"{name}: expected shape {expected}, got {_shape(value)}{hint}")
-
-
-def _check_colors(colors: Tensor, rest: Tensor | None, n: int, c: int, sh_degree: int | None) -> None:
-    shape = list(colors.shape)
-    if sh_degree is None:
-        if rest is not None:
-            raise ValueError("colors: a pair of tensors is for spherical harmonics, which need sh_degree")
-        if shape[:-1] not in ([n], [c, n]) or shape[-1] == 0:
-            raise ValueError(f"colors: expected shape [{n}, D] or [{c}, {n}, D], got {shape}")
-        return
-    if sh_degree not in (0, 1, 2, 3):
-        raise ValueError(f"sh_degree: must be 0, 1, 2 or 3, got {sh_degree!r}")
-    needed = (sh_degree + 1) ** 2
-    if rest is not None:
-        if shape != [n, 1, 3]:
-            raise ValueError(f"colors[0]: expected shape [{n}, 1, 3], got {shape}")
-        shape = list(rest.shape)
-        if len(shape) != 3 or shape[0] != n or shape[1] < needed - 1 or shape[2] != 3:
-            wanted = f"[{n}, K >= {needed - 1}, 3] for sh_degree {sh_degree}"
-            raise ValueError(f"colors[1]: expected shape {wanted}, got {shape}")
-    elif len(shape) != 3 or shape[0] != n or shape[1] < needed or shape[2] != 3:
-        wanted = f"[{n}, K >= {needed}, 3] for sh_degree {sh_degree}"
-        raise ValueError(f"colors: expected shape {wanted}, got {shape}")
+    return image, alphas, work

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 Float32 = NDArray[np.float32]
@@ -42,3 +45,22 @@ def to_levels(image: NDArray[np.uint8] | NDArray[np.float32], what: str) -> Floa
 def luma(levels: Floats) -> Floats:
     """[H, W] from [H, W, 3]."""
     return levels @ LUMA
+
+
+def picture(image: Tensor | Floats | NDArray[np.uint8]) -> Image.Image:
+    """A render or a photo [H, W, 3] as a picture of Pillow, which notebooks show.
+
+    Floats have white at 1 and are clipped. ValueError for another shape.
+    """
+    pixels = image.detach().numpy() if isinstance(image, Tensor) else np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise ValueError(f"image has shape {list(pixels.shape)}, wanted [H, W, 3]")
+    whole = pixels if pixels.dtype == np.uint8 else to_uint8(np.nan_to_num(pixels.astype(np.float32)))
+    return Image.fromarray(np.ascontiguousarray(whole))
+
+
+def png(image: Tensor | Floats | NDArray[np.uint8]) -> bytes:
+    """The same as the bytes of a PNG file."""
+    file = io.BytesIO()
+    picture(image).save(file, "PNG")
+    return file.getvalue()

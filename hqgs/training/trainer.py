@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
+from hqgs.base.machine import peak_rss_mb
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
-from hqgs.diagnosis.scene import Inspector
+from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import RenderedView, held_out_mean, held_out_renders
 from hqgs.evaluation.metrics import psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
@@ -67,6 +68,7 @@ class Trainer:
         self.scene = scene
         self.extent: float = scene.extent
         self.method: Method[Any] = make_method(scene, config, inspector)
+        self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
         with one_torch_thread():
             self._targets = [self.method.prepare(view) for view in scene.train]
             start = self.method.start(scene, self._targets, config)
@@ -169,12 +171,13 @@ class Trainer:
         if self.history and self.history[-1]["iteration"] == self.iteration:
             return
         views = self.render_test_views()
-        means = {name: held_out_mean(metric, views) for name, metric in (("psnr", psnr), ("ssim", ssim))}
         entry: HistoryEntry = {
             "iteration": self.iteration,
             "seconds": self.seconds,
-            "psnr": means["psnr"],
-            "ssim": means["ssim"],
+            "psnr": held_out_mean(psnr, views),
+            "ssim": held_out_mean(ssim, views),
+            "gaussians": len(self.gaussians),
+            "memory_mb": peak_rss_mb(),
         }
         self.history.append(entry)
 
@@ -250,10 +253,9 @@ class Trainer:
         """Note the gradients of the 2D means and let Adam take its step."""
         state, radii = self.state, meta["radii"][0]
         if plan.observes:
-            camera = view.camera
             gradient = meta["means2d"].grad
             assert gradient is not None  # the backward pass was sound
-            state.densifier.observe(gradient[0], radii, camera.width, camera.height)
+            state.densifier.observe(gradient[0], radii, view.camera.width, view.camera.height)
         visible = (radii > 0).all(dim=1) if self.config.selective_adam else None
         state.optimizer.step(visible=visible)
 
@@ -330,8 +332,7 @@ class Trainer:
             return
         state, indices = self.state, torch.nonzero(fault.rows)[:, 0]
         listed = indices[:LISTED].tolist()
-        event = Event(state.iteration, view.name, fault.what, fault.tensors, len(indices), listed)
-        state.guard.add(event)
+        state.guard.add(Event(state.iteration, view.name, fault.what, fault.tensors, len(indices), listed))
         if len(indices):
             self._remove(fault.rows)
             state.guard.culled += len(indices)

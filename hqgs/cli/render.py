@@ -1,0 +1,157 @@
+"""`hqgs render`: pictures and films of a trained scene."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.scenes import Factor, Number
+from hqgs.model.formats.files import scene_file
+
+if TYPE_CHECKING:
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.scene.camera_files import RunCameras
+    from hqgs.scene.scene import Camera
+
+PATHS = ("cameras", "orbit")
+FRAMES = 240
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Options of `hqgs render`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """The folder of a run, or a scene file."""
+    out: Annotated[Path, tyro.conf.arg(metavar="PATH")]
+    """PATH.mp4, PATH.gif, PATH.png, or a folder for pictures."""
+    views: Annotated[str | None, tyro.conf.arg(metavar="WHICH", help_behavior_hint="")] = None
+    """The run's own views in place of a path: train, test, all, or names with commas."""
+    path: Annotated[str, tyro.conf.arg(metavar="KIND")] = PATHS[0]
+    """cameras (a smooth way through the training cameras), orbit, or the JSON file of a camera path, of the
+    viewer or of nerfstudio. A scene file without cameras gets an orbit."""
+    frames: Number = None
+    """Frames of a path that is made here (240)."""
+    fps: Factor = None
+    """Frames per second (30, or what the path file says)."""
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
+    """In pixels (as the cameras have)."""
+    show: Literal["color", "depth", "alpha"] = "color"
+    """What the pictures show."""
+    background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
+    """Behind everything; 1 is white."""
+    up: Annotated[
+        tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")
+    ] = None
+    """Where up is in a scene file without cameras (0 -1 0)."""
+
+
+OPTIONS = Render
+
+
+def run(options: Render) -> int:
+    """Render, and say what was written; return the exit code (0 done, 1 failed, 2 bad input)."""
+    source, out, size = options.source, options.out, options.size
+    try:
+        file = scene_file(source)
+        from hqgs.export.frames import render_frames  # here: they load torch
+        from hqgs.model.gaussians import Gaussians
+        from hqgs.scene.paths import resized
+
+        gaussians = Gaussians.load(file)
+        names, cameras, rate = _cameras(options, gaussians)
+        if size is not None:
+            cameras = [resized(camera, *size) for camera in cameras]
+        if out.suffix.lower() == ".png" and options.views is None:
+            cameras = cameras[:1]
+        started = time.perf_counter()
+        render_frames(
+            gaussians,
+            cameras,
+            out,
+            fps=rate if options.fps is None else options.fps,
+            show=options.show,
+            background=options.background,
+            names=names,
+            progress=_progress if sys.stderr.isatty() else None,
+        )
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{out}: {error}")
+    seconds = time.perf_counter() - started
+    kinds = sorted({(camera.width, camera.height) for camera in cameras})
+    px = f"{kinds[0][0]} x {kinds[0][1]} px" if len(kinds) == 1 else "several sizes"
+    many = f"{len(cameras)} frames" if len(cameras) > 1 else "1 frame"
+    print(f"{out}: {many}, {px}, {len(gaussians)} Gaussians, {len(cameras) / seconds:.1f} frames/s")
+    return 0
+
+
+def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:
+    """Names of the pictures, if they have any, the cameras, and frames per second."""
+    from hqgs.export.frames import FPS
+    from hqgs.model.orbit import orbit
+    from hqgs.scene.camera_files import load_path
+    from hqgs.scene.paths import UP, camera_path
+
+    source, views, path, frames = options.source, options.views, options.path, options.frames
+    known = _known(source)
+    count = FRAMES if frames is None else frames
+    if views is not None:
+        if known is None:
+            raise ValueError(f"{source} has no cameras.json, which says what its views are; use --path orbit")
+        chosen = _chosen(known, views)
+        return [_file_name(k, name) for k, (name, _) in enumerate(chosen)], [c for _, c in chosen], FPS
+    if path not in PATHS:
+        if frames is not None:
+            raise ValueError("--frames is for paths that are made here; a path file has its own")
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"--path is {path!r}: no such file, and none of: {', '.join(PATHS)}")
+        return None, *load_path(path)
+    if known is None or not known.train:
+        return None, orbit(gaussians, count, up=UP if options.up is None else options.up), FPS
+    made = orbit(known.train, count) if path == "orbit" else camera_path(known.train, count)
+    return None, made, FPS
+
+
+def _known(source: Path) -> RunCameras | None:
+    """The cameras of a run's folder, or of the folder that a scene file lies in."""
+    from hqgs.scene.camera_files import CAMERAS, load_cameras
+
+    folder = source if source.is_dir() else source.parent
+    return load_cameras(folder) if (folder / CAMERAS).is_file() else None
+
+
+def _chosen(known: RunCameras, views: str) -> list[tuple[str, Camera]]:
+    kinds = {"train": (False,), "test": (True,), "all": (False, True)}
+    if views in kinds:
+        found = [(v.name, v.camera) for v in known.views if v.held_out in kinds[views]]
+        if not found:
+            raise ValueError(f"--views {views}: the run has no such view")
+        return found
+    by_name = {v.name: v.camera for v in known.views}
+    by_name |= {Path(v.name).stem: v.camera for v in known.views if Path(v.name).stem not in by_name}
+    missing = [name for name in views.split(",") if name not in by_name]
+    if missing:
+        some = ", ".join(v.name for v in known.views[:3])
+        raise ValueError(
+            f"--views: the run has no view {missing[0]!r}; there are: train, test, all, {some}, ..."
+        )
+    return [(name, by_name[name]) for name in views.split(",")]
+
+
+def _file_name(number: int, view: str) -> str:
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(view).stem).strip("._")[:80]
+    return f"{number:03}_{stem}"
+
+
+def _progress(done: int, total: int) -> None:
+    end = "\n" if done == total else ""
+    print(f"\rframe {done} of {total}", end=end, file=sys.stderr, flush=True)

@@ -1,0 +1,123 @@
+"""`hqgs view`: a page on this machine to look at a scene, and the same while it trains."""
+
+from __future__ import annotations
+
+import time
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.model.formats.files import scene_file
+from hqgs.viewer.guard import PORT, check
+
+if TYPE_CHECKING:
+    from hqgs.scene.scene import Scene
+    from hqgs.training.progress import Progress
+
+EVERY = 2.0  # seconds between copies of the scene while it trains
+
+
+Port = Annotated[int, tyro.conf.arg(metavar="P", help="Of the page: the first port to try; 0: any.")]
+Open = Annotated[bool, tyro.conf.arg(help_behavior_hint="", help="Open the page in this machine's browser.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """Options of `hqgs view`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """The folder of a run, or a scene file."""
+    port: Port = PORT
+    open: Open = False
+
+
+OPTIONS = View
+
+
+def run(options: View, seconds: float | None = None) -> int:
+    """Show a scene until Ctrl-C, or for some seconds; return the exit code (0 done, 2 bad input)."""
+    try:
+        file = scene_file(options.source)
+        check(options.port)
+        from hqgs.model.gaussians import Gaussians  # here: they load torch
+        from hqgs.scene.camera_files import CAMERAS, load_cameras
+        from hqgs.viewer.viewer import Viewer
+
+        gaussians = Gaussians.load(file)
+        folder = file.parent
+        known = load_cameras(folder) if (folder / CAMERAS).is_file() else None
+        viewer = Viewer(known, folder, port=options.port, title=folder.resolve().name)
+    except BAD_INPUT as error:
+        return fail(2, error)
+    viewer.set_scene(gaussians, _numbers(folder, len(gaussians)))
+    _tell(viewer.url, options.open)
+    try:
+        viewer.serve(seconds)
+    except KeyboardInterrupt:
+        print()
+    finally:
+        viewer.close()
+    return 0
+
+
+class LiveView:
+    """The page of a run that trains: hand it to `hqgs.train` as `progress`, or call it in yours."""
+
+    def __init__(self, scene: Scene, out: Path, *, port: int = PORT, open_browser: bool = False) -> None:
+        """ValueError without viser, the extra `view`."""
+        from hqgs.scene.camera_files import load_cameras, save_cameras
+        from hqgs.viewer.viewer import Viewer
+
+        save_cameras(out, scene)
+        self.viewer = Viewer(load_cameras(out), out, port=port, title=scene.name)
+        self._copied = -EVERY
+        _tell(self.viewer.url, open_browser)
+
+    def __call__(self, now: Progress) -> None:
+        """Show the scene as it is, every two seconds, and answer the page after each step."""
+        first, last = now.iteration == 1, now.iteration == now.length
+        due = self.viewer.watched and time.monotonic() - self._copied > EVERY
+        if first or last or due:
+            rows = [("iteration", f"{now.iteration} of {now.length}"), ("Gaussians", f"{now.gaussians:,}")]
+            if now.evaluated is not None and now.evaluated["psnr"] is not None:
+                rows.append(("held-out PSNR", f"{now.evaluated['psnr']:.2f} dB"))
+            self.viewer.set_scene(now.model(), rows)
+            self._copied = time.monotonic()
+        self.viewer.pump()
+
+    def stay(self) -> None:
+        """Go on showing the trained scene until Ctrl-C."""
+        _tell(self.viewer.url, open_browser=False)
+        try:
+            self.viewer.serve()
+        except KeyboardInterrupt:
+            print()
+        finally:
+            self.viewer.close()
+
+
+def _tell(url: str, open_browser: bool) -> None:
+    print(f"look at {url} in a browser of this machine; Ctrl-C ends it", flush=True)
+    if open_browser:
+        webbrowser.open(url)
+
+
+def _numbers(folder: Path, gaussians: int) -> list[tuple[str, str]]:
+    from hqgs.evaluation.report import REPORT, read_report
+
+    rows = [("Gaussians", f"{gaussians:,}")]
+    if (folder / REPORT).is_file():
+        report: Any = read_report(folder / REPORT)
+        mean = report["metrics"]["mean"]
+        rows += [
+            ("iterations", f"{report.get('iterations', '-')}"),
+            ("method", str(report.get("method", "-"))),
+        ]
+        rows += [
+            (name.upper(), f"{mean[name]:.3f}") for name in ("psnr", "ssim") if mean.get(name) is not None
+        ]
+    return rows

@@ -1,0 +1,237 @@
+"""Renders as files: a picture, a folder of pictures, an MP4 film or a GIF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.files import atomic_path
+from hqgs.base.threads import one_torch_thread
+from hqgs.model.constants import BACKGROUND
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.rasterization import rasterization
+from hqgs.scene.scene import Camera
+
+SHOWN = ("color", "depth", "alpha")
+FILMS = (".mp4", ".gif")
+FPS = 30.0
+CRF = "18"  # of x264: no difference that an eye finds
+SAMPLES = 8  # frames that say which depths a film shows
+DEPTHS = (2, 98)  # percentiles of the depths that get the ends of the colour scale
+Picture = NDArray[np.uint8]
+OnFrame = Callable[[int, int], None]
+
+
+def render_frames(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    out: str | Path,
+    *,
+    fps: float = FPS,
+    show: str = "color",
+    background: Sequence[float] = BACKGROUND,
+    names: Sequence[str] | None = None,
+    progress: OnFrame | None = None,
+) -> Path:
+    """Render what cameras see into a file, which appears when it is complete, or into a folder of pictures.
+
+    Args:
+        gaussians: the scene.
+        cameras: at least 1; for a film, all of one size.
+        out: ends in .mp4 (H.264, with the extra `video`; odd sides lose a pixel), .gif, or .png for a single
+            camera; any other path is a folder, made if it is missing, for one PNG of each camera.
+        fps: frames per second of a film.
+        show: "color", "depth" (near is red, far is blue; one scale for all) or "alpha" (white is opaque).
+        background: R, G, B behind everything, 1 is white.
+        names: of the pictures in a folder, without .png; None: 00000, 00001, ...
+        progress: is called after each frame with how many are done and how many there are.
+
+    Returns:
+        `out`.
+
+    Raises:
+        ValueError: no camera, several for a .png, several sizes for a film, an unknown `show`, a background
+            that is no three numbers, or .mp4 without PyAV.
+        OSError: a file cannot be written; what was there before stays.
+    """
+    out = Path(out)
+    if not cameras:
+        raise ValueError("there is no camera to render")
+    if show not in SHOWN:
+        raise ValueError(f"show is {show!r}, wanted one of: {', '.join(SHOWN)}")
+    if not 0 < fps <= 1000:
+        raise ValueError(f"fps is {fps}, wanted a number above 0 and at most 1000")
+    pictures = _counted(frames(gaussians, cameras, show, background), len(cameras), progress)
+    suffix = out.suffix.lower()
+    if suffix in FILMS:
+        sizes = sorted({(camera.width, camera.height) for camera in cameras})
+        if len(sizes) > 1:
+            each = " and ".join(f"{w} x {h}" for w, h in sizes[:2])
+            raise ValueError(f"{out}: a film has frames of one size, these cameras have {each} px")
+        av = _pyav() if suffix == ".mp4" else None
+        with atomic_path(out) as tmp:
+            if av is None:
+                _write_gif(tmp, pictures, fps)
+            else:
+                _write_mp4(av, tmp, pictures, fps)
+    elif suffix == ".png":
+        if len(cameras) > 1:
+            raise ValueError(f"{out} holds one picture, and there are {len(cameras)}: give a folder")
+        with atomic_path(out) as tmp:
+            Image.fromarray(next(pictures)).save(tmp)
+    else:
+        if out.exists() and not out.is_dir():
+            raise ValueError(f"{out} is a file; wanted a folder, or a path that ends in .mp4, .gif or .png")
+        places = [f"{k:05}" for k in range(len(cameras))] if names is None else names
+        for name, picture in zip(places, pictures, strict=True):
+            with atomic_path(out / f"{name}.png") as tmp:
+                Image.fromarray(picture).save(tmp, compress_level=3)
+    return out
+
+
+def frames(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    show: str = "color",
+    background: Sequence[float] = BACKGROUND,
+) -> Iterator[Picture]:
+    """What each camera sees, [H, W, 3], in turn; see `render_frames`."""
+    if len(background) != 3:
+        raise ValueError(f"background is {background}, wanted three numbers: R, G, B")
+    with torch.no_grad():
+        prepared = Activated(gaussians)
+    if show == "color":
+        yield from (prepared.color(camera, background) for camera in cameras)
+    elif show == "alpha":
+        yield from (_grey(prepared.depth(camera)[1]) for camera in cameras)
+    else:
+        places = np.unique(np.linspace(0, len(cameras) - 1, SAMPLES).round().astype(int))
+        low_high = depth_range([prepared.depth(cameras[k]) for k in places])
+        yield from (depth_picture(*prepared.depth(camera), low_high) for camera in cameras)
+
+
+class Activated:
+    """Gaussians that are rendered many times: activated once, without a gradient history."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        g = gaussians.detached()
+        self.degree = g.sh_degree
+        colors = (g.sh0, g.shN) if g.sh_degree else g.sh0
+        self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
+
+    @torch.no_grad()
+    def color(self, camera: Camera, background: Sequence[float] = BACKGROUND) -> Picture:
+        """[H, W, 3], clipped and rounded to 8 bits."""
+        behind = torch.tensor([[*background]], dtype=self._tensors[0].dtype)
+        with one_torch_thread():
+            image, _, _ = rasterization(
+                *self._tensors, *_of(camera), sh_degree=self.degree, backgrounds=behind
+            )
+            return image[0].mul_(255).round_().clamp_(0, 255).byte().numpy()
+
+    @torch.no_grad()
+    def depth(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Expected depth along the viewing axis, world units, and alpha, both [H, W]."""
+        with one_torch_thread():
+            means, quats, scales, opacities, _ = self._tensors
+            none = means.new_zeros(len(means), 1)
+            image, alpha, _ = rasterization(
+                means, quats, scales, opacities, none, *_of(camera), render_mode="ED"
+            )
+        return image[0, ..., 0].float().numpy(), alpha[0, ..., 0].float().numpy()
+
+
+def depth_range(
+    samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
+) -> tuple[float, float]:
+    """The nearest and farthest depth that pictures of these depths and alphas tell apart."""
+    seen = np.concatenate([depth[alpha > 0.5] for depth, alpha in samples])
+    if not seen.size:
+        return 1.0, 2.0
+    low, high = (max(float(value), 1e-6) for value in np.percentile(seen, DEPTHS))
+    return low, max(high, low * 1.001)
+
+
+def depth_picture(
+    depth: NDArray[np.float32], alpha: NDArray[np.float32], low_high: tuple[float, float]
+) -> Picture:
+    """Depths [H, W] as colours: 1 / depth from red (near) to blue (far), black where nothing is."""
+    from matplotlib import colormaps  # here: it takes a while to load
+
+    low, high = low_high
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near = (1 / depth - 1 / high) / (1 / low - 1 / high)
+    level = np.rint(np.nan_to_num(near, nan=0.0).clip(0, 1) * 255).astype(np.intp)
+    table = np.asarray(colormaps["turbo"](np.arange(256)))[:, :3]
+    return np.rint(255 * table[level] * alpha[..., None].clip(0, 1)).astype(np.uint8)
+
+
+def _grey(alpha: NDArray[np.float32]) -> Picture:
+    level = np.rint(255 * alpha.clip(0, 1)).astype(np.uint8)
+    return np.repeat(level[..., None], 3, axis=2)
+
+
+def _of(camera: Camera) -> tuple[torch.Tensor, torch.Tensor, int, int]:
+    return torch.tensor(camera.viewmat[None]), torch.tensor(camera.K[None]), camera.width, camera.height
+
+
+def _counted(pictures: Iterator[Picture], total: int, progress: OnFrame | None) -> Iterator[Picture]:
+    for done, picture in enumerate(pictures, 1):
+        yield picture
+        if progress is not None:
+            progress(done, total)
+
+
+def _pyav() -> Any:
+    """The module, which is imported when it is used: only films need it."""
+    try:
+        import av
+    except ImportError as error:
+        raise ValueError(
+            f".mp4 needs PyAV, the extra 'video': pip install 'hqgs[video]' ({error}); .gif does not"
+        ) from error
+    return av
+
+
+def _write_mp4(av: Any, path: Path, pictures: Iterator[Picture], fps: float) -> None:
+    first = next(pictures)
+    height, width = (side - side % 2 for side in first.shape[:2])
+    if not (height and width):
+        raise ValueError(f"a film has sides of at least 2 px, these are {first.shape[1]} x {first.shape[0]}")
+    with av.open(str(path), "w", options={"movflags": "+faststart"}) as film:
+        stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": CRF, "preset": "veryfast"}
+
+        def encode(picture: Picture) -> None:
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format="rgb24")
+            for packet in stream.encode(frame):
+                film.mux(packet)
+
+        # The encoder works on a frame while the next one is rendered.
+        with ThreadPoolExecutor(1) as pool:
+            waiting = None
+            for picture in chain([first], pictures):
+                if waiting is not None:
+                    waiting.result()
+                waiting = pool.submit(encode, picture)
+            if waiting is not None:
+                waiting.result()
+        for packet in stream.encode():
+            film.mux(packet)
+
+
+def _write_gif(path: Path, pictures: Iterator[Picture], fps: float) -> None:
+    """GIF counts hundredths of a second; players are slow below two of them."""
+    first, *rest = (Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE) for picture in pictures)
+    length = max(round(100 / fps), 2) * 10
+    first.save(path, save_all=True, append_images=rest, duration=length, loop=0)

@@ -1,0 +1,57 @@
+"""What the writers share: rows that can be written, and an order that puts neighbours side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.model.formats.arrays import Arrays
+
+CURVE_BITS = 10  # of a cell along each axis
+
+
+def finite_rows(arrays: Arrays) -> NDArray[np.bool_]:
+    """Which Gaussians hold no NaN or Inf, and a rotation that is one, [N]."""
+    keep = np.square(arrays["quats"].astype(np.float64)).sum(axis=1) > 0
+    for name in ("means", "scales", "quats", "opacities", "sh0", "shN"):
+        values = arrays[name]
+        keep &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    return keep
+
+
+def pick(arrays: Arrays, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Arrays:
+    """Those rows of each array."""
+    return {
+        "means": arrays["means"][rows],
+        "scales": arrays["scales"][rows],
+        "quats": arrays["quats"][rows],
+        "opacities": arrays["opacities"][rows],
+        "sh0": arrays["sh0"][rows],
+        "shN": arrays["shN"][rows],
+    }
+
+
+def curve_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
+    """The order of points [N, 3] along a Morton curve."""
+    if not len(means):
+        return np.zeros(0, np.intp)
+    points = means.astype(np.float64)
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)  # a few far ones must not make the cells large
+    cells = (points - low) / np.maximum(high - low, np.finfo(np.float64).tiny) * (2**CURVE_BITS - 1)
+    cells = cells.clip(0, 2**CURVE_BITS - 1).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def to_logits(opacities: NDArray[np.floating], step: float) -> NDArray[np.float32]:
+    """Logits of opacities 0..1; 0 and 1 have none and are taken a quarter of a step inwards."""
+    inside = opacities.astype(np.float64).clip(0.25 * step, 1 - 0.25 * step)
+    return np.log(inside / (1 - inside)).astype(np.float32)
+
+
+def to_opacities(logits: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The sigmoid."""
+    return 1 / (1 + np.exp(-logits.astype(np.float64).clip(-700, 700)))

@@ -1,0 +1,1 @@
+"""One page to send: a run's report as HTML, with the scene to fly through."""

@@ -1,0 +1,257 @@
+"""report.html: all of a run in one file that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.files import write_text
+from hqgs.diagnosis.photo import PhotoDiagnosis
+from hqgs.diagnosis.scene import Diagnosis
+from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.records import LearnedRecord, Report, ViewMetricValues
+from hqgs.evaluation.verdict import verdict
+from hqgs.model.gaussians import Gaussians
+from hqgs.page.charts import line_chart
+from hqgs.page.packing import pack_scene
+from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.scene.paths import focus, world_up
+from hqgs.scene.scene import Camera, Scene
+
+TEMPLATES = Path(__file__).parent / "templates"
+SCRIPTS = ("splat_shaders.js", "splats.js")
+PAIRS = 8  # pictures of photo and render: the best, the worst, and some between
+PAIR_SIDE = 720  # px
+LEARNED_SIDE = 1080  # px
+QUALITY = 82  # of JPEG
+VIEWS = 200  # cameras to jump to
+CHARTS = (
+    ("Held-out PSNR", "dB", "psnr", "#2f7fc4"),
+    ("Held-out SSIM", "", "ssim", "#d0672a"),
+    ("Gaussians", "", "gaussians", "#3f9b57"),
+    ("Memory", "MB", "memory_mb", "#8a5fbf"),
+)
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows. Without Gaussians it has no scene to fly through."""
+
+    report: Report
+    scene: Scene
+    gaussians: Gaussians | None
+    views: Sequence[RenderedView] = field(repr=False)
+    diagnosis: Diagnosis | None = None
+    learned: Image.Image | None = None  # what was learned of the photos' cameras
+
+
+def told_verdict(report: Report) -> str:
+    """What came out, in words, with the number that it goes by."""
+    psnr = report["metrics"]["mean"]["psnr"]
+    word, why = verdict(psnr)
+    text = f"Quality: {word}. {why[0].upper()}{why[1:]}."
+    if psnr is None:
+        return text
+    count = len(report["metrics"]["views"])
+    return f"{text} Measured on {count} held-out photo{'s' * (count > 1)}: {psnr:.1f} dB PSNR."
+
+
+def summary_html(report: Report, views: Sequence[RenderedView]) -> str:
+    """The verdict, and the first held-out photo beside its render, as HTML for a notebook."""
+    parts = [
+        Markup("<p>{}: {} iterations, {} Gaussians, {}. {}</p>").format(
+            report["scene"],
+            report["iterations"],
+            report["gaussians"],
+            _time(report["seconds"]),
+            told_verdict(report),
+        )
+    ]
+    for view in views[:1]:
+        pair = _pair(view, None)
+        shown = Markup('<img src="{}" alt="photo" width="45%"> <img src="{}" alt="render" width="45%">')
+        parts.append(shown.format(pair["photo"], pair["render"]))
+    return str(Markup("").join(parts))
+
+
+def write_page(path: str | Path, page: Page) -> None:
+    """Write the page atomically. OSError where it cannot be written."""
+    write_text(path, page_text(page))
+
+
+def page_text(page: Page) -> str:
+    """The page as HTML. Names from files are escaped; nothing in it is loaded from elsewhere."""
+    from jinja2 import Environment, FileSystemLoader  # here: only the page needs it
+
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    report, history = page.report, page.report["history"]
+    measured = {view["name"]: view for view in report["metrics"]["views"]}
+    chosen = _chosen(page.views, measured)
+    charts = [
+        line_chart(name, unit, [(h["seconds"], v) for h in history if (v := h.get(key)) is not None], color)
+        for name, unit, key, color in CHARTS
+    ]
+    diagnosis = page.diagnosis
+    return environment.get_template("report.html.j2").render(
+        title=f"{report['scene']}, {report['method']}",
+        verdict=told_verdict(report),
+        facts=_facts(report, page.scene),
+        report=report,
+        scene=None if page.gaussians is None else _scene(page.scene, page.gaussians),
+        splats=Markup("\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)),
+        pairs=[_pair(view, measured.get(view.name)) for view in chosen],
+        pairs_left=len(page.views) - len(chosen),
+        charts=charts,
+        parts=[] if diagnosis is None else diagnosis.parts,
+        photos=[] if diagnosis is None else [_photo(photo) for photo in diagnosis.photos],
+        learned=[_learned(record) for record in report["learned"]],
+        learned_picture=None if page.learned is None else _jpeg(page.learned, LEARNED_SIDE),
+        left_out=[_left_out(dict(item)) for item in report["left_out"]],
+        notes=report["notes"],
+        environment=_environment(report),
+        config=json.dumps(report["config"], indent=1),
+    )
+
+
+def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
+    mean = report["metrics"]["mean"]
+    facts = [
+        ("PSNR, held out", "-" if mean["psnr"] is None else f"{mean['psnr']:.2f} dB"),
+        ("SSIM, held out", "-" if mean["ssim"] is None else f"{mean['ssim']:.3f}"),
+        ("Gaussians", f"{report['gaussians']:,}"),
+        ("training", _time(report["seconds"])),
+        ("photos trained on", f"{len(scene.train)}"),
+        ("iterations", f"{report['iterations']:,}"),
+    ]
+    if report["peak_rss_mb"] is not None:
+        facts.append(("memory", f"{report['peak_rss_mb']:,.0f} MB"))
+    if report["scene_bytes"] is not None:
+        facts.append(("scene.ply", f"{report['scene_bytes'] / 1e6:.1f} MB"))
+    return facts
+
+
+def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
+    packed = pack_scene(gaussians)
+    views = [*scene.test, *scene.train][:VIEWS]
+    cameras = [view.camera for view in views]
+    middle = focus([view.camera for view in scene.train])
+    note = (
+        f"{packed.gaussians:,} Gaussians, harmonics of degree {packed.sh_degree}, {packed.bytes / 1e6:.1f} MB"
+    )
+    if packed.left_out:
+        note += f"; without {packed.left_out:,} that show least"
+    first = cameras[0]
+    return {
+        "data": packed.data,
+        "head": packed.head,
+        "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
+        "up": world_up([view.camera for view in scene.train]).tolist(),
+        "aspect": f"{first.width} / {first.height}",
+        "note": note,
+    }
+
+
+def _view(camera: Camera, middle: NDArray[np.float64]) -> dict[str, Any]:
+    R, K = camera.viewmat[:3, :3], camera.K
+    away = float(np.linalg.norm(middle - camera.center))
+    ahead = float(R[2] @ (middle - camera.center))
+    return {
+        "R": R.tolist(),
+        "eye": camera.center.tolist(),
+        "fy": K[1, 1] / camera.height,
+        "ratio": K[0, 0] / K[1, 1],
+        "middle": [K[0, 2] / camera.width, K[1, 2] / camera.height],
+        "distance": max(ahead, 0.1 * away, 1e-3),
+    }
+
+
+def _chosen(views: Sequence[RenderedView], measured: dict[str, ViewMetricValues]) -> list[RenderedView]:
+    """Some of the held-out views, evenly from the best to the worst."""
+
+    def psnr(view: RenderedView) -> float:
+        value = measured[view.name]["psnr"] if view.name in measured else None
+        return -np.inf if value is None else value
+
+    ordered = sorted(views, key=psnr, reverse=True)
+    places = np.unique(np.linspace(0, len(ordered) - 1, PAIRS).round().astype(int)) if ordered else []
+    return [ordered[k] for k in places]
+
+
+def _pair(view: RenderedView, metrics: ViewMetricValues | None) -> dict[str, str]:
+    numbers = []
+    if metrics is not None:
+        numbers += [] if metrics["psnr"] is None else [f"{metrics['psnr']:.2f} dB"]
+        numbers += [] if metrics["ssim"] is None else [f"SSIM {metrics['ssim']:.3f}"]
+    return {
+        "name": view.name,
+        "numbers": ", ".join(numbers),
+        "photo": _jpeg(Image.fromarray(to_uint8(as_floats(view.photo)))),
+        "render": _jpeg(Image.fromarray(to_uint8(view.render))),
+    }
+
+
+def _jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
+    picture, file = picture.copy(), io.BytesIO()
+    picture.thumbnail((side, side), Image.Resampling.LANCZOS)
+    picture.save(file, "JPEG", quality=QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def _photo(photo: PhotoDiagnosis) -> tuple[str, ...]:
+    blur = "not told" if photo.blur is None else f"{photo.blur.kind}, {photo.blur.amount:.2f} px"
+    noise = "not told" if photo.noise is None else f"{photo.noise:.1f} levels"
+    quality = "no JPEG seen" if photo.jpeg.quality is None else f"{photo.jpeg.quality}"
+    factor = photo.enlargement.factor
+    return (
+        photo.name,
+        f"{photo.width} x {photo.height}",
+        blur,
+        noise,
+        quality,
+        "no" if factor == 1 else f"x{factor}",
+    )
+
+
+def _learned(record: LearnedRecord) -> tuple[str, ...]:
+    stops = np.log2(record["gains"])
+    shake = f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"
+    return record["name"], shake, f"{stops.mean():+.2f}", *(f"{value:+.2f}" for value in stops - stops.mean())
+
+
+def _left_out(item: dict[str, Any]) -> dict[str, str]:
+    saved = []
+    if "seconds" in item:
+        saved.append(_time(item["seconds"]))
+    if "bytes" in item:
+        saved.append(f"{item['bytes'] / 1e6:.1f} MB")
+    return {
+        "what": item["what"],
+        "why": item["why"],
+        "evidence": item.get("evidence", ""),
+        "saved": ", ".join(saved),
+    }
+
+
+def _environment(report: Report) -> list[tuple[str, str]]:
+    machine, versions = report["machine"], report["versions"]
+    rows = [("seed", str(report["seed"])), ("scene read as", report["source"])]
+    rows += [(name.replace("_", " "), str(value)) for name, value in machine.items() if value is not None]
+    return rows + [
+        (name.replace("_", " "), str(value)) for name, value in versions.items() if value is not None
+    ]
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

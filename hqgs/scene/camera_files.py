@@ -1,0 +1,199 @@
+"""Cameras in files: those of a run, with small photos, and camera paths as nerfstudio has them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.files import atomic_path, write_json
+from hqgs.photos.pixels import to_uint8
+from hqgs.scene.paths import view_matrix, world_up
+from hqgs.scene.scene import Camera, Scene, View
+
+CAMERAS, PHOTOS = "cameras.json", "photos"
+MAX_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to train
+MAX_PIXELS = 1 << 28  # of a camera in a file
+MAX_FRAMES = 100_000
+_FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to OpenCV's
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """A camera of a run, with its photo."""
+
+    name: str
+    camera: Camera
+    held_out: bool
+    photo: Path | None  # as it was trained on, at most 800 px wide and high; None: it is not there
+
+
+@dataclass(frozen=True)
+class RunCameras:
+    """What cameras.json holds."""
+
+    up: NDArray[np.float64]  # [3], unit, world
+    views: list[KnownCamera]  # in the scene's order, held-out ones last
+
+    @property
+    def train(self) -> list[Camera]:
+        """Of the training views."""
+        return [view.camera for view in self.views if not view.held_out]
+
+    @property
+    def test(self) -> list[Camera]:
+        """Of the held-out views."""
+        return [view.camera for view in self.views if view.held_out]
+
+
+def save_cameras(folder: str | Path, scene: Scene) -> None:
+    """Write cameras.json and photos/*.jpg of a scene's views, each atomically."""
+    folder, entries = Path(folder), list[dict[str, Any]]()
+    for number, (view, held_out) in enumerate(
+        [*((view, False) for view in scene.train), *((view, True) for view in scene.test)]
+    ):
+        photo = f"{PHOTOS}/{number:05}.jpg"
+        with atomic_path(folder / photo) as tmp:
+            picture = small_photo(view)
+            picture.save(tmp, quality=88)
+        entries.append(
+            {
+                "name": view.name,
+                "held_out": held_out,
+                "width": view.camera.width,
+                "height": view.camera.height,
+                "K": view.camera.K.tolist(),
+                "world_to_camera": view.camera.viewmat.tolist(),
+                "photo": photo,
+            }
+        )
+    up = world_up([view.camera for view in scene.train])
+    frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
+    write_json(folder / CAMERAS, {"frame": frame, "up": up.tolist(), "views": entries})
+
+
+def small_photo(view: View, most: int = MAX_SIDE) -> Image.Image:
+    """The photo of a view with 8 bits, at most `most` px wide and high."""
+    pixels = view.image if view.image.dtype == np.uint8 else to_uint8(cast(NDArray[np.float32], view.image))
+    picture = Image.fromarray(pixels)
+    picture.thumbnail((most, most), Image.Resampling.LANCZOS)
+    return picture
+
+
+def load_cameras(folder: str | Path) -> RunCameras:
+    """Read cameras.json of a run's folder.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is damaged, or names a photo outside its folder; the message names the file.
+    """
+    folder = Path(folder)
+    path = folder / CAMERAS
+    value = _read_json(path)
+    try:
+        up = np.array(value["up"], np.float64)
+        views = [_known(path, folder, entry) for entry in value["views"]]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: no cameras of a run: {error!r}") from error
+    if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
+        raise ValueError(f"{path}: up is no direction: {value['up']!r:.60}")
+    return RunCameras(up / np.linalg.norm(up), views)
+
+
+def _known(path: Path, folder: Path, entry: Any) -> KnownCamera:
+    name, photo = entry["name"], entry["photo"]
+    if not isinstance(name, str):
+        raise ValueError(f"a name is {name!r:.60}")
+    file = None
+    if photo is not None:
+        parts = PurePosixPath(photo)
+        if parts.is_absolute() or ".." in parts.parts or "\0" in photo:
+            raise ValueError(f"photo {photo!r:.60} leaves the folder")
+        file = folder / parts
+    camera = checked_camera(entry["width"], entry["height"], entry["K"], entry["world_to_camera"])
+    return KnownCamera(name, camera, bool(entry["held_out"]), file)
+
+
+def save_path(path: str | Path, cameras: Sequence[Camera], fps: float = 30.0) -> None:
+    """Write a camera path as JSON, in the style of nerfstudio's camera_path files, atomically.
+
+    Poses are camera to world with OpenGL's axes, in this scene's world; `fov` is vertical, in degrees.
+    Principal points are taken for the middle. ValueError without a camera.
+    """
+    if not cameras:
+        raise ValueError("cameras is empty, wanted at least one")
+    frames = []
+    for camera in cameras:
+        pose = np.eye(4)
+        pose[:3, :3] = camera.viewmat[:3, :3].T @ _FLIP
+        pose[:3, 3] = camera.center
+        fov = math.degrees(2 * math.atan(camera.height / (2 * camera.K[1, 1])))
+        aspect = camera.width * camera.K[1, 1] / (camera.height * camera.K[0, 0])
+        frames.append({"camera_to_world": pose.ravel().tolist(), "fov": fov, "aspect": aspect})
+    head = {
+        "camera_type": "perspective",
+        "render_width": cameras[0].width,
+        "render_height": cameras[0].height,
+        "fps": fps,
+        "seconds": len(cameras) / fps,
+    }
+    write_json(path, head | {"camera_path": frames})
+
+
+def load_path(path: str | Path) -> tuple[list[Camera], float]:
+    """Read a camera path: its cameras, and frames per second.
+
+    Raises FileNotFoundError, or ValueError that names the file.
+    """
+    path = Path(path)
+    value = _read_json(path)
+    try:
+        width, height, fps = value["render_width"], value["render_height"], float(value.get("fps", 30))
+        frames = value["camera_path"]
+        if not 0 < len(frames) <= MAX_FRAMES:
+            raise ValueError(f"{len(frames)} frames")
+        if not 0 < fps <= 1000:
+            raise ValueError(f"fps is {fps}")
+        cameras = [_frame(frame, width, height) for frame in frames]
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{path}: no camera path: {error!r}") from error
+    return cameras, fps
+
+
+def _frame(frame: Any, width: int, height: int) -> Camera:
+    pose = np.array(frame["camera_to_world"], np.float64).reshape(-1, 4)
+    fov = float(frame["fov"])
+    if pose.shape not in ((4, 4), (3, 4)) or not 0 < fov < 180:
+        raise ValueError(f"a pose of shape {list(pose.shape)} with fov {fov}")
+    focal = float(height) / (2 * math.tan(math.radians(fov) / 2))
+    K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    axes = _FLIP @ pose[:3, :3].T
+    with np.errstate(all="ignore"):
+        return checked_camera(width, height, K, view_matrix(axes, pose[:3, 3]))
+
+
+def checked_camera(width: Any, height: Any, K: Any, viewmat: Any) -> Camera:
+    """A pinhole camera of values from a file. ValueError for those that no camera has."""
+    if not all(type(side) is int and side > 0 for side in (width, height)) or width * height > MAX_PIXELS:
+        raise ValueError(f"a picture of {width!r:.20} x {height!r:.20} px")
+    K, viewmat = np.array(K, np.float64), np.array(viewmat, np.float64)
+    if K.shape != (3, 3) or viewmat.shape != (4, 4) or not (np.isfinite(K).all() and K[0, 0] * K[1, 1] > 0):
+        raise ValueError("a camera's K is no pinhole")
+    R = viewmat[:3, :3]
+    if not np.isfinite(viewmat).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise ValueError("a pose is no rotation and translation")
+    return Camera(width, height, K, viewmat)
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error

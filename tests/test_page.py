@@ -1,0 +1,168 @@
+"""report.html: what it says, that it holds all it needs, and that names from files stay text."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from test_ply import random_gaussians
+from tiny_scene import tiny_config, tiny_scene
+
+import hqgs
+from hqgs.page.charts import line_chart
+from hqgs.page.packing import BLOCK, pack_scene
+from hqgs.page.page import Page, page_text, told_verdict
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> hqgs.Run:
+    return hqgs.train(tiny_scene(), out=tmp_path_factory.mktemp("run"), config=tiny_config())
+
+
+def page_of(run: hqgs.Run, **changes: Any) -> Page:
+    return replace(Page(run.report, tiny_scene(), run.model, run.views, None), **changes)
+
+
+def test_a_run_has_its_page(run: hqgs.Run) -> None:
+    assert run.out is not None
+    text = (run.out / "report.html").read_text(encoding="utf-8")
+    mean = run.report["metrics"]["mean"]["psnr"]
+    assert f"{mean:.2f} dB" in text
+    assert f"Measured on 1 held-out photo: {mean:.1f} dB PSNR." in text
+    assert text.count("<svg") == 4
+    assert text.count("<circle") == 4 * len(run.history)
+    assert text.count("data:image/jpeg;base64,") == 2 * len(run.views)
+    assert '"max_gaussians": ' in text.replace("&#34;", '"')
+    assert "does not look at them" in text  # 3dgs diagnoses nothing
+
+
+def test_nothing_is_loaded_from_elsewhere(run: hqgs.Run) -> None:
+    text = page_text(page_of(run))
+    assert "default-src 'none'" in text
+    without_data = re.sub(r'"data:[^"]*"', '""', text)
+    assert not re.search(r'(src|href)\s*=\s*"[^"]', without_data)
+    assert "http" not in re.sub(r"http-equiv", "", without_data)
+
+
+def test_names_from_files_are_text(run: hqgs.Run) -> None:
+    rude = '</script><script>alert(1)</script><img src=x onerror="a()">'
+    scene = tiny_scene()
+    scene = replace(scene, test=[replace(scene.test[0], name=rude)])
+    report: Any = dict(run.report) | {
+        "scene": rude,
+        "notes": [rude],
+        "left_out": [{"what": rude, "why": rude}],
+    }
+    text = page_text(page_of(run, scene=scene, report=report, views=[replace(run.views[0], name=rude)]))
+    assert "alert(1)" in text
+    assert "<script>alert" not in text
+    assert "<img src=x" not in text
+    assert text.count("</script>") == page_text(page_of(run)).count("</script>")
+
+
+def test_a_page_without_scene_views_or_history(run: hqgs.Run) -> None:
+    report: Any = dict(run.report)
+    report["history"] = []
+    report["metrics"] = {"mean": dict.fromkeys(run.report["metrics"]["mean"]), "views": [], "reasons": {}}
+    text = page_text(page_of(run, report=report, gaussians=None, views=[]))
+    assert "<canvas" not in text
+    assert text.count("not measured while it trained") == 4
+    assert told_verdict(report) == "Quality: not measured. No photo was held out: look at the scene."
+
+
+def test_the_diagnosis_is_told(run: hqgs.Run) -> None:
+    scene = tiny_scene()
+    diagnosis = hqgs.diagnose(scene)
+    text = page_text(page_of(run, diagnosis=diagnosis))
+    for part in diagnosis.parts:
+        assert part.reason in text
+    assert "Each of the 5 photos" in text
+
+
+def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
+    assert "What was learned" not in page_text(page_of(run))
+    way = [[0.5 * k, 0.0] for k in range(-4, 5)]
+    learned = [
+        {"name": "a<b>.png", "shake_px": 4.0, "way_px": way, "gains": [2.0, 2.0, 0.5]},
+        {"name": "c.png", "shake_px": 0.0, "way_px": [[0.0, 0.0]] * 9, "gains": [1.0, 1.0, 1.0]},
+    ]
+    report: Any = {**run.report, "learned": learned}
+    sheet = Image.new("RGB", (2000, 100), "white")
+    text = page_text(page_of(run, report=report, learned=sheet))
+    cells = "".join(
+        f"<td>{cell}</td>" for cell in ("a&lt;b&gt;.png", "4.0 px", "+0.33", "+0.67", "+0.67", "-1.33")
+    )
+    assert cells in text
+    assert "<td>c.png</td><td>still</td><td>+0.00</td>" in text
+    assert text.count("data:image/jpeg;base64,") == 2 * len(run.views) + 1
+
+
+@pytest.mark.parametrize(("psnr", "word"), [(31, "very good"), (26, "good"), (21, "fair"), (9, "poor")])
+def test_the_verdict_goes_by_the_held_out_photos(run: hqgs.Run, psnr: float, word: str) -> None:
+    mean = {**run.report["metrics"]["mean"], "psnr": psnr}
+    report: Any = {**run.report, "metrics": {**run.report["metrics"], "mean": mean}}
+    assert told_verdict(report).startswith(f"Quality: {word}. ")
+    assert told_verdict(report).endswith(f" Measured on 1 held-out photo: {psnr:.1f} dB PSNR.")
+
+
+def test_packed_values_are_near(run: hqgs.Run) -> None:
+    """Read by the layout that packing.py states."""
+    g = random_gaussians(1000, 3)
+    g.opacities[:] = 2.0
+    packed = pack_scene(g)
+    head, n = packed.head, 1000
+    assert (packed.gaussians, packed.left_out, packed.sh_degree) == (n, 0, 3)
+    data = gzip.decompress(base64.b64decode(packed.data))
+    assert len(data) == n * (6 + 3 + 4 + 1 + 3 + 45)
+    levels = np.frombuffer(data[: 6 * n], "<u2").reshape(3, n).T
+    low, size = (np.array(head[key]).reshape(-1, 3)[np.arange(n) // BLOCK] for key in ("low", "size"))
+    means = low + size * levels / 65535
+    order = ((means[:, None] - g.means.numpy()[None]) ** 2).sum(2).argmin(1)  # the file has another order
+    assert len(set(order)) == n
+    assert np.abs(means - g.means.numpy()[order]).max() < size.max() / 65535
+    logs = np.frombuffer(data[6 * n : 9 * n], np.uint8).reshape(3, n).T
+    span = head["scales"][1] - head["scales"][0]
+    away = np.abs(head["scales"][0] + span * logs / 255 - g.scales.numpy()[order])
+    assert 0 < away.max() <= span / 510 + 1e-6
+    sh = np.frombuffer(data[17 * n :], np.int8).reshape(45, n).T.reshape(n, 15, 3) / 127
+    for degree, top in enumerate(head["tops"], 1):
+        part = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
+        away = np.abs(top * sh[:, part] - g.shN.numpy()[order][:, part])
+        assert np.quantile(away, 0.99) <= top / 254 + 1e-6
+
+
+def test_50000_gaussians_take_less_than_5_mb() -> None:
+    packed = pack_scene(random_gaussians(50_000, 3))  # noise, which packs worst
+    assert packed.sh_degree == 3
+    assert packed.bytes < 5e6
+
+
+def test_large_and_broken_scenes() -> None:
+    g = random_gaussians(3000, 3)
+    g.opacities[:] = 0.0
+    g.means[5] = torch.nan
+    g.scales[:100] += 9  # the largest show most
+    packed = pack_scene(g, most=120)
+    assert (packed.gaussians, packed.left_out) == (120, 2880)
+    assert packed.head["scales"][1] == pytest.approx(float(g.scales[:100].max()))
+    assert pack_scene(random_gaussians(70_000, 3)).sh_degree == 2
+    assert pack_scene(random_gaussians(4, 0)).head["degree"] == 0
+    g.opacities[:] = -20
+    assert pack_scene(g).gaussians == 0
+
+
+def test_charts() -> None:
+    chart = str(line_chart("A <b>", "dB", [(1, 10), (2, 20), (4, 15)], "#000"))
+    assert "A &lt;b&gt;" in chart
+    x = [float(v) for v in re.findall(r'<circle cx="([\d.]+)"', chart)]
+    y = [float(v) for v in re.findall(r'cy="([\d.]+)"', chart)]
+    assert x[2] - x[1] == pytest.approx(2 * (x[1] - x[0]), abs=0.2)
+    assert (y[0] - y[1]) == pytest.approx(2 * (y[0] - y[2]), abs=0.2)
+    assert "nan" not in str(line_chart("one", "", [(0, 5)], "#000"))

@@ -1,0 +1,155 @@
+"""Backgrounds of any kind, covariances, and leading batch dimensions: what the plain call gives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from scenes import GaussianScene, random_scene
+from torch import Tensor
+
+import hqgs
+
+F32, F64 = torch.float32, torch.float64
+
+
+def batch_of(scenes: list[GaussianScene], shape: tuple[int, ...]) -> dict[str, Any]:
+    """The arguments of scenes of one size, stacked."""
+    names = scenes[0].tensors()
+    joined = {name: torch.stack([getattr(s, name) for s in scenes]).unflatten(0, shape) for name in names}
+    return scenes[0].arguments(**{name: t.clone().requires_grad_(name != "Ks") for name, t in joined.items()})
+
+
+@pytest.mark.parametrize("shape", [(2,), (2, 1), (1, 3), (1,)])
+@pytest.mark.parametrize(("sh_degree", "mode"), [(None, "RGB+ED"), (2, "RGB")])
+def test_a_batch_is_its_scenes_one_by_one(shape: tuple[int, ...], sh_degree: int | None, mode: str) -> None:
+    count = int(torch.tensor(shape).prod())
+    scenes = [
+        random_scene(
+            30, 20, 14, cameras=2, seed=k, dtype=F64, sh_degree=sh_degree, per_camera_colors=not sh_degree
+        )
+        for k in range(count)
+    ]
+    joined = batch_of(scenes, shape)
+    images, alphas, meta = hqgs.rasterization(**joined, render_mode=mode)
+    assert images.shape[: len(shape) + 1] == (*shape, 2)
+    for name in ("means2d", "radii", "depths", "conics", "opacities"):
+        assert meta[name].shape[: len(shape) + 2] == (*shape, 2, 30), name  # type: ignore[literal-required]
+    meta["means2d"].retain_grad()
+    weights = torch.linspace(-1, 1, images.numel(), dtype=F64).view(images.shape)
+    ((images * weights).sum() + 0.3 * alphas.square().sum() + 0.01 * meta["depths"].sum()).backward()
+    works = [0, 0, 0]
+    for k, scene in enumerate(scenes):
+        one = scene.with_grad(*(name for name in scene.tensors() if name != "Ks"))
+        image, alpha, known = hqgs.rasterization(**one.arguments(), render_mode=mode)
+        assert torch.equal(images.flatten(0, len(shape) - 1)[k], image)
+        assert torch.equal(alphas.flatten(0, len(shape) - 1)[k], alpha)
+        known["means2d"].retain_grad()
+        part = weights.flatten(0, len(shape) - 1)[k]
+        ((image * part).sum() + 0.3 * alpha.square().sum() + 0.01 * known["depths"].sum()).backward()
+        for name, leaf in one.tensors().items():
+            if name != "Ks":
+                gradient = joined[name].grad.flatten(0, len(shape) - 1)[k]
+                assert leaf.grad is not None
+                assert torch.equal(gradient, leaf.grad), name
+        assert meta["means2d"].grad is not None
+        assert known["means2d"].grad is not None
+        assert torch.equal(meta["means2d"].grad.flatten(0, len(shape) - 1)[k], known["means2d"].grad)
+        works = [a + b for a, b in zip(works, known["work"], strict=True)]
+    assert list(meta["work"]) == works
+
+
+def test_a_batch_of_pairs_of_harmonics_and_one_background() -> None:
+    scenes = [random_scene(20, 16, 12, seed=k, dtype=F32, sh_degree=1) for k in range(2)]
+    joined = batch_of(scenes, (2,))
+    colors = joined.pop("colors")
+    joined["colors"] = colors[:, :, :1], colors[:, :, 1:]
+    joined["backgrounds"] = (0, 0.5, 1)
+    images = hqgs.rasterization(**joined)[0]
+    for k, scene in enumerate(scenes):
+        alone = scene.arguments(backgrounds=torch.tensor([[0, 0.5, 1]]))
+        assert torch.equal(images[k], hqgs.rasterization(**alone)[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"quats": torch.ones(3, 8, 4)}, "quats: expected shape [2, ...], as means has, got [3, 8, 4]"),
+        ({"opacities": torch.ones(2, 9)}, "opacities: expected shape [8], got [9]"),
+        ({"backgrounds": torch.ones(1, 3)}, "backgrounds: expected shape [2, ...], as means has, got [1, 3]"),
+        ({"Ks": torch.ones(2, 3, 3)}, "Ks: expected shape [1, 3, 3], got [3, 3]"),
+        ({"means": torch.ones(0, 8, 3)}, "means: no scene in a batch of shape [0]"),
+        ({"absgrad": True}, "absgrad: not with leading batch dimensions; call hqgs for each scene"),
+    ],
+)
+def test_wrong_batches_are_refused(change: dict[str, Any], message: str) -> None:
+    scenes = [random_scene(8, 10, 7, seed=k, dtype=F32) for k in range(2)]
+    with pytest.raises((ValueError, NotImplementedError)) as error:
+        hqgs.rasterization(**{**batch_of(scenes, (2,)), **change})
+    assert str(error.value) == message
+
+
+@pytest.mark.parametrize("value", [(0, 0, 0), [[0, 0, 0]], torch.tensor([0, 0, 0]), torch.zeros(1, 3).long()])
+def test_black_is_black_however_it_is_written(value: Any) -> None:
+    scene = random_scene(8, 10, 7, seed=0, dtype=F32)
+    black = hqgs.rasterization(**scene.arguments(backgrounds=torch.zeros(1, 3)))[0]
+    assert torch.equal(hqgs.rasterization(**scene.arguments(backgrounds=value))[0], black)
+    white = hqgs.rasterization(**scene.arguments(backgrounds=(1, 1, 1)))[0]
+    assert not torch.equal(white, black)
+
+
+def covariances(scene: GaussianScene) -> Tensor:
+    """R S S^T R^T, with the rotation matrix of each quaternion written out."""
+    w, x, y, z = torch.nn.functional.normalize(scene.quats, dim=-1).unbind(-1)
+    R = torch.stack(
+        [
+            w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z,
+        ], -1
+    ).unflatten(-1, (3, 3))  # fmt: skip
+    M = R * scene.scales[..., None, :]
+    return M @ M.mT
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(F64, 1e-9), (F32, 2e-4)])
+@pytest.mark.parametrize("batch", [False, True])
+def test_covariances_give_the_picture_of_their_quats_and_scales(
+    dtype: torch.dtype, error: float, batch: bool
+) -> None:
+    scene = random_scene(60, 24, 18, seed=5, dtype=dtype, anisotropy=20.0)
+    arguments = scene.arguments(quats=None, scales=None)
+    covars = covariances(scene)
+    if batch:
+        arguments |= {name: t[None] for name, t in arguments.items() if isinstance(t, Tensor)}
+        covars = covars[None]
+    plain = hqgs.rasterization(**scene.arguments())[0]
+    image = hqgs.rasterization(**arguments, covars=covars)[0]
+    assert (image - plain).abs().max() < error
+    assert plain.std() > 0.05
+
+
+def test_round_flat_and_broken_covariances() -> None:
+    scene = random_scene(4, 24, 18, seed=5, dtype=F64)
+    matrices = torch.stack(
+        [
+            0.04 * torch.eye(3, dtype=F64),
+            torch.diag(torch.tensor([0.04, 0.01, 0.0], dtype=F64)),
+            -torch.eye(3, dtype=F64),
+            torch.full((3, 3), torch.nan, dtype=F64),
+        ]
+    )
+    image, _, meta = hqgs.rasterization(**scene.arguments(), covars=matrices)
+    plain, _, known = hqgs.rasterization(
+        **scene.arguments(
+            quats=torch.tensor([1.0, 0, 0, 0]).double().expand(4, 4),
+            scales=torch.tensor([[0.2] * 3, [0.2, 0.1, 0.0], [0.0] * 3, [torch.nan] * 3], dtype=F64),
+        )
+    )
+    assert torch.equal(meta["radii"], known["radii"])
+    assert (image - plain).abs().max() < 1e-9
+    gradients = scene.with_grad("means", "colors")
+    hqgs.rasterization(**gradients.arguments(), covars=matrices)[0].sum().backward()
+    assert gradients.means.grad is not None
+    assert gradients.means.grad.isfinite().all()
