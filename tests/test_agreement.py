@@ -18,7 +18,7 @@ def test_wrong_guesses_are_moved_to_the_surface() -> None:
     assert scene.seen is not None
     views = scene.train
     rng = np.random.default_rng(0)
-    pixels = rng.integers(20, 76, (200, 2)) + 0.5
+    pixels = rng.integers(20, 76, (200, 2)).astype(np.float64) + 0.5
     guesses = rng.uniform(0.75, 1.35, 200)  # the plane is at depth 1
     depths, agreed = Agreement(views, scene.seen).depths(3, pixels, guesses)
     assert agreed.mean() > 0.9
@@ -34,7 +34,8 @@ def on_plane(view: View, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_flat_and_contradicting_photos_do_not_agree() -> None:
     scene = textured_scene(8, 96)
     assert scene.seen is not None
-    pixels, guesses = np.random.default_rng(0).integers(20, 76, (100, 2)) + 0.5, np.ones(100)
+    pixels = np.random.default_rng(0).integers(20, 76, (100, 2)).astype(np.float64) + 0.5
+    guesses = np.ones(100)
     flat = [replace(view, image=np.full_like(view.image, 128)) for view in scene.train]
     assert not Agreement(flat, scene.seen).depths(3, pixels, guesses)[1].any()
     rng = np.random.default_rng(1)
