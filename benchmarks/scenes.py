@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from hqgs.base.files import is_room
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.builtin import embedded_scene, room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.formats.degradation_json import FILE
 from hqgs.scene.formats.llff import hold_marker
@@ -42,6 +43,8 @@ def load_scenes(
             folder = cache / f"{source}_{width}x{height}_{embedded[2]}"
             made = embedded_scene(folder, width, height, num_views=embedded[2], gloss=BUILT_IN[source])
             scene = replace(made, name=str(source))
+        elif is_room(source):
+            scene = replace(room(source, cache / f"{source}_x{downscale:g}", downscale), name=str(source))
         else:
             if (source / FILE).is_file():
                 raise ValueError(f"{source} holds degraded photos; give the folder of the clean ones")

@@ -165,7 +165,9 @@ def test_bad_poses_file(tmp_path: Path, kind: str) -> None:
 
 def test_unknown_folder_says_what_was_looked_for_and_found(tmp_path: Path) -> None:
     (tmp_path / "holiday.txt").touch()
-    with pytest.raises(ValueError, match=r"looked for a COLMAP model.*poses_bounds\.npy; found holiday\.txt"):
+    with pytest.raises(
+        ValueError, match=r"no scene \(a COLMAP model.*poses_bounds\.npy\); it holds holiday\.txt"
+    ):
         load_scene(tmp_path)
     with pytest.raises(ValueError, match="is a file"):
         load_scene(tmp_path / "holiday.txt")

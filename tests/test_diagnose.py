@@ -209,6 +209,8 @@ def test_report_is_json_and_names_every_part() -> None:
     found = diagnose_scene(scene)
     assert json.loads(json.dumps(asdict(found), allow_nan=False))["formation"] == found.formation
     assert [(name, needed) for name, needed, _ in found.needs()] == [
+        ("exposure", False),
+        ("shake", False),
         ("blur", False),
         ("lowres", True),
         ("noise", False),

@@ -126,7 +126,7 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
         return Trainer(scene, tiny_config(method="hqgs", hqgs=hqgs))
 
     started = trainer(sparse)
-    assert len(started.gaussians) == int(0.2 * pixels) > 3 * 20
+    assert 3 * 20 < len(started.gaussians) <= int(0.2 * pixels)
     np.testing.assert_array_equal(started.gaussians.means[:20].detach().numpy(), sparse.points)
     assert "first points along edges" not in told(started)
     (note,) = json.loads(run_report(started, tmp_path))["notes"]

@@ -16,7 +16,9 @@ from filelock import FileLock, Timeout
 
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
-EMBEDDED = "embedded"  # in the place of a scene folder: the scene that is built in
+EMBEDDED, SPARSE = "embedded", "sparse"
+# In the place of a scene folder: what is built in. Those of a true camera may have a value, `true-shake:8`.
+ROOMS = (EMBEDDED, SPARSE, "true-shake", "true-defocus", "true-rolling", "true-exposure")
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
@@ -146,3 +148,8 @@ def remove_leftovers(path: str | Path) -> None:
     for pattern in (f".{path.stem}.*{path.suffix}", SAFETENSORS_TMP):
         for leftover in path.parent.glob(pattern):
             leftover.unlink()
+
+
+def is_room(name: str | Path) -> bool:
+    """Whether this names a built-in scene."""
+    return str(name).partition(":")[0] in ROOMS

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.files import EMBEDDED, existing_folder, is_film
+from hqgs.base.files import existing_folder, is_film, is_room
 from hqgs.cli.errors import fail
 
 if TYPE_CHECKING:
@@ -40,14 +40,14 @@ class Photos:
 
     scene: SceneName
     """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
-    'embedded', the room that is built in."""
+    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-rolling or true-exposure."""
     downscale: Factor = None
     """Divide the photos' sides by F."""
 
 
 def ready(scene: str) -> None:
     """Tell a wrong path at once; then load what takes seconds, after which SIGTERM counts as Ctrl-C."""
-    if scene != EMBEDDED and not is_film(scene):
+    if not is_room(scene) and not is_film(scene):
         existing_folder(scene)
     warnings.filterwarnings(
         "ignore", category=FutureWarning, message=".*torch.jit"

@@ -11,6 +11,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import QhullError
 
+from hqgs.model.consistency import Agreement
 from hqgs.photos.edges import edge_magnitude
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
@@ -25,7 +26,12 @@ Colors = NDArray[np.uint8]
 
 
 def points_along_edges(
-    views: Sequence[View], points: Points, seen: Mapping[str, NDArray[np.intp]], count: int, seed: int
+    views: Sequence[View],
+    points: Points,
+    seen: Mapping[str, NDArray[np.intp]],
+    count: int,
+    seed: int,
+    agreement: Agreement | None = None,
 ) -> tuple[Points, Colors]:
     """About `count` points [M, 3] (world) under pixels of the photos, and those pixels' colours [M, 3].
 
@@ -41,6 +47,8 @@ def points_along_edges(
         seen: by the view's name, which rows of `points` it sees; a view that is not there sees none.
         count: at least 0.
         seed: of the draw. Each view has its own numbers, whatever the others are.
+        agreement: of the same views: depths are moved to where other photos agree best, and points that they
+            do not agree with are left out. Guessed depths are far off where views are far apart.
     """
     found, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
     for k, view in enumerate(views):
@@ -52,6 +60,9 @@ def points_along_edges(
         depths = _depths(view, points[rows].astype(np.float64), pixels)
         if depths is None:
             continue
+        if agreement is not None:
+            depths, agreed = agreement.depths(k, pixels, depths)
+            pixels, depths = pixels[agreed], depths[agreed]
         found.append(unproject(view.camera, pixels, depths).astype(np.float32))
         columns, lines = pixels.astype(np.intp).T
         colors.append(to_uint8(as_floats(view.image)[lines, columns]))

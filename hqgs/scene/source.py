@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hqgs.base.files import CONFIG, EMBEDDED, KEPT, is_film
+from hqgs.base.files import CONFIG, KEPT, is_film, is_room
 from hqgs.base.stages import OnStage, untold
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import film_frames
 from hqgs.scene.load import load_pictures, load_scene
@@ -22,8 +22,7 @@ from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 
-EMBEDDED_SIZE = (504, 378)  # pixels
-EMBEDDED_TEST_EVERY = 8
+ROOM_TEST_EVERY = 8
 
 
 def load(
@@ -45,14 +44,15 @@ def load(
 
     Args:
         path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
-            Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or "embedded", the room that is built in
-            (504 x 378 px, 24 views).
+            Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or a scene that is built in
+            (`hqgs.scene.builtin.room`): "embedded", "sparse", "true-shake", "true-defocus", "true-rolling"
+            or "true-exposure".
         downscale: divide the photos' sides by this, at least 1.
         test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
         sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
         degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
-        seed: of the degradation.
+        seed: of the degradation, and of what a built-in camera does.
         restore: weights of an image network that the training photos go through at last.
         skip_unreadable: leave out training photos that cannot be read, as long as at least half of them can;
             `Scene.notes` names them. False: an error.
@@ -71,7 +71,7 @@ def load(
         ValueError: anything else that is wrong; the message names the file or the photo.
     """
     origin = {
-        "path": EMBEDDED if str(path) == EMBEDDED else str(Path(path).resolve()),
+        "path": str(path if is_room(path) else Path(path).resolve()),
         "downscale": downscale,
         "test_every": test_every,
         "sfm": sfm,
@@ -85,15 +85,12 @@ def load(
     degradation = parse_degradation(degrade)
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
-    if str(path) == EMBEDDED:
-        if not downscale >= 1:
-            raise ValueError(f"downscale must be at least 1, got {downscale}")
-        if test_every != EMBEDDED_TEST_EVERY:
+    if is_room(path):
+        if test_every != ROOM_TEST_EVERY:
             raise ValueError(
-                f"test_every is {test_every}, but the embedded scene holds out every {EMBEDDED_TEST_EVERY}th"
+                f"test_every is {test_every}, but built-in scenes hold out every {ROOM_TEST_EVERY}th"
             )
-        width, height = (round(size / downscale) for size in EMBEDDED_SIZE)
-        scene = embedded_scene(cache=None if kept is None else kept / "scene", width=width, height=height)
+        scene = room(path, None if kept is None else kept / "scene", downscale, seed)
     else:
         with ExitStack() as stack:
             notes, name = list[str](), None
@@ -141,7 +138,7 @@ def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = 
 
     Of photos alone some are read, spread over the folder.
     """
-    if str(path) != EMBEDDED:
+    if not is_room(path):
         with TemporaryDirectory(prefix="hqgs-film-") as name:
             source = film_frames(Path(path), Path(name))[0] if is_film(path) else path
             if (scene := load_pictures(source, downscale)) is not None:

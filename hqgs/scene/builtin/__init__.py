@@ -1,5 +1,6 @@
 """The embedded scene: a ray-cast room that needs no download and holds no Gaussian."""
 
+from hqgs.scene.builtin.rooms import room
 from hqgs.scene.builtin.scene import embedded_cameras, embedded_scene
 from hqgs.scene.builtin.shading import render_depth, render_view
 from hqgs.scene.builtin.sparse import sparse_room
@@ -11,6 +12,7 @@ __all__ = [
     "embedded_scene",
     "render_depth",
     "render_view",
+    "room",
     "sparse_room",
     "wild_room",
 ]

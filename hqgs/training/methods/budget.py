@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from hqgs.base.left_out import LeftOut
+from hqgs.model.consistency import Agreement
 from hqgs.model.first_points import Colors, Points, points_along_edges
 from hqgs.scene.scene import Scene
 from hqgs.training.config import DensifyConfig
@@ -59,7 +60,8 @@ def with_budget(
 
 
 def first_points(scene: Scene, wanted: int, seed: int) -> tuple[Points, Colors, list[LeftOut]]:
-    """The scene's points and more along the photos' edges, `wanted` in all; and why there are no more."""
+    """The scene's points and more along the photos' edges that other photos agree with, at most `wanted` in
+    all; and why there are no more."""
     what, points, colors = "first points along edges", scene.points, scene.point_colors
     if not wanted:
         return points, colors, []
@@ -69,7 +71,8 @@ def first_points(scene: Scene, wanted: int, seed: int) -> tuple[Points, Colors, 
     if len(points) >= wanted:
         why = f"it has {len(points)} points for {wanted} that are called for"
         return points, colors, [LeftOut(what, why)]
-    more = points_along_edges(scene.train, points, scene.seen, wanted - len(points), seed)
+    agreement = Agreement(scene.train, scene.seen)
+    more = points_along_edges(scene.train, points, scene.seen, wanted - len(points), seed, agreement)
     return np.concatenate([points, more[0]]), np.concatenate([colors, more[1]]), []
 
 

@@ -7,7 +7,7 @@ cannot tell is fixed by construction: the mean of a way is the photo's pose, the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,10 +128,7 @@ class LearnedCameras:
         """What ages, and which photos stand still from now on."""
         number = self._numbers[view.name]
         if self._gains:
-            with torch.no_grad():
-                mean = torch.stack(self._gains).mean(0)
-                for gains in self._gains:
-                    gains -= mean
+            _center(self._gains)
         if not self._paths:
             return
         self._active = iteration >= self._begin
@@ -216,6 +213,14 @@ def _steps(path: Tensor, count: int) -> Tensor:
     t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
     square = t.square()
     return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+
+
+@torch.no_grad()
+def _center(tensors: Sequence[Tensor]) -> None:
+    """Take their mean off each."""
+    mean = torch.stack([*tensors]).mean(0)
+    for tensor in tensors:
+        tensor -= mean
 
 
 def _middle(path: Tensor) -> Tensor:

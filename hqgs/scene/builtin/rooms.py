@@ -1,0 +1,34 @@
+"""The built-in scenes by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from hqgs.base.files import EMBEDDED, SPARSE
+from hqgs.scene.builtin.scene import embedded_scene
+from hqgs.scene.builtin.sparse import sparse_room
+from hqgs.scene.builtin.wild import parse_true_kind, wild_room
+from hqgs.scene.scene import Scene
+
+SIZE = (504, 378)  # px, of the photos where nothing else is said
+
+
+def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, seed: int = 0) -> Scene:
+    """A built-in scene with photos of 504 x 378 px, divided by `downscale`.
+
+    "embedded": `embedded_scene`; "sparse": few photos from far apart (`sparse_room`); "true-shake[:PX]",
+    "true-defocus[:R]", "true-rolling[:PX]", "true-exposure[:EV]": training photos that a camera has truly
+    taken so, held-out ones clean (`wild_room`, with `seed`). `cache` keeps what was made. ValueError for an
+    unknown name, a value or a downscale out of range.
+    """
+    text = str(name)
+    if not downscale >= 1:
+        raise ValueError(f"downscale must be at least 1, got {downscale}")
+    width, height = (round(side / downscale) for side in SIZE)
+    if text == EMBEDDED:
+        return embedded_scene(cache, width, height)
+    if text == SPARSE:
+        return sparse_room(cache, width, height)
+    parse_true_kind(text, width)  # its errors name the kinds and values there are
+    return replace(wild_room(text, seed, cache, width, height).scene, name=text.replace(":", "-"))

@@ -1,0 +1,44 @@
+"""Depths that other photos agree with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from test_learned_cameras import textured_scene
+
+from hqgs.model.consistency import Agreement
+from hqgs.scene.geometry import project, unproject
+from hqgs.scene.scene import View
+
+
+def test_wrong_guesses_are_moved_to_the_surface() -> None:
+    scene = textured_scene(8, 96)
+    assert scene.seen is not None
+    views = scene.train
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(20, 76, (200, 2)).astype(np.float64) + 0.5
+    guesses = rng.uniform(0.75, 1.35, 200)  # the plane is at depth 1
+    depths, agreed = Agreement(views, scene.seen).depths(3, pixels, guesses)
+    assert agreed.mean() > 0.9
+    points = unproject(views[3].camera, pixels[agreed], depths[agreed])
+    found, true = (project(views[0].camera, p)[0] for p in (points, on_plane(views[3], pixels[agreed])))
+    assert np.median(np.abs(found - true)) < 0.5  # px
+
+
+def on_plane(view: View, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    return unproject(view.camera, pixels, np.ones(len(pixels)))
+
+
+def test_flat_and_contradicting_photos_do_not_agree() -> None:
+    scene = textured_scene(8, 96)
+    assert scene.seen is not None
+    pixels = np.random.default_rng(0).integers(20, 76, (100, 2)).astype(np.float64) + 0.5
+    guesses = np.ones(100)
+    flat = [replace(view, image=np.full_like(view.image, 128)) for view in scene.train]
+    assert not Agreement(flat, scene.seen).depths(3, pixels, guesses)[1].any()
+    rng = np.random.default_rng(1)
+    noise = [replace(v, image=rng.integers(0, 256, v.image.shape).astype(np.uint8)) for v in scene.train]
+    assert Agreement(noise, scene.seen).depths(3, pixels, guesses)[1].mean() < 0.2
+    assert not Agreement(scene.train[:2], scene.seen).depths(0, pixels, guesses)[1].any()
