@@ -14,7 +14,8 @@ const KNEE_LIGHT: f64 = 0.003_130_8;
 const POWER: f64 = 2.4;
 const SHIFT: f64 = 0.055;
 
-/// Values between 0 and 1 for f32, by linear interpolation: off by less than 1e-7 of white.
+/// Values between 0 and 1 for f32, by linear interpolation: light is off by less than 1e-7 of white, values by less
+/// than 1e-6.
 #[derive(Debug)]
 pub struct Tables {
     /// The light of `i / STEPS`.
@@ -156,7 +157,7 @@ mod tests {
                 "{x}"
             );
             assert!(
-                (f64::from((x as f32).to_value(tables)) - value(x)).abs() < 2e-7,
+                (f64::from((x as f32).to_value(tables)) - value(x)).abs() < 1e-6,
                 "{x}"
             );
         }
