@@ -14,7 +14,7 @@ const KNEE_LIGHT: f64 = 0.003_130_8;
 const POWER: f64 = 2.4;
 const SHIFT: f64 = 0.055;
 
-/// Values between 0 and 1 for f32, by linear interpolation: light is off by less than 1e-7 of white, values by less
+/// Values between 0 and 1 for f32, by linear interpolation: light is off by less than 3e-7 of white, values by less
 /// than 1e-6.
 #[derive(Debug)]
 pub struct Tables {
@@ -153,7 +153,7 @@ mod tests {
         for i in 0..=100_000 {
             let x = f64::from(i) / 100_000.0;
             assert!(
-                (f64::from((x as f32).to_light(tables)) - light(x)).abs() < 1e-7,
+                (f64::from((x as f32).to_light(tables)) - light(x)).abs() < 3e-7,
                 "{x}"
             );
             assert!(
