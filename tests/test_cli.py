@@ -27,8 +27,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     calls: list[dict[str, Any]] = []
 
     def room(name: str, cache: Path | None, downscale: float, seed: int) -> Scene:
-        if downscale < 1:
-            raise ValueError(f"downscale must be at least 1, got {downscale}")
         calls.append({"name": name, "cache": cache, "downscale": downscale})
         return tiny_scene()
 

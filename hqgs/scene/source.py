@@ -86,6 +86,8 @@ def load(
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
     if is_room(path):
+        if not downscale >= 1:
+            raise ValueError(f"downscale must be at least 1, got {downscale}")
         if test_every != ROOM_TEST_EVERY:
             raise ValueError(
                 f"test_every is {test_every}, but built-in scenes hold out every {ROOM_TEST_EVERY}th"

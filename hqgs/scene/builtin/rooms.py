@@ -20,11 +20,9 @@ def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, se
     "embedded": `embedded_scene`; "sparse": few photos from far apart (`sparse_room`); "true-shake[:PX]",
     "true-defocus[:R]", "true-rolling[:PX]", "true-exposure[:EV]": training photos that a camera has truly
     taken so, held-out ones clean (`wild_room`, with `seed`). `cache` keeps what was made. ValueError for an
-    unknown name, a value or a downscale out of range.
+    unknown name or a value out of range.
     """
     text = str(name)
-    if not downscale >= 1:
-        raise ValueError(f"downscale must be at least 1, got {downscale}")
     width, height = (round(side / downscale) for side in SIZE)
     if text == EMBEDDED:
         return embedded_scene(cache, width, height)
