@@ -299,6 +299,15 @@ def test_ways_are_learned_and_the_scene_gets_sharper() -> None:
     assert learned.history[-1]["psnr"] > plain.history[-1]["psnr"] + 0.5  # type: ignore[operator]
 
 
+@pytest.mark.parametrize("formation", ["exposure+lowres:2", "exposure+shake+blur:1+noise:5", "shake+jpeg:30"])
+def test_other_steps_come_after_the_camera(formation: str) -> None:
+    scene = tiny_scene()
+    trainer = run(hqgs.degrade(scene, formation), formation, iterations=20)
+    assert trainer.guard.skipped == 0
+    assert trainer.config.hqgs.formation == formation
+    assert len(trainer.method.found()) == len(scene.train)
+
+
 def test_without_photos_to_hold_back_a_run_has_a_length() -> None:
     config = replace(learned_config("shake"), leave_out=("photos", "iterations"), iterations=30_000).scaled()
     trainer = Trainer(tiny_scene(), config)

@@ -118,7 +118,7 @@ class LearnedCameras:
                 gains = self._gains[number].exp()
             full = None if near is None else _enlarged(near, size).to(render)
             taken = take_photo(render, size, full, warps, gains)
-            if self._gains:  # what the sensor could not hold may be brighter than the photo
+            if self._gains and photo.shape == taken.shape:  # what the sensor could not hold may be brighter
                 taken = torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
             return taken
 
