@@ -73,7 +73,7 @@ class LiveView:
         from hqgs.viewer.viewer import Viewer
 
         save_cameras(out, scene)
-        self.viewer = Viewer(load_cameras(out), out, port=port, title=scene.name)
+        self.viewer: Viewer = Viewer(load_cameras(out), out, port=port, title=scene.name)
         self._copied = -EVERY
         _tell(self.viewer.url, open_browser)
 

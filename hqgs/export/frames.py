@@ -124,7 +124,7 @@ class Activated:
 
     def __init__(self, gaussians: Gaussians) -> None:
         g = gaussians.detached()
-        self.degree = g.sh_degree
+        self.degree: int = g.sh_degree
         colors = (g.sh0, g.shN) if g.sh_degree else g.sh0
         self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
 

@@ -49,7 +49,7 @@ class Viewer:
         self._keys: list[Camera] = []
         self._stats = ""
         self._server = start_server(port, title)
-        self.url = f"http://127.0.0.1:{self._server.get_port()}"
+        self.url: str = f"http://127.0.0.1:{self._server.get_port()}"
         self._up = np.array(UP) if known is None else known.up
         self._server.scene.set_up_direction(self._up)
         self._server.scene.world_axes.visible = False
