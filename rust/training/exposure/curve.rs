@@ -4,7 +4,7 @@
 
 use crate::simd::Real;
 use std::{
-    ops::{Add, AddAssign, Div, Mul, Sub},
+    ops::{Add, AddAssign, Div, Mul, MulAssign, Sub},
     sync::OnceLock,
 };
 
@@ -72,6 +72,7 @@ pub trait Light:
     + Mul<Output = Self>
     + Div<Output = Self>
     + AddAssign
+    + MulAssign
 {
     /// Of a value, white at 1.
     fn to_light(self, tables: &Tables) -> Self;

@@ -186,7 +186,7 @@ impl<T: Light> Photograph<T> {
                 let values = self.image[at * 3..].chunks_exact(3);
                 for ((v, light), value) in v.chunks_exact_mut(3).zip(pixels).zip(values) {
                     for c in 0..3 {
-                        v[c] = v[c] * value[c].light_slope(light[c]);
+                        v[c] *= value[c].light_slope(light[c]);
                     }
                 }
             });
