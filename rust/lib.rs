@@ -50,6 +50,8 @@
 //! 4. `composite`: the splats of each tile are blended into pixels;
 //! 5. [`training`]: the loss of the picture, and the step of the optimizer.
 //!
+//! Before the first step, `stereo` finds where photos agree on a surface, for points to start from.
+//!
 //! [`render`] is the whole way of one image, there and back. Each stage has its forward function and its
 //! vector-Jacobian product side by side.
 //!
@@ -60,6 +62,7 @@ mod composite;
 mod project;
 pub mod render;
 pub mod scene;
+mod stereo;
 mod tiles;
 pub mod training;
 
@@ -90,6 +93,7 @@ pub mod internals {
         counts,
         project,
         simd,
+        stereo,
         threads,
         tiles
     );

@@ -1,4 +1,4 @@
-"""Whether photos agree on where a pixel's surface is: a small sweep of its depth, judged by other photos."""
+"""Whether photos agree on where a pixel's surface is: a sweep of its depth, judged by other photos."""
 
 from __future__ import annotations
 
@@ -6,71 +6,68 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
+from hqgs import _rust
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.geometry import project, unproject
-from hqgs.scene.scene import View
+from hqgs.photos.resize import area_downscale
+from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
 
+LONGEST = 800  # px: larger photos are looked at in a smaller copy
 SMOOTH = 1.0  # px, before patches are compared: of noise there is less then
-REACH, STEPS = 1.6, 15  # of the nearness to either side of the guess, and how many are tried
-PATCH, STRIDE = 2, 1.5  # samples to each side of a patch's middle, and px between them
 NEIGHBOURS, AGREEING = 4, 2  # photos that are asked, and how many of them must agree
 AGREED = 0.6  # correlation of the patches
-FLAT = 1e-4  # variance of a patch, where 1 is white squared, below which it tells nothing
 
 
 class Agreement:
     """The training photos as they are asked."""
 
     def __init__(self, views: Sequence[View], seen: Mapping[str, NDArray[np.intp]]) -> None:
-        self._views = views
-        self._grey = [
-            gaussian_filter(as_floats(view.image).mean(2).astype(np.float64), SMOOTH) for view in views
-        ]
+        """`seen`: by the view's name, which points it sees. Views that share most are asked first."""
+        self._cameras, self._grey = [], []
+        for view in views:
+            camera, grey = _small(view)
+            self._cameras.append(camera)
+            self._grey.append(grey)
+        self._scales = [c.width / v.camera.width for c, v in zip(self._cameras, views, strict=True)]
         sets = [set(seen.get(view.name, np.zeros(0, np.intp)).tolist()) for view in views]
         self._shared = np.array([[len(a & b) for b in sets] for a in sets])
         np.fill_diagonal(self._shared, -1)
 
-    def depths(self, number: int, pixels: Floats, guesses: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Depths [M] of pixels [M, 2] of a view near their guesses [M], and where other photos agree."""
-        view = self._views[number]
+    def depths(self, number: int, pixels: Floats, ranges: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where other photos agree."""
         order = np.argsort(-self._shared[number], kind="stable")
         others = [int(k) for k in order[: min(NEIGHBOURS, len(order) - 1)]]
         if len(others) < AGREEING:
-            return guesses, np.zeros(len(guesses), bool)
-        steps = STRIDE * np.arange(-PATCH, PATCH + 1)
-        offsets = np.stack(np.meshgrid(steps, steps), -1).reshape(-1, 2)  # [S, 2]
-        mine = self._sample(number, pixels[:, None] + offsets)
-        spread = mine.var(1)
-        mine = mine - mine.mean(1, keepdims=True)
-        best, found = np.full(len(pixels), -1.0), guesses.copy()
-        for factor in np.geomspace(1 / REACH, REACH, STEPS):
-            depths = guesses * factor
-            corners = np.repeat(depths, len(offsets))
-            points = unproject(view.camera, (pixels[:, None] + offsets).reshape(-1, 2), corners)
-            scores = []
-            for k in others:
-                where, front = project(self._views[k].camera, points)
-                theirs = self._sample(k, where.reshape(len(pixels), -1, 2))
-                theirs[(front <= 0).reshape(theirs.shape)] = np.nan
-                theirs = theirs - theirs.mean(1, keepdims=True)
-                norm = np.sqrt((mine**2).sum(1) * (theirs**2).sum(1))
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    scores.append(np.nan_to_num((mine * theirs).sum(1) / norm, nan=-1.0))
-            score = np.sort(scores, axis=0)[-AGREEING:].mean(0)
-            better = score > best
-            best, found = np.where(better, score, best), np.where(better, depths, found)
-        return found, (best >= AGREED) & (spread > FLAT)
+            return ranges[:, 0], np.zeros(len(ranges), bool)
+        depths, scores = _rust.agreed_depths(
+            self._grey[number],
+            [self._grey[k] for k in others],
+            np.stack([_map(self._cameras[number], self._cameras[k]) for k in others]),
+            np.ascontiguousarray(pixels * self._scales[number]),
+            np.ascontiguousarray(ranges),
+            AGREEING,
+        )
+        return depths, scores >= AGREED
 
-    def _sample(self, number: int, where: Floats) -> Floats:
-        """The photo at [..., 2], x and y; NaN outside."""
-        grey = self._grey[number]
-        height, width = grey.shape[0], grey.shape[-1]
-        x, y = where[..., 0] - 0.5, where[..., 1] - 0.5
-        with np.errstate(invalid="ignore"):
-            inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        values = map_coordinates(grey, [np.where(inside, y, 0), np.where(inside, x, 0)], order=1)
-        return np.where(inside, values, np.nan)
+
+def _small(view: View) -> tuple[Camera, NDArray[np.float32]]:
+    """The view's camera and photo [h, w] as they are compared."""
+    camera, image = view.camera, view.image
+    factor = max(camera.width, camera.height) / LONGEST
+    if factor > 1:
+        width, height = (max(1, round(side / factor)) for side in (camera.width, camera.height))
+        image, _ = area_downscale(image, None, width, height)
+        K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+        camera = Camera(width, height, K, camera.viewmat)
+    grey = as_floats(image).mean(2, dtype=np.float32)
+    return camera, np.ascontiguousarray(gaussian_filter(grey, SMOOTH), np.float32)
+
+
+def _map(first: Camera, second: Camera) -> Floats:
+    """The matrix [3, 4] that takes (x, y, 1, 1 / depth) of a pixel of the first camera to the second's."""
+    relative = second.viewmat @ np.linalg.inv(first.viewmat)
+    turn = second.K @ relative[:3, :3] @ np.linalg.inv(first.K)
+    return np.concatenate([turn, (second.K @ relative[:3, 3])[:, None]], 1)

@@ -17,9 +17,11 @@ def unproject(
     camera: Camera, pixels: NDArray[np.float64], depths: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Points [M, 3], world, at view-space `depths` [M] behind `pixels` [M, 2], x and y."""
-    in_camera = np.linalg.solve(camera.K, np.stack([*pixels.T, np.ones(len(pixels))])) * depths
-    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
-    return (in_camera - t[:, None]).T @ R
+    # Written out: BLAS would start threads for this, which cost more than the work.
+    R, K = camera.viewmat[:3, :3], camera.K
+    x, y = (pixels[:, 0] - K[0, 2]) / K[0, 0] * depths, (pixels[:, 1] - K[1, 2]) / K[1, 1] * depths
+    x, y, z = x - camera.viewmat[0, 3], y - camera.viewmat[1, 3], depths - camera.viewmat[2, 3]
+    return np.stack([x * R[0, i] + y * R[1, i] + z * R[2, i] for i in range(3)], axis=1)
 
 
 def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -27,10 +29,11 @@ def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.flo
 
     Nothing is left out: pixels of points behind the camera mean nothing, and are not finite at depth 0.
     """
-    inside = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    depths = inside[:, 2]
+    V, K = camera.viewmat, camera.K
+    # Written out: BLAS would start threads for this, which cost more than the work.
+    x, y, depths = (sum(points[:, j] * V[i, j] for j in range(3)) + V[i, 3] for i in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return (inside @ camera.K.T)[:, :2] * (1 / depths)[:, None], depths
+        return np.stack([x * K[0, 0] / depths + K[0, 2], y * K[1, 1] / depths + K[1, 2]], axis=1), depths
 
 
 def median_depth(scene: Scene, view: View) -> float:

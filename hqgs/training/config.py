@@ -24,7 +24,7 @@ ITEMS = {
     "resolution": "full resolution in the first part of the run",
     "iterations": "the rest of a run that has stopped improving",
 }
-ASKED_FOR = ("resolution", "iterations")  # not automatic: the first costs, a number of iterations means it
+ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 CLOSEST = 50  # iterations between evaluations, unless asked for: each one takes as long as some steps
@@ -216,6 +216,7 @@ class TrainConfig:
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
+    start_points: int = 100_000  # to start from at most, where photos agree on more than the scene has
     adam_eps: float = 1e-15
     selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
     leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays
@@ -232,8 +233,9 @@ class TrainConfig:
         for name in ("iterations", "sh_interval", "eval_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}, wanted at least 0")
+        for name in ("seed", "start_points"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree is {self.sh_degree}, wanted 0..{MAX_SH_DEGREE}")
         for name, value in vars(self).items():

@@ -15,7 +15,8 @@ from hqgs.training.config import TrainConfig
 
 T = TypeVar("T")
 
-COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.3, 2, 32  # of the run; of the sides; px that are left
+COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.6, 2, 32  # of the run; of the sides; px that are left
+COARSE_MOST = 1_500  # iterations
 HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
 FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
@@ -144,7 +145,8 @@ class Schedule:
     @property
     def coarse_end(self) -> int:
         """The last iteration at the smaller size; 0: there is none."""
-        return round(COARSE_PART * self.config.iterations) if "resolution" in self.items else 0
+        end = min(round(COARSE_PART * self.config.iterations), COARSE_MOST)
+        return end if "resolution" in self.items else 0
 
     def is_coarse(self, iteration: int) -> bool:
         return iteration <= self.coarse_end

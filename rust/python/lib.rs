@@ -8,6 +8,7 @@ mod exposure;
 mod max_weights;
 mod pictures;
 mod project;
+mod stereo;
 mod training;
 
 use arrays::{Array, by_dtype};
@@ -105,5 +106,6 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     training::register(m)?;
     pictures::register(m)?;
     exposure::register(m)?;
+    stereo::register(m)?;
     max_weights::register(m)
 }

@@ -11,10 +11,11 @@ import numpy as np
 from hqgs.base.left_out import LeftOut
 from hqgs.model.consistency import Agreement
 from hqgs.model.first_points import Colors, Points, points_along_edges
-from hqgs.scene.scene import Scene
+from hqgs.scene.scene import Scene, View
 from hqgs.training.config import DensifyConfig
 from hqgs.training.methods.formed import Formation, FormedTarget
 
+PIXELS = 100  # of the photos, for each point to start from where they are as photographed
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 
@@ -57,6 +58,11 @@ def with_budget(
         grad_threshold=threshold,
         reset_every=max(densify.reset_every, densify.stop),
     )
+
+
+def start_points(views: Sequence[View], most: int) -> int:
+    """How many points photos without a fault call for, `most` at most."""
+    return min(most, sum(view.camera.width * view.camera.height for view in views) // PIXELS)
 
 
 def first_points(scene: Scene, wanted: int, seed: int) -> tuple[Points, Colors, list[LeftOut]]:

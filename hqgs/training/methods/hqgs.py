@@ -20,9 +20,9 @@ from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
-from hqgs.training.config import AUTO, HQGSConfig, TrainConfig
+from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, HQGSConfig, TrainConfig
 from hqgs.training.methods.base import Plain, Start
-from hqgs.training.methods.budget import first_points, with_budget
+from hqgs.training.methods.budget import first_points, start_points, with_budget
 from hqgs.training.methods.cameras import Found, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
@@ -48,7 +48,7 @@ class HQGS(Plain):
       The mean of Gaussian noise over the views is nearer to the truth than their median, which L1 asks for.
     - Shake and exposure, each photo its own: what its camera did is learned with the scene
       (`LearnedCameras`), and the render is taken like that. With nothing else, the rest is 3DGS's.
-    - None of them: the loss of 3DGS.
+    - None of them: the loss of 3DGS, and the start below.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
@@ -109,6 +109,11 @@ class HQGS(Plain):
             self._cameras.schedule(config.iterations)
         if self.formation.kinds <= set(LEARNED):
             plain = self.as_photographed and config.method == AUTO
+            wanted = start_points(scene.train, min(config.start_points, config.densify.max_gaussians))
+            points, colors, _ = first_points(scene, wanted, config.seed)
+            if self.as_photographed and len(points) > len(scene.points):
+                config = _coarse_first(config)
+            scene = replace(scene, points=points, point_colors=colors)
             start = super().start(scene, targets, replace(config, method="3dgs") if plain else config)
             return replace(start, left_out=left_out)
         least, densify = len(scene.points), config.densify
@@ -194,3 +199,12 @@ def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut
     what = f"iterations {ENOUGH + 1} to {config.iterations}"
     why = "no photo can be held back to tell when to end: its camera would not be learned"
     return short, [LeftOut(what, why)]
+
+
+def _coarse_first(config: TrainConfig) -> TrainConfig:
+    """For a run that starts from points all over the photos: at the smaller size it loses nothing then."""
+    if not set(AUTOMATIC) <= set(config.leave_out):
+        return config
+    return replace(
+        config, leave_out=tuple(item for item in ITEMS if item in {*config.leave_out, "resolution"})
+    )
