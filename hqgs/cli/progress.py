@@ -136,8 +136,10 @@ def duration(seconds: float) -> str:
 
 
 def _evaluated(now: Progress) -> str:
-    means = now.evaluated or {"psnr": None, "ssim": None}
+    means = now.evaluated
+    assert means is not None  # or it is not called
     values = ["no PSNR" if means["psnr"] is None else f"{means['psnr']:.2f} dB"]
     values += [] if means["ssim"] is None else [f"SSIM {means['ssim']:.4f}"]
     where = f"iteration {now.iteration}: {now.gaussians} Gaussians, {now.seconds:.0f} s"
-    return f"{where}, held-out views {', '.join(values)}"
+    which = f"{means['views']} of the held-out views" if "views" in means else "held-out views"
+    return f"{where}, {which} {', '.join(values)}"
