@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from hqgs.base.files import (
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
-from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
@@ -52,7 +52,7 @@ class Run:
     iterations: int  # steps done
     length: int  # steps of the whole run
     seconds: float  # of training, without loading and the report
-    views: list[RenderedView] = field(repr=False)  # the held-out views
+    views: Sequence[RenderedView] = field(repr=False)  # the held-out views; large ones are rendered anew
     out: Path | None  # the folder with the files; None: nothing was written
 
     def _repr_html_(self) -> str:
@@ -174,13 +174,14 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
                 progress(progress_of(trainer, step, trainer.history[-1] if evaluate else None))
             if out is not None and trainer.iteration % config.checkpoint_every == 0:
                 trainer.save(out / CHECKPOINT)
-        trainer.evaluate()
+        views = trainer.held_out()
+        trainer.evaluate(views)
         if out is not None:
             trainer.save(out / CHECKPOINT)
-        return _results(trainer, out)
+        return _results(trainer, views, out)
 
 
-def _results(trainer: Trainer, out: Path | None) -> Run:
+def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
     """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
     scene, config, guard = trainer.scene, trainer.config, trainer.guard
     model, left_out = trainer.shown(), trainer.left_out()
@@ -195,9 +196,9 @@ def _results(trainer: Trainer, out: Path | None) -> Run:
     if trainer.iteration < trainer.length:
         what = f"iterations {trainer.iteration + 1} to {trainer.length}"
         left_out.append(LeftOut(what, "the run was stopped"))
-    if not (views := trainer.render_test_views()):
+    if not views:
         left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
-    culled = [view.culled for view in views if view.culled is not None]
+    culled = views.culled()
     result = RunResult(
         scene=scene.name,
         source=scene.source,
@@ -254,6 +255,11 @@ def _notes(trainer: Trainer) -> list[str]:
     own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
     if more := trainer.first_points - own:
         notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+    if some := [entry["views"] for entry in trainer.history if "views" in entry]:
+        notes.append(
+            f"while it trained, {max(some)} of {len(trainer.scene.test)} held-out views were measured, which "
+            "are evenly spread, to save time; the last values are of all"
+        )
     if trainer.lengthened is not None:
         notes.append(
             f"the run had ended at iteration {trainer.lengthened}; from there on its schedule is that of "

@@ -267,14 +267,14 @@ def test_the_origin_and_the_unit_of_the_world_change_nothing(shift: list[float],
     for scene in (solid, moved(solid, np.array(shift, dtype=np.float64), scale)):
         # Without split or clone: which Gaussian passes a threshold may hang on a rounding.
         trainer = Trainer(scene, tiny_config(method="fast", densify=DensifyConfig(stop=0)))
-        at_start = trainer.render_test_views()[0].render
+        at_start = trainer.held_out()[0].render
         method = paper(trainer)
         assert method.esfg is not None
         before = method.esfg().detach()
         for _ in range(12):
             trainer.step()
         assert (method.esfg() - before).abs().max() > 0.05  # the modulation itself has moved
-        renders.append((at_start, trainer.render_test_views()[0].render))
+        renders.append((at_start, trainer.held_out()[0].render))
     (start, trained), (start_moved, trained_moved) = renders
     np.testing.assert_allclose(start_moved, start, atol=2e-4)
     np.testing.assert_allclose(trained_moved, trained, atol=5e-3)
@@ -364,7 +364,7 @@ def test_a_resumed_run_has_the_same_bits(tmp_path: Path, method: str, at: int) -
     path = tmp_path / "checkpoint.safetensors"
     run(method, at).save(path)
     trainer = Trainer(tiny_scene(), tiny_config(method=method))
-    trainer.render_test_views()
+    list(trainer.held_out())
     trainer.restore(path)
     trainer.save(path)  # at once, before any step
     trainer.restore(path)

@@ -159,10 +159,12 @@ def test_large_and_broken_scenes() -> None:
 
 
 def test_charts() -> None:
-    chart = str(line_chart("A <b>", "dB", [(1, 10), (2, 20), (4, 15)], "#000"))
+    chart = str(line_chart("A <b>", "dB", [[(1, 10), (2, 20)], [(4, 15)]], "#000"))
     assert "A &lt;b&gt;" in chart
     x = [float(v) for v in re.findall(r'<circle cx="([\d.]+)"', chart)]
     y = [float(v) for v in re.findall(r'cy="([\d.]+)"', chart)]
     assert x[2] - x[1] == pytest.approx(2 * (x[1] - x[0]), abs=0.2)
     assert (y[0] - y[1]) == pytest.approx(2 * (y[0] - y[2]), abs=0.2)
-    assert "nan" not in str(line_chart("one", "", [(0, 5)], "#000"))
+    lines = re.findall(r'<polyline points="([^"]*)"', chart)
+    assert [len(line.split()) for line in lines] == [2, 1]  # no line leads to what was measured otherwise
+    assert "nan" not in str(line_chart("one", "", [[(0, 5)]], "#000"))

@@ -47,7 +47,7 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
     """
     done = train(photos, cell.config)
     trainer = done.trainer
-    views = trainer.render_test_views()
+    views = list(trainer.held_out())
     measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
     mean = asdict(mean_metrics(measured))
     formation = trainer.config.hqgs.formation if cell.row.method == "hqgs" else AUTO

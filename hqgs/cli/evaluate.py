@@ -62,7 +62,7 @@ def run(options: Evaluate) -> int:
         measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
         mean = mean_metrics(measured)
         if options.out is not None:
-            each = {view.name: asdict(one) for view, one in zip(views, measured, strict=True)}
+            each = {name: asdict(one) for name, one in zip(views.names, measured, strict=True)}
             write_json(options.out, {"mean": asdict(mean), "views": each})
     except BAD_INPUT as error:
         return fail(2, error)
@@ -74,7 +74,7 @@ def run(options: Evaluate) -> int:
             name,
             *(f"{getattr(one, metric):.4g}" if getattr(one, metric) is not None else "-" for metric in shown),
         ]
-        for name, one in [*((v.name, m) for v, m in zip(views, measured, strict=True)), ("mean", mean)]
+        for name, one in [*zip(views.names, measured, strict=True), ("mean", mean)]
     ]
     print(markdown_table(f"{source} on the held-out photos of {scene.name}", ["photo", *shown], rows))
     word, why = verdict(mean.psnr)

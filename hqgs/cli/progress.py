@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 _NUMBERS_EVERY = 10  # steps between updates of the bar
 _LINES_EVERY = 5.0  # s between lines without a terminal
-_WARM_UP, _MEASURED = 5, 30  # steps: before any are timed, and until the time that is left is told
+_TOLD_EVERY = 60.0  # s between lines of the training without a terminal
+_WARM_UP, _MEASURED = 5, 30  # steps: before any are timed, and until the time that is left is told,
+_SOON = 5.0  # s of steps after which it is told in any case
 _SLOWER = 3.0  # times as long a step may take when the scene has grown
 Self = TypeVar("Self", bound="Screen")
 
@@ -93,6 +95,7 @@ class TrainingScreen(Screen):
         self._held_out = "not measured yet"
         self._first: tuple[int, float] | None = None  # iteration and seconds from which on steps are timed
         self._told = False
+        self._mark: tuple[float, int, float] | None = None  # of the last line: when, iteration, s of training
         self.began: float | None = None  # `time.perf_counter` after the first step
         self.ended: float | None = None  # and after the last one
 
@@ -103,11 +106,24 @@ class TrainingScreen(Screen):
         if now.evaluated is not None:
             psnr = now.evaluated["psnr"]
             self._held_out = "no PSNR" if psnr is None else f"{psnr:.2f} dB"
-            self.say(_evaluated(now))
+            self.say(_evaluated(now) + self._left(now))
+        elif self._mark is None:
+            self._mark = self.ended, now.iteration, now.seconds
+        elif not self.live and self.ended - self._mark[0] > _TOLD_EVERY:
+            numbers = f"{now.gaussians} Gaussians, {now.seconds:.0f} s, loss {now.loss:.3f}"
+            self.say(f"iteration {now.iteration} of {now.length}: {numbers}{self._left(now)}")
         if now.iteration % _NUMBERS_EVERY == 0 or now.evaluated is not None:
             more = f"held-out {self._held_out}, {now.gaussians:,} Gaussians, loss {now.loss:.3f}"
             self.show("training", now.iteration, now.length, more)
         self._estimate(now)
+
+    def _left(self, now: Progress) -> str:
+        """The time that is left, from the steps since the last line."""
+        mark, self._mark = self._mark, (self.ended or 0.0, now.iteration, now.seconds)
+        if mark is None or now.iteration in (mark[1], now.length):
+            return ""
+        step = (now.seconds - mark[2]) / (now.iteration - mark[1])
+        return f"; about {duration(step * (now.length - now.iteration))} left"
 
     def _estimate(self, now: Progress) -> None:
         """Once, in the first seconds: how long the run will take here."""
@@ -118,7 +134,7 @@ class TrainingScreen(Screen):
         start, seconds = self._first
         if now.iteration == start:
             self._first = start, now.seconds
-        elif now.iteration >= start + _MEASURED:
+        elif now.iteration >= start + _MEASURED or (now.iteration > start and now.seconds - seconds >= _SOON):
             self._told = True
             step, left = (now.seconds - seconds) / (now.iteration - start), now.length - now.iteration
             self.say(
@@ -136,8 +152,10 @@ def duration(seconds: float) -> str:
 
 
 def _evaluated(now: Progress) -> str:
-    means = now.evaluated or {"psnr": None, "ssim": None}
+    means = now.evaluated
+    assert means is not None  # or it is not called
     values = ["no PSNR" if means["psnr"] is None else f"{means['psnr']:.2f} dB"]
     values += [] if means["ssim"] is None else [f"SSIM {means['ssim']:.4f}"]
     where = f"iteration {now.iteration}: {now.gaussians} Gaussians, {now.seconds:.0f} s"
-    return f"{where}, held-out views {', '.join(values)}"
+    which = f"{means['views']} of the held-out views" if "views" in means else "held-out views"
+    return f"{where}, {which} {', '.join(values)}"

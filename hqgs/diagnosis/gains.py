@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 WINDOW = 5  # px around a point, whose mean is its colour there
 DARK, BRIGHT = 0.02, 0.9  # of white in linear light: beyond them noise and the sensor's white tell nothing
 FEWEST = 20  # points that a photo must share with others
+MOST_VALUES = 8_000_000  # photos times points that are looked at: 200 MB a table
 ROUNDS = 30
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
 SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
@@ -36,10 +37,12 @@ def log_gains(scene: Scene) -> Floats | None:
     """
     if scene.seen is None or len(scene.train) < 3:
         return None
-    colors = np.full((len(scene.train), len(scene.points), 3), np.nan)
+    chosen = _chosen_points(scene, scene.seen)
+    colors = np.full((len(scene.train), len(chosen), 3), np.nan)
     for k, view in enumerate(scene.train):
-        if (rows := scene.seen.get(view.name)) is not None and len(rows):
-            _note_colors(view, scene.points[rows].astype(np.float64), rows, colors[k])
+        rows = np.flatnonzero(np.isin(chosen, scene.seen.get(view.name, [])))
+        if len(rows):
+            _note_colors(view, scene.points[chosen[rows]].astype(np.float64), rows, colors[k])
     told = np.isfinite(colors).all(2)
     told &= told.sum(0) >= 2
     if told.sum(1).min() < FEWEST:
@@ -55,11 +58,26 @@ def log_gains(scene: Scene) -> Floats | None:
     return _apart(scene.train, gains)
 
 
+def _chosen_points(scene: Scene, seen: Mapping[str, NDArray[np.intp]]) -> NDArray[np.intp]:
+    """Rows of the points to look at, rising: all, or where memory is short those that most photos show."""
+    count = MOST_VALUES // len(scene.train)
+    if len(scene.points) <= count:
+        return np.arange(len(scene.points))
+    shown = np.zeros(len(scene.points), np.int64)
+    for view in scene.train:
+        shown[seen.get(view.name, [])] += 1
+    return np.sort(np.argsort(-shown, kind="stable")[:count])
+
+
 def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Floats) -> None:
     """Write the light of a photo at `points`, which have these `rows`; NaN where it does not tell."""
     where, depths = project(view.camera, points)
     rows, where = rows[depths > 0], where[depths > 0]
-    light = to_linear(np.clip(as_floats(view.image), 0, 1).astype(np.float64))
+    if view.image.dtype == np.uint8:  # 256 powers, not one for each value
+        table = to_linear(as_floats(np.arange(256, dtype=np.uint8)).astype(np.float64))
+        light = table[view.image.astype(np.uint8, copy=False)]
+    else:
+        light = to_linear(np.clip(view.image, 0, 1).astype(np.float64))
     for c in range(3):
         smooth = uniform_filter(light[..., c], WINDOW, mode="nearest")
         found = map_coordinates(smooth, (where - 0.5).T[::-1], order=1, mode="nearest")

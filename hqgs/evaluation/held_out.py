@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ from hqgs.evaluation.metrics import psnr
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
-from hqgs.scene.scene import Scene
+from hqgs.scene.scene import Scene, View
+
+KEPT_BYTES = 256e6  # of renders; 12 of 1600 x 1067 px
 
 
 @dataclass(frozen=True)
@@ -30,32 +32,87 @@ class RenderedView:
     turn: int = 0  # quarter turns clockwise that show it upright
 
 
+class HeldOutViews(Sequence[RenderedView]):
+    """Held-out views as training renders them, not clamped, rendered when they are asked for.
+
+    Only the last renders are kept, KEPT_BYTES of them: all those of a thousand large photos would not fit
+    into memory. The Gaussians must stay as they are as long as the views are in use.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        gaussians: Gaussians,
+        sh_degree: int,
+        background: tuple[float, float, float] = BACKGROUND,
+    ) -> None:
+        self.names: list[str] = [view.name for view in views]
+        self._views, self._gaussians = views, gaussians
+        self._sh_degree, self._background = sh_degree, background
+        self._culled: dict[int, int] = {}  # by number of the view, as far as it was rendered
+        self._kept: dict[int, RenderedView] = {}  # the one that was asked for last comes last
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, index: int) -> RenderedView: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[RenderedView]: ...
+    def __getitem__(self, index: int | slice) -> RenderedView | list[RenderedView]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        number = range(len(self))[index]
+        rendered = self._kept.pop(number, None) or self._render(number)
+        self._kept[number] = rendered
+        while len(self._kept) > 1 and sum(view.render.nbytes for view in self._kept.values()) > KEPT_BYTES:
+            del self._kept[next(iter(self._kept))]
+        return rendered
+
+    def culled(self) -> list[int]:
+        """How many Gaussians each view does not show."""
+        for number in range(len(self)):
+            if number not in self._culled:
+                self[number]
+        return [self._culled[number] for number in range(len(self))]
+
+    def _render(self, number: int) -> RenderedView:
+        view = self._views[number]
+        with one_torch_thread(), torch.no_grad():
+            render, meta = render_view(self._gaussians, view.camera, self._sh_degree, self._background)
+            self._culled[number] = int((meta["radii"][0] == 0).any(dim=1).sum())
+        return RenderedView(view.name, view.image, render.numpy(), view.mask, self._culled[number], view.turn)
+
+
 def held_out_renders(
     scene: Scene,
     gaussians: Gaussians,
     sh_degree: int | None = None,
     background: tuple[float, float, float] = BACKGROUND,
-) -> list[RenderedView]:
-    """The held-out views as training renders them, not clamped; `sh_degree` None: the Gaussians' own."""
-    degree = gaussians.sh_degree if sh_degree is None else sh_degree
-    views = []
-    with one_torch_thread(), torch.no_grad():
-        for view in scene.test:
-            render, meta = render_view(gaussians, view.camera, degree, background)
-            culled = int((meta["radii"][0] == 0).any(dim=1).sum())
-            views.append(RenderedView(view.name, view.image, render.numpy(), view.mask, culled, view.turn))
-    return views
+) -> HeldOutViews:
+    """The scene's held-out views; `sh_degree` None: the Gaussians' own."""
+    return HeldOutViews(
+        scene.test, gaussians, gaussians.sh_degree if sh_degree is None else sh_degree, background
+    )
 
 
-def held_out_mean(metric: Callable[..., float | None], views: Sequence[RenderedView]) -> float | None:
-    """Mean of `metric(render, photo, mask)`; None where there is no view, or one without a value."""
-    values: list[Any] = [metric(view.render, view.photo, view.mask) for view in views]
-    return float(np.mean(values)) if values and None not in values else None
+def names_of(views: Sequence[RenderedView]) -> list[str]:
+    """The views' names, without rendering any."""
+    return views.names if isinstance(views, HeldOutViews) else [view.name for view in views]
+
+
+def held_out_means(
+    metrics: Sequence[Callable[..., float | None]], views: Sequence[RenderedView]
+) -> list[float | None]:
+    """Mean of each `metric(render, photo, mask)`; None where there is no view, or one without a value."""
+    rows: list[Any] = [[metric(view.render, view.photo, view.mask) for metric in metrics] for view in views]
+    columns: list[Any] = [[row[k] for row in rows] for k in range(len(metrics))]
+    return [float(np.mean(values)) if values and None not in values else None for values in columns]
 
 
 def held_out_psnr(scene: Scene, views: Sequence[RenderedView]) -> float:
     """Mean PSNR (dB) of renders of the held-out views. ValueError where a view has none."""
-    mean = held_out_mean(psnr, views)
+    (mean,) = held_out_means([psnr], views)
     if mean is None:
         raise ValueError(f"scene {scene.name!r} has no held-out view, or one without a PSNR")
     return mean

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import groupby
 from typing import TypeAlias, TypedDict
 
 from hqgs.base.left_out import LeftOutRecord
@@ -10,18 +12,27 @@ from hqgs.base.machine import MachineFacts
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
 
-class _Resources(TypedDict, total=False):
+class _More(TypedDict, total=False):
     gaussians: int  # older runs do not tell
     memory_mb: float | None  # the most that the process has held so far
+    views: int  # held-out views that were measured, where that is not all of them
 
 
-class HistoryEntry(_Resources):
-    """Means over the held-out views at one moment of a run. None: no such value."""
+class HistoryEntry(_More):
+    """Means over the held-out views, or some of them, at one moment of a run. None: no such value."""
 
     iteration: int
     seconds: float  # of training until then
     psnr: float | None  # dB
     ssim: float | None
+
+
+def alike(history: Sequence[HistoryEntry]) -> list[list[HistoryEntry]]:
+    """The entries in their order, parted where another number of views was measured.
+
+    Their means are not of the same photos there, so that no line leads from one to the other.
+    """
+    return [list(part) for _, part in groupby(history, lambda entry: entry.get("views"))]
 
 
 class MetricValues(TypedDict):

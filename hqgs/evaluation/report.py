@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
@@ -16,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import machine_facts, version_facts
-from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, evaluate_view, mean_metrics
 from hqgs.evaluation.records import (
     GuardRecord,
@@ -28,6 +29,7 @@ from hqgs.evaluation.records import (
     Report,
     RunRecord,
     SfmRecord,
+    alike,
 )
 from hqgs.photos.files import PHOTO_SUFFIXES
 
@@ -66,7 +68,7 @@ class RunResult:
     config: dict[str, Json]
     guard: GuardRecord
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
-    views: list[RenderedView] = field(repr=False)
+    views: Sequence[RenderedView] = field(repr=False)
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
 
@@ -91,7 +93,7 @@ def write_report(out_dir: str | Path, result: RunResult) -> Report:
     """
     out_dir = Path(out_dir)
     metrics = [_evaluate(view) for view in result.views]
-    files = _file_names([view.name for view in result.views])
+    files = _file_names(names_of(result.views))
     report = _report(result, metrics, files)
 
     out_dir.mkdir(parents=True, exist_ok=True)
@@ -165,7 +167,9 @@ def error_chart(result: RunResult) -> Figure:
 
     figure = Figure(figsize=(7, 5.2), dpi=150, layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
-    title = f"{result.scene}, {result.method}, seed {result.seed}: held-out views while training"
+    some = {entry["views"] for entry in result.history if "views" in entry}
+    views = f"{max(some)} of {len(result.views)} held-out views" if some else "held-out views"
+    title = f"{result.scene}, {result.method}, seed {result.seed}: {views} while training"
     top.set_title(_printable(title, 90), fontsize=11, loc="left", parse_math=False)
     _curve(top, result.history, "psnr", "PSNR (dB)", "{:.2f} dB", "#1f6fb2")
     _curve(bottom, result.history, "ssim", "SSIM", "{:.3f}", "#c2571a")
@@ -186,7 +190,9 @@ def _curve(
         axes.set_yticks([])
         return
     seconds, values = zip(*points, strict=True)
-    axes.plot(seconds, values, color=color, marker="o", markersize=3.5, linewidth=1.6)
+    for part in alike(history):
+        line = [(h["seconds"], h[key]) for h in part if h[key] is not None]
+        axes.plot(*zip(*line, strict=True), color=color, marker="o", markersize=3.5, linewidth=1.6)
     axes.margins(x=0.02, y=0.18)
     axes.set_xlim(left=0, right=max(seconds) * 1.12 or 1)  # room for the last value's label
     axes.annotate(
@@ -207,8 +213,8 @@ def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | No
     measured: MetricsRecord = {
         "mean": _values(mean),
         "views": [
-            {"name": view.name, **_values(m), "picture": picture}
-            for view, m, picture in zip(result.views, metrics, pictures, strict=True)
+            {"name": name, **_values(m), "picture": picture}
+            for name, m, picture in zip(names_of(result.views), metrics, pictures, strict=True)
         ],
         "reasons": mean.reasons,
     }

@@ -11,8 +11,9 @@ WIDTH, HEIGHT = 420, 220
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 26, 34  # px around the curve
 
 
-def line_chart(title: str, unit: str, points: Sequence[tuple[float, float]], color: str) -> Markup:
-    """Values against seconds of run time. Without points: the title and a sentence."""
+def line_chart(title: str, unit: str, lines: Sequence[Sequence[tuple[float, float]]], color: str) -> Markup:
+    """Values against seconds of run time, as lines. Without points: the title and a sentence."""
+    points = [point for line in lines for point in line]
     parts = [Markup('<svg viewBox="0 0 {} {}" role="img"><title>{}</title>').format(WIDTH, HEIGHT, title)]
     parts.append(Markup('<text x="{}" y="16" font-weight="600">{}</text>').format(LEFT, title))
     if not points:
@@ -43,10 +44,11 @@ def line_chart(title: str, unit: str, points: Sequence[tuple[float, float]], col
                 x, HEIGHT - 16, _number(value)
             )
         )
-    line = " ".join(f"{x},{y}" for x, y in (at(x, y) for x, y in zip(xs, ys, strict=True)))
-    parts.append(
-        Markup('<polyline points="{}" fill="none" stroke="{}" stroke-width="2"/>').format(line, color)
-    )
+    for line in lines:
+        places = " ".join(f"{x},{y}" for x, y in (at(x, y) for x, y in line))
+        parts.append(
+            Markup('<polyline points="{}" fill="none" stroke="{}" stroke-width="2"/>').format(places, color)
+        )
     for x, y in zip(xs, ys, strict=True):
         spot = Markup('<circle cx="{}" cy="{}" r="3" fill="{}"><title>{} {} after {:.0f} s</title></circle>')
         parts.append(spot.format(*at(x, y), color, _number(y), unit, x))

@@ -18,8 +18,8 @@ from PIL import Image
 from hqgs.base.files import write_text
 from hqgs.diagnosis.photo import PhotoDiagnosis
 from hqgs.diagnosis.scene import Diagnosis
-from hqgs.evaluation.held_out import RenderedView
-from hqgs.evaluation.records import LearnedRecord, Report, ViewMetricValues
+from hqgs.evaluation.held_out import RenderedView, names_of
+from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.page.charts import line_chart
@@ -100,9 +100,10 @@ def page_text(page: Page) -> str:
     measured = {view["name"]: view for view in report["metrics"]["views"]}
     chosen = _chosen(page.views, measured)
     charts = [
-        line_chart(name, unit, [(h["seconds"], v) for h in history if (v := h.get(key)) is not None], color)
+        line_chart(name, unit, [_line(part, key) for part in alike(history)], color)
         for name, unit, key, color in CHARTS
     ]
+    measured_some = [h["views"] for h in history if "views" in h]
     diagnosis = page.diagnosis
     return environment.get_template("report.html.j2").render(
         title=f"{report['scene']}, {report['method']}",
@@ -114,6 +115,7 @@ def page_text(page: Page) -> str:
         pairs=[_pair(view, measured.get(view.name)) for view in chosen],
         pairs_left=len(page.views) - len(chosen),
         charts=charts,
+        measured_on=max(measured_some, default=0),
         parts=[] if diagnosis is None else diagnosis.parts,
         photos=[] if diagnosis is None else [_photo(photo) for photo in diagnosis.photos],
         learned=[_learned(record) for record in report["learned"]],
@@ -123,6 +125,10 @@ def page_text(page: Page) -> str:
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
+
+
+def _line(history: Sequence[HistoryEntry], key: str) -> list[tuple[float, float]]:
+    return [(h["seconds"], value) for h in history if (value := h.get(key)) is not None]
 
 
 def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
@@ -179,14 +185,15 @@ def _view(camera: Camera, middle: NDArray[np.float64]) -> dict[str, Any]:
 
 def _chosen(views: Sequence[RenderedView], measured: dict[str, ViewMetricValues]) -> list[RenderedView]:
     """Some of the held-out views, evenly from the best to the worst."""
+    names = names_of(views)
 
-    def psnr(view: RenderedView) -> float:
-        value = measured[view.name]["psnr"] if view.name in measured else None
+    def psnr(number: int) -> float:
+        value = measured[names[number]]["psnr"] if names[number] in measured else None
         return -np.inf if value is None else value
 
-    ordered = sorted(views, key=psnr, reverse=True)
+    ordered = sorted(range(len(views)), key=psnr, reverse=True)
     places = np.unique(np.linspace(0, len(ordered) - 1, PAIRS).round().astype(int)) if ordered else []
-    return [ordered[k] for k in places]
+    return [views[ordered[k]] for k in places]
 
 
 def _pair(view: RenderedView, metrics: ViewMetricValues | None) -> dict[str, str]:

@@ -58,8 +58,13 @@ def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
         raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
 
 
-def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def decode(
+    path: Path, least: tuple[int, int] | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """The photo as uint8 RGB [H, W, 3], and its mask [H, W] (alpha >= 128) where it is not opaque everywhere.
+
+    `least`: the width and height that are enough. A JPEG file is then decoded at 1/2, 1/4 or 1/8 of its
+    sides, rounded up, where that is at least as much; `shrunk` tells by how much. None: at its full size.
 
     Greyscale becomes three equal channels, 16 bits become 8. Colours are as stored: nothing is composited,
     no colour profile is applied. EXIF orientation is not applied either: the cameras were computed for the
@@ -67,6 +72,8 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """
     try:
         with open_photo(path) as photo:
+            if least is not None:
+                photo.draft(None, least)  # pyright: ignore[reportArgumentType]  (None keeps the mode)
             if photo.mode == "F":
                 raise ValueError("floating-point pixels have no agreed white")
             if photo.mode.startswith("I"):
@@ -81,6 +88,11 @@ def decode(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
             return np.array(photo.convert("RGB")), None
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the photo {path}: {e}") from e
+
+
+def shrunk(stored: int, decoded: int) -> int:
+    """By how much a side of a photo was divided, rounded up, when it was decoded: 1, 2, 4 or 8."""
+    return next(factor for factor in (1, 2, 4, 8) if -(-stored // factor) <= decoded)
 
 
 def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 Pixels = NDArray[np.uint8] | NDArray[np.float32]
 A = -0.5  # of Keys's cubic: the value at which it reproduces quadratics
 RADIUS = 2  # of the cubic, in samples
+BAND = 8  # new rows at a time: what is between then fits into the caches
 
 
 def resize_matrix(size_in: int, size_out: int) -> NDArray[np.float64]:
@@ -65,22 +66,30 @@ def _cubic(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def area_downscale(
-    image: Pixels, mask: NDArray[np.bool_] | None, width: int, height: int
+    image: Pixels,
+    mask: NDArray[np.bool_] | None,
+    width: int,
+    height: int,
+    size: tuple[float, float] | None = None,
 ) -> tuple[Pixels, NDArray[np.bool_] | None]:
     """Mean over each new pixel's area in the old photo; parts of old pixels count by their share.
 
     With a mask, only what counts enters the mean (hidden colours must not bleed over the edge), and the new
     pixel counts where at least half of its area does. Not Pillow's BOX filter: that takes old pixels whole or
     not at all, which moves the picture by up to half a pixel at factors that are not whole.
+
+    `size`: width and height of the picture in old pixels, where it ends within the last ones; None: it fills
+    them.
     """
-    if image.shape[:2] == (height, width):
+    size = size or (image.shape[1], image.shape[0])
+    if image.shape[:2] == (height, width) and size == (width, height):
         return image, mask
-    area = image.shape[0] * image.shape[1] / (height * width)
+    area = size[0] * size[1] / (height * width)
     if mask is None:
-        return _as(image, _area_sum(image, height, width) / area), None
-    share = _area_sum(mask.astype(np.uint8), height, width)
-    visible = _area_sum(np.where(mask[..., None], image, 0), height, width)
-    hidden = _area_sum(np.where(mask[..., None], 0, image), height, width)
+        return _as(image, _area_sum(image, height, width, size) / area), None
+    share = _area_sum(mask, height, width, size)
+    visible = _area_sum(np.where(mask[..., None], image, 0), height, width, size)
+    hidden = _area_sum(np.where(mask[..., None], 0, image), height, width, size)
     seen = share > 1e-6 * area
     mean = np.where(seen[..., None], visible / np.where(seen, share, 1.0)[..., None], hidden / area)
     return _as(image, mean), share >= 0.5 * area
@@ -93,20 +102,31 @@ def _as(image: Pixels, values: NDArray[np.float64]) -> Pixels:
     return values.astype(np.float32)
 
 
-def _area_sum(image: Pixels | NDArray[np.uint8], height: int, width: int) -> NDArray[np.float64]:
-    """Sums over the new pixels' areas, [height, width, ...]. Whole numbers stay exact at whole factors."""
-    return _sum_rows(_sum_rows(image, height).swapaxes(0, 1), width).swapaxes(0, 1)
-
-
-def _sum_rows(
-    a: NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float64], count: int
+def _area_sum(
+    image: Pixels | NDArray[np.bool_], height: int, width: int, size: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Merge the rows of `a` into `count` equal stretches by differences of the running sum."""
-    total = np.uint32 if a.dtype == np.uint8 else np.float64  # 255 * MAX_SIDE fits into 32 bits
-    running = np.zeros((len(a) + 1, *a.shape[1:]), total)
-    np.cumsum(a, axis=0, dtype=total, out=running[1:])
-    edges = np.arange(count + 1) * len(a) / count
-    below = np.minimum(edges.astype(np.int64), len(a) - 1)
-    part = (edges - below).reshape(-1, *[1] * (a.ndim - 1))
-    at_edges = running[below] + part * (running[below + 1] - running[below])
-    return np.diff(at_edges, axis=0)
+    """Sums over the new pixels' areas, [height, width, ...]. Whole numbers stay exact at whole factors."""
+    old_height, old_width = image.shape[:2]
+    columns, rows = _overlaps(old_width, width, size[0]), _overlaps(old_height, height, size[1])
+    pixels = image.reshape(old_height, -1)
+    out = np.empty((height, width, pixels.shape[1] // old_width))
+    for top in range(0, height, BAND):
+        band = rows[top : top + BAND]
+        first, last = int(band.indices.min()), int(band.indices.max()) + 1
+        tall = band[:, first:last] @ pixels[first:last].astype(np.float64)  # [B, W C]
+        turned = tall.reshape(len(tall), old_width, -1).swapaxes(0, 1).reshape(old_width, -1)  # [W, B C]
+        wide = (columns @ turned).reshape(width, len(tall), -1)
+        out[top : top + BAND] = wide.swapaxes(0, 1)
+    return out.reshape(height, width, *image.shape[2:])
+
+
+def _overlaps(old: int, new: int, size: float) -> csr_array:
+    """What each of `new` equal parts of 0..size shares with each of `old` pixels, in lengths of these."""
+    edges = np.arange(new + 1) * size / new
+    below, above = edges[:-1, None], edges[1:, None]
+    first = np.minimum(below.astype(np.int64), old - 1)
+    at = first + np.arange(int(np.ceil(size / new)) + 1)
+    lengths = (np.minimum(above, at + 1) - np.maximum(below, at)).clip(0)
+    part, place = np.nonzero((lengths > 0) & (at < old))
+    starts = np.searchsorted(part, np.arange(new + 1))
+    return csr_array((lengths[part, place], at[part, place], starts), shape=(new, old))

@@ -25,6 +25,9 @@ from hqgs.scene.sfm.photos_alone import read_photos
 from hqgs.scene.views import load_views
 
 COLMAP = "colmap"
+MOST_BYTES = (
+    4e9  # of all photos in memory, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
+)
 
 
 def load_scene(
@@ -41,7 +44,7 @@ def load_scene(
 
     The format is recognised in this order: a COLMAP model with photos (`sparse/0`, `sparse`, or the folder
     itself; `images`), `transforms.json` or `transforms_train.json`, `poses_bounds.npy`. Distorted photos are
-    undistorted at their stored size, then scaled down by `downscale` (>= 1) by area; where a COLMAP or LLFF
+    undistorted, and scaled down by `downscale` (>= 1) by area; where a COLMAP or LLFF
     scene has `images_N` for N = `downscale`, those photos are taken as they are.
 
     Views are sorted by name; every `test_every`-th one (index % test_every == 0) is a test view, 0 means
@@ -55,7 +58,8 @@ def load_scene(
     folder for that reconstruction, which the next call takes from there. `told` hears what takes long. Half
     a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
 
-    `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger.
+    `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
+    where all of them would take more than MOST_BYTES of memory.
 
     With `skip_unreadable` training photos that cannot be decoded (or whose mask or small photo cannot) are
     left out, as long as at least half of the training photos remain; `Scene.notes` names them. The other
@@ -80,7 +84,7 @@ def load_scene(
     test_names = _test_names(root, capture, test_every, notes)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
-    views, unreadable = load_views(capture.photos, capture.downscale, optional)
+    views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
     if degraded is not None and downscale == 1:
         views = _with_lows(views, degraded, root, optional, unreadable)
     train = [v for v in views if v.name not in test_names]
@@ -187,16 +191,27 @@ def _nothing(root: Path) -> str:
 
 
 def _bounded(capture: Capture, longest: int) -> Capture:
-    """The capture with its photos scaled down until no side is longer."""
+    """The capture with its photos scaled down until no side is longer, and all of them fit into memory."""
     sizes = [stored_size(photo.path) for photo in capture.photos if photo.path.is_file()]
-    largest = max((max(size) for size in sizes), default=0) / capture.downscale
-    if largest <= longest:
+    if not sizes:
         return capture
-    downscale = largest / longest * capture.downscale
+    largest = max(sizes, key=max)
+    bounded = max(max(largest) / longest, capture.downscale)
+    pixels = sum(width * height for width, height in sizes)
+    downscale = max(bounded, math.sqrt(3 * pixels / MOST_BYTES))
+    if downscale <= capture.downscale:
+        return capture
+    width, height = (round(side / downscale) for side in largest)
+    up_to, count = "" if len(set(sizes)) == 1 else "up to ", len(sizes)
     note = (
-        f"photos of up to {largest:.0f} px a side were scaled down to {longest} px (by {downscale:.3g}); "
-        "`--downscale 1` trains them at their full size, which takes far longer"
+        f"{count} photos of {up_to}{largest[0]} x {largest[1]} px are used at {up_to}{width} x {height} px "
+        f"(sides divided by {downscale:.3g}); `--downscale 1` takes their full size, and far longer"
     )
+    if downscale > bounded:
+        note += (
+            f". A side may have {longest} px, but so many photos would take more than "
+            f"{MOST_BYTES / 1e9:g} GB of memory then"
+        )
     return replace(capture, downscale=downscale, notes=[*capture.notes, note])
 
 

@@ -58,7 +58,8 @@ def load(
             `Scene.notes` names them. False: an error.
         cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film,
             the embedded scene.
-        longest: px; scale the photos down further where a side is longer.
+        longest: px; scale the photos down further where a side is longer, or where all photos together
+            would take more than 4 GB of memory.
         frames: how many of a film; None: two a second, 30 to 90.
         told: hears what is being done, and how far it is.
 

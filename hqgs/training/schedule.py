@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from hqgs.photos.resize import area_downscale
-from hqgs.scene.scene import Camera, View
+from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import TrainConfig
 
 T = TypeVar("T")
@@ -22,6 +22,7 @@ FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standar
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
 EARLIEST = 2_000  # iterations before which they cannot tell yet
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
+EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 
 
@@ -159,6 +160,18 @@ def learning_rates(config: TrainConfig, extent: float, part: float) -> dict[str,
     return {"means": means, **others}
 
 
+def on_the_way(scene: Scene, every: int) -> list[int]:
+    """Numbers of the held-out views that a run measures every so many steps, before its end: evenly spread.
+
+    As many as have EVALUATED of the pixels that it trains on between two evaluations, and at least one. It
+    follows from sizes alone, so that the same run measures the same views on any machine.
+    """
+    trained = every * np.mean([view.camera.width * view.camera.height for view in scene.train])
+    pixels = np.sort([view.camera.width * view.camera.height for view in scene.test])[::-1]
+    count = int((np.cumsum(pixels) <= EVALUATED * trained).sum())
+    return spread(range(len(scene.test)), max(count, 1))
+
+
 def smaller(view: View) -> View:
     """The view with photo and camera at 1 / COARSE_FACTOR of the size."""
     camera = view.camera
@@ -176,3 +189,16 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 
 def _band_check(config: TrainConfig) -> int:
     return max(EARLIEST, round(BAND_CHECK * config.iterations), 1)
+
+
+def check_views(scene: Scene) -> None:
+    """ValueError where a scene cannot be trained on."""
+    if not scene.train:
+        raise ValueError(f"scene {scene.name!r} has no training views")
+    for view in [*scene.train, *scene.test]:
+        wanted = (view.camera.height, view.camera.width, 3)
+        if view.image.dtype not in (np.uint8, np.float32) or view.image.shape != wanted:
+            raise ValueError(
+                f"view {view.name!r}: the image is {view.image.dtype} {list(view.image.shape)}, "
+                f"its camera wants uint8 or float32 {list(wanted)}"
+            )

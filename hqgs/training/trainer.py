@@ -18,7 +18,7 @@ from hqgs.base.machine import peak_rss_mb
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
-from hqgs.evaluation.held_out import RenderedView, held_out_mean, held_out_renders
+from hqgs.evaluation.held_out import HeldOutViews, held_out_means
 from hqgs.evaluation.metrics import psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
@@ -35,7 +35,7 @@ from hqgs.training.frugality import Frugality
 from hqgs.training.guard import LISTED, Event, Fault, Guard, bad_values, gradient_fault, parameter_fault
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method, Target
-from hqgs.training.schedule import Plan, Schedule, learning_rates, smaller
+from hqgs.training.schedule import Plan, Schedule, check_views, learning_rates, on_the_way, smaller
 from hqgs.training.state import TrainState
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
@@ -60,7 +60,7 @@ class Trainer:
 
     def __init__(self, scene: Scene, config: TrainConfig) -> None:
         """ValueError if the scene or the configuration cannot be trained."""
-        _check_views(scene)
+        check_views(scene)
         inspector = Inspector()  # for all that looks at the photos before the first step
         self.photos_left_out: list[LeftOut] = []
         if "photos" in config.leave_out:
@@ -161,24 +161,36 @@ class Trainer:
         """What the run did without so far."""
         return [*self.photos_left_out, *self.frugality.left_out(), *self.method_left_out]
 
-    def render_test_views(self) -> list[RenderedView]:
-        """All held-out views with their renders [H, W, 3]."""
+    def held_out(self, numbers: Sequence[int] | None = None) -> HeldOutViews:
+        """The held-out views of these numbers (None: all), for use before the next step."""
+        views = self.scene.test if numbers is None else [self.scene.test[k] for k in numbers]
         degree = self.schedule.degree(self.iteration, self.state.decisions)
-        return held_out_renders(self.scene, self.shown(), degree, self.config.background)
+        return HeldOutViews(views, self.shown(), degree, self.config.background)
 
-    def evaluate(self) -> None:
-        """Add the held-out means at this iteration to the history, once. Takes no training time."""
+    def evaluate(self, views: HeldOutViews | None = None) -> None:
+        """Add the held-out means at this iteration to the history, once. Takes no training time.
+
+        `views`: what to measure; None: all at the end of the run, and what `on_the_way` says before it.
+        """
+        if views is None:
+            some = on_the_way(self.scene, self.config.eval_every)
+            views = self.held_out(None if self.iteration >= self.length else some)
+        of = len(self.scene.test)
         if self.history and self.history[-1]["iteration"] == self.iteration:
-            return
-        views = self.render_test_views()
+            if self.history[-1].get("views", of) >= len(views):
+                return
+            self.history.pop()  # it was of fewer views
+        means = held_out_means([psnr, ssim], views)
         entry: HistoryEntry = {
             "iteration": self.iteration,
             "seconds": self.seconds,
-            "psnr": held_out_mean(psnr, views),
-            "ssim": held_out_mean(ssim, views),
+            "psnr": means[0],
+            "ssim": means[1],
             "gaussians": len(self.gaussians),
             "memory_mb": peak_rss_mb(),
         }
+        if len(views) < of:
+            entry["views"] = len(views)
         self.history.append(entry)
 
     def save(self, path: str | Path) -> None:
@@ -336,15 +348,3 @@ class Trainer:
         if len(indices):
             self._remove(fault.rows)
             state.guard.culled += len(indices)
-
-
-def _check_views(scene: Scene) -> None:
-    if not scene.train:
-        raise ValueError(f"scene {scene.name!r} has no training views")
-    for view in [*scene.train, *scene.test]:
-        wanted = (view.camera.height, view.camera.width, 3)
-        if view.image.dtype not in (np.uint8, np.float32) or view.image.shape != wanted:
-            raise ValueError(
-                f"view {view.name!r}: the image is {view.image.dtype} {list(view.image.shape)}, "
-                f"its camera wants uint8 or float32 {list(wanted)}"
-            )
