@@ -348,7 +348,8 @@ def test_train_shows_its_page_and_stays(
 def test_looking_on_does_not_change_a_run(tmp_path: Path) -> None:
     scene = tiny_scene()
     alone = hqgs.train(scene, config=tiny_config())
-    live = view.LiveView(scene, tmp_path, port=0)
+    live = view.LiveView(scene, tmp_path / "missing", port=0)
+    assert not any(tmp_path.iterdir())  # the folder is the run's
     try:
         live.viewer._clients[0] = Looking()  # type: ignore[assignment]
         watched = hqgs.train(scene, config=tiny_config(), progress=live)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import webbrowser
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,7 @@ from hqgs.viewer.guard import PORT, check
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
     from hqgs.training.progress import Progress
+    from hqgs.viewer.viewer import Viewer
 
 EVERY = 2.0  # seconds between copies of the scene while it trains
 
@@ -68,14 +70,22 @@ class LiveView:
     """The page of a run that trains: hand it to `hqgs.train` as `progress`, or call it in yours."""
 
     def __init__(self, scene: Scene, out: Path, *, port: int = PORT, open_browser: bool = False) -> None:
-        """ValueError without viser, the extra `view`."""
-        from hqgs.scene.camera_files import load_cameras, save_cameras
+        self._scene, self._out, self._port, self._open = scene, out, port, open_browser
+        self._copied = -EVERY
+
+    @cached_property
+    def viewer(self) -> Viewer:
+        """The page, from the first step on: by then the run holds its folder, and has written its cameras.
+
+        ValueError without viser, the extra `view`.
+        """
+        from hqgs.scene.camera_files import CAMERAS, load_cameras
         from hqgs.viewer.viewer import Viewer
 
-        save_cameras(out, scene)
-        self.viewer: Viewer = Viewer(load_cameras(out), out, port=port, title=scene.name)
-        self._copied = -EVERY
-        _tell(self.viewer.url, open_browser)
+        known = load_cameras(self._out) if (self._out / CAMERAS).is_file() else None
+        viewer = Viewer(known, self._out, port=self._port, title=self._scene.name)
+        _tell(viewer.url, self._open)
+        return viewer
 
     def __call__(self, now: Progress) -> None:
         """Show the scene as it is, every two seconds, and answer the page after each step."""
