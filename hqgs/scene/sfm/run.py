@@ -28,6 +28,7 @@ from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 PROGRAM = Path(__file__).with_name("program.py")
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
+NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 LISTEN = 0.25  # s between looks at what COLMAP is doing
 STAGES = {
     "features": "COLMAP: features",
@@ -44,6 +45,7 @@ class Guess:
     sizes: list[tuple[int, int]]  # width and height of each camera
     focals: list[float]  # px; 0: not known
     camera_of: list[int]  # of each photo, the number of its camera
+    ordered: bool = False  # frames of a film: photos see what those before and after them see
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,20 @@ class Model:
     def first_pass(self) -> int | None:
         """Photos that the first pass registered, where a second one was made. None: one was enough."""
         return self.passes[0].registered if len(self.passes) > 1 else None
+
+
+def film_pairs(count: int) -> NDArray[np.int64]:
+    """The pairs of frames [P, 2] that are matched, sorted; their number does not grow with the frames squared.
+
+    Each frame with the next 10, and with those 16, 32, 64, ... after it, which make tracks long; and for a
+    camera that comes back to a place each with each of 24 frames that are spread over the film.
+    """
+    first, second = np.triu_indices(count, 1)
+    apart = second - first
+    thin = np.isin(np.arange(count), np.linspace(0, count - 1, THIN).round())
+    near = (apart <= NEAR) | ((apart & (apart - 1)) == 0)
+    chosen = near | (thin[first] & thin[second])
+    return np.stack([first[chosen], second[chosen]], axis=1)
 
 
 def run_colmap(
@@ -106,6 +122,8 @@ def run_colmap(
         given["sizes"] = np.array(cameras.sizes)
         given["focals"] = np.array(cameras.focals, np.float64)
         given["camera_of"] = np.array(cameras.camera_of)
+        if cameras.ordered:
+            given["pairs"] = film_pairs(len(names))
     else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
@@ -199,7 +217,7 @@ def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArr
     digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode() + PROGRAM.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
-    for part in ("sizes", "Ks", "focals", "camera_of"):
+    for part in ("sizes", "Ks", "focals", "camera_of", "pairs"):
         if part in given:
             digest.update(given[part].tobytes())
     return digest.hexdigest()[:16]
