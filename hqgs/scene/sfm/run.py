@@ -77,7 +77,7 @@ class Model:
 
 
 def film_pairs(count: int) -> NDArray[np.int64]:
-    """The pairs of frames [P, 2] that are matched, sorted; their number does not grow with the frames squared.
+    """The pairs of frames [P, 2] that are matched, sorted; they do not grow with the frames squared.
 
     Each frame with the next 10, and with those 16, 32, 64, ... after it, which make tracks long; and for a
     camera that comes back to a place each with each of 24 frames that are spread over the film.
