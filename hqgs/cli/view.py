@@ -45,17 +45,20 @@ def run(options: View, seconds: float | None = None) -> int:
     try:
         file = scene_file(options.source)
         check(options.port)
-        from hqgs.model.gaussians import Gaussians  # here: they load torch
+        from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
+        from hqgs.model.gaussians import Gaussians
         from hqgs.scene.camera_files import CAMERAS, load_cameras
         from hqgs.viewer.viewer import Viewer
 
         gaussians = Gaussians.load(file)
         folder = file.parent
         known = load_cameras(folder) if (folder / CAMERAS).is_file() else None
+        report = _report(folder)
         viewer = Viewer(known, folder, port=options.port, title=folder.resolve().name)
     except BAD_INPUT as error:
         return fail(2, error)
-    viewer.set_scene(gaussians, _numbers(folder, len(gaussians)))
+    viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
+    viewer.set_facts({} if report is None else facts_of_photos(report))
     _tell(viewer.url, options.open)
     try:
         viewer.serve(seconds)
@@ -100,7 +103,11 @@ class LiveView:
         self.viewer.pump()
 
     def stay(self) -> None:
-        """Go on showing the trained scene until Ctrl-C."""
+        """Go on showing the trained scene, and what the report says of its photos, until Ctrl-C."""
+        from hqgs.evaluation.photo_facts import facts_of_photos
+
+        if (report := _report(self._out)) is not None:
+            self.viewer.set_facts(facts_of_photos(report))
         _tell(self.viewer.url, open_browser=False)
         try:
             self.viewer.serve()
@@ -116,12 +123,16 @@ def _tell(url: str, open_browser: bool) -> None:
         webbrowser.open(url)
 
 
-def _numbers(folder: Path, gaussians: int) -> list[tuple[str, str]]:
+def _report(folder: Path) -> Any:
+    """report.json of a folder; None where there is none. ValueError where it is damaged."""
     from hqgs.evaluation.report import REPORT, read_report
 
+    return read_report(folder / REPORT) if (folder / REPORT).is_file() else None
+
+
+def _numbers(report: Any, gaussians: int) -> list[tuple[str, str]]:
     rows = [("Gaussians", f"{gaussians:,}")]
-    if (folder / REPORT).is_file():
-        report: Any = read_report(folder / REPORT)
+    if report is not None:
         mean = report["metrics"]["mean"]
         rows += [
             ("iterations", f"{report.get('iterations', '-')}"),

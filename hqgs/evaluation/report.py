@@ -25,6 +25,7 @@ from hqgs.evaluation.records import (
     LearnedRecord,
     MetricsRecord,
     MetricValues,
+    PhotoRecord,
     Report,
     RunRecord,
     SfmRecord,
@@ -69,6 +70,7 @@ class RunResult:
     views: list[RenderedView] = field(repr=False)
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
+    photos: list[PhotoRecord] = field(default_factory=list)
 
 
 def measure(result: RunResult) -> Report:
