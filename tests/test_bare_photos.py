@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -13,15 +14,18 @@ from PIL import Image
 from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 
 from hqgs.base.stages import Stage
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import heard
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, check_whole, decode
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.scene import Scene
+from hqgs.scene.sfm import program
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 from hqgs.scene.sfm.program import _Pass
-from hqgs.scene.sfm.run import film_pairs
+from hqgs.scene.sfm.run import LARGEST, expected_time, film_pairs
 
 ROOT = Path(__file__).parent.parent
 
@@ -223,6 +227,28 @@ def test_frames_of_a_film_are_matched_with_their_neighbours_and_a_few_others() -
     assert (0, 11) not in pairs
     assert len(pairs) < 0.12 * 300 * 299 / 2
     assert all(i < j for i, j in pairs)
+
+
+def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
+    def told(count: int, width: int, height: int, threads: int = 2, pairs: int | None = None) -> list[int]:
+        text = expected_time(np.tile([width, height], (count, 1)), pairs, threads)
+        found = re.search(r"takes (\d+) to (\d+) minutes", text)
+        return [] if found is None else [int(part) for part in found.groups()]
+
+    assert told(9, 192, 144) == []  # seconds
+    few, many = told(25, 4032, 3024), told(200, 4032, 3024)
+    assert few[0] < few[1] < many[1]
+    assert told(200, 4032, 3024, threads=8)[1] < many[1] / 2
+    assert told(200, 4032, 3024, pairs=2000)[1] < many[1] / 3
+    text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
+    assert text.startswith("200 photos of 12.0 megapixels, which COLMAP looks at at 1.9: ")
+    assert text.endswith("; 100 photos are plenty for most scenes")
+    with LoadingScreen() as screen:
+        heard(screen)(Stage("COLMAP", 0, 200, text))
+        heard(screen)(Stage("COLMAP: features", 1, 200))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [text, "COLMAP: features: 1 of 200"]
+    assert LARGEST == program.LARGEST
 
 
 def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_path: Path) -> None:

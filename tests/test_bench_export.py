@@ -72,7 +72,7 @@ def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert picture is not None
     with Image.open(io.BytesIO(base64.b64decode(picture[1]))) as chart:
         assert chart.size == (1200, 750)
-    assert "http" not in shown  # nothing of it lies elsewhere
+    assert "://" not in shown  # nothing of it lies elsewhere
 
 
 def test_the_front_holds_what_no_other_beats_in_both() -> None:
