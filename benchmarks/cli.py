@@ -35,6 +35,7 @@ def make_parser() -> argparse.ArgumentParser:
         add = parser_of_one.add_argument
         out = Path("out", "bench")
         add("--out", type=Path, default=out, metavar="DIR", help=f"for {name}.json (%(default)s)")
+        add("--page", type=Path, metavar="FILE", help="also write all of it as one HTML file")
         add("--threads", type=int, metavar="T", help="(all cores)")
         add("--quick", action="store_true", help="tiny sizes, seconds: only a test")
         if benchmark.protocols is not None:
@@ -59,10 +60,12 @@ def _run(args: argparse.Namespace) -> int:
     name = args.benchmark
     try:
         args.out.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
+        if args.page is not None and args.page.is_dir():
+            raise ValueError(f"--page {args.page} is a folder: name a file")
         if args.threads is not None:
             hqgs.set_num_threads(args.threads)
         report = BENCHMARKS[name].run(args)
-        files = write_results(args.out, name, command_line(args), report)
+        files = write_results(args.out, name, command_line(args), report, args.page)
     except BAD_INPUT as error:
         return fail(2, error)
     except TrainingError as error:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import hqgs
+from benchmarks.page import write_page
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.base.text import markdown_table
@@ -70,8 +71,11 @@ def with_repeats(sizes: dict[str, Any], args: argparse.Namespace) -> dict[str, A
     return sizes | {"repeats": repeats, "seed": args.seed}
 
 
-def write_results(out: Path, name: str, command: str, report: Report) -> list[Path]:
-    """Write `NAME_PART.json` and `NAME_PART_FIGURE.png` into `out`; return their paths, JSON first."""
+def write_results(out: Path, name: str, command: str, report: Report, page: Path | None = None) -> list[Path]:
+    """Write `NAME_PART.json` and `NAME_PART_FIGURE.png` into `out`, and all of it as a page, if asked.
+
+    Returns their paths, JSON first.
+    """
     versions = version_facts()
     facts = {
         "benchmark": name,
@@ -91,14 +95,21 @@ def write_results(out: Path, name: str, command: str, report: Report) -> list[Pa
         with atomic_path(path) as tmp:
             figure.savefig(tmp)
     write_json(out / f"{stem}.json", facts)
-    return [out / f"{stem}.json", *pictures]
+    if page is not None:
+        write_page(page, facts, report)
+    return [out / f"{stem}.json", *pictures, *([] if page is None else [page])]
 
 
 def command_line(args: argparse.Namespace) -> str:
     """The command that gives these results again, every option written out, folders by their name alone."""
     words = ["python", "-m", "benchmarks", args.benchmark]
     for name, value in sorted(vars(args).items()):
-        if name in ("benchmark", "command", "out") or value is None or value is False or callable(value):
+        if (
+            name in ("benchmark", "command", "out", "page")
+            or value is None
+            or value is False
+            or callable(value)
+        ):
             continue
         values = value if isinstance(value, list) else [] if value is True else [value]
         words += [f"--{name.replace('_', '-')}", *(v.name if isinstance(v, Path) else str(v) for v in values)]

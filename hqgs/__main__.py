@@ -1,11 +1,17 @@
-"""`python -m hqgs`."""
+"""`python -m hqgs`, and what the installed command `hqgs` calls."""
 
 import sys
 
-if __name__ == "__main__":
+
+def run() -> int:
+    """The command line's exit code, also where Ctrl-C comes while it is being loaded."""
     try:
         from hqgs.cli.main import main
 
-        sys.exit(main())
+        return main()
     except KeyboardInterrupt:  # before the command line itself can tell
-        sys.exit(130)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(run())

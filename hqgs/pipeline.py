@@ -26,6 +26,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
+from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
@@ -220,6 +221,7 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
         views=views,
         learned=[_learned(found) for found in trainer.method.found()],
+        photos=[] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
     )
     learned = None
     if out is not None and result.learned:

@@ -24,7 +24,16 @@ from hqgs.cli.train import Whole
 
 ROOT = Path(__file__).parent.parent
 PAGES = [*ROOT.glob("*.md"), *sorted(ROOT.glob("docs/**/*.md"))]
-FOLDERS = ("benchmarks", "docs", "examples", "hqgs", "rust", "tests", ".ci")  # whose paths are checked
+FOLDERS = (
+    "benchmarks",
+    "docs",
+    "examples",
+    "hqgs",
+    "rust",
+    "scripts",
+    "tests",
+    ".ci",
+)  # whose paths are checked
 SOURCES = (".py", ".rs", ".toml", ".md")  # a name with such an end is a path from the repository's top
 CLASSES = ("hqgs", "hqgs.model.gaussians", "hqgs.scene.scene", "hqgs.training.config")  # of `Scene.extent`
 TOOLS = ("pip", "pytest", "ruff", "sphinx-build")  # of others, whose flags are not checked
@@ -89,7 +98,7 @@ def _wrong_mention(words: list[str]) -> list[str]:
     """A command as prose names it, where arguments may be missing: flags and choices that do not exist."""
     if words[0] == "cargo":
         return _wrong_cargo(words)
-    if words[0].startswith("examples/"):
+    if words[0].startswith(("examples/", "scripts/")):
         source = (ROOT / words[0]).read_text(encoding="utf-8") if (ROOT / words[0]).is_file() else ""
         return [f"{words[0]} {flag}" for flag in _flags(words) if f'"{flag}"' not in source]
     if words[0].startswith("--"):

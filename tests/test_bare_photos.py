@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -13,14 +14,18 @@ from PIL import Image
 from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 
 from hqgs.base.stages import Stage
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import heard
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, check_whole, decode
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.scene import Scene
+from hqgs.scene.sfm import program
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 from hqgs.scene.sfm.program import _Pass
+from hqgs.scene.sfm.run import LARGEST, expected_time, film_pairs
 
 ROOT = Path(__file__).parent.parent
 
@@ -211,6 +216,64 @@ def test_a_failure_tells_blur_no_overlap_and_too_few_photos_apart() -> None:
     assert "taken from one place" in why_no_model(20, passes(3000, [900] * 100))
     assert "20 photos show few" not in why_few(20, passes(3000, [900] * 100, registered=8))
     assert "overlap too little" in why_few(20, passes(3000, [900] * 100, registered=8))
+
+
+def test_frames_of_a_film_are_matched_with_their_neighbours_and_a_few_others() -> None:
+    assert film_pairs(3).tolist() == [[0, 1], [0, 2], [1, 2]]
+    assert len(film_pairs(24)) == 24 * 23 // 2  # a short film: every pair
+    pairs = {(i, j) for i, j in film_pairs(300).tolist()}
+    assert {(i, i + k) for i in range(200) for k in (1, 2, 10, 16, 32, 64)} <= pairs
+    assert (0, 299) in pairs  # where it began and where it ended
+    assert (0, 11) not in pairs
+    assert len(pairs) < 0.12 * 300 * 299 / 2
+    assert all(i < j for i, j in pairs)
+
+
+def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
+    def told(count: int, width: int, height: int, threads: int = 2, pairs: int | None = None) -> list[int]:
+        text = expected_time(np.tile([width, height], (count, 1)), pairs, threads)
+        found = re.search(r"takes (\d+) to (\d+) minutes", text)
+        return [] if found is None else [int(part) for part in found.groups()]
+
+    assert told(9, 192, 144) == []  # seconds
+    few, many = told(25, 4032, 3024), told(200, 4032, 3024)
+    assert few[0] < few[1] < many[1]
+    assert told(200, 4032, 3024, threads=8)[1] < many[1] / 2
+    assert told(200, 4032, 3024, pairs=2000)[1] < many[1] / 3
+    text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
+    assert text.startswith("200 photos of 12.0 megapixels, which COLMAP looks at at 1.9: ")
+    assert text.endswith("; 100 photos are plenty for most scenes")
+    with LoadingScreen() as screen:
+        heard(screen)(Stage("COLMAP", 0, 200, text))
+        heard(screen)(Stage("COLMAP: features", 1, 200))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [text, "COLMAP: features: 1 of 200"]
+    assert LARGEST == program.LARGEST
+
+
+def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_path: Path) -> None:
+    for k, image in enumerate(photos):
+        Image.fromarray(image).save(tmp_path / f"{k}.png")
+    (tmp_path / "frames.json").write_text("{}")
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    guess = readable(found).guess()
+    assert guess.ordered
+    work = tmp_path / "work"
+    (work / "photos").mkdir(parents=True)
+    found.write(work / "photos")
+    pairs = np.array([[0, 1], [1, 2], [0, 8]])
+    given = {"names": np.array(found.names), "photos": np.array(str(work / "photos")), "pairs": pairs}
+    given |= {"sizes": np.array(guess.sizes), "focals": np.array(guess.focals)}
+    given["camera_of"] = np.array(guess.camera_of)
+    one = _Pass(work, given, 1, tolerant=False)
+    one.run()
+    assert len(one.facts()["matches"]) == 3
+    import pycolmap
+
+    with pycolmap.Database.open(work / "colmap.db") as db:
+        numbers = [pycolmap.pair_id_to_image_pair(pair) for pair in db.read_all_matches()[0]]
+    assert sorted(numbers) == [(1, 2), (1, 9), (2, 3)]
 
 
 def test_the_second_pass_takes_more() -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -24,7 +28,10 @@ def call(*arguments: str | Path) -> int:
 def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr(scenes, "embedded_scene", lambda *args, **_: asked.append(args) or tiny_scene())
-    assert call("--quick", "--threads", "1", "--out", tmp_path) == 0
+    assert call("--quick", "--out", tmp_path, "--page", tmp_path) == 2
+    assert "is a folder: name a file" in capsys.readouterr().err
+    page = tmp_path / "page.html"
+    assert call("--quick", "--threads", "1", "--out", tmp_path, "--page", page) == 0
     assert asked == [(tmp_path / "scenes" / "embedded_42x32_24", 42, 32)]
     report = json.loads((tmp_path / "export.json").read_text(encoding="utf-8"))
     result = report["results"]
@@ -54,6 +61,18 @@ def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     with Image.open(tmp_path / "export_size.png") as chart:
         assert chart.size == (1200, 750)
     assert not list(tmp_path.glob("tmp*"))
+
+    shown = page.read_text(encoding="utf-8")
+    for row in text.splitlines():  # each cell of what was printed, and the chart
+        if row.startswith("|") and "---" not in row:
+            assert all(f">{cell.strip()}<" in html.unescape(shown) for cell in row.strip("|").split(" | "))
+    assert f"<code>{report['command']}</code>" in shown
+    assert f"commit {report['commit']}; 1 threads" in shown
+    picture = re.search(r'src="data:image/png;base64,([^"]+)"', shown)
+    assert picture is not None
+    with Image.open(io.BytesIO(base64.b64decode(picture[1]))) as chart:
+        assert chart.size == (1200, 750)
+    assert "://" not in shown  # nothing of it lies elsewhere
 
 
 def test_the_front_holds_what_no_other_beats_in_both() -> None:

@@ -13,7 +13,7 @@ import pytest
 from tiny_scene import tiny_scene
 
 import hqgs
-from hqgs.base.files import CHECKPOINT
+from hqgs.base.files import CHECKPOINT, lock_folder
 from hqgs.cli import main as cli
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source
@@ -144,6 +144,17 @@ def test_diagnose_prints_and_writes_what_it_found(
     assert f": {written['formation']}\n" in printed
     assert call("diagnose", "/no/such/scene") == 2
     assert one_line(capsys).startswith("hqgs: there is no scene folder")
+
+
+def test_a_folder_that_another_run_holds_stays_as_it_is(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cameras.json").write_text("of the other run")
+    with lock_folder(tmp_path):
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+        assert call("train", "embedded", "--out", tmp_path, "--view", "--port", "0") == 2
+        assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert "another run is writing into" in one_line(capsys)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -43,7 +44,8 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
     source = film(tmp_path / "walk.mp4", 60)
     stages: list[Stage] = []
     folder, note = film_frames(source, tmp_path / "frames", 6, stages.append)
-    names = sorted(path.name for path in folder.iterdir())
+    names = sorted(path.name for path in folder.glob("*.jpg"))
+    assert json.loads((folder / "frames.json").read_text()) == {"film": "walk.mp4"}
     assert names == [f"{k:06d}.jpg" for k in (7, 17, 27, 37, 47, 57)]
     assert "sharpest 6 frames of walk.mp4" in note
     assert stages[-1].done == 60
@@ -54,7 +56,7 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
     assert {path: path.stat().st_mtime_ns for path in again.iterdir()} == times
     few, _ = film_frames(source, tmp_path / "frames")
     assert few != folder
-    assert len(list(few.iterdir())) == 30  # of 2 s: the fewest that are taken
+    assert len(list(few.glob("*.jpg"))) == 30  # of 2 s: the fewest that are taken
 
 
 def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

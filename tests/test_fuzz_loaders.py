@@ -30,6 +30,7 @@ from safetensors.torch import save_file
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.report import read_report
+from hqgs.model.formats.spz import write_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
 from hqgs.scene.formats.degradation_json import DegradedFolder, write_degraded_folder
@@ -142,6 +143,10 @@ def as_format(root: Path, name: str) -> None:
     some_gaussians().save(root / f"scene.{name}")
 
 
+def as_spz_4(root: Path) -> None:
+    write_spz(root / "scene.spz", some_gaussians().arrays(), version=4)
+
+
 def as_path(root: Path) -> None:
     save_path(root / "path.json", [view.camera for view in tiny_scene().train])
 
@@ -168,6 +173,7 @@ TARGETS: dict[str, tuple[Callable[[Path], None], str, Callable[[Path], None], bo
     **{name: (lambda root, name=name: as_format(root, name), f"scene.{name}",
               partial(load_gaussians, name=f"scene.{name}"), False)
        for name in ("spz", "splat", "compressed.ply", "glb")},
+    "spz 4": (as_spz_4, "scene.spz", partial(load_gaussians, name="scene.spz"), False),
     "ply": (as_ply, "scene.ply", load_gaussians, False),
     "ply text": (lambda root: as_ply(root, True), "scene.ply", load_gaussians, True),
     "cameras": (lambda root: save_cameras(root, tiny_scene()), "cameras.json", load_views, True),

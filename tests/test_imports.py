@@ -26,6 +26,23 @@ def test_import_loads_nothing_heavy() -> None:
     assert not loaded("import hqgs") & {*HEAVY, "torch", "numpy"}
 
 
+def test_the_command_loads_nothing_before_it_hears_ctrl_c() -> None:
+    names = loaded("import hqgs.__main__")
+    assert not names & {*HEAVY, "torch", "numpy", "tyro", "rich", "filelock"}
+
+
+def test_ctrl_c_while_the_command_line_loads_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    from hqgs.__main__ import run
+    from hqgs.cli import main
+
+    def stopped() -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(main, "main", stopped)
+    assert run() == 130
+    assert '\nhqgs = "hqgs.__main__:run"\n' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
 def test_to_render_and_to_read_a_scene_needs_torch_alone() -> None:
     names = loaded(
         "import hqgs\nhqgs.rasterization, hqgs.Gaussians.load, hqgs.Camera, hqgs.get_num_threads()"

@@ -14,8 +14,8 @@ from tiny_scene import tiny_scene
 import hqgs
 from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
 from hqgs.scene.geometry import project
-from hqgs.scene.paths import circle, focus, resized, world_up
-from hqgs.scene.scene import Camera
+from hqgs.scene.paths import circle, focus, resized, view_matrix, world_up
+from hqgs.scene.scene import Camera, Scene, View
 
 
 def ring(count: int, *, radius: float = 3.0, tilt: float = 0.5) -> list[Camera]:
@@ -59,6 +59,37 @@ def test_up_and_focus_of_cameras_on_a_ring() -> None:
     np.testing.assert_allclose(world_up(cameras), [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(focus(cameras), [0, 0, 0], atol=0.05)
     np.testing.assert_allclose(world_up(cameras[:1]), -cameras[0].viewmat[1, :3], atol=1e-9)
+
+
+def on_its_side(camera: Camera) -> Camera:
+    """The same camera turned so that left in its picture is up: a quarter turn clockwise shows it."""
+    right, down, forward = camera.viewmat[:3, :3]
+    return Camera(
+        camera.height, camera.width, camera.K, view_matrix(np.stack([down, -right, forward]), camera.center)
+    )
+
+
+def test_up_follows_photos_that_were_held_on_their_side(tmp_path: Path) -> None:
+    cameras, turns = ring(9), [k % 4 for k in range(9)]
+    stored = []
+    for camera, turn in zip(cameras, turns, strict=True):
+        for _ in range(turn):
+            camera = on_its_side(camera)
+        stored.append(camera)
+    np.testing.assert_allclose(world_up(stored, turns), [0, 0, 1], atol=1e-9)
+    assert np.abs(world_up(stored) - [0, 0, 1]).max() > 0.5
+    np.testing.assert_allclose(world_up(stored[1:2], turns[1:2]), -cameras[1].viewmat[1, :3], atol=1e-9)
+    photo = np.zeros((8, 8, 3), np.uint8)
+    views = [View(str(k), camera, photo, turn=turns[k]) for k, camera in enumerate(stored)]
+    scene = Scene("a", views, [], np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), "photos")
+    save_cameras(tmp_path, scene)
+    up = load_cameras(tmp_path).up
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-9)
+    centers = np.stack([camera.center for camera in hqgs.orbit(stored, 7, up=2 * up)])
+    heights = np.stack([camera.center for camera in hqgs.orbit(cameras, 7)])[:, 2]
+    np.testing.assert_allclose(centers[:, 2], heights, atol=1e-9)
+    with pytest.raises(ValueError, match=r"up is \[0.0, 0.0, 0.0\], wanted a direction"):
+        hqgs.orbit(stored, 7, up=(0, 0, 0))
 
 
 def test_a_path_goes_through_its_cameras_at_an_even_speed() -> None:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,18 +21,23 @@ import pytest
 import torch
 from browser import PATIENCE, chromium, wait
 from PIL import Image
+from scipy.spatial.transform import Rotation
+from test_ply import random_gaussians
 from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 from hqgs.cli import main as cli
 from hqgs.cli import view
+from hqgs.evaluation.photo_facts import facts_of_photos
+from hqgs.evaluation.report import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import resized
 from hqgs.viewer import guard
 from hqgs.viewer.guard import MAX_MESSAGE, allowed, start_server
 from hqgs.viewer.pictures import Pose, beside, same_view
-from hqgs.viewer.viewer import Viewer
+from hqgs.viewer.splats import browser_splats
+from hqgs.viewer.viewer import BROWSER, RASTERIZER, Viewer
 
 
 @pytest.fixture(scope="module")
@@ -277,6 +283,84 @@ def test_the_page_in_a_browser(folder: Path, capsys: pytest.CaptureFixture[str])
         assert str(viewer._numbers.content).endswith("| Gaussians | many |")
 
 
+def test_the_browser_draws_the_scene_itself(folder: Path) -> None:
+    """Its splats, without harmonics, look like the rasterizer's picture of the same."""
+    model = hqgs.Gaussians.load(folder)
+    plain = replace(model, shN=model.shN[:, :0])
+    with serving(folder) as viewer, chromium(600, 400) as (page, wrong):
+        page.goto(viewer.url)
+        wait(page, "document.querySelector('canvas') && document.body.innerText.includes('Show cameras')")
+        until(lambda: viewer.watched)
+        (client,) = viewer._clients.values()
+        time.sleep(2)
+        viewer._drawn.value = BROWSER
+        until(lambda: viewer._splats is not None)
+
+        def shown() -> np.ndarray:
+            return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)[190:395, 5:270]
+
+        pose = Pose.of(client.handle.camera)
+        assert pose is not None
+        ours = expected(plain, pose.camera(400))[190:395, 5:270]
+        until(lambda: np.abs(shown() - ours).mean() < 12)
+        viewer.set_scene(model)  # as a run that trains does
+        assert viewer._splats is not None
+        viewer._drawn.value = RASTERIZER
+        until(lambda: viewer._splats is None)
+        known = ("deprecated", "computeBoundingSphere")  # of viser's own splats
+        assert [text for text in wrong if not any(word in text for word in known)] == []
+
+
+def test_splats_of_the_browser_are_the_gaussians() -> None:
+    g = random_gaussians(50, 3)
+    g.means[7, 1] = math.nan
+    g.quats[9] = math.inf
+    splats = browser_splats(g)
+    keep = torch.tensor([k for k in range(50) if k not in (7, 9)])
+    assert splats.centers.shape == (48, 3)
+    np.testing.assert_array_equal(splats.centers, g.means[keep].numpy())
+    w, *xyz = g.quats[keep].numpy().T.astype(np.float64)
+    R = Rotation.from_quat(np.stack([*xyz, w], 1)).as_matrix()
+    squares = np.exp(2 * g.scales[keep].numpy().astype(np.float64))
+    wanted = (R * squares[:, None]) @ R.swapaxes(1, 2)
+    np.testing.assert_allclose(splats.covariances, wanted, rtol=2e-4, atol=1e-5)
+    np.testing.assert_allclose(splats.opacities[:, 0], torch.sigmoid(g.opacities[keep]).numpy(), rtol=1e-6)
+    colors = np.clip(0.5 + 0.28209479 * g.sh0[keep, 0].numpy(), 0, 1)
+    np.testing.assert_allclose(splats.rgbs, colors, atol=1e-6)
+
+
+def test_the_page_says_what_the_report_says_of_a_photo(folder: Path) -> None:
+    with serving(folder) as viewer:
+        (held_out,) = (view.name for view in viewer._views.values() if view.held_out)
+        trained = next(view.name for view in viewer._views.values() if not view.held_out)
+        photo = {"name": trained, "width": 24, "height": 16, "blur": "motion", "blur_px": 3.25, "noise": 7.04}
+        photo |= {"jpeg_quality": None, "enlarged": 2}
+        learned = {"name": trained, "shake_px": 1.5, "gains": [2.0, 2.0, 2.0]}
+        view = {"name": held_out, "psnr": 25.5, "ssim": None}
+        report = {"photos": [photo], "learned": [learned], "metrics": {"views": [view]}}
+        viewer.set_facts(facts_of_photos(report))
+        assert viewer._of_photo.content == ""
+        viewer._photo.value = trained
+        until(lambda: "motion, 3.25 px" in viewer._of_photo.content)
+        for row in (
+            "| noise | 7.0 levels |",
+            "| enlarged | x2 |",
+            "| shake | 1.5 px |",
+            "| exposure, stops | +1.00 |",
+        ):
+            assert row in viewer._of_photo.content
+        viewer._photo.value = held_out
+        until(lambda: viewer._of_photo.content.endswith("|---|---|\n| PSNR | 25.500 |"))
+
+
+def test_a_report_says_what_its_photos_suffer_from(tmp_path: Path) -> None:
+    run = hqgs.train(tiny_scene(), out=tmp_path, iterations=3)
+    facts = facts_of_photos(read_report(tmp_path / "report.json"))
+    assert {view.name for view in (*tiny_scene().train, *tiny_scene().test)} == facts.keys()
+    assert facts["view1.png"]["size"] == f"{WIDTH} x {HEIGHT}"
+    assert run.report["photos"][0]["enlarged"] == 1
+
+
 def test_a_path_that_was_made_in_the_page_is_rendered(folder: Path, tmp_path: Path) -> None:
     with serving(folder) as viewer:
         viewer._save(None)
@@ -348,7 +432,8 @@ def test_train_shows_its_page_and_stays(
 def test_looking_on_does_not_change_a_run(tmp_path: Path) -> None:
     scene = tiny_scene()
     alone = hqgs.train(scene, config=tiny_config())
-    live = view.LiveView(scene, tmp_path, port=0)
+    live = view.LiveView(scene, tmp_path / "missing", port=0)
+    assert not any(tmp_path.iterdir())  # the folder is the run's
     try:
         live.viewer._clients[0] = Looking()  # type: ignore[assignment]
         watched = hqgs.train(scene, config=tiny_config(), progress=live)

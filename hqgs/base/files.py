@@ -23,6 +23,7 @@ FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts"
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
 KEPT = "sfm"  # in the folder of a run: what COLMAP found
+FRAMES = "frames.json"  # in a folder of photos: they are frames of a film, named in its order
 
 
 @contextmanager

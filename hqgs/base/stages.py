@@ -13,6 +13,7 @@ class Stage:
     what: str  # "features", "matches", ...: the same words as long as it is the same work
     done: int
     total: int  # 0: not known
+    note: str = ""  # a sentence that the user should read before the work begins
 
 
 OnStage = Callable[[Stage], None]

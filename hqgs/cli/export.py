@@ -38,6 +38,8 @@ class ExportScene:
     """Of the harmonics, at most."""
     sh_bits: Annotated[tuple[int, int], tyro.conf.arg(metavar="B B")] = DEFAULTS.sh_bits
     """SPZ: of the harmonics of degree 1, and of degrees 2 and 3."""
+    spz_version: Annotated[int, tyro.conf.arg(metavar="V")] = DEFAULTS.spz_version
+    """SPZ: 3, which more programs read, or 4, which is smaller and which newer ones ask for."""
     band_tolerance: Annotated[float, tyro.conf.arg(metavar="T")] = DEFAULTS.band_tolerance
     """Harmonics that change a colour by no more are left out; white is 1."""
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
@@ -57,6 +59,7 @@ def run(args: ExportScene) -> int:
             sh_degree=args.sh_degree,
             band_tolerance=args.band_tolerance,
             sh_bits=args.sh_bits,
+            spz_version=args.spz_version,
         )
         source = scene_file(args.source)
         if args.out.exists() and args.out.samefile(source):

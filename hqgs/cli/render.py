@@ -117,7 +117,8 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
         return None, *load_path(path)
     if known is None or not known.train:
         return None, orbit(gaussians, count, up=UP if options.up is None else options.up), FPS
-    made = orbit(known.train, count) if path == "orbit" else camera_path(known.train, count)
+    up = known.up if options.up is None else options.up
+    made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count)
     return None, made, FPS
 
 

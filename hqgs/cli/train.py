@@ -19,7 +19,7 @@ from hqgs.base.left_out import format_left_out
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
-from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, heard, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
@@ -269,7 +269,7 @@ def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
         **(before | asked | {"path": options.scene, "seed": config.seed}),
         skip_unreadable="photos" in config.leave_out,
         cache=options.out,
-        told=screen,
+        told=heard(screen),
     )
 
 

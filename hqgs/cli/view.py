@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import webbrowser
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,7 @@ from hqgs.viewer.guard import PORT, check
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
     from hqgs.training.progress import Progress
+    from hqgs.viewer.viewer import Viewer
 
 EVERY = 2.0  # seconds between copies of the scene while it trains
 
@@ -43,17 +45,20 @@ def run(options: View, seconds: float | None = None) -> int:
     try:
         file = scene_file(options.source)
         check(options.port)
-        from hqgs.model.gaussians import Gaussians  # here: they load torch
+        from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
+        from hqgs.model.gaussians import Gaussians
         from hqgs.scene.camera_files import CAMERAS, load_cameras
         from hqgs.viewer.viewer import Viewer
 
         gaussians = Gaussians.load(file)
         folder = file.parent
         known = load_cameras(folder) if (folder / CAMERAS).is_file() else None
+        report = _report(folder)
         viewer = Viewer(known, folder, port=options.port, title=folder.resolve().name)
     except BAD_INPUT as error:
         return fail(2, error)
-    viewer.set_scene(gaussians, _numbers(folder, len(gaussians)))
+    viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
+    viewer.set_facts({} if report is None else facts_of_photos(report))
     _tell(viewer.url, options.open)
     try:
         viewer.serve(seconds)
@@ -68,14 +73,22 @@ class LiveView:
     """The page of a run that trains: hand it to `hqgs.train` as `progress`, or call it in yours."""
 
     def __init__(self, scene: Scene, out: Path, *, port: int = PORT, open_browser: bool = False) -> None:
-        """ValueError without viser, the extra `view`."""
-        from hqgs.scene.camera_files import load_cameras, save_cameras
+        self._scene, self._out, self._port, self._open = scene, out, port, open_browser
+        self._copied = -EVERY
+
+    @cached_property
+    def viewer(self) -> Viewer:
+        """The page, from the first step on: by then the run holds its folder, and has written its cameras.
+
+        ValueError without viser, the extra `view`.
+        """
+        from hqgs.scene.camera_files import CAMERAS, load_cameras
         from hqgs.viewer.viewer import Viewer
 
-        save_cameras(out, scene)
-        self.viewer: Viewer = Viewer(load_cameras(out), out, port=port, title=scene.name)
-        self._copied = -EVERY
-        _tell(self.viewer.url, open_browser)
+        known = load_cameras(self._out) if (self._out / CAMERAS).is_file() else None
+        viewer = Viewer(known, self._out, port=self._port, title=self._scene.name)
+        _tell(viewer.url, self._open)
+        return viewer
 
     def __call__(self, now: Progress) -> None:
         """Show the scene as it is, every two seconds, and answer the page after each step."""
@@ -90,7 +103,11 @@ class LiveView:
         self.viewer.pump()
 
     def stay(self) -> None:
-        """Go on showing the trained scene until Ctrl-C."""
+        """Go on showing the trained scene, and what the report says of its photos, until Ctrl-C."""
+        from hqgs.evaluation.photo_facts import facts_of_photos
+
+        if (report := _report(self._out)) is not None:
+            self.viewer.set_facts(facts_of_photos(report))
         _tell(self.viewer.url, open_browser=False)
         try:
             self.viewer.serve()
@@ -106,12 +123,16 @@ def _tell(url: str, open_browser: bool) -> None:
         webbrowser.open(url)
 
 
-def _numbers(folder: Path, gaussians: int) -> list[tuple[str, str]]:
+def _report(folder: Path) -> Any:
+    """report.json of a folder; None where there is none. ValueError where it is damaged."""
     from hqgs.evaluation.report import REPORT, read_report
 
+    return read_report(folder / REPORT) if (folder / REPORT).is_file() else None
+
+
+def _numbers(report: Any, gaussians: int) -> list[tuple[str, str]]:
     rows = [("Gaussians", f"{gaussians:,}")]
-    if (folder / REPORT).is_file():
-        report: Any = read_report(folder / REPORT)
+    if report is not None:
         mean = report["metrics"]["mean"]
         rows += [
             ("iterations", f"{report.get('iterations', '-')}"),

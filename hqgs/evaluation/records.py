@@ -101,6 +101,19 @@ class SfmRecord(TypedDict):
     advice: str | None
 
 
+class PhotoRecord(TypedDict):
+    """What a training photo was found to suffer from, `PhotoDiagnosis` in short. None: not told from it."""
+
+    name: str
+    width: int
+    height: int
+    blur: str | None  # beyond a sharp photo's own: gaussian, defocus or motion, and how much of it
+    blur_px: float | None  # sigma, radius or length
+    noise: float | None  # levels of 1/255
+    jpeg_quality: int | None  # None: no JPEG was seen
+    enlarged: int  # 1: it was not
+
+
 class LearnedRecord(TypedDict):
     """What was learned of a training photo's camera."""
 
@@ -130,6 +143,7 @@ class RunRecord(TypedDict):
     left_out: list[LeftOutRecord]
     guard: GuardRecord
     sfm: SfmRecord | None  # None: poses and points are the scene's own
+    photos: list[PhotoRecord]  # those that were looked at; empty where the method does not ask for it
     learned: list[LearnedRecord]  # of the photos' cameras; empty where nothing of them is learned
     config: dict[str, Json]  # `TrainConfig`, as the method has fitted it to the scene
 

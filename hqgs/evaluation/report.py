@@ -26,6 +26,7 @@ from hqgs.evaluation.records import (
     LearnedRecord,
     MetricsRecord,
     MetricValues,
+    PhotoRecord,
     Report,
     RunRecord,
     SfmRecord,
@@ -71,6 +72,7 @@ class RunResult:
     views: Sequence[RenderedView] = field(repr=False)
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
+    photos: list[PhotoRecord] = field(default_factory=list)
 
 
 def measure(result: RunResult) -> Report:

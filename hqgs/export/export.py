@@ -53,7 +53,9 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     if options.format != "spz":
         reduced.save(path, options.format)
     else:
-        clipped = write_spz(path, along_a_curve(reduced).arrays(), options.sh_bits).clipped
+        clipped = write_spz(
+            path, along_a_curve(reduced).arrays(), options.sh_bits, options.spz_version
+        ).clipped
     written = path.stat().st_size
     sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
     sizes.append(written if options.format == "spz" else _size(reduced, options))
@@ -173,6 +175,6 @@ def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
     if options.format == "compressed.ply":
         return n * (16 + higher) + -(-n // 256) * 72
     try:
-        return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits).data)
+        return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits, options.spz_version).data)
     except ValueError:
         return None

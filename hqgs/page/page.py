@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import write_text
-from hqgs.diagnosis.photo import PhotoDiagnosis
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.held_out import RenderedView, names_of
-from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, ViewMetricValues, alike
+from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
+from hqgs.evaluation.records import HistoryEntry, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.page.charts import line_chart
@@ -117,8 +117,10 @@ def page_text(page: Page) -> str:
         charts=charts,
         measured_on=max(measured_some, default=0),
         parts=[] if diagnosis is None else diagnosis.parts,
-        photos=[] if diagnosis is None else [_photo(photo) for photo in diagnosis.photos],
-        learned=[_learned(record) for record in report["learned"]],
+        photos=[]
+        if diagnosis is None
+        else [_row(p.name, photo_words(photo_record(p))) for p in diagnosis.photos],
+        learned=[_row(record["name"], learned_words(record)) for record in report["learned"]],
         learned_picture=None if page.learned is None else _jpeg(page.learned, LEARNED_SIDE),
         left_out=[_left_out(dict(item)) for item in report["left_out"]],
         notes=report["notes"],
@@ -163,7 +165,7 @@ def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
         "data": packed.data,
         "head": packed.head,
         "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
-        "up": world_up([view.camera for view in scene.train]).tolist(),
+        "up": world_up([v.camera for v in scene.train], [v.turn for v in scene.train]).tolist(),
         "aspect": f"{first.width} / {first.height}",
         "note": note,
     }
@@ -216,25 +218,8 @@ def _jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 
-def _photo(photo: PhotoDiagnosis) -> tuple[str, ...]:
-    blur = "not told" if photo.blur is None else f"{photo.blur.kind}, {photo.blur.amount:.2f} px"
-    noise = "not told" if photo.noise is None else f"{photo.noise:.1f} levels"
-    quality = "no JPEG seen" if photo.jpeg.quality is None else f"{photo.jpeg.quality}"
-    factor = photo.enlargement.factor
-    return (
-        photo.name,
-        f"{photo.width} x {photo.height}",
-        blur,
-        noise,
-        quality,
-        "no" if factor == 1 else f"x{factor}",
-    )
-
-
-def _learned(record: LearnedRecord) -> tuple[str, ...]:
-    stops = np.log2(record["gains"])
-    shake = f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"
-    return record["name"], shake, f"{stops.mean():+.2f}", *(f"{value:+.2f}" for value in stops - stops.mean())
+def _row(name: str, words: dict[str, str]) -> tuple[str, ...]:
+    return name, *words.values()
 
 
 def _left_out(item: dict[str, Any]) -> dict[str, str]:

@@ -74,7 +74,7 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
                 "photo": photo,
             }
         )
-    up = world_up([view.camera for view in scene.train])
+    up = world_up([view.camera for view in scene.train], [view.turn for view in scene.train])
     frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
     write_json(folder / CAMERAS, {"frame": frame, "up": up.tolist(), "views": entries})
 

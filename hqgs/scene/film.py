@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.base.files import FRAMES, write_json
 from hqgs.base.stages import OnStage, Stage, untold
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
@@ -32,7 +33,7 @@ def film_frames(
         raise ValueError(f"frames is {count}, wanted at least 3")
     av = _pyav(path)
     state = path.stat()
-    name = f"{path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
+    name = f"2 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -41,10 +42,14 @@ def film_frames(
         try:
             for number, frame in _sharpest(av, path, count, told):
                 Image.fromarray(frame).save(new / f"{number:06d}.jpg", quality=QUALITY, subsampling=0)
+            write_json(new / FRAMES, {"film": path.name})
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
-    return target, f"the sharpest {len(list(target.iterdir()))} frames of {path.name}, one for each interval"
+    return (
+        target,
+        f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval",
+    )
 
 
 def _sharpest(

@@ -17,6 +17,9 @@ MOST_KEYS = 24  # cameras that a path goes through: more of them shake it
 TURN = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle
 _Array = NDArray[np.float64]
+# What is right in a picture that is shown upright, by quarter turns clockwise, in the frame of its camera; up
+# is what is right one turn on.
+RIGHT = np.array([[1.0, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0]])
 
 
 def look_at(
@@ -74,15 +77,18 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, K, camera.viewmat)
 
 
-def world_up(cameras: Sequence[Camera]) -> _Array:
+def world_up(cameras: Sequence[Camera], turns: Sequence[int] | None = None) -> _Array:
     """The direction in the world that is up, unit [3], as most photographers hold their cameras.
 
-    It is orthogonal to the cameras' x axes as far as that says anything (photos that look down do not tilt
-    it then), and the mean of the pictures' upward directions where not.
+    It is orthogonal to the upright pictures' x axes as far as that says anything (photos that look down do
+    not tilt it then), and the mean of their upward directions where not. `turns`: the quarter turns clockwise
+    that show each camera's picture upright (`View.turn`); None: they are upright.
     """
     R = np.stack([camera.viewmat[:3, :3] for camera in cameras])
-    mean = -R[:, 1].mean(axis=0)
-    values, vectors = np.linalg.eigh(R[:, 0].T @ R[:, 0] / len(R))
+    quarters = np.zeros(len(R), int) if turns is None else np.asarray(turns) % 4
+    right = np.einsum("nj,njk->nk", RIGHT[quarters], R)
+    mean = np.einsum("nj,njk->nk", RIGHT[(quarters + 1) % 4], R).mean(axis=0)
+    values, vectors = np.linalg.eigh(right.T @ right / len(R))
     level = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
     if values[1] > 0.1 and values[0] < 0.05 and level @ mean > 0.5:
         mean = level
@@ -192,14 +198,14 @@ def circle(
     return made
 
 
-def orbit_cameras(cameras: Sequence[Camera], frames: int = 120) -> list[Camera]:
-    """An orbit of what given cameras look at, as far away as they are.
+def orbit_cameras(cameras: Sequence[Camera], frames: int = 120, up: ArrayLike | None = None) -> list[Camera]:
+    """An orbit of what given cameras look at, as far away as they are. `up`: [3]; None: `world_up`.
 
     Cameras that stand around their focus are followed in a circle; those on one side of it get a small
     ellipse before it, since what is behind it was never seen.
     """
     _check(cameras, frames)
-    up, middle = world_up(cameras), focus(cameras)
+    up, middle = world_up(cameras) if up is None else _unit("up", up), focus(cameras)
     offsets = np.stack([camera.center for camera in cameras]) - middle
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
@@ -293,3 +299,11 @@ def _vector(name: str, value: ArrayLike) -> _Array:
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"{name} is {np.asarray(value).tolist()}, wanted three finite numbers")
     return vector
+
+
+def _unit(name: str, value: ArrayLike) -> _Array:
+    vector = _vector(name, value)
+    length = float(np.linalg.norm(vector))
+    if not length > 0:
+        raise ValueError(f"{name} is {vector.tolist()}, wanted a direction")
+    return vector / length

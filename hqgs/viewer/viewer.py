@@ -6,7 +6,7 @@ import io
 import threading
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -21,15 +21,16 @@ from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
+from hqgs.viewer.client import SHARP, Client
 from hqgs.viewer.guard import PORT, start_server
 from hqgs.viewer.pictures import Pose, beside, same_view, shown
+from hqgs.viewer.splats import browser_splats
 
-REST = 0.2  # seconds without a move: then the picture gets sharp
-SHARP, COARSEST = 800, 96  # px, heights
-GOAL = 0.06  # seconds for a picture while the camera moves
 FRUSTUMS = 150  # training cameras that are drawn, evenly chosen
 THUMB = 160  # px, of the photos at the cameras
 FREE = "(free)"
+BLACK = np.zeros((1, 1, 3), np.uint8)  # what is behind the Gaussians
+RASTERIZER, BROWSER = "rasterizer", "browser"  # who draws
 PATH_FILE = "camera_path.json"
 
 
@@ -43,11 +44,14 @@ class Viewer:
         self._lock = threading.RLock()
         self._known, self._folder = known, folder
         self._views: dict[str, KnownCamera] = {} if known is None else {v.name: v for v in known.views}
-        self._scene: Activated | None = None
+        self._gaussians: Gaussians | None = None
+        self._scene: Activated | None = None  # they, ready to be rendered
         self._reach = 1.0
-        self._clients: dict[int, _Client] = {}
+        self._clients: dict[int, Client] = {}
         self._keys: list[Camera] = []
         self._stats = ""
+        self._facts: Mapping[str, Mapping[str, str]] = {}
+        self._splats: Any = None  # of the browser, while it draws
         self._server = start_server(port, title)
         self.url: str = f"http://127.0.0.1:{self._server.get_port()}"
         self._up = np.array(UP) if known is None else known.up
@@ -69,19 +73,26 @@ class Viewer:
         first = self._scene is None
         scene = Activated(copy)
         with self._lock:
-            self._scene = scene
+            self._gaussians, self._scene = copy, scene
             if first:
                 self._start_view(copy)
             for client in self._clients.values():
                 client.stale = True
-        self._stats = "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in stats)])
+            if self._drawn.value == BROWSER:
+                self._draw_in_browser()
+        self._stats = _table(stats)
         self._numbers.content = self._stats
+
+    def set_facts(self, facts: Mapping[str, Mapping[str, str]]) -> None:
+        """What the page says of each photo, by its name, where it is chosen: rows of names and values."""
+        self._facts = facts
+        self._tell_photo()
 
     def pump(self) -> bool:
         """Render what pages wait for; whether there was anything."""
         worked = False
         for client in list(self._clients.values()):
-            if self._scene is not None and client.waits():
+            if self._scene is not None and self._splats is None and client.waits():
                 self._render(client)
                 worked = True
         return worked
@@ -99,7 +110,7 @@ class Viewer:
             self._server.stop()
             time.sleep(0.1)
 
-    def _render(self, client: _Client) -> None:
+    def _render(self, client: Client) -> None:
         pose = Pose.of(client.handle.camera)
         sharp = client.begin()
         if pose is None or self._scene is None:
@@ -148,7 +159,7 @@ class Viewer:
         first.near, first.far = 1e-3 * self._reach, 1e3 * self._reach
 
     def _connected(self, handle: Any) -> None:
-        client = _Client(handle)
+        client = Client(handle)
         handle.camera.on_update(lambda _: client.moved())
         with self._lock:
             self._clients[handle.client_id] = client
@@ -165,11 +176,17 @@ class Viewer:
         gui = self._server.gui
         self._numbers = gui.add_markdown(self._stats)
         with gui.add_folder("Picture"):
+            self._drawn = gui.add_dropdown(
+                "Drawn by",
+                (RASTERIZER, BROWSER),
+                hint="The browser moves smoothly and needs a graphics card; it leaves out the harmonics.",
+            )
             self._show = gui.add_dropdown("Show", ("color", "depth", "alpha"))
             self._detail = gui.add_slider("Height, px", 200, 1600, 50, SHARP, hint="of the sharp picture")
         with gui.add_folder("Photos", visible=bool(self._views)):
             names = [v.name for v in sorted(self._views.values(), key=lambda v: not v.held_out)]
             self._photo = gui.add_dropdown("Camera", (FREE, *names))
+            self._of_photo = gui.add_markdown("")
             self._split = gui.add_slider("Photo | render", 0.0, 1.0, 0.01, 0.5)
             self._cameras_box = gui.add_checkbox("Show cameras", False)
         with gui.add_folder("Camera path", expand_by_default=False):
@@ -179,6 +196,7 @@ class Viewer:
             self._told = gui.add_markdown("No view yet.")
         for handle in (self._show, self._detail, self._split):
             handle.on_update(self._refresh)
+        self._drawn.on_update(self._change_drawn)
         self._photo.on_update(self._go_to_photo)
         self._cameras_box.on_update(self._toggle_cameras)
         add.on_click(self._add_key)
@@ -215,18 +233,47 @@ class Viewer:
             made.append(handle)
         return made
 
+    def _change_drawn(self, _: object) -> None:
+        with self._lock:
+            if self._drawn.value == BROWSER:
+                self._draw_in_browser()
+            elif self._splats is not None:
+                self._splats.remove()
+                self._splats = None
+        self._refresh()
+
+    def _draw_in_browser(self) -> None:
+        """The scene as it is, as splats in place of the streamed pictures."""
+        if self._gaussians is None:
+            return
+        old, self._splats = (
+            self._splats,
+            self._server.scene.add_gaussian_splats(
+                f"/splats/{time.monotonic_ns()}", *browser_splats(self._gaussians)
+            ),
+        )
+        if old is not None:
+            old.remove()
+        for client in self._clients.values():
+            client.handle.scene.set_background_image(BLACK)
+
+    def _tell_photo(self) -> None:
+        rows = self._facts.get(self._photo.value, {}).items()
+        self._of_photo.content = _table([*rows]) if rows else ""
+
     def _toggle_cameras(self, _: object) -> None:
         for handle in self._frustums:
             handle.visible = self._cameras_box.value
 
     def _go_to_photo(self, _: object) -> None:
+        self._tell_photo()
         view = self._views.get(self._photo.value)
         if view is not None:
             for client in list(self._clients.values()):
                 self._fly(client, view.camera)
         self._refresh()
 
-    def _fly(self, client: _Client, camera: Camera) -> None:
+    def _fly(self, client: Client, camera: Camera) -> None:
         handle = client.handle.camera
         R = camera.viewmat[:3, :3]
         with client.handle.atomic():
@@ -275,38 +322,10 @@ class Viewer:
         self._told.content = f"{views} {text}"
 
 
-class _Client:
-    """A page: what it waits for."""
-
-    def __init__(self, handle: Any) -> None:
-        self.handle = handle
-        self.stale = True  # what it shows is not what it should
-        self.coarse = SHARP // 2  # px, of a picture while it moves
-        self._last_move = 0.0
-        self._is_sharp = False
-
-    def moved(self) -> None:
-        """Its camera has another pose."""
-        self._last_move = time.monotonic()
-        self.stale = True
-
-    def waits(self) -> bool:
-        """Whether it needs a picture: another one, or the same sharper."""
-        return self.stale or (not self._is_sharp and self._rests())
-
-    def begin(self) -> bool:
-        """A picture for it is begun: whether a sharp one."""
-        self.stale, self._is_sharp = False, self._rests()
-        return self._is_sharp
-
-    def took(self, seconds: float, height: int, sharp: bool) -> None:
-        """Choose the height of the next coarse picture by the time of this one."""
-        if not sharp:
-            wanted = height * (GOAL / max(seconds, 1e-3)) ** 0.5
-            self.coarse = int(min(max(0.5 * (self.coarse + wanted), COARSEST), SHARP))
-
-    def _rests(self) -> bool:
-        return time.monotonic() - self._last_move > REST
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    """Markdown; names of files may hold what its tables mean otherwise."""
+    lines = (f"| {name} | {value} |".replace("\n", " ") for name, value in rows)
+    return "\n".join(["| | |", "|---|---|", *lines])
 
 
 def _quaternion(R: Any) -> Any:

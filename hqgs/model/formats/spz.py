@@ -1,9 +1,10 @@
 """SPZ files (Niantic's open format): a tenth of a PLY file, with a known error in every value.
 
-A gzip stream of a 16-byte header and one array after the other: positions, opacities, colours, scales,
-rotations, SH. Written is version 3; versions 2 and 3 are read. A file holds its scene in the frame RUB (x
-right, y up, z back), the Gaussians here and PLY files are RDF (x right, y down, z forward): y and z change
-their sign, and with them those parts of the rotations and of the SH that are odd in them.
+One array after the other, positions, opacities, colours, scales, rotations, SH, in a container
+(`hqgs.model.formats.spz_container`): versions 3 and 4 differ in that alone. Written are both; version 2 is
+read too. A file holds its scene in the frame RUB (x right, y up, z back), the Gaussians here and PLY files
+are RDF (x right, y down, z forward): y and z change their sign, and with them those parts of the rotations
+and of the SH that are odd in them.
 
 What a value that was written and read back may differ by, float32 rounding aside:
 
@@ -22,8 +23,6 @@ Values outside a range become its end; `SpzFile.clipped` counts them.
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,19 +31,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.files import atomic_path
-from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.spz_container import (
+    MAX_FRACTION,
+    MAX_GAUSSIANS,
+    VERSIONS,
+    Bytes,
+    Content,
+    pack,
+    unpack,
+)
 
-MAGIC = 0x5053474E  # "NGSP"
-HEADER = struct.Struct("<IIIBBBB")  # magic, version, Gaussians, SH degree, fractional bits, flags, 0
-VERSION = 3
-MAX_GAUSSIANS = 10_000_000  # Niantic's reader takes no more
-GZIP = 31  # zlib's number for a stream with a gzip header
-MAX_RATIO = 1032  # deflate packs no better
+VERSION = VERSIONS[0]  # what more programs read
 SH_BITS = (8, 8)  # of degree 1, of degrees 2 and 3; less rounds small values that many Gaussians share to 0
 
 LIMIT = (1 << 23) - 1  # of a 24-bit number; its negative is used alike
-MAX_FRACTION = 23  # bits: a step of 1.2e-7, what float32 can tell apart at 1
 FINE = 1 / 64  # the error of a position, as a share of its Gaussian's largest scale, that is fine enough
 COARSE = 1 / 8  # and the one that shows
 MISFIT_SHARE = 0.01  # of the Gaussians, whose positions or sizes the format may miss
@@ -61,7 +62,6 @@ FLIP_QUATS = np.array([1.0, -1.0, -1.0, 1.0])  # x y z w
 FLIP_SH = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float64)
 
 Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -75,26 +75,31 @@ class SpzFile:
     clipped: dict[str, int]  # values outside the format's range, by name; only what is not 0
 
 
-def write_spz(path: str | Path, gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
+def write_spz(
+    path: str | Path, gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS, version: int = VERSION
+) -> SpzFile:
     """Write Gaussians atomically. See `encode_spz` for the errors."""
-    file = encode_spz(gaussians, sh_bits)
+    file = encode_spz(gaussians, sh_bits, version)
     with atomic_path(path) as tmp:
         tmp.write_bytes(file.data)
     return file
 
 
-def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile:
+def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS, version: int = VERSION) -> SpzFile:
     """The bytes of an SPZ file, without the Gaussians that hold NaN or Inf.
 
     Args:
         gaussians: at most 10,000,000.
         sh_bits: 1..8 bits for the SH coefficients of degree 1, and of degrees 2 and 3.
+        version: 3 or 4; the same values in another container.
 
     Raises ValueError where the format's ranges do not fit the scene: where more than 1 % of the Gaussians
     would be displaced by more than an eighth of their largest scale, or have a largest scale out of range.
     """
     if len(sh_bits) != 2 or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"sh_bits is {sh_bits}, wanted two numbers in 1..8")
+    if version not in VERSIONS:
+        raise ValueError(f"version is {version}, wanted one of: {', '.join(map(str, VERSIONS))}")
     n, rest = gaussians["shN"].shape[:2]
     if n > MAX_GAUSSIANS:
         raise ValueError(f"{n:,} Gaussians, but an SPZ file takes at most {MAX_GAUSSIANS:,}")
@@ -126,14 +131,12 @@ def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS) -> SpzFile
         _pack_quats(FLIP_QUATS * arrays["quats"]),
         byte("shN", FLIP_SH[:rest, None] * arrays["shN"] * SH_ONE + SH_ONE, steps[:rest, None]),
     ]
-    header = HEADER.pack(MAGIC, VERSION, len(means), math.isqrt(rest + 1) - 1, fraction, 0, 0)
-    packer = zlib.compressobj(wbits=GZIP)
-    data = packer.compress(header) + b"".join(packer.compress(s.tobytes()) for s in sections) + packer.flush()
-    return SpzFile(data, len(means), n - len(means), fraction, clipped)
+    content = Content(version, len(means), math.isqrt(rest + 1) - 1, fraction, sections)
+    return SpzFile(pack(content), len(means), n - len(means), fraction, clipped)
 
 
 def read_spz(path: str | Path) -> Arrays:
-    """Read an SPZ file of version 2 or 3 with harmonics of degree 0 to 3: float32 arrays.
+    """Read an SPZ file of version 2, 3 or 4 with harmonics of degree 0 to 3: float32 arrays.
 
     An opacity of 0 or 1 has no finite logit: it is taken a quarter of a step inwards.
 
@@ -144,42 +147,16 @@ def read_spz(path: str | Path) -> Arrays:
             most 10,000,000. The message names the file.
     """
     path = Path(path)
-    packed = path.read_bytes()
-    unpacker = zlib.decompressobj(wbits=GZIP)
-    head = _unpack(unpacker, packed, HEADER.size, path)
-    if len(head) < HEADER.size:
-        raise ValueError(f"{path}: not an SPZ file: it ends within the header")
-    magic, version, n, degree, fraction, flags, _ = HEADER.unpack(head)
-    if magic != MAGIC:
-        raise ValueError(f"{path}: not an SPZ file: its first number is {magic:#x}, wanted {MAGIC:#x}")
-    if version not in (2, 3):
-        raise ValueError(f"{path}: SPZ version {version}, wanted 2 or 3")
-    if degree > MAX_SH_DEGREE:
-        raise ValueError(f"{path}: harmonics of degree {degree}, wanted 0..{MAX_SH_DEGREE}")
-    if flags:
-        raise ValueError(f"{path}: flags {flags:#x}: antialiased scenes and extensions are not supported")
-    if fraction > MAX_FRACTION:
-        raise ValueError(f"{path}: {fraction} fractional bits, wanted at most {MAX_FRACTION}")
-    rest = (degree + 1) ** 2 - 1
-    widths = [9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest]
-    size = n * sum(widths)
-    if n > MAX_GAUSSIANS or size > MAX_RATIO * len(packed):
-        raise ValueError(f"{path}: the header promises {n:,} Gaussians, the file has {len(packed):,} bytes")
-    data = np.frombuffer(_unpack(unpacker, unpacker.unconsumed_tail, size, path), np.uint8)
-    more = _unpack(unpacker, unpacker.unconsumed_tail, 1, path) or unpacker.unused_data
-    if len(data) < size or not unpacker.eof or more:
-        raise ValueError(f"{path}: damaged: {'more' if more else 'less'} data than {n:,} Gaussians have")
-    bounds = np.cumsum([n * width for width in widths])[:-1]
-    means, opacities, colors, scales, quats, sh = (
-        part.reshape(n, width) for part, width in zip(np.split(data, bounds), widths, strict=True)
-    )
+    file = unpack(path.read_bytes(), path)
+    n, rest = file.gaussians, (file.sh_degree + 1) ** 2 - 1
+    means, opacities, colors, scales, quats, sh = file.arrays
     fixed = np.zeros((n, 3, 4), np.uint8)
     fixed[..., 1:] = means.reshape(n, 3, 3)  # in the upper bytes, so that the shift below keeps the sign
-    xyzw = _unpack_quats(quats) if version == 3 else _first_three(quats)
+    xyzw = _unpack_quats(quats) if file.version >= 3 else _first_three(quats)
     from scipy.special import logit
 
     return {
-        "means": _floats(FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**fraction),
+        "means": _floats(FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**file.fraction),
         "scales": _floats(scales / LOG_SCALE - LOG_OFFSET),
         "quats": _floats(np.roll(FLIP_QUATS * xyzw, 1, axis=1)),
         "opacities": _floats(logit(opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255)),
@@ -250,13 +227,3 @@ def _first_three(packed: Bytes) -> Array:
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1)))
     return np.concatenate([xyz, w[:, None]], axis=1)
-
-
-def _unpack(unpacker: Any, packed: bytes, size: int, path: Path) -> bytes:
-    """The next `size` bytes of a gzip stream, never more; less where it ends."""
-    if size == 0:
-        return b""  # zlib would take 0 for no limit
-    try:
-        return unpacker.decompress(packed, size)
-    except zlib.error as error:
-        raise ValueError(f"{path}: not a readable SPZ file: {error}") from error

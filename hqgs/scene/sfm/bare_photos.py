@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from hqgs.base.files import FRAMES
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
@@ -54,6 +55,7 @@ class BarePhotos:
             [self.sizes[k] for k in first],
             [self.exif[k].focal for k in first],
             [cameras.index(k) for k in keys],
+            (self.folder / FRAMES).is_file(),
         )
 
     def write(self, folder: Path) -> None:

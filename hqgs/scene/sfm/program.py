@@ -11,10 +11,11 @@ and of each sighting the numbers of the photo and of the point: photos [O], rows
 `reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is
 no model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes
 [C, 2], focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera,
-camera_of [V]. Where the first pass registers few photos, a second, more tolerant one follows; the better of
-the two counts. `facts.json` says what both came to, `stage.json` what is being done now, which is read from
-COLMAP's log: the caller sends the output to `log.txt`. A second call in the same DIRECTORY goes on with the
-features and matches that the first one left. The program ends when its standard input does.
+camera_of [V]. Where it has pairs [P, 2], numbers of photos, the first pass matches those alone. Where that
+registers few photos, a second, more tolerant one follows, with every pair; the better of the two counts.
+`facts.json` says what both came to, `stage.json` what is being done now, which is read from COLMAP's log: the
+caller sends the output to `log.txt`. A second call in the same DIRECTORY goes on with the features and
+matches that the first one left. The program ends when its standard input does.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ LARGEST = 1600  # px a side: features of larger photos cost minutes and place no
 ENOUGH = 0.7  # of the photos: with fewer, the second pass follows
 FOCAL = 1.2  # of the longer side, where nothing tells
 BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
+LISTED = 64  # blocks of pairs that are listed
 EVERY = 0.5  # s between looks into the log
-BLOCK = re.compile(r"Processing block \[(\d+)/(\d+), (\d+)/(\d+)\]")
+BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 
 
 def triangulate(directory: Path) -> None:
@@ -71,7 +73,7 @@ def triangulate(directory: Path) -> None:
 
 
 def reconstruct(directory: Path, threads: int) -> None:
-    """SIFT, exhaustive matching, RANSAC, incremental mapping; the threads change no bit of the result.
+    """SIFT, matching, RANSAC, incremental mapping; the threads change no bit of the result.
 
     Features and matches of one photo or pair depend on no other, and are read back in the order of their
     numbers. What draws random numbers or adds up in the order of arrival has one thread and the seed 0.
@@ -117,7 +119,9 @@ class _Pass:
         if self.tolerant:
             extraction.sift.peak_threshold /= 4
         photos = Path(str(self.given["photos"]))
-        _match(self.directory, photos, self.names, extraction, self.threads, self.database, self._watched)
+        pairs = None if self.tolerant else self.given.get("pairs")
+        todo = self.directory, photos, self.names, extraction, self.threads, self.database
+        _match(*todo, self._watched, pairs)
         self._tell("verify", 0)
         verifier = pycolmap.GeometricVerifierOptions()
         verifier.num_threads = 1
@@ -189,7 +193,7 @@ class _Pass:
                 text = log.read_bytes()[start:].decode(errors="replace") if log.exists() else ""
                 count = text.count("Processed file [")
                 if blocks := BLOCK.findall(text):
-                    row, rows, column, columns = map(int, blocks[-1])
+                    row, rows, column, columns = (int(part or 1) for part in blocks[-1])
                     count = round(total * ((row - 1) * columns + column - 1) / (rows * columns))
                 self._tell(stage, count, total)
 
@@ -223,8 +227,9 @@ def _match(
     threads: int,
     database: Path,
     watched: Callable[[str, int], AbstractContextManager[None]] = _unwatched,
+    pairs: Any = None,
 ) -> None:
-    """Features and matches of every pair, not yet checked by geometry."""
+    """Features, and matches of these pairs [P, 2] or of every pair, not yet checked by geometry."""
     reader = pycolmap.ImageReaderOptions()
     if (directory / "masks").is_dir():
         reader.mask_path = directory / "masks"
@@ -240,6 +245,15 @@ def _match(
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = threads
     matching.skip_geometric_verification = True
+    if pairs is not None:
+        listed = pycolmap.ImportedPairingOptions()
+        listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // LISTED)
+        listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist()))
+        with watched("matches", len(pairs)):
+            pycolmap.match_image_pairs(
+                database, matching_options=matching, pairing_options=listed, device=pycolmap.Device.cpu
+            )
+        return
     pairing = pycolmap.ExhaustivePairingOptions()
     pairing.block_size = max(2, -(-len(names) // BLOCKS))
     with watched("matches", len(names) * (len(names) - 1) // 2):

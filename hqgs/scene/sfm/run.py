@@ -28,6 +28,9 @@ from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 PROGRAM = Path(__file__).with_name("program.py")
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
+NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
+LARGEST = 1600  # px a side of what COLMAP looks at, as `program.py` has it
+LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
 LISTEN = 0.25  # s between looks at what COLMAP is doing
 STAGES = {
     "features": "COLMAP: features",
@@ -44,6 +47,7 @@ class Guess:
     sizes: list[tuple[int, int]]  # width and height of each camera
     focals: list[float]  # px; 0: not known
     camera_of: list[int]  # of each photo, the number of its camera
+    ordered: bool = False  # frames of a film: photos see what those before and after them see
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,44 @@ class Model:
         return self.passes[0].registered if len(self.passes) > 1 else None
 
 
+def film_pairs(count: int) -> NDArray[np.int64]:
+    """The pairs of frames [P, 2] that are matched, sorted; they do not grow with the frames squared.
+
+    Each frame with the next 10, and with those 16, 32, 64, ... after it, which make tracks long; and for a
+    camera that comes back to a place each with each of 24 frames that are spread over the film.
+    """
+    first, second = np.triu_indices(count, 1)
+    apart = second - first
+    thin = np.isin(np.arange(count), np.linspace(0, count - 1, THIN).round())
+    near = (apart <= NEAR) | ((apart & (apart - 1)) == 0)
+    chosen = near | (thin[first] & thin[second])
+    return np.stack([first[chosen], second[chosen]], axis=1)
+
+
+def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int) -> str:
+    """A sentence on how long COLMAP takes, where that may be more than a minute; else nothing.
+
+    `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all. The range is that of photos with
+    little and with much detail, measured on two threads of an AMD EPYC.
+    """
+    count = len(sizes)
+    pairs = count * (count - 1) // 2 if pairs is None else pairs
+    stored = sizes.prod(axis=1) / 1e6  # megapixels
+    seen = stored * np.minimum(1, LARGEST / sizes.max(axis=1)) ** 2
+    share = 2 / threads
+    least = share * (0.8 * seen.sum() + 0.015 * pairs) + 0.02 * pairs
+    most = share * (2.2 * seen.sum() + 0.4 * pairs * min(1, seen.mean()) ** 2) + 0.05 * pairs + 1.6 * count
+    if most < LONG:
+        return ""
+    shrunk = f", which COLMAP looks at at {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
+    advice = "; 100 photos are plenty for most scenes" if count > MANY else ""
+    return (
+        f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
+        f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} threads, more the "
+        f"more detail they show{advice}"
+    )
+
+
 def run_colmap(
     names: Sequence[str],
     contents: Iterable[bytes],
@@ -101,17 +143,22 @@ def run_colmap(
             f"structure from motion needs at least {LEAST_PHOTOS} photos, got {len(names)}: 20 to 100 that "
             "overlap make a good scene"
         )
-    given: dict[str, NDArray[np.generic]] = {"names": np.array(names)}
+    given: dict[str, NDArray[Any]] = {"names": np.array(names)}
     if isinstance(cameras, Guess):
         given["sizes"] = np.array(cameras.sizes)
         given["focals"] = np.array(cameras.focals, np.float64)
         given["camera_of"] = np.array(cameras.camera_of)
+        if cameras.ordered:
+            given["pairs"] = film_pairs(len(names))
     else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
     kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
         return _read(kept)
+    sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
+    if note := expected_time(sizes, len(given["pairs"]) if "pairs" in given else None, get_num_threads()):
+        told(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:
         photos = directory / "photos"
         if not photos.is_dir():
@@ -199,7 +246,7 @@ def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArr
     digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode() + PROGRAM.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
-    for part in ("sizes", "Ks", "focals", "camera_of"):
+    for part in ("sizes", "Ks", "focals", "camera_of", "pairs"):
         if part in given:
             digest.update(given[part].tobytes())
     return digest.hexdigest()[:16]

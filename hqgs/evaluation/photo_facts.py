@@ -1,0 +1,62 @@
+"""What a photo was found to suffer from, as the report keeps it, and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hqgs.diagnosis.photo import PhotoDiagnosis
+from hqgs.evaluation.records import LearnedRecord, PhotoRecord
+
+
+def photo_record(found: PhotoDiagnosis) -> PhotoRecord:
+    """The diagnosis of a photo as the report keeps it."""
+    return {
+        "name": found.name,
+        "width": found.width,
+        "height": found.height,
+        "blur": None if found.blur is None else found.blur.kind,
+        "blur_px": None if found.blur is None else found.blur.amount,
+        "noise": found.noise,
+        "jpeg_quality": found.jpeg.quality,
+        "enlarged": found.enlargement.factor,
+    }
+
+
+def photo_words(record: PhotoRecord) -> dict[str, str]:
+    """Size and faults, by name, for people."""
+    blur, quality, factor = record["blur"], record["jpeg_quality"], record["enlarged"]
+    return {
+        "size": f"{record['width']} x {record['height']}",
+        "blur": "not told" if blur is None else f"{blur}, {record['blur_px']:.2f} px",
+        "noise": "not told" if record["noise"] is None else f"{record['noise']:.1f} levels",
+        "JPEG quality": "no JPEG seen" if quality is None else f"{quality}",
+        "enlarged": "no" if factor == 1 else f"x{factor}",
+    }
+
+
+def learned_words(record: LearnedRecord) -> dict[str, str]:
+    """Shake and exposure, by name, for people."""
+    stops = np.log2(record["gains"])
+    rgb = {name: f"{value:+.2f}" for name, value in zip("RGB", stops - stops.mean(), strict=True)}
+    shake = f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"
+    return {"shake": shake, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
+
+
+def facts_of_photos(report: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """What a report says of each photo, by its name: faults, what was learned, how well it is rendered.
+
+    Reports of older runs say less.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for record in report.get("photos", []):
+        found.setdefault(record["name"], {}).update(photo_words(record))
+    for record in report.get("learned", []):
+        found.setdefault(record["name"], {}).update(learned_words(record))
+    for view in report["metrics"]["views"]:
+        values = {name.upper(): view.get(name) for name in ("psnr", "ssim", "haarpsi")}
+        told = {name: f"{value:.3f}" for name, value in values.items() if value is not None}
+        found.setdefault(view["name"], {}).update(told)
+    return found

@@ -1,0 +1,50 @@
+"""The Gaussians as splats of the browser, which sorts and blends them itself."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from hqgs.model.constants import SH_C0
+from hqgs.model.gaussians import Gaussians
+
+Floats = NDArray[np.float32]
+
+
+class Splats(NamedTuple):
+    """What `viser` draws, in the order of its arguments."""
+
+    centers: Floats  # [N, 3]
+    covariances: Floats  # [N, 3, 3]
+    rgbs: Floats  # [N, 3], 0 to 1
+    opacities: Floats  # [N, 1]
+
+
+def browser_splats(gaussians: Gaussians) -> Splats:
+    """The Gaussians as the browser draws them.
+
+    Colours are those of the constant harmonic alone: the same from every side. Gaussians with a value
+    that is not finite are left out.
+    """
+    rows = torch.cat([tensor.detach().flatten(1) for tensor in _columns(gaussians)], dim=1)
+    g = Gaussians(**{name: t.detach()[rows.isfinite().all(1)] for name, t in gaussians.named().items()})
+    w, x, y, z = torch.nn.functional.normalize(g.quats, dim=1).unbind(1)
+    rotations = torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        dim=1,
+    )
+    factors = rotations * g.activated_scales()[:, None]
+    colors = (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1)
+    found = g.means, factors @ factors.mT, colors, g.activated_opacities()[:, None]
+    return Splats(*(tensor.numpy().astype(np.float32) for tensor in found))
+
+
+def _columns(g: Gaussians) -> list[torch.Tensor]:
+    return [g.means, g.scales, g.quats, g.opacities[:, None], g.sh0]
