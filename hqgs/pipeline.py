@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
@@ -15,6 +15,7 @@ from hqgs.base.files import (
     CHECKPOINT,
     CONFIG,
     PAGE,
+    PLAN,
     PLY,
     atomic_path,
     lock_folder,
@@ -33,10 +34,11 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.page.page import Page, summary_html, write_page
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Scene
+from hqgs.training.clock import fitting
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.cameras import Found
 from hqgs.training.progress import OnProgress, progress_of
-from hqgs.training.settings import config_values
+from hqgs.training.settings import config_values, plan_values, with_iterations
 from hqgs.training.trainer import Trainer
 
 LEARNED = "learned.png"  # what was learned of the photos' cameras
@@ -71,6 +73,7 @@ def train(
     *,
     out: str | Path | None = None,
     iterations: int | None = None,
+    seconds: float | None = None,
     method: str = AUTO,
     leave_out: str = AUTO,
     seed: int = 0,
@@ -94,6 +97,9 @@ def train(
         out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, report.html,
             `comparison/*.png`, error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
         iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
+        seconds: of training, in place of `iterations`: as many as fit in, by the steps of this machine before
+            the run and once more after growth. `iterations` and `turn` of the configuration in the report,
+            and plan.json, tell what that came to: a run with these makes the same bits again.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
             "srgs" or "hqgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
@@ -129,26 +135,38 @@ def train(
         raise ValueError("config is the whole configuration: nothing of it can be given beside it")
     if out is not None and (Path(out) / CHECKPOINT).exists() and not (resume or overwrite):
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
-    with open_run(scene, config or asked, out, resume) as trainer:
+    if seconds is not None and iterations is not None:
+        raise ValueError("iterations and seconds: only one of them can be given")
+    with open_run(scene, config or asked, out, resume, seconds) as trainer:
         return run_to_end(trainer, out, progress)
 
 
 @contextmanager
 def open_run(
-    scene: Scene, config: TrainConfig, out: str | Path | None = None, resume: bool = False
+    scene: Scene,
+    config: TrainConfig,
+    out: str | Path | None = None,
+    resume: bool = False,
+    seconds: float | None = None,
 ) -> Iterator[Trainer]:
     """A trainer that holds the folder `out`: fresh, or with `resume` where the checkpoint there ends.
+
+    With `seconds` a fresh one has as many iterations as fit in.
 
     Without a checkpoint `resume` starts fresh (the run may have been killed before its first one). A fresh
     run removes an older checkpoint. See `train` for the errors.
     """
+    if seconds is not None:
+        config = replace(config, seconds=seconds)
     if out is None:
-        yield Trainer(scene, config)
+        yield Trainer(scene, _fitted(scene, config))
         return
     checkpoint = Path(out) / CHECKPOINT
     with lock_folder(out):
         for file in (CHECKPOINT, PLY):
             remove_leftovers(Path(out) / file)
+        going_on = resume and checkpoint.exists()
+        config = config if going_on else _fitted(scene, config)
         trainer = Trainer(scene, config)
         if not resume:
             checkpoint.unlink(missing_ok=True)
@@ -157,6 +175,14 @@ def open_run(
         asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
         write_json(Path(out) / CONFIG, asked)
         yield trainer
+
+
+def _fitted(scene: Scene, config: TrainConfig) -> TrainConfig:
+    """The configuration with the iterations that fit into its seconds, if it has any."""
+    if config.seconds is None or config.turn is not None:
+        return config
+    trainer = Trainer(scene, config)
+    return with_iterations(config, fitting(trainer, config.seconds))
 
 
 def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProgress | None = None) -> Run:
@@ -184,7 +210,10 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
 
 def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
     """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
-    scene, config, guard = trainer.scene, trainer.config, trainer.guard
+    scene, guard = trainer.scene, trainer.guard
+    config, decisions = trainer.config, trainer.state.decisions
+    if decisions.turned:
+        config = replace(config, turn=(decisions.turned, decisions.length))
     model, left_out = trainer.shown(), trainer.left_out()
     model.look = (scene.test or scene.train)[0].camera
     if out is not None and (rows := model.save(out / PLY)):
@@ -228,6 +257,8 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
         learned = learned_picture([view.image for view in scene.train], result.learned)
         with atomic_path(out / LEARNED) as tmp:
             learned.save(tmp)
+    if out is not None and config.seconds is not None:
+        write_json(out / PLAN, plan_values(config))
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
         write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, learned))
@@ -262,6 +293,11 @@ def _notes(trainer: Trainer) -> list[str]:
             f"while it trained, {max(some)} of {len(trainer.scene.test)} held-out views were measured, which "
             "are evenly spread, to save time; the last values are of all"
         )
+    if (seconds := trainer.config.seconds) is not None:
+        text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
+        if at := trainer.state.decisions.turned:
+            text += f"; after iteration {at}, {trainer.length} in all"
+        notes.append(f"{text}. `--plan` with plan.json trains the same again, bit for bit")
     if trainer.lengthened is not None:
         notes.append(
             f"the run had ended at iteration {trainer.lengthened}; from there on its schedule is that of "

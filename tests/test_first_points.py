@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,24 @@ def on_the_plane(view: View, pixels: np.ndarray) -> np.ndarray:
     return center + rays * ((OFFSET - center @ NORMAL) / (rays @ NORMAL))[:, None]
 
 
+class Plane:
+    """What photos of the plane agree on: every pixel, at its depth."""
+
+    def __init__(self, views: list[View]) -> None:
+        self.views = views
+        self.ranges = [np.zeros((0, 2))]
+
+    def depths(self, number: int, pixels: np.ndarray, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        camera = self.views[number].camera
+        self.ranges.append(ranges)
+        depths = on_the_plane(self.views[number], pixels) @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        return depths, np.ones(len(pixels), bool)
+
+
+def found_points(views: list[View], *arguments: Any, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    return points_along_edges(views, *arguments, seed, Plane(views))  # type: ignore[arg-type]
+
+
 CORNERS = np.array([[0.0, 0], [64, 0], [0, 48], [64, 48], [30, 20]])
 
 
@@ -46,7 +65,7 @@ def test_they_lie_on_the_surface_between_the_points_and_mostly_on_edges() -> Non
     points = np.concatenate([on_the_plane(view, CORNERS) for view in views]).astype(np.float32)
     points = np.concatenate([points, [[0, 0, 1], [0, 0, 900]]]).astype(np.float32)  # which neither view sees
     seen = {"a": np.arange(5), "b": np.arange(5, 10)}
-    found, colors = points_along_edges(views, points, seen, 401, seed=0)
+    found, colors = found_points(views, points, seen, 401)
     assert (found.dtype, found.shape) == (np.float32, (401, 3))
     assert (colors.dtype, colors.shape) == (np.uint8, (401, 3))
     np.testing.assert_allclose(found @ NORMAL, OFFSET, rtol=1e-5)
@@ -58,22 +77,25 @@ def test_they_lie_on_the_surface_between_the_points_and_mostly_on_edges() -> Non
         assert len(np.unique(np.stack([x, y]).round(1), axis=1).T) == len(own)
         near = np.abs(x - 20) < 4
         assert 0.6 < near.mean() < 0.95  # 1/8 of all pixels
-    again, _ = points_along_edges(views, points, seen, 401, seed=0)
-    other, _ = points_along_edges(views, points, seen, 401, seed=1)
+    again, _ = found_points(views, points, seen, 401)
+    other, _ = found_points(views, points, seen, 401, seed=1)
     assert np.array_equal(found, again)
     assert not np.array_equal(found, other)
 
 
-def test_beyond_the_points_the_nearest_one_tells_the_depth() -> None:
+def test_depths_are_sought_around_those_of_the_nearest_points() -> None:
     view = plane_view()
-    pixels = np.array([[10.0, 10], [12, 10], [10, 12]])
-    for chosen in (pixels, np.array([[10.0, 10], [20, 10], [30, 10]])):  # a small triangle; a line
-        points = on_the_plane(view, chosen).astype(np.float32)
-        found, _ = points_along_edges([view], points, {"a": np.arange(3)}, 50, seed=0)
-        depths = found @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
-        own = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
-        assert depths.min() >= own.min() - 1e-5
-        assert depths.max() <= own.max() + 1e-5
+    near, far = on_the_plane(view, np.array([[8.0, 8], [12, 8], [8, 12], [12, 12], [10, 6], [6, 10]])), None
+    far = 3 * on_the_plane(view, np.array([[50.0, 40], [54, 40], [50, 44], [54, 44], [52, 38], [48, 42]]))
+    points = np.concatenate([near, far]).astype(np.float32)
+    asked = Plane([view])
+    points_along_edges([view], points, {"a": np.arange(12)}, 3000, 0, asked)  # type: ignore[arg-type]
+    ranges = np.concatenate(asked.ranges)
+    depths = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
+    assert ranges.min() < depths.min() < depths.max() < ranges.max()
+    alone = ranges[:, 1] < 1.8 * 1.6 * depths[:6].max()  # beside the near ones
+    assert 0.2 < alone.mean() < 0.8
+    assert (ranges[alone, 0] < depths[:6].min()).all()
 
 
 def test_masked_pixels_flat_photos_and_views_without_points() -> None:
@@ -81,14 +103,14 @@ def test_masked_pixels_flat_photos_and_views_without_points() -> None:
     mask[:, 40:] = True
     view = plane_view(mask=mask)
     points = on_the_plane(view, CORNERS).astype(np.float32)
-    found, _ = points_along_edges([view], points, {"a": np.arange(5)}, 100, seed=0)
+    found, _ = found_points([view], points, {"a": np.arange(5)}, 100)
     inside = found @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
     assert len(found) == 100
     assert ((inside @ view.camera.K.T)[:, 0] / inside[:, 2] > 40).all()
-    all_of_them, _ = points_along_edges([view], points, {"a": np.arange(5)}, 10_000, seed=0)
+    all_of_them, _ = found_points([view], points, {"a": np.arange(5)}, 10_000)
     assert len(all_of_them) == 48 * 24
     black = replace(view, image=np.zeros_like(view.image), mask=None)
-    assert len(points_along_edges([black], points, {"a": np.arange(5)}, 100, seed=0)[0]) == 100
+    assert len(found_points([black], points, {"a": np.arange(5)}, 100)[0]) == 100
     hidden = replace(view, mask=np.zeros_like(mask))
     behind = {"a": np.arange(5), "b": np.arange(2), "c": np.arange(0)}
     for given, count in (
@@ -96,10 +118,10 @@ def test_masked_pixels_flat_photos_and_views_without_points() -> None:
         ([plane_view("b"), plane_view("c"), plane_view("d")], 100),
         ([view], 0),
     ):
-        found, colors = points_along_edges(given, points, behind, count, seed=0)
+        found, colors = found_points(given, points, behind, count)
         assert (found.shape, colors.shape) == ((0, 3), (0, 3))
     turned = plane_view(angle=np.pi)
-    assert len(points_along_edges([turned], points, {"a": np.arange(5)}, 100, seed=0)[0]) == 0
+    assert len(found_points([turned], points, {"a": np.arange(5)}, 100)[0]) == 0
 
 
 def with_tracks(scene: Scene) -> Scene:

@@ -72,8 +72,9 @@ def test_a_coarse_beginning_has_coarser_limits() -> None:
     config = tiny_config(100, leave_out=("growth", "resolution"))
     timetable = Schedule.of(config, [large] * 3, as_photographed=True)
     made = plans(timetable)
-    assert [plan.coarse for plan in made] == [True] * 30 + [False] * 69
-    assert [made[k].finest for k in (0, 29, 30)] == [2 * FINEST, 2 * FINEST, FINEST]
+    assert [plan.coarse for plan in made] == [True] * 60 + [False] * 39
+    assert [made[k].finest for k in (0, 59, 60)] == [2 * FINEST, 2 * FINEST, FINEST]
+    assert Schedule.of(replace(config, iterations=9_000), [large] * 3, True).coarse_end == 1_500
     degraded = Schedule.of(config, [large] * 3, as_photographed=False)
     assert degraded.items == frozenset()
     assert not any(plan.coarse or plan.finest for plan in plans(degraded))

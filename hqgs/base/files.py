@@ -22,6 +22,7 @@ ROOMS = (EMBEDDED, SPARSE, "true-shake", "true-defocus", "true-rolling", "true-e
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
+PLAN = "plan.json"  # what a number of seconds came to
 KEPT = "sfm"  # in the folder of a run: what COLMAP found
 FRAMES = "frames.json"  # in a folder of photos: they are frames of a film, named in its order
 

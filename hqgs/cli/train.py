@@ -24,7 +24,7 @@ from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
-from hqgs.training.settings import PRESETS, read_config, with_iterations
+from hqgs.training.settings import PRESETS, read_config, with_iterations, with_plan
 from hqgs.viewer.guard import PORT, check
 
 if TYPE_CHECKING:
@@ -48,6 +48,10 @@ class Train(Photos):
     photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
     iterations: Number = None
     """Training steps (standard: at most 30,000, fewer where the scene has stopped improving)."""
+    seconds: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
+    """Train for S seconds, in place of --iterations: the best scene that this machine makes in them."""
+    plan: Annotated[Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint="")] = None
+    """Repeat what the seconds of another run came to, bit for bit: its folder, or its plan.json."""
     method: Annotated[
         str | None,
         tyro.conf.arg(metavar="NAME", help_behavior_hint="", help=f"One of {', '.join(METHODS)} (auto)."),
@@ -153,6 +157,9 @@ def config_of(options: Train) -> TrainConfig:
     if file is None and options.resume and kept.is_file() and (options.out / CHECKPOINT).exists():
         file = kept
     iterations = options.iterations
+    given = [name for name in ("iterations", "seconds", "plan") if getattr(options, name) is not None]
+    if len(given) > 1:
+        raise ValueError(f"only one of --{' and --'.join(given)} can be given")
     if file is not None:
         config = read_config(file)
         if iterations is not None and iterations != config.iterations:
@@ -173,7 +180,8 @@ def config_of(options: Train) -> TrainConfig:
     of_hqgs = {
         name: value for name in ("guidance", "formation") if (value := getattr(options, name)) is not None
     }
-    return replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
+    config = replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
+    return config if options.plan is None else with_plan(config, options.plan)
 
 
 def scene_of_run(out: Path) -> dict[str, Any]:
@@ -209,7 +217,10 @@ def run(options: Train) -> int:
             scene = _load(options, config, screen)
         tell_notes(scene)
         loaded = time.perf_counter()
-        print(f"looking at the photos, then at most {config.iterations:,} iterations", flush=True)
+        length = f"at most {config.iterations:,} iterations"
+        if options.seconds is not None:
+            length = f"{duration(options.seconds)} of training"
+        print(f"looking at the photos, then {length}", flush=True)
         live = (
             LiveView(scene, options.out, port=options.port, open_browser=options.open)
             if options.view
@@ -226,6 +237,7 @@ def run(options: Train) -> int:
                 scene,
                 out=options.out,
                 config=config,
+                seconds=options.seconds,
                 resume=options.resume,
                 overwrite=options.overwrite,
                 progress=show,

@@ -37,7 +37,7 @@ class Agreement:
         np.fill_diagonal(self._shared, -1)
 
     def depths(self, number: int, pixels: Floats, ranges: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where other photos agree."""
+        """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where others agree."""
         order = np.argsort(-self._shared[number], kind="stable")
         others = [int(k) for k in order[: min(NEIGHBOURS, len(order) - 1)]]
         if len(others) < AGREEING:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, sobel
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from hqgs.model.consistency import Agreement
 from hqgs.photos.pixels import as_floats, to_uint8
@@ -89,6 +89,6 @@ def _ranges(
     where, depths = where[depths > 0], depths[depths > 0]
     if len(depths) < LEAST:
         return None
-    _, nearest = cKDTree(where).query(pixels, min(AROUND, len(depths)))
+    _, nearest = KDTree(where).query(pixels, min(AROUND, len(depths)))
     around = depths[nearest]
     return np.stack([around.min(1) / BEYOND, around.max(1) * BEYOND], axis=1)

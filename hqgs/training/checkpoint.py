@@ -131,3 +131,16 @@ def _crc32(text: str, tensors: dict[str, Tensor]) -> int:
         crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
         crc = zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, crc)
     return crc
+
+
+def lengthened(meta: dict[str, Any], total: int) -> int | None:
+    """The iteration at which a run had come to its end that is now to have `total` iterations, and its
+    decisions in `meta` changed to that; None: it goes on as it was."""
+    done, decisions = meta["iteration"], meta["decisions"]
+    if not done == decisions["length"] < total != meta["config"]["iterations"]:
+        return None
+    meta["decisions"] = decisions | {
+        "length": total,
+        "released": decisions["released"] or done,  # what was held back has come back
+    }
+    return done

@@ -207,6 +207,8 @@ class TrainConfig:
     iterations: int = 30_000  # training steps
     method: str = AUTO  # one of METHODS
     seed: int = 0  # of everything random
+    seconds: float | None = None  # of training that the number of iterations was chosen for
+    turn: tuple[int, int] | None = None  # the iteration after which the run gets another length, and that
     sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
     lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
@@ -233,6 +235,10 @@ class TrainConfig:
         for name in ("iterations", "sh_interval", "eval_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
+            raise ValueError(f"seconds is {self.seconds}, wanted a positive number")
+        if self.turn is not None and not (len(self.turn) == 2 and 0 < self.turn[0] < self.turn[1]):
+            raise ValueError(f"turn is {self.turn}, wanted an iteration and a larger length")
         for name in ("seed", "start_points"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")

@@ -116,6 +116,11 @@ class Frugality:
         self.memory.seconds += time.perf_counter() - started
         return verdict
 
+    @property
+    def step_seconds(self) -> float:
+        """Of a step now, the mean of the last ones; 0 before the first."""
+        return float(np.mean(self._seconds)) if self._seconds else 0.0
+
     def left_out(self) -> list[LeftOut]:
         """What was left out, in the order of the decisions."""
         found = [LeftOut(**record) for record in self.memory.records]
@@ -190,7 +195,7 @@ class Frugality:
             f"iterations {length + 1} to {total}",
             "the held-back photos stopped improving",
             f"best {memory.best:.2f} dB at iteration {memory.best_at}, {now:.2f} dB at {iteration}",
-            seconds=float(np.mean(self._seconds)) * (total - length),
+            seconds=self.step_seconds * (total - length),
         )
         self._note(left, state)
         return length
@@ -217,12 +222,12 @@ class Frugality:
     def _note(self, item: LeftOut, state: TrainState) -> None:
         self.memory.records.append(asdict(item))
         if len(self._seconds) == WINDOW and item.seconds is None:
-            opened = len(self.memory.records) - 1, state.iteration, float(np.mean(self._seconds))
+            opened = len(self.memory.records) - 1, state.iteration, self.step_seconds
             self._open.append(opened)
 
     def _close(self, state: TrainState) -> None:
         """Fill in what the decisions WINDOW steps ago saved, if things stay as they are."""
         while self._open and state.iteration >= self._open[0][1] + WINDOW:
             index, start, before = self._open.pop(0)
-            saved = max(before - float(np.mean(self._seconds)), 0.0)
+            saved = max(before - self.step_seconds, 0.0)
             self.memory.records[index]["seconds"] = saved * (state.decisions.length - start)

@@ -33,6 +33,7 @@ class Decisions:
     length: int  # iterations of the run as far as it is known: those of the configuration, or fewer
     degree: int  # of the harmonics, at most
     released: int = 0  # the iteration after which the held-back photos came back; 0: not yet
+    turned: int = 0  # the iteration after which the clock gave the run another length; 0: it did not
 
     @property
     def num_higher(self) -> int:
@@ -120,9 +121,9 @@ class Schedule:
         total = self.config.iterations
         if decisions.length == total:
             return iteration / total
-        released, length = decisions.released, decisions.length
-        start = released / total  # what follows is squeezed into the shortened rest
-        return start + (1 - start) * (iteration - released) / (length - released)
+        changed, length = decisions.turned or decisions.released, decisions.length
+        start = changed / total  # what follows is squeezed into the rest, or stretched
+        return start + (1 - start) * (iteration - changed) / (length - changed)
 
     def degree(self, iteration: int, decisions: Decisions) -> int:
         """Of the harmonics that are trained: it rises with the iterations."""
@@ -134,7 +135,7 @@ class Schedule:
     def growth_end(self, decisions: Decisions) -> int:
         """The iteration from which on nothing grows; a shortened run ends growth sooner."""
         stop = self.config.densify.stop
-        if decisions.length == self.config.iterations:
+        if decisions.length == self.config.iterations or decisions.turned:
             return stop
         return min(stop, math.ceil((1 + REST / 2) * decisions.released))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar, get_args, get_type_hints
 
+from hqgs.base.files import PLAN
 from hqgs.training.config import TrainConfig, run_config
 
 T = TypeVar("T")
@@ -73,6 +74,26 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
         densify=replace(config.densify, **fitted(config.densify, before.densify, after.densify, GROWTH)),
         **fitted(config, before, after, SCHEDULE),
     )
+
+
+def plan_values(config: TrainConfig) -> dict[str, Any]:
+    """How long the run of a configuration was, as JSON values; `with_plan` reads it."""
+    return {"iterations": config.iterations, "turn": None if config.turn is None else list(config.turn)}
+
+
+def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
+    """The configuration with the length that a run with a number of seconds came to: plan.json, or the run's
+    folder. FileNotFoundError, or ValueError that says what is wrong with it."""
+    path = Path(path) / PLAN if Path(path).is_dir() else Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no plan {path}; runs with a number of seconds write one")
+    try:
+        plan = json.loads(path.read_text(encoding="utf-8"))
+        iterations, turn = plan["iterations"], plan["turn"]
+        turn = None if turn is None else (int(turn[0]), int(turn[1]))
+        return replace(with_iterations(config, int(iterations)), turn=turn)
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        raise ValueError(f"{path} is no plan: {error!r}") from error
 
 
 def _build(kind: type[T], values: Any, where: str) -> T:

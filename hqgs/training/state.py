@@ -32,6 +32,14 @@ class TrainState:
     guard: Guard = field(default_factory=Guard)
     history: list[HistoryEntry] = field(default_factory=list)  # of the held-out means
 
+    def none_left(self) -> str:
+        """What is wrong where no Gaussian is left."""
+        return (
+            f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent, too "
+            f"large (scene's reach {self.densifier.reach:.3g}) or not finite ({self.guard.culled}); are the "
+            "cameras and points in one frame?"
+        )
+
     def tensors(self) -> dict[str, Tensor]:
         """All of its tensors by name, for a checkpoint."""
         tensors = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.named().items()}

@@ -27,8 +27,9 @@ from hqgs.model.render import render_view
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
+from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, cut_harmonics, reset_opacities
-from hqgs.training.checkpoint import check_same, load_checkpoint, part, save_checkpoint, scene_fingerprint
+from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
 from hqgs.training.frugality import Frugality
@@ -116,11 +117,15 @@ class Trainer:
         """Iterations of the run, as far as it is known: those of the configuration, or fewer."""
         return self.state.decisions.length
 
-    def step(self) -> Step:
-        """Train on one view."""
+    def next_plan(self) -> Plan:
+        """What the next step is to do."""
+        return self.schedule.plan(self.iteration + 1, self.state.decisions)
+
+    def step(self, plan: Plan | None = None) -> Step:
+        """Train on one view; `plan`: None: the next one."""
         started = time.perf_counter()
         state, method = self.state, self.method
-        plan = self.schedule.plan(state.iteration + 1, state.decisions)
+        plan = self.next_plan() if plan is None else plan
         if plan.resets:
             reset_opacities(state.gaussians, state.optimizer, self.config.densify.reset_opacity)
         state.iteration = plan.iteration
@@ -141,15 +146,12 @@ class Trainer:
             growth = self._grow(plan) if plan.grows else Growth()
             self._cull(view, parameter_fault(state.gaussians, growth.parents is not None))
             if not len(state.gaussians):
-                raise TrainingError(
-                    f"no Gaussians are left at iteration {state.iteration}: all were pruned as transparent, "
-                    f"too large (scene's reach {state.densifier.reach:.3g}) or not finite "
-                    f"({state.guard.culled}); are the cameras and points in one frame?"
-                )
+                raise TrainingError(state.none_left())
             method.after_step(state, view, image, target)
             self._leave_out(growth, time.perf_counter() - started)
 
         state.seconds += time.perf_counter() - started
+        state.decisions = turned(self.config, self.schedule, state, self.frugality.step_seconds)
         return Step(float(loss.detach()), photo.detach(), view)
 
     def shown(self) -> Gaussians:
@@ -199,9 +201,9 @@ class Trainer:
         meta = self.state.values() | {
             "frugality": self.frugality.state_dict(),
             "config": asdict(self.config),
-            "scene": scene_fingerprint(self.scene),
+            "scene": checkpoint.scene_fingerprint(self.scene),
         }
-        save_checkpoint(path, self.state.tensors() | of_method, meta)
+        checkpoint.save_checkpoint(path, self.state.tensors() | of_method, meta)
 
     def restore(self, path: str | Path) -> None:
         """Go on from a checkpoint, bit for bit.
@@ -210,23 +212,19 @@ class Trainer:
         run, so that learning rates rise again, and the scene may grow again. `lengthened` tells. ValueError
         for a damaged checkpoint, or one of another run; it names the field in which that differs.
         """
-        tensors, meta = load_checkpoint(path)
-        lists = {name: list(getattr(self.config, name)) for name in ("background", "leave_out")}
+        tensors, meta = checkpoint.load_checkpoint(path)
+        lists = {k: list(v) for k, v in vars(self.config).items() if isinstance(v, tuple)}  # as JSON has them
         try:
             # The scene first: methods fit the configuration to it.
-            check_same(path, "scene ", meta["scene"], scene_fingerprint(self.scene))
-            done, total = meta["iteration"], self.config.iterations
-            longer = done == meta["decisions"]["length"] < total != meta["config"]["iterations"]
-            check_same(path, "", meta["config"], asdict(self.config) | lists, longer)
-            if longer:
-                released = meta["decisions"]["released"] or done  # what was held back has come back
-                meta["decisions"] |= {"length": total, "released": released}
-                self.lengthened = done
+            checkpoint.check_same(path, "scene ", meta["scene"], checkpoint.scene_fingerprint(self.scene))
+            self.lengthened = checkpoint.lengthened(meta, self.config.iterations)
+            longer = self.lengthened is not None
+            checkpoint.check_same(path, "", meta["config"], asdict(self.config) | lists, longer)
             state = self.state.restored(path, tensors, meta, self._optimizer)
             self.frugality.load_state_dict(meta["frugality"])
             if longer:
                 self.frugality.forget_end()
-            self.method.load_state_dict(part("method.", tensors))
+            self.method.load_state_dict(checkpoint.part("method.", tensors))
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error
         self.state = state

@@ -1,0 +1,73 @@
+"""The length of a run that has so many seconds: from steps timed before it, and once more after growth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hqgs.training.config import TrainConfig
+from hqgs.training.schedule import Decisions, Schedule
+from hqgs.training.settings import with_iterations
+from hqgs.training.state import TrainState
+
+if TYPE_CHECKING:
+    from hqgs.training.trainer import Trainer
+
+WARM, TIMED = 2, 4  # steps of each size before the run: the first ones start threads and fill caches
+GROWTH = 1.5  # a mean step of a run over one at its start: the scene grows
+FEWEST, MOST = 50, 30_000  # iterations
+TAIL = 50  # steps after the end of growth that tell what the rest costs
+SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
+
+
+def fitting(trainer: Trainer, seconds: float) -> int:
+    """As many iterations as fit into `seconds` of training on this machine, now.
+
+    The trainer is a fresh one; it has made steps then, and is of no more use.
+    """
+    config, schedule = trainer.config, trainer.schedule
+    costs = {coarse: GROWTH * _timed(trainer, coarse) for coarse in (True, False)}
+
+    def needed(iterations: int) -> float:
+        coarse = replace(schedule, config=with_iterations(config, iterations)).coarse_end
+        return coarse * costs[True] + (iterations - coarse) * costs[False]
+
+    few, many = FEWEST, MOST
+    while many - few > 1:
+        middle = (few + many) // 2
+        few, many = (middle, many) if needed(middle) <= seconds else (few, middle)
+    return few
+
+
+def turned(config: TrainConfig, schedule: Schedule, state: TrainState, step: float) -> Decisions:
+    """The decisions after a step: TAIL steps after growth the rest gets the length that the clock allows.
+
+    `step`: seconds of a step now. A configuration with a `turn` follows that in place of the clock.
+    """
+    decisions, iteration = state.decisions, state.iteration
+    if decisions.turned:
+        return decisions
+    if config.turn is not None:
+        at, length = config.turn
+    elif config.seconds is not None:
+        at = schedule.growth_end(decisions) + TAIL
+        rest = config.iterations - at
+        left = (config.seconds - state.seconds) / step if step > 0 else rest
+        length = at + round(min(max(left, SHORTEST * rest), LONGEST * rest))
+    else:
+        return decisions
+    if iteration != at or not at < min(length, config.iterations):
+        return decisions
+    return replace(decisions, length=length, turned=at)
+
+
+def _timed(trainer: Trainer, coarse: bool) -> float:
+    """Mean seconds of a step at the smaller or at full size."""
+    if coarse and not trainer.schedule.coarse_end:
+        return 0.0
+    for _ in range(WARM):
+        trainer.step(replace(trainer.next_plan(), coarse=coarse))
+    started = trainer.seconds
+    for _ in range(TIMED):
+        trainer.step(replace(trainer.next_plan(), coarse=coarse))
+    return (trainer.seconds - started) / TIMED

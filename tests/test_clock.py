@@ -1,0 +1,145 @@
+"""Runs that have a number of seconds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from test_learned_cameras import textured_scene
+from tiny_scene import tiny_config, tiny_scene
+
+import hqgs
+from hqgs.base.files import CONFIG, PLAN, PLY
+from hqgs.cli.main import main
+from hqgs.training import clock
+from hqgs.training.config import AUTOMATIC, DensifyConfig, TrainConfig, run_config
+from hqgs.training.schedule import Schedule
+from hqgs.training.settings import with_iterations, with_plan
+from hqgs.training.trainer import Trainer
+
+N, STOP = 300, 200
+
+
+def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
+    """When a run of N steps gets another length, and which; each step takes `step` s."""
+    config = tiny_config(N, densify=DensifyConfig(stop=STOP), seconds=seconds, **changes)
+    schedule = Schedule.of(config, tiny_scene().train, as_photographed=True)
+    state = SimpleNamespace(decisions=schedule.start(), iteration=0, seconds=0.0)
+    while state.iteration < state.decisions.length:
+        state.iteration += 1
+        state.seconds += step
+        state.decisions = clock.turned(config, schedule, state, step)  # type: ignore[arg-type]
+    assert schedule.part(state.iteration, state.decisions) == pytest.approx(1.0)
+    assert schedule.growth_end(state.decisions) == STOP
+    return state.decisions.turned, state.iteration
+
+
+def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
+    at = STOP + clock.TAIL
+    assert turned_at(seconds=30.0, step=0.1) == (at, 300)
+    assert turned_at(seconds=35.0, step=0.1) == (at, 350)
+    assert turned_at(seconds=27.0, step=0.1) == (at, 270)
+    assert turned_at(seconds=1.0, step=0.1) == (at, at + 5)  # a tenth of what was planned is left
+    assert turned_at(seconds=1e6, step=0.1) == (at, at + 200)  # four times as much
+    assert turned_at(seconds=1.0, step=0.1, turn=(260, 280)) == (260, 280)  # a plan, not the clock
+
+
+def test_as_many_iterations_as_fit() -> None:
+    """A full step takes 0.1 s, one at the smaller size 0.02 s, before the scene grows."""
+    config = run_config(leave_out="photos,growth,resolution")
+    large = [replace(view, camera=replace(view.camera, width=64, height=64)) for view in tiny_scene().train]
+
+    class Fake:
+        seconds, steps = 0.0, 0
+        schedule = Schedule.of(config, large, as_photographed=True)
+
+        def __init__(self, config: TrainConfig) -> None:
+            self.config = config
+
+        def next_plan(self) -> Any:
+            return self.schedule.plan(1, self.schedule.start())
+
+        def step(self, plan: Any) -> None:
+            self.seconds += 0.02 if plan.coarse else 0.1
+
+    fits = clock.fitting(Fake(config), 60.0)  # type: ignore[arg-type]
+    assert (0.6 * 0.02 + 0.4 * 0.1) * clock.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
+    assert clock.fitting(Fake(config), 1e-3) == clock.FEWEST  # type: ignore[arg-type]
+    assert clock.fitting(Fake(config), 1e9) == pytest.approx(clock.MOST, abs=1)  # type: ignore[arg-type]
+
+
+def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "TAIL", 3)
+    monkeypatch.setattr(clock, "FEWEST", 30)
+    monkeypatch.setattr(clock, "MOST", 31)
+    scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
+    run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
+    plan = json.loads((tmp_path / "a" / PLAN).read_text())
+    assert plan["iterations"] == 30
+    at, length = plan["turn"]
+    assert (at, length) == (23, run.iterations)
+    assert run.report["config"]["turn"] == (at, length)
+    assert any("planned for 0.5 s" in note for note in run.report["notes"])
+    again = hqgs.train(scene, out=tmp_path / "b", config=with_plan(config, tmp_path / "a"))
+    assert again.iterations == run.iterations
+    assert (tmp_path / "a" / PLY).read_bytes() == (tmp_path / "b" / PLY).read_bytes()
+    other = hqgs.train(scene, config=with_iterations(config, 30))
+    assert (other.iterations == run.iterations) == (length == 30)
+    kept = json.loads((tmp_path / "a" / CONFIG).read_text())["train"]
+    assert (kept["iterations"], kept["seconds"]) == (30, 0.5)  # a resumed run is not planned anew
+
+
+def test_bad_plans_and_seconds_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = run_config(iterations=100)
+    with pytest.raises(FileNotFoundError, match="there is no plan"):
+        with_plan(config, tmp_path)
+    for text in (
+        "{",
+        "[]",
+        '{"iterations": 10}',
+        '{"iterations": 10, "turn": [5]}',
+        '{"iterations": 0, "turn": null}',
+    ):
+        (tmp_path / PLAN).write_text(text)
+        with pytest.raises(ValueError, match="is no plan"):
+            with_plan(config, tmp_path)
+    for seconds in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="seconds is"):
+            TrainConfig(seconds=seconds)
+    for turn in ((5, 5), (0, 7)):
+        with pytest.raises(ValueError, match="turn is"):
+            TrainConfig(turn=turn)
+    with pytest.raises(ValueError, match="only one of them"):
+        hqgs.train(tiny_scene(), iterations=10, seconds=3.0)
+    argv = ["train", "embedded", "--out", str(tmp_path / "r"), "--seconds", "5", "--iterations", "10"]
+    assert main(argv) == 2
+    assert "only one of --iterations and --seconds" in capsys.readouterr().err
+
+
+def test_clean_photos_start_from_points_that_they_agree_on() -> None:
+    scene = textured_scene(8, 96)
+    pixels = sum(view.image[..., 0].size for view in scene.train)
+    few = replace(
+        scene,
+        points=scene.points[::20],
+        point_colors=scene.point_colors[::20],
+        seen={name: rows[rows % 20 == 0] // 20 for name, rows in (scene.seen or {}).items()},
+    )
+
+    def trainer(method: str = "auto", **changes: Any) -> Trainer:
+        return Trainer(few, replace(run_config(iterations=50, method=method, formation="none"), **changes))
+
+    dense = trainer()
+    assert 2 * len(few.points) < len(dense.gaussians) <= max(pixels // 100, len(few.points))
+    assert (
+        dense.config.leave_out == (*AUTOMATIC[:-1], *AUTOMATIC[-1:]) or "resolution" in dense.config.leave_out
+    )
+    assert len(trainer(start_points=0).gaussians) == len(few.points)
+    plain = trainer("3dgs")
+    assert len(plain.gaussians) == len(few.points)
+    assert "resolution" not in plain.config.leave_out
+    assert asdict(trainer(leave_out=("growth",)).config)["leave_out"] == ("growth",)
