@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import weakref
 from dataclasses import replace
@@ -172,3 +174,26 @@ def test_few_photos_are_large_at_a_time(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(views, "MAX_WORKERS", 1)
     for a, b in zip(scene.train, load_scene(tmp_path, 4.0).train, strict=True):
         np.testing.assert_array_equal(a.image, b.image)
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(), reason="the system does not tell the memory in use"
+)
+def test_what_was_made_on_the_way_is_given_back(tmp_path: Path) -> None:
+    """In a process of its own: after loading, memory holds the photos and little else."""
+    write_colmap(large(".png", 24, BENT), tmp_path)
+    code = """
+import sys
+from pathlib import Path
+from hqgs.scene.load import load_scene
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+load_scene(sys.argv[1], 4.0)
+before = resident()
+scene = load_scene(sys.argv[1], 1.1)
+print(resident() - before, sum(view.image.nbytes for view in [*scene.train, *scene.test]))
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
+    more, photos = map(int, done.stdout.split())
+    assert photos > 3e7
+    assert more < photos + 6e7

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
+from hqgs.diagnosis import gains
 from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
 from hqgs.diagnosis.gains import log_gains
 from hqgs.photos.exposure import take_photo
@@ -149,6 +150,25 @@ def test_gains_are_found() -> None:
     clean = gain_spread(scene)
     assert clean is not None
     assert clean < UNLIKE_GAINS / 3
+    logs = np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3))
+    logs -= logs.mean(0)
+    found = log_gains(with_gains(scene, logs))
+    assert found is not None
+    assert np.abs(found - logs).max() < 0.05
+
+
+def test_gains_of_many_photos_come_from_the_points_that_most_of_them_show(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The tables stay small, and the gains are found all the same."""
+    scene = textured_scene()
+    assert scene.seen is not None
+    shown = np.bincount(np.concatenate([scene.seen[view.name] for view in scene.train]))
+    most = 200
+    monkeypatch.setattr(gains, "MOST_VALUES", most * len(scene.train))
+    chosen = gains._chosen_points(scene, scene.seen)  # pyright: ignore[reportPrivateUsage]
+    assert len(chosen) == most < len(scene.points)
+    assert shown[chosen].min() >= np.delete(shown, chosen).max()
     logs = np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3))
     logs -= logs.mean(0)
     found = log_gains(with_gains(scene, logs))

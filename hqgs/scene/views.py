@@ -20,6 +20,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
+from hqgs.base.machine import give_back_memory
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
@@ -31,6 +32,7 @@ STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is
 MAX_SHARE = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
 BAND = 1 << 20  # pixels mapped at a time, to bound memory
 SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
+GIVEN_BACK = 50  # photos after which freed memory goes back to the system
 MAX_WORKERS = 4  # each holds a few photos at their stored size
 DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
 LATTICE, EXACT = 8, 0.02  # px of such a grid: positions are computed so far apart, if that is exact enough
@@ -91,6 +93,8 @@ def load_views(
                 if (view := job.result()) is not None:
                     views.append(view)
                 told(Stage("photos read", k + 1, len(photos)))
+                if (k + 1) % GIVEN_BACK == 0 or k + 1 == len(photos):
+                    give_back_memory()
         finally:
             pool.shutdown(cancel_futures=True)  # after an error the photos still waiting are not wanted
     return views, {photo.name: unreadable[photo.name] for photo in photos if photo.name in unreadable}

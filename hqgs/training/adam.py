@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from typing import Any
@@ -41,6 +42,12 @@ class Adam(torch.optim.Optimizer):
     Raises:
         ValueError: in `step`, a setting out of its range, or a tensor that it cannot work on.
     """
+
+    # torch wraps these so that its compiler leaves them alone, and loads the compiler for that: 4 s of a start.
+    add_param_group = inspect.unwrap(Optimizer.add_param_group)
+    zero_grad = inspect.unwrap(Optimizer.zero_grad)
+    state_dict = inspect.unwrap(Optimizer.state_dict)
+    load_state_dict = inspect.unwrap(Optimizer.load_state_dict)
 
     def __init__(
         self,
