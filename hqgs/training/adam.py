@@ -43,7 +43,7 @@ class Adam(torch.optim.Optimizer):
         ValueError: in `step`, a setting out of its range, or a tensor that it cannot work on.
     """
 
-    # torch wraps these so that its compiler leaves them alone, and loads the compiler for that: 4 s of a start.
+    # torch wraps these so that its compiler leaves them alone, and loads it for that: 4 s of a start.
     add_param_group = inspect.unwrap(Optimizer.add_param_group)
     zero_grad = inspect.unwrap(Optimizer.zero_grad)
     state_dict = inspect.unwrap(Optimizer.state_dict)
