@@ -90,6 +90,8 @@ def look(environment: Environment, run: str) -> None:
         env=environment.variables,
         stdout=subprocess.PIPE,
         text=True,
+        # In the background of a shell Ctrl-C is ignored, and what is started there inherits that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert server.stdout is not None
     try:

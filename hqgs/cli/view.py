@@ -57,10 +57,10 @@ def run(options: View, seconds: float | None = None) -> int:
         viewer = Viewer(known, folder, port=options.port, title=folder.resolve().name)
     except BAD_INPUT as error:
         return fail(2, error)
-    viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
-    viewer.set_facts({} if report is None else facts_of_photos(report))
-    _tell(viewer.url, options.open)
     try:
+        viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
+        viewer.set_facts({} if report is None else facts_of_photos(report))
+        _tell(viewer.url, options.open)
         viewer.serve(seconds)
     except KeyboardInterrupt:
         print()

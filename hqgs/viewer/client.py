@@ -15,8 +15,8 @@ class Client:
 
     def __init__(self, handle: Any) -> None:
         self.handle = handle
-        self.stale = True  # what it shows is not what it should
-        self.coarse = SHARP // 2  # px, of a picture while it moves
+        self.stale: bool = True  # what it shows is not what it should
+        self.coarse: int = SHARP // 2  # px, of a picture while it moves
         self._last_move = 0.0
         self._is_sharp = False
 
