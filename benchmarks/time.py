@@ -47,9 +47,9 @@ def lines(runs: DataFrame) -> list[dict[str, Any]]:
     """A line for each scene and number of seconds, means over the seeds."""
     found = []
     timed = runs[(runs["row"] != "3dgs") & ~runs["row"].str.endswith(OWN)]
-    for _, same in timed.groupby(["scene", "row"], sort=False):
-        scene, row = same[["scene", "row"]].iloc[0]
-        asked = float(str(row).removesuffix(" s"))
+    for scene, row in dict.fromkeys(zip(timed["scene"], timed["row"], strict=True)):
+        same = timed[(timed["scene"] == scene) & (timed["row"] == row)]
+        asked = float(row.removesuffix(" s"))
         own = runs[(runs["scene"] == scene) & (runs["row"] == f"{row}{OWN}")]
         base = runs[(runs["scene"] == scene) & (runs["row"] == "3dgs")]
         reference = [value for h in base["history"] if (value := then(h, asked)) is not None]
