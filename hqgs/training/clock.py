@@ -13,7 +13,7 @@ from hqgs.training.state import TrainState
 if TYPE_CHECKING:
     from hqgs.training.trainer import Trainer
 
-WARM, TIMED = 2, 4  # steps of each size before the run: the first ones start threads and fill caches
+WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
 GROWTH = 1.5  # a mean step of a run over one at its start: the scene grows
 FEWEST, MOST = 50, 30_000  # iterations
 TAIL = 50  # steps after the end of growth that tell what the rest costs
