@@ -79,7 +79,8 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
         if evaluate and trainer.iteration % trainer.config.eval_every == 0:
             trainer.evaluate()
 
-    done.steps(config.iterations, after)
+    while trainer.iteration < trainer.length:  # which the clock may change on the way
+        done.steps(trainer.length - trainer.iteration, after)
     if evaluate:
         trainer.evaluate()
     return done

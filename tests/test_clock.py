@@ -54,7 +54,7 @@ def test_as_many_iterations_as_fit() -> None:
     large = [replace(view, camera=replace(view.camera, width=64, height=64)) for view in tiny_scene().train]
 
     class Fake:
-        seconds, steps = 0.0, 0
+        seconds, first_points, scene = 0.0, 2, SimpleNamespace(points=[0, 0])
         schedule = Schedule.of(config, large, as_photographed=True)
 
         def __init__(self, config: TrainConfig) -> None:

@@ -28,10 +28,10 @@ class Agreement:
         """`seen`: by the view's name, which points it sees. Views that share most are asked first."""
         self._cameras, self._grey = [], []
         for view in views:
-            camera, grey = _small(view)
+            camera, grey, _ = small(view)
             self._cameras.append(camera)
             self._grey.append(grey)
-        self._scales = [c.width / v.camera.width for c, v in zip(self._cameras, views, strict=True)]
+        self._scales = [scale(v.camera, c) for c, v in zip(self._cameras, views, strict=True)]
         sets = [set(seen.get(view.name, np.zeros(0, np.intp)).tolist()) for view in views]
         self._shared = np.array([[len(a & b) for b in sets] for a in sets])
         np.fill_diagonal(self._shared, -1)
@@ -53,17 +53,22 @@ class Agreement:
         return depths, scores >= AGREED
 
 
-def _small(view: View) -> tuple[Camera, NDArray[np.float32]]:
-    """The view's camera and photo [h, w] as they are compared."""
-    camera, image = view.camera, view.image
+def small(view: View) -> tuple[Camera, NDArray[np.float32], NDArray[np.bool_] | None]:
+    """The view as its photo is looked at: the camera, the photo [h, w] in one channel, smoothed, its mask."""
+    camera, image, mask = view.camera, view.image, view.mask
     factor = max(camera.width, camera.height) / LONGEST
     if factor > 1:
         width, height = (max(1, round(side / factor)) for side in (camera.width, camera.height))
-        image, _ = area_downscale(image, None, width, height)
+        image, mask = area_downscale(image, mask, width, height)
         K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
         camera = Camera(width, height, K, camera.viewmat)
     grey = as_floats(image).mean(2, dtype=np.float32)
-    return camera, np.ascontiguousarray(gaussian_filter(grey, SMOOTH), np.float32)
+    return camera, np.ascontiguousarray(gaussian_filter(grey, SMOOTH), np.float32), mask
+
+
+def scale(camera: Camera, smaller: Camera) -> Floats:
+    """What takes a pixel (x, y) of the one to that of the other, [2]."""
+    return np.array([smaller.width / camera.width, smaller.height / camera.height])
 
 
 def _map(first: Camera, second: Camera) -> Floats:

@@ -6,15 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, sobel
+from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
-from hqgs.model.consistency import Agreement
+from hqgs.model.consistency import Agreement, scale, small
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import View
 
-SMOOTH = 1.0  # px, standard deviation of the blur before the edges: noise has some in every pixel
 FLAT = 0.2  # share of the points that all pixels alike get
 AROUND, BEYOND = 6, 1.6  # the nearest points tell the range of depths, which is widened by a factor
 LEAST = 3  # points of a view that tell it
@@ -65,8 +64,8 @@ def points_along_edges(
 
 def _drawn(view: View, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Centres [M, 2] of pixels as x, y; M is `count`, or fewer where so many do not count."""
-    grey = gaussian_filter(as_floats(view.image).mean(2), SMOOTH)
-    mask = np.ones(grey.shape, bool) if view.mask is None else view.mask
+    camera, grey, mask = small(view)
+    mask = np.ones(grey.shape, bool) if mask is None else mask
     edges = np.where(mask, np.hypot(sobel(grey, 0), sobel(grey, 1)), 0.0)
     weights = np.where(mask, FLAT / max(mask.sum(), 1), 0.0)
     weights += (1 - FLAT) * edges / max(edges.sum(), np.finfo(float).tiny)
@@ -76,8 +75,8 @@ def _drawn(view: View, count: int, rng: np.random.Generator) -> NDArray[np.float
     with np.errstate(divide="ignore"):
         keys = np.log(rng.random(weights.size)) / weights
     chosen = np.sort(np.argpartition(-keys, max(count - 1, 0))[:count])
-    lines, columns = np.divmod(chosen, view.camera.width)
-    return np.stack([columns, lines], 1) + 0.5
+    lines, columns = np.divmod(chosen, camera.width)
+    return (np.stack([columns, lines], 1) + 0.5) / scale(view.camera, camera)
 
 
 def _ranges(

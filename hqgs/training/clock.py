@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from hqgs.training.trainer import Trainer
 
 WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
-GROWTH = 1.5  # a mean step of a run over one at its start: the scene grows
+# A mean step of a run over one at its start. A scene that starts from points all over the photos hardly grows, and
+# its Gaussians hide more of each other as they become opaque.
+GROWTH, GROWTH_DENSE = 2.0, 1.0
+DENSE = 2  # times the scene's own points
 FEWEST, MOST = 50, 30_000  # iterations
 TAIL = 50  # steps after the end of growth that tell what the rest costs
 SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
@@ -26,7 +29,8 @@ def fitting(trainer: Trainer, seconds: float) -> int:
     The trainer is a fresh one; it has made steps then, and is of no more use.
     """
     config, schedule = trainer.config, trainer.schedule
-    costs = {coarse: GROWTH * _timed(trainer, coarse) for coarse in (True, False)}
+    growth = GROWTH_DENSE if trainer.first_points > DENSE * len(trainer.scene.points) else GROWTH
+    costs = {coarse: growth * _timed(trainer, coarse) for coarse in (True, False)}
 
     def needed(iterations: int) -> float:
         coarse = replace(schedule, config=with_iterations(config, iterations)).coarse_end
