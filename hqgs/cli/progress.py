@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _NUMBERS_EVERY = 10  # steps between updates of the bar
 _LINES_EVERY = 5.0  # s between lines without a terminal
+_OFTEN_QUICK = ("photos read", "photos looked at")  # worth a line only once they have taken as long as that
 _TOLD_EVERY = 60.0  # s between lines of the training without a terminal
 _WARM_UP, _MEASURED = 5, 30  # steps: before any are timed, and until the time that is left is told,
 _SOON = 5.0  # s of steps after which it is told in any case
@@ -76,6 +77,8 @@ class LoadingScreen(Screen):
         self.seconds[stage.what] = self.seconds.get(stage.what, 0.0) + now - self._since
         self._since = now
         self.show(stage.what, stage.done, stage.total)
+        if stage.what != self._now and stage.what in _OFTEN_QUICK:
+            self._said, self._now = now, stage.what
         if not self.live and (stage.what != self._now or now - self._said > _LINES_EVERY):
             self._said = now
             self.say(f"{stage.what}: {stage.done}" + (f" of {stage.total}" if stage.total else ""))
