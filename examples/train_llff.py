@@ -1,6 +1,6 @@
-"""Train a scene with plain 3DGS and look at the result.
+"""Train a scene and look at the result.
 
-    python examples/train_llff.py                 # the scene that is built in, under 5 minutes on 2 cores
+    python examples/train_llff.py                 # the scene that is built in, under 2 minutes on 2 cores
     python examples/train_llff.py FOLDER          # a COLMAP, LLFF or nerfstudio folder
 
 The output folder then holds report.json, comparison/*.png (photo | render | difference), error_vs_time.png
@@ -16,11 +16,11 @@ import hqgs
 def main() -> None:
     parser = argparse.ArgumentParser(description="Train a scene with 3D Gaussian Splatting on the CPU.")
     parser.add_argument("scene", nargs="?", default="embedded", help="scene folder (the built-in scene)")
-    parser.add_argument("--iterations", type=int, default=2_000, help="training steps (%(default)s)")
+    parser.add_argument("--iterations", type=int, default=1_500, help="training steps (%(default)s)")
     parser.add_argument("--out", type=Path, help="(outputs/ and the scene's name)")
     parser.add_argument("--downscale", type=float, default=1.0, help="divide the photos' sides by this")
-    parser.add_argument("--method", default="3dgs", help="auto, 3dgs, srgs or hqgs (%(default)s)")
-    parser.add_argument("--leave-out", default="none", help="auto, none, or a list (%(default)s)")
+    parser.add_argument("--method", default="auto", help="auto, 3dgs, srgs or hqgs (%(default)s)")
+    parser.add_argument("--leave-out", default="auto", help="auto, none, or a list (%(default)s)")
     args = parser.parse_args()
 
     out = args.out or Path("outputs", Path(args.scene).resolve().name)

@@ -16,6 +16,7 @@ from tiny_scene import tiny_config, tiny_scene
 import hqgs
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
+from hqgs.training.config import AUTOMATIC
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 LONGEST = 80  # lines
@@ -48,7 +49,11 @@ def test_train_llff(folder: Path, tmp_path: Path) -> None:
     told = run("train_llff.py", tmp_path, folder, "--iterations", "20")
     out = tmp_path / "outputs" / "desk"
     report = json.loads((out / "report.json").read_text())
-    assert (report["method"], report["iterations"], report["config"]["leave_out"]) == ("3dgs", 20, [])
+    assert (report["method"], report["iterations"], report["config"]["leave_out"]) == (
+        "3dgs",
+        20,
+        list(AUTOMATIC),
+    )
     assert f"{report['gaussians']} Gaussians after 20 iterations" in told
     assert f"psnr  {report['metrics']['mean']['psnr']:.4f}" in told
     assert len(list((out / "comparison").iterdir())) == 1
