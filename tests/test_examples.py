@@ -49,11 +49,8 @@ def test_train_llff(folder: Path, tmp_path: Path) -> None:
     told = run("train_llff.py", tmp_path, folder, "--iterations", "20")
     out = tmp_path / "outputs" / "desk"
     report = json.loads((out / "report.json").read_text())
-    assert (report["method"], report["iterations"], report["config"]["leave_out"]) == (
-        "3dgs",
-        20,
-        list(AUTOMATIC),
-    )
+    assert (report["method"], report["iterations"]) == ("3dgs", 20)
+    assert report["config"]["leave_out"] == list(AUTOMATIC)
     assert f"{report['gaussians']} Gaussians after 20 iterations" in told
     assert f"psnr  {report['metrics']['mean']['psnr']:.4f}" in told
     assert len(list((out / "comparison").iterdir())) == 1
