@@ -43,12 +43,6 @@ class Adam(torch.optim.Optimizer):
         ValueError: in `step`, a setting out of its range, or a tensor that it cannot work on.
     """
 
-    # torch wraps these so that its compiler leaves them alone, and loads it for that: 4 s of a start.
-    add_param_group = inspect.unwrap(Optimizer.add_param_group)
-    zero_grad = inspect.unwrap(Optimizer.zero_grad)
-    state_dict = inspect.unwrap(Optimizer.state_dict)
-    load_state_dict = inspect.unwrap(Optimizer.load_state_dict)
-
     def __init__(
         self,
         params: ParamsT,
@@ -57,6 +51,20 @@ class Adam(torch.optim.Optimizer):
         eps: float = 1e-8,
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    # torch wraps these four so that its compiler leaves them alone, and loads it for that: 4 s of a start.
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        inspect.unwrap(Optimizer.add_param_group)(self, param_group)
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        inspect.unwrap(Optimizer.zero_grad)(self, set_to_none)
+
+    def state_dict(self) -> dict[str, Any]:
+        return inspect.unwrap(Optimizer.state_dict)(self)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        inspect.unwrap(Optimizer.load_state_dict)(self, state_dict)
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's base says None)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hqgs.training.trainer import Trainer
 
 WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
-# A mean step of a run over one at its start. A scene that starts from points all over the photos hardly grows,
+# A mean step of a run over one at its start. One that starts from points all over the photos grows little,
 # and its Gaussians hide more of each other as they become opaque.
 GROWTH, GROWTH_DENSE = 2.0, 1.0
 DENSE = 2  # times the scene's own points
