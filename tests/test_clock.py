@@ -15,6 +15,8 @@ from tiny_scene import tiny_config, tiny_scene
 import hqgs
 from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
+from hqgs.photos.formula import parse_degradation
+from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock
 from hqgs.training.config import AUTOMATIC, DensifyConfig, TrainConfig, run_config
 from hqgs.training.schedule import Schedule
@@ -143,3 +145,16 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
     assert len(plain.gaussians) == len(few.points)
     assert "resolution" not in plain.config.leave_out
     assert asdict(trainer(leave_out=("growth",)).config)["leave_out"] == ("growth",)
+
+
+def test_a_run_of_seconds_can_be_stopped_resumed_and_made_longer(tmp_path: Path) -> None:
+    scene, out = tmp_path / "desk", tmp_path / "run"
+    write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)
+    argv = ["train", str(scene), "--out", str(out), "--method", "3dgs"]
+    assert main([*argv, "--seconds", "0.3"]) == 0
+    first = json.loads((out / "report.json").read_text())
+    assert first["config"]["seconds"] == 0.3
+    longer = first["iterations"] + 20
+    assert main([*argv, "--resume", "--iterations", str(longer)]) == 0
+    assert json.loads((out / "report.json").read_text())["iterations"] == longer
+    assert main([*argv, "--overwrite", "--seconds", "0"]) == 2

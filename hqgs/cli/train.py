@@ -163,7 +163,7 @@ def config_of(options: Train) -> TrainConfig:
     if file is not None:
         config = read_config(file)
         if iterations is not None and iterations != config.iterations:
-            config = with_iterations(config, iterations)
+            config = replace(with_iterations(config, iterations), seconds=None, turn=None)
     else:
         length = preset.iterations if iterations is None else iterations
         config = run_config(iterations=length, leave_out=options.leave_out or AUTO)
@@ -180,6 +180,8 @@ def config_of(options: Train) -> TrainConfig:
     of_hqgs = {
         name: value for name in ("guidance", "formation") if (value := getattr(options, name)) is not None
     }
+    if options.seconds is not None:
+        changes["seconds"] = options.seconds
     config = replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
     return config if options.plan is None else with_plan(config, options.plan)
 
@@ -237,7 +239,6 @@ def run(options: Train) -> int:
                 scene,
                 out=options.out,
                 config=config,
-                seconds=options.seconds,
                 resume=options.resume,
                 overwrite=options.overwrite,
                 progress=show,

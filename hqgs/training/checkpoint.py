@@ -21,7 +21,8 @@ from hqgs.scene.scene import Scene
 
 FORMAT = 4  # raised when a newer reader could not use an older file
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
-LENGTH_FIELDS = ("iterations", "sh_interval", "start", "stop", "every", "leave_out")  # in a longer run too
+# In a longer run too.
+LENGTH_FIELDS = ("iterations", "sh_interval", "start", "stop", "every", "leave_out", "seconds", "turn")
 
 
 def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
