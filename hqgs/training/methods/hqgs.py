@@ -52,7 +52,7 @@ class HQGS(Plain):
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
-      more: pixels along the photos' edges, at the depth of the points around them (`points_along_edges`).
+      more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
     - Noise: the learning rates are halved as often as a fiftieth of the pixels, which the loss leaves out,
       finds that nothing is gained any more (`Plateau`). At constant rates the Gaussians learn the noise.
     """
