@@ -126,8 +126,7 @@ def run(args: argparse.Namespace) -> Report:
     """Train what is not finished, row after row of a scene; each is kept as soon as it is done."""
     study = begin(args, "frugality", PROTOCOLS["quick" if args.quick else "standard"])
     study.train(run_cell)
-    report, runs = study.report(), DataFrame(study.results())
-    report.results["runs"] = study.results()
+    report, runs = study.report_of_runs()
     if not len(runs):
         return report
     labels = [label for label in study.protocol.labels if label != NONE]

@@ -23,6 +23,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from pandas import DataFrame
+
 import hqgs
 from benchmarks.measure import Estimate, Run, duration
 from benchmarks.output import Report
@@ -253,6 +255,12 @@ class Study:
         """The runs that are not there, with the reasons."""
         missing = [cell for cell in self.cells if cell not in self.runs]
         return [{"what": f"run {c}", "why": self.failures.get(c, "not finished")} for c in missing]
+
+    def report_of_runs(self) -> tuple[Report, DataFrame]:
+        """A report that holds the finished runs, and these as a table."""
+        report = self.report()
+        report.results["runs"] = runs = self.results()
+        return report, DataFrame(runs)
 
     def results(self) -> list[Run]:
         """The finished runs with the labels of their rows, in the order of the cells."""

@@ -15,10 +15,8 @@ from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
 from benchmarks.protocol import read_protocols
 from benchmarks.study import Cell, begin
+from hqgs.pipeline import fitted
 from hqgs.scene.scene import Scene
-from hqgs.training.clock import fitting
-from hqgs.training.settings import with_iterations
-from hqgs.training.trainer import Trainer
 
 FILE = Path(__file__).with_suffix(".toml")
 PROTOCOLS, DATA = read_protocols(FILE), read_toml(FILE)
@@ -30,10 +28,8 @@ SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
 
 def run_cell(cell: Cell, photos: Scene) -> Run:
     """Train one row; what came of it, as plain JSON values."""
-    config, timed = cell.config, cell.config.seconds is not None and cell.row.label != "3dgs"
-    if config.seconds is not None and timed:
-        config = with_iterations(config, fitting(Trainer(photos, config), config.seconds))
-    done = train(photos, config, evaluate=not timed)
+    config = fitted(photos, cell.config)
+    done = train(photos, config, evaluate=config.seconds is None)
     done.trainer.evaluate(done.trainer.held_out())
     last = done.trainer.history[-1]
     return done.record() | {"psnr": last["psnr"], "ssim": last["ssim"]}
@@ -106,8 +102,7 @@ def run(args: argparse.Namespace) -> Report:
     """Train what is not finished; each run is kept as soon as it is done."""
     study = begin(args, "time", PROTOCOLS["quick" if args.quick else "standard"])
     study.train(run_cell)
-    report, runs = study.report(), DataFrame(study.results())
-    report.results["runs"] = study.results()
+    report, runs = study.report_of_runs()
     if len(runs) and (found := lines(runs)):
         report.results["lines"] = found
         report.tables += [

@@ -251,20 +251,25 @@ def test_the_same_gaussians_give_the_same_bytes() -> None:
     assert encode_spz(g.arrays()).data == encode_spz(g.arrays()).data
 
 
-def test_every_cut_and_every_changed_byte_of_the_end_is_noticed(tmp_path: Path) -> None:
-    path = tmp_path / "a.spz"
-    whole = encode_spz(in_range(3, 0).arrays()).data
-    for length in range(0, len(whole), 3):
+def damage_is_noticed(path: Path, whole: bytes, cuts: range, places: range) -> None:
+    """The file cut at these lengths, with one bit of these bytes changed, and with a byte more."""
+    for length in cuts:
         path.write_bytes(whole[:length])
         with pytest.raises(ValueError, match=r"a\.spz: "):
             Gaussians.load(path)
-    for place in range(len(whole) - 8, len(whole)):
+    for place in places:
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         with pytest.raises(ValueError, match=r"a\.spz: "):
             Gaussians.load(path)
     path.write_bytes(whole + b"x")
     with pytest.raises(ValueError, match=r"a\.spz: damaged: more data"):
         Gaussians.load(path)
+
+
+def test_every_cut_and_every_changed_byte_of_the_end_is_noticed(tmp_path: Path) -> None:
+    whole = encode_spz(in_range(3, 0).arrays()).data
+    end = len(whole)
+    damage_is_noticed(tmp_path / "a.spz", whole, range(0, end, 3), range(end - 8, end))
 
 
 @pytest.mark.parametrize(
