@@ -159,14 +159,14 @@ def open_run(
     if seconds is not None:
         config = replace(config, seconds=seconds)
     if out is None:
-        yield Trainer(scene, _fitted(scene, config))
+        yield Trainer(scene, fitted(scene, config))
         return
     checkpoint = Path(out) / CHECKPOINT
     with lock_folder(out):
         for file in (CHECKPOINT, PLY):
             remove_leftovers(Path(out) / file)
         going_on = resume and checkpoint.exists()
-        config = config if going_on else _fitted(scene, config)
+        config = config if going_on else fitted(scene, config)
         trainer = Trainer(scene, config)
         if not resume:
             checkpoint.unlink(missing_ok=True)
@@ -177,7 +177,7 @@ def open_run(
         yield trainer
 
 
-def _fitted(scene: Scene, config: TrainConfig) -> TrainConfig:
+def fitted(scene: Scene, config: TrainConfig) -> TrainConfig:
     """The configuration with the iterations that fit into its seconds, if it has any."""
     if config.seconds is None or config.turn is not None:
         return config

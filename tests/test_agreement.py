@@ -43,3 +43,6 @@ def test_flat_and_contradicting_photos_do_not_agree() -> None:
     noise = [replace(v, image=rng.integers(0, 256, v.image.shape).astype(np.uint8)) for v in scene.train]
     assert Agreement(noise, scene.seen).depths(3, pixels, ranges)[1].mean() < 0.2
     assert not Agreement(scene.train[:2], scene.seen).depths(0, pixels, ranges)[1].any()
+    assert Agreement(scene.train, {}).depths(0, pixels, ranges)[0].shape == (
+        100,
+    )  # what they see is not known

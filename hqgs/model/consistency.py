@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.sparse import csr_array
 
 from hqgs import _rust
 from hqgs.photos.pixels import as_floats
-from hqgs.photos.resize import area_downscale
+from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
@@ -21,19 +23,37 @@ NEIGHBOURS, AGREEING = 4, 2  # photos that are asked, and how many of them must 
 AGREED = 0.6  # correlation of the patches
 
 
+@dataclass(frozen=True)
+class Look:
+    """A photo as it is looked at: small, in one channel, smoothed."""
+
+    camera: Camera  # of this size
+    grey: NDArray[np.float32]  # [h, w]
+    mask: NDArray[np.bool_] | None  # [h, w], as that of a view
+    scale: Floats  # [2]: what takes a pixel (x, y) of the view to one of this photo
+
+    @classmethod
+    def of(cls, view: View) -> Look:
+        whole = view.camera
+        if (factor := max(whole.width, whole.height) / LONGEST) > 1:
+            view = resized(view, *(max(1, round(side / factor)) for side in (whole.width, whole.height)))
+        camera, grey = view.camera, as_floats(view.image).mean(2, dtype=np.float32)
+        smooth = np.ascontiguousarray(gaussian_filter(grey, SMOOTH), np.float32)
+        scale = np.array([camera.width / whole.width, camera.height / whole.height])
+        return cls(camera, smooth, view.mask, scale)
+
+
 class Agreement:
     """The training photos as they are asked."""
 
     def __init__(self, views: Sequence[View], seen: Mapping[str, NDArray[np.intp]]) -> None:
         """`seen`: by the view's name, which points it sees. Views that share most are asked first."""
-        self._cameras, self._grey = [], []
-        for view in views:
-            camera, grey, _ = small(view)
-            self._cameras.append(camera)
-            self._grey.append(grey)
-        self._scales = [scale(v.camera, c) for c, v in zip(self._cameras, views, strict=True)]
-        sets = [set(seen.get(view.name, np.zeros(0, np.intp)).tolist()) for view in views]
-        self._shared = np.array([[len(a & b) for b in sets] for a in sets])
+        self.looks: list[Look] = [Look.of(view) for view in views]
+        rows = [np.unique(seen.get(view.name, np.zeros(0, np.intp))) for view in views]
+        ends = np.cumsum([0, *map(len, rows)])
+        points = 1 + max((int(some[-1]) for some in rows if len(some)), default=0)
+        sees = csr_array((np.ones(ends[-1], np.intp), np.concatenate(rows), ends), (len(views), points))
+        self._shared: NDArray[np.intp] = (sees @ sees.T).toarray()
         np.fill_diagonal(self._shared, -1)
 
     def depths(self, number: int, pixels: Floats, ranges: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -42,33 +62,16 @@ class Agreement:
         others = [int(k) for k in order[: min(NEIGHBOURS, len(order) - 1)]]
         if len(others) < AGREEING:
             return ranges[:, 0], np.zeros(len(ranges), bool)
+        look = self.looks[number]
         depths, scores = _rust.agreed_depths(
-            self._grey[number],
-            [self._grey[k] for k in others],
-            np.stack([_map(self._cameras[number], self._cameras[k]) for k in others]),
-            np.ascontiguousarray(pixels * self._scales[number]),
+            look.grey,
+            [self.looks[k].grey for k in others],
+            np.stack([_map(look.camera, self.looks[k].camera) for k in others]),
+            np.ascontiguousarray(pixels * look.scale),
             np.ascontiguousarray(ranges),
             AGREEING,
         )
         return depths, scores >= AGREED
-
-
-def small(view: View) -> tuple[Camera, NDArray[np.float32], NDArray[np.bool_] | None]:
-    """The view as its photo is looked at: the camera, the photo [h, w] in one channel, smoothed, its mask."""
-    camera, image, mask = view.camera, view.image, view.mask
-    factor = max(camera.width, camera.height) / LONGEST
-    if factor > 1:
-        width, height = (max(1, round(side / factor)) for side in (camera.width, camera.height))
-        image, mask = area_downscale(image, mask, width, height)
-        K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
-        camera = Camera(width, height, K, camera.viewmat)
-    grey = as_floats(image).mean(2, dtype=np.float32)
-    return camera, np.ascontiguousarray(gaussian_filter(grey, SMOOTH), np.float32), mask
-
-
-def scale(camera: Camera, smaller: Camera) -> Floats:
-    """What takes a pixel (x, y) of the one to that of the other, [2]."""
-    return np.array([smaller.width / camera.width, smaller.height / camera.height])
 
 
 def _map(first: Camera, second: Camera) -> Floats:

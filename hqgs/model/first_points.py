@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
-from hqgs.model.consistency import Agreement, scale, small
+from hqgs.model.consistency import Agreement, Look
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import View
@@ -42,7 +42,8 @@ def points_along_edges(
         seen: by the view's name, which rows of `points` it sees; a view that is not there sees none.
         count: at least 0.
         seed: of the draw. Each view has its own numbers, whatever the others are.
-        agreement: of the same views: it tells the depths; points that it does not find are left out.
+        agreement: of the same views: how they are looked at; it tells the depths, and points that it does
+            not find are left out.
     """
     found, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
     for k, view in enumerate(views):
@@ -50,7 +51,7 @@ def points_along_edges(
         rows = seen.get(view.name)
         if rows is None or not share:
             continue
-        pixels = _drawn(view, share, np.random.default_rng([seed, k]))
+        pixels = _drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
         ranges = _ranges(view, points[rows].astype(np.float64), pixels)
         if ranges is None:
             continue
@@ -58,14 +59,14 @@ def points_along_edges(
         pixels, depths = pixels[agreed], depths[agreed]
         found.append(unproject(view.camera, pixels, depths).astype(np.float32))
         columns, lines = pixels.astype(np.intp).T
-        colors.append(to_uint8(as_floats(view.image)[lines, columns]))
+        colors.append(to_uint8(as_floats(view.image[lines, columns])))
     return np.concatenate(found), np.concatenate(colors)
 
 
-def _drawn(view: View, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Centres [M, 2] of pixels as x, y; M is `count`, or fewer where so many do not count."""
-    camera, grey, mask = small(view)
-    mask = np.ones(grey.shape, bool) if mask is None else mask
+def _drawn(look: Look, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Centres [M, 2] of pixels of the view as x, y; M is `count`, or fewer where so many do not count."""
+    grey = look.grey
+    mask = np.ones(grey.shape, bool) if look.mask is None else look.mask
     edges = np.where(mask, np.hypot(sobel(grey, 0), sobel(grey, 1)), 0.0)
     weights = np.where(mask, FLAT / max(mask.sum(), 1), 0.0)
     weights += (1 - FLAT) * edges / max(edges.sum(), np.finfo(float).tiny)
@@ -75,8 +76,8 @@ def _drawn(view: View, count: int, rng: np.random.Generator) -> NDArray[np.float
     with np.errstate(divide="ignore"):
         keys = np.log(rng.random(weights.size)) / weights
     chosen = np.sort(np.argpartition(-keys, max(count - 1, 0))[:count])
-    lines, columns = np.divmod(chosen, camera.width)
-    return (np.stack([columns, lines], 1) + 0.5) / scale(view.camera, camera)
+    lines, columns = np.divmod(chosen, look.camera.width)
+    return (np.stack([columns, lines], 1) + 0.5) / look.scale
 
 
 def _ranges(

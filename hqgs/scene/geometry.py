@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs._rust import NEAR_PLANE
+from hqgs.photos.resize import area_downscale
 from hqgs.scene.scene import Camera, Scene, View
 
 MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
@@ -72,3 +73,11 @@ def in_picture(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         & (y.abs() * K[1, 1] < MARGIN * camera.height / 2 * z)
     )
     return z, seen
+
+
+def resized(view: View, width: int, height: int) -> View:
+    """The view with photo, mask and camera at a smaller size, px."""
+    camera = view.camera
+    image, mask = area_downscale(view.image, view.mask, width, height)
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    return View(view.name, Camera(width, height, K, camera.viewmat), image, mask)

@@ -66,6 +66,18 @@ class Scene:
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
 
+    def check_trainable(self) -> None:
+        """ValueError where it cannot be trained on."""
+        if not self.train:
+            raise ValueError(f"scene {self.name!r} has no training views")
+        for view in [*self.train, *self.test]:
+            wanted = (view.camera.height, view.camera.width, 3)
+            if view.image.dtype not in (np.uint8, np.float32) or view.image.shape != wanted:
+                raise ValueError(
+                    f"view {view.name!r}: the image is {view.image.dtype} {list(view.image.shape)}, "
+                    f"its camera wants uint8 or float32 {list(wanted)}"
+                )
+
     @property
     def extent(self) -> float:
         """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera."""

@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from hqgs.photos.resize import area_downscale
-from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.geometry import resized
+from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
 
 T = TypeVar("T")
@@ -176,10 +176,7 @@ def on_the_way(scene: Scene, every: int) -> list[int]:
 def smaller(view: View) -> View:
     """The view with photo and camera at 1 / COARSE_FACTOR of the size."""
     camera = view.camera
-    width, height = round(camera.width / COARSE_FACTOR), round(camera.height / COARSE_FACTOR)
-    image, mask = area_downscale(view.image, view.mask, width, height)
-    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
-    return View(view.name, Camera(width, height, K, camera.viewmat), image, mask)
+    return resized(view, round(camera.width / COARSE_FACTOR), round(camera.height / COARSE_FACTOR))
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:
@@ -190,16 +187,3 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 
 def _band_check(config: TrainConfig) -> int:
     return max(EARLIEST, round(BAND_CHECK * config.iterations), 1)
-
-
-def check_views(scene: Scene) -> None:
-    """ValueError where a scene cannot be trained on."""
-    if not scene.train:
-        raise ValueError(f"scene {scene.name!r} has no training views")
-    for view in [*scene.train, *scene.test]:
-        wanted = (view.camera.height, view.camera.width, 3)
-        if view.image.dtype not in (np.uint8, np.float32) or view.image.shape != wanted:
-            raise ValueError(
-                f"view {view.name!r}: the image is {view.image.dtype} {list(view.image.shape)}, "
-                f"its camera wants uint8 or float32 {list(wanted)}"
-            )

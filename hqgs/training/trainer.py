@@ -36,7 +36,7 @@ from hqgs.training.frugality import Frugality
 from hqgs.training.guard import LISTED, Event, Fault, Guard, bad_values, gradient_fault, parameter_fault
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method, Target
-from hqgs.training.schedule import Plan, Schedule, check_views, learning_rates, on_the_way, smaller
+from hqgs.training.schedule import Plan, Schedule, learning_rates, on_the_way, smaller
 from hqgs.training.state import TrainState
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
@@ -61,7 +61,7 @@ class Trainer:
 
     def __init__(self, scene: Scene, config: TrainConfig) -> None:
         """ValueError if the scene or the configuration cannot be trained."""
-        check_views(scene)
+        scene.check_trainable()
         inspector = Inspector()  # for all that looks at the photos before the first step
         self.photos_left_out: list[LeftOut] = []
         if "photos" in config.leave_out:
