@@ -280,6 +280,8 @@ def _learned(found: Found) -> LearnedRecord:
         "name": found.name,
         "shake_px": found.extent,
         "way_px": found.way.tolist(),
+        "defocus_px": found.defocus,
+        "focus": found.focus,
         "gains": found.gains.tolist(),
     }
 
@@ -313,6 +315,13 @@ def _notes(trainer: Trainer) -> list[str]:
                 f"{moved} of {len(ways)} photos are shaken, by {ways[len(ways) // 2]:.1f} px in the median "
                 f"and {ways[-1]:.1f} px at most; held-out photos that are shaken themselves measure a sharp "
                 "scene as worse than it is"
+            )
+        discs = sorted(photo.defocus for photo in found)
+        if soft := sum(disc > 0 for disc in discs):
+            notes.append(
+                f"{soft} of {len(discs)} photos are out of focus somewhere, with discs of up to "
+                f"{discs[-1]:.1f} px radius; held-out photos that are so themselves measure a sharp scene as "
+                "worse than it is"
             )
         gains = np.log2([photo.gains for photo in found])
         if gains.any():

@@ -211,6 +211,7 @@ def test_report_is_json_and_names_every_part() -> None:
     assert [(name, needed) for name, needed, _ in found.needs()] == [
         ("exposure", False),
         ("shake", False),
+        ("focus", False),
         ("blur", False),
         ("lowres", True),
         ("noise", False),

@@ -243,12 +243,12 @@ def assert_same(a: Trainer, b: Trainer) -> None:
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     scene = hqgs.degrade(tiny_scene(), "shake:3+exposure")
-    whole = run(scene, "shake+exposure")
-    half = Trainer(scene, learned_config("shake+exposure"))
+    whole = run(scene, "shake+focus+exposure")
+    half = Trainer(scene, learned_config("shake+focus+exposure"))
     while half.iteration < 17:
         half.step()
     half.save(tmp_path / "checkpoint.safetensors")
-    rest = Trainer(scene, learned_config("shake+exposure"))
+    rest = Trainer(scene, learned_config("shake+focus+exposure"))
     rest.restore(tmp_path / "checkpoint.safetensors")
     while rest.iteration < rest.length:
         rest.step()
@@ -261,7 +261,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     try:
         for threads in (1, 3):
             hqgs.set_num_threads(threads)
-            runs.append(run(scene, "shake+exposure"))
+            runs.append(run(scene, "shake+focus+exposure"))
     finally:
         hqgs.set_num_threads(before)
     assert_same(*runs)
@@ -319,10 +319,11 @@ def test_ways_are_learned_and_the_scene_gets_sharper() -> None:
     assert learned.history[-1]["psnr"] > plain.history[-1]["psnr"] + 0.5  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("formation", ["exposure+lowres:2", "exposure+shake+blur:1+noise:5", "shake+jpeg:30"])
+@pytest.mark.parametrize("formation", ["exposure+lowres:2", "exposure+shake+blur:1+noise:5", "focus+jpeg:30"])
 def test_other_steps_come_after_the_camera(formation: str) -> None:
     scene = tiny_scene()
-    trainer = run(hqgs.degrade(scene, formation), formation, iterations=20)
+    degraded = hqgs.degrade(scene, formation.replace("focus", "defocus:1"))
+    trainer = run(degraded, formation, iterations=20)
     assert trainer.guard.skipped == 0
     assert trainer.config.hqgs.formation == formation
     assert len(trainer.method.found()) == len(scene.train)
@@ -337,6 +338,6 @@ def test_without_photos_to_hold_back_a_run_has_a_length() -> None:
 
 def test_cameras_of_other_sizes_stay_still() -> None:
     scene = tiny_scene()
-    cameras = LearnedCameras(scene, True, None, 0)
+    cameras = LearnedCameras(scene, True, True, None, 0)
     view = replace(scene.train[0], camera=replace(scene.train[0].camera, width=12))
     assert cameras.shot(view, torch.zeros(16, 12, 3)).camera is view.camera

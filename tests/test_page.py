@@ -90,17 +90,32 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
     assert "What was learned" not in page_text(page_of(run))
     way = [[0.5 * k, 0.0] for k in range(-4, 5)]
     learned = [
-        {"name": "a<b>.png", "shake_px": 4.0, "way_px": way, "gains": [2.0, 2.0, 0.5]},
-        {"name": "c.png", "shake_px": 0.0, "way_px": [[0.0, 0.0]] * 9, "gains": [1.0, 1.0, 1.0]},
+        {
+            "name": "a<b>.png",
+            "shake_px": 4.0,
+            "defocus_px": 0.0,
+            "focus": None,
+            "way_px": way,
+            "gains": [2.0, 2.0, 0.5],
+        },
+        {
+            "name": "c.png",
+            "shake_px": 0.0,
+            "defocus_px": 1.5,
+            "focus": 2.0,
+            "way_px": [[0.0, 0.0]] * 9,
+            "gains": [1.0, 1.0, 1.0],
+        },
     ]
     report: Any = {**run.report, "learned": learned}
     sheet = Image.new("RGB", (2000, 100), "white")
     text = page_text(page_of(run, report=report, learned=sheet))
     cells = "".join(
-        f"<td>{cell}</td>" for cell in ("a&lt;b&gt;.png", "4.0 px", "+0.33", "+0.67", "+0.67", "-1.33")
+        f"<td>{cell}</td>"
+        for cell in ("a&lt;b&gt;.png", "4.0 px", "sharp", "+0.33", "+0.67", "+0.67", "-1.33")
     )
     assert cells in text
-    assert "<td>c.png</td><td>still</td><td>+0.00</td>" in text
+    assert "<td>c.png</td><td>still</td><td>1.5 px, sharp at 2 of the median depth</td><td>+0.00</td>" in text
     assert text.count("data:image/jpeg;base64,") == 2 * len(run.views) + 1
 
 

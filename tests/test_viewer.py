@@ -335,7 +335,13 @@ def test_the_page_says_what_the_report_says_of_a_photo(folder: Path) -> None:
         trained = next(view.name for view in viewer._views.values() if not view.held_out)
         photo = {"name": trained, "width": 24, "height": 16, "blur": "motion", "blur_px": 3.25, "noise": 7.04}
         photo |= {"jpeg_quality": None, "enlarged": 2}
-        learned = {"name": trained, "shake_px": 1.5, "gains": [2.0, 2.0, 2.0]}
+        learned = {
+            "name": trained,
+            "shake_px": 1.5,
+            "defocus_px": 1.5,
+            "focus": 2.0,
+            "gains": [2.0, 2.0, 2.0],
+        }
         view = {"name": held_out, "psnr": 25.5, "ssim": None}
         report = {"photos": [photo], "learned": [learned], "metrics": {"views": [view]}}
         viewer.set_facts(facts_of_photos(report))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
+from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import NONE, parse_degradation
@@ -23,7 +24,7 @@ VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
 class Part:
     """One step of how the photos were made, and whether the method must undo it."""
 
-    name: str  # "exposure", "shake", "blur", "lowres", "noise" or "jpeg"
+    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise" or "jpeg"
     needed: bool
     value: float | None  # median over photos: px, factor, levels or quality; None: not told
     spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
@@ -68,7 +69,7 @@ class Inspector:
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
-        self._differences: dict[tuple[int, ...], tuple[Part, Part]] = {}
+        self._differences: dict[tuple[int, ...], tuple[Part, Part, Part]] = {}
         self.last: Diagnosis | None = None  # that was made
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
@@ -102,12 +103,14 @@ class Inspector:
         photos = self._concluded[key]
         everyone = tuple(map(id, scene.train))
         if everyone not in self._differences:
-            self._differences[everyone] = _exposure(scene), _shake(scene)
-        exposure, shake = self._differences[everyone]
+            shake = _shake(scene)
+            self._differences[everyone] = _exposure(scene), shake, _focus(scene, shake.needed)
+        exposure, shake, focus = self._differences[everyone]
         blur = _blur(photos)
-        if shake.needed:
-            blur = replace(blur, needed=False, step=None, reason="each photo has its own, see shake")
-        parts = (exposure, shake, blur, _lowres(photos), _noise(photos), _jpeg(photos))
+        if own := [part.name for part in (shake, focus) if part.needed]:
+            reason = f"each photo has its own, see {' and '.join(own)}"
+            blur = replace(blur, needed=False, step=None, reason=reason)
+        parts = (exposure, shake, focus, blur, _lowres(photos), _noise(photos), _jpeg(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
         self.last = Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
         return self.last
@@ -144,6 +147,21 @@ def _shake(scene: Scene) -> Part:
         reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
         return Part("shake", False, unlike.sharpness, None, None, reason)
     return Part("shake", True, unlike.sharpness, None, "shake", reason)
+
+
+def _focus(scene: Scene, shaken: bool) -> Part:
+    """`shaken`: photos then differ in sharpness as a whole, whatever their focus."""
+    signs = focus_signs(scene)
+    if signs is None:
+        return Part("focus", False, None, None, None, "the photos share too few points to tell")
+    needed = signs.with_depth >= GOES_WITH_DEPTH or (signs.in_all >= DIFFERS and not shaken)
+    reason = (
+        f"points are sharper or softer from photo to photo by {signs.with_depth:.2f} with their distance and "
+        f"by {signs.in_all:.2f} in all"
+    )
+    if not needed:
+        reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g} in the logarithm of contrast)"
+    return Part("focus", needed, signs.with_depth, None, "focus" if needed else None, reason)
 
 
 def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:

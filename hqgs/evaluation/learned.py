@@ -21,9 +21,10 @@ LARGER = 4  # times: ways are drawn so much larger than the photo
 def learned_picture(
     photos: Sequence[NDArray[np.uint8] | NDArray[np.float32]], learned: Sequence[LearnedRecord]
 ) -> Image.Image:
-    """Up to 12 photos [H, W, 3], from the most to the least shaken, each with its camera's way (four times as
-    large) in its middle and its gain in the caption."""
-    order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"])
+    """Up to 12 photos [H, W, 3], the least sharp one first, each with its camera's way and largest disc
+    out of focus (four times as large) in its middle and its gain in the caption.
+    """
+    order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"] - 2 * learned[k]["defocus_px"])
     chosen = [order[k] for k in np.linspace(0, len(order) - 1, min(MOST, len(order))).round().astype(int)]
     tiles = [_tile(photos[k], learned[k]) for k in chosen]
     width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
@@ -43,10 +44,15 @@ def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord)
     draw = ImageDraw.Draw(tile)
     stops = float(np.log2(record["gains"]).mean())
     facts = [f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"]
+    facts += [f"focus {record['defocus_px']:.1f} px"] if record["defocus_px"] else []
     facts += [f"{stops:+.2f} stops"] if np.ptp(record["gains"]) or stops else []
     draw.text((2, 3), f"{Path(record['name']).stem[-16:]}  {', '.join(facts)}", fill=(25, 25, 25))
     middle = np.array([picture.width / 2, LINE + picture.height / 2])
     way = [tuple(middle + LARGER * scale * np.array(point)) for point in record["way_px"]]
+    if record["defocus_px"]:
+        radius = LARGER * scale * record["defocus_px"]
+        for width, color in ((3, (0, 0, 0)), (1, (255, 210, 0))):
+            draw.circle(tuple(middle), radius, outline=color, width=width)
     if record["shake_px"]:
         draw.line(way, fill=(0, 0, 0), width=5, joint="curve")
         draw.line(way, fill=(255, 210, 0), width=3, joint="curve")

@@ -38,11 +38,14 @@ def photo_words(record: PhotoRecord) -> dict[str, str]:
 
 
 def learned_words(record: LearnedRecord) -> dict[str, str]:
-    """Shake and exposure, by name, for people."""
+    """Shake, focus and exposure, by name, for people."""
     stops = np.log2(record["gains"])
     rgb = {name: f"{value:+.2f}" for name, value in zip("RGB", stops - stops.mean(), strict=True)}
     shake = f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"
-    return {"shake": shake, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
+    focus = f"{record['defocus_px']:.1f} px" if record["defocus_px"] else "sharp"
+    if record["focus"] is not None:
+        focus += f", sharp at {record['focus']:.2g} of the median depth"
+    return {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
 
 
 def facts_of_photos(report: Mapping[str, Any]) -> dict[str, dict[str, str]]:

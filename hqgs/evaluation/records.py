@@ -120,6 +120,10 @@ class LearnedRecord(TypedDict):
     name: str
     shake_px: float  # how far the picture's middle went during the exposure
     way_px: list[list[float]]  # its way, [9, 2], x to the right and y down; of mean 0
+    defocus_px: float  # radius of the largest disc that a point becomes
+    focus: (
+        float | None
+    )  # where it was focused, 1 at the photo's median depth; None: sharp, or out of focus as a whole
     gains: list[float]  # of red, green and blue in linear light; their logarithms' mean over photos is 0
 
 

@@ -28,6 +28,7 @@ KINDS = {
     "defocus": Kind(0.5, 50, "a radius in px", at_504=5.0),
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
     "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0),
+    "focus": Kind(0, 0, "no value", default=0, some=False),
     "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
     "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
@@ -37,7 +38,7 @@ KINDS = {
 NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
 VIDEOS = ("video", "video265")
-LEARNED = ("shake", "exposure")  # of each photo its own, which is learned with the scene
+LEARNED = ("shake", "focus", "exposure")  # of each photo its own, which is learned with the scene
 
 
 @dataclass(frozen=True)

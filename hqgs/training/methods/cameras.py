@@ -1,7 +1,8 @@
-"""What each photo's camera did, learned with the scene: its way during the exposure, and its gains.
+"""What each photo's camera did, learned with the scene: its way during the exposure, its lens and its gains.
 
-One render, warped along the way (`hqgs/photos/exposure.py`), stands for the whole exposure. What photos
-cannot tell is fixed by construction: the mean of a way is the photo's pose, the mean of the log gains is 0.
+One render, warped along the way and over the lens (`hqgs/photos/exposure.py`), stands for the whole exposure.
+What photos cannot tell is fixed by construction: the mean of a way is the photo's pose, the mean of the log
+gains is 0.
 """
 
 from __future__ import annotations
@@ -22,12 +23,14 @@ from hqgs.photos.exposure import take_photo
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.methods.lens import SMALLEST, first_lens, lens_warps, samples, sharp_at, widest
 
 BEGIN = 0.1  # of the run: before, ways would only hide what the scene does not show yet
 LOOKS = (0.5, 0.75)  # of the run: when short ways are given up
 SHORTEST = 0.7  # px, of the way of the picture's middle: less than that a photo stands still
 FIRST = 1e-3  # of the photo's width, standard deviation: from 0 a way has no direction to grow in
 PATH_RATE, GAIN_RATE = 8e-4, 0.005  # learning rates: of the photo's width, and of the log gains
+LENS_RATE = 4e-4  # the same for lenses, of the photo's width
 NARROW = 200  # px: narrower photos count as that wide
 LAST = 0.1  # of the rates, at the end of the run
 WAY = 9  # points that stand for a way
@@ -53,6 +56,17 @@ class Found:
     name: str
     way: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
     gains: NDArray[np.float64]  # [3], of red, green and blue in linear light
+    lens: NDArray[np.float64]  # [2], px: see `hqgs.training.methods.lens`
+
+    @property
+    def defocus(self) -> float:
+        """Radius of the largest disc that a point becomes, px."""
+        return widest(*self.lens)
+
+    @property
+    def focus(self) -> float | None:
+        """Where the photo is sharp, 1 at its median depth; None: nowhere, or all of it."""
+        return sharp_at(*self.lens)
 
     @property
     def extent(self) -> float:
@@ -67,7 +81,9 @@ class LearnedCameras:
     all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median depth.
     """
 
-    def __init__(self, scene: Scene, shake: bool, log_gains: NDArray[np.float64] | None, seed: int) -> None:
+    def __init__(
+        self, scene: Scene, shake: bool, focus: bool, log_gains: NDArray[np.float64] | None, seed: int
+    ) -> None:
         """`log_gains` [N, 3]: to start from; None: all gains are 1 and stay so."""
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
         self._depths = [median_depth(scene, view) for view in scene.train]
@@ -83,9 +99,11 @@ class LearnedCameras:
             torch.from_numpy(gains.copy()).requires_grad_()
             for gains in (log_gains if log_gains is not None else [])
         ]
+        self._lenses = [first_lens(width).requires_grad_() for width in (self._widths if focus else [])]
         self._nearness: list[Tensor | None] = [None] * count
         self._visits = torch.zeros(count, dtype=torch.int64)
         self._still = torch.full((count,), not shake)
+        self._sharp = torch.full((count,), not focus)
         self._active = False
         self._begin, self._looks = 0, (0, 0)
 
@@ -98,19 +116,18 @@ class LearnedCameras:
         """Of a training view."""
         number, camera = self._numbers[view.name], view.camera
         size = camera.height, camera.width
-        moves = self._active and not self._still[number] and self._sizes[number] == size
-        if not moves and not self._gains:
+        blurs = self._active and self._blurs(number) and self._sizes[number] == size
+        if not blurs and not self._gains:
             return Shot(camera, lambda render: render)
         warps, margin = torch.zeros(0, 3, 4, dtype=torch.float64), 0
-        if moves:
-            count = min(max(3, math.ceil(self._extent(number, camera) / SPACING) + 1), MOST)
-            warps = self._warps(number, camera, count)
+        if blurs:
+            warps = self._warps(number, camera)
             reach = float(_moved(warps.detach(), camera, nearness=2.0).abs().max())
             margin = min(4 * math.ceil((reach + 1) / 4), MOST_MARGIN)
         K = camera.K.copy()
         K[:2, 2] += margin
         wide = Camera(camera.width + 2 * margin, camera.height + 2 * margin, K, camera.viewmat)
-        near = self._nearness[number] if moves else None
+        near = self._nearness[number] if blurs else None
 
         def develop(render: Tensor) -> Tensor:
             gains = torch.ones(3, dtype=torch.float64)
@@ -129,20 +146,24 @@ class LearnedCameras:
         number = self._numbers[view.name]
         if self._gains:
             _center(self._gains)
-        if not self._paths:
+        if not self._paths and not self._lenses:
             return
         self._active = iteration >= self._begin
         if not self._active:
             return
-        if not self._still[number]:
+        if self._blurs(number):
             if self._visits[number] % REFRESH == 0:
                 near = nearness_map(gaussians, view.camera, COARSER) * self._depths[number]
                 self._nearness[number] = near.clamp(0.05, 10).to(torch.float16)
             self._visits[number] += 1
         if iteration in self._looks:
             for k, path in enumerate(self._paths):
-                if _longest(_middle(path)) < SHORTEST:
-                    self._still[k], self._nearness[k] = True, None
+                self._still[k] |= _longest(_middle(path)) < SHORTEST
+            for k, lens in enumerate(self._lenses):
+                self._sharp[k] |= widest(*lens.tolist()) < SMALLEST
+            for k in range(len(self._nearness)):
+                if not self._blurs(k):
+                    self._nearness[k] = None
 
     def found(self) -> list[Found]:
         """For each photo."""
@@ -151,6 +172,7 @@ class LearnedCameras:
                 name,
                 np.zeros((WAY, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
+                np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
             )
             for name, k in self._numbers.items()
         ]
@@ -159,6 +181,8 @@ class LearnedCameras:
         groups: list[dict[str, Any]] = []
         if self._paths:
             groups.append({"name": "paths", "params": self._paths, "lr": 0.0, "betas": (0.9, 0.99)})
+        if self._lenses:
+            groups.append({"name": "lenses", "params": self._lenses, "lr": 0.0, "betas": (0.9, 0.99)})
         if self._gains:
             groups.append({"name": "gains", "params": self._gains, "lr": 0.0, "betas": (0.9, 0.99)})
         return groups
@@ -168,39 +192,53 @@ class LearnedCameras:
         rates = {}
         if self._paths:
             rates["paths"] = PATH_RATE * float(np.mean(self._widths)) * LAST**part
+        if self._lenses:
+            rates["lenses"] = LENS_RATE * float(np.mean(self._widths)) * LAST**part
         if self._gains:
             rates["gains"] = GAIN_RATE * LAST**part
         return rates
 
     def state_dict(self) -> dict[str, Tensor]:
-        state = {"visits": self._visits, "still": self._still, "active": torch.tensor(self._active)}
+        state = {"visits": self._visits, "still": self._still, "sharp": self._sharp}
+        state["active"] = torch.tensor(self._active)
         state |= {f"path.{k}": path.detach() for k, path in enumerate(self._paths)}
+        state |= {f"lens.{k}": lens.detach() for k, lens in enumerate(self._lenses)}
         state |= {f"gains.{k}": gains.detach() for k, gains in enumerate(self._gains)}
         return state | {f"near.{k}": near for k, near in enumerate(self._nearness) if near is not None}
 
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self._visits, self._still = state["visits"].clone(), state["still"].clone()
+        self._visits = state["visits"].clone()
+        self._still, self._sharp = state["still"].clone(), state["sharp"].clone()
         self._active = bool(state["active"])
         for k, path in enumerate(self._paths):
             path.copy_(state[f"path.{k}"])
+        for k, lens in enumerate(self._lenses):
+            lens.copy_(state[f"lens.{k}"])
         for k, gains in enumerate(self._gains):
             gains.copy_(state[f"gains.{k}"])
         self._nearness = [state.get(f"near.{k}") for k in range(len(self._nearness))]
 
-    def _extent(self, number: int, camera: Camera) -> float:
-        """The longest way in px of the picture's corners and middle."""
-        with torch.no_grad():
-            moved = _moved(self._warps(number, camera, WAY), camera, nearness=1.0)
-        return max(_longest(moved[:, k]) for k in range(moved.shape[1]))
+    def _blurs(self, number: int) -> bool:
+        """Whether a photo's camera moved or was out of focus."""
+        return not (self._still[number] and self._sharp[number])
 
-    def _warps(self, number: int, camera: Camera, count: int) -> Tensor:
-        """As `take_photo` takes them, [count, 3, 4]; nearness is 1 at the median depth."""
-        steps, focal = _steps(self._paths[number], count), float(camera.K[0, 0])
-        K = torch.from_numpy(camera.K)
-        turned = K @ _turns(steps[:, :3] / focal) @ torch.linalg.inv(K)
-        moved = steps[:, 3:] @ (K / focal).T
-        return torch.cat([turned, moved[:, :, None]], dim=2)
+    def _warps(self, number: int, camera: Camera) -> Tensor:
+        """As `take_photo` takes them, [K, 3, 4], as many as it needs; nearness is 1 at the median depth."""
+        count, still, sharp = 0, bool(self._still[number]), bool(self._sharp[number])
+        if not still:
+            with torch.no_grad():
+                moved = _moved(_way_warps(self._paths[number], camera, WAY), camera, nearness=1.0)
+            extent = max(_longest(moved[:, k]) for k in range(moved.shape[1]))
+            count = min(max(3, math.ceil(extent / SPACING) + 1), MOST)
+        if not sharp:
+            count = max(count, samples(self._lenses[number]))
+        warps = torch.zeros(count, 3, 4, dtype=torch.float64)
+        if not still:
+            warps = warps + _way_warps(self._paths[number], camera, count)
+        if not sharp:
+            warps = warps + lens_warps(self._lenses[number], count)
+        return warps
 
 
 def no_shot(view: View) -> Shot:
@@ -213,6 +251,14 @@ def _steps(path: Tensor, count: int) -> Tensor:
     t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
     square = t.square()
     return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+
+
+def _way_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
+    """Warps of a camera that goes along a way, [count, 3, 4]."""
+    steps, focal, K = _steps(path, count), float(camera.K[0, 0]), torch.from_numpy(camera.K)
+    turned = K @ _turns(steps[:, :3] / focal) @ torch.linalg.inv(K)
+    moved = steps[:, 3:] @ (K / focal).T
+    return torch.cat([turned, moved[:, :, None]], dim=2)
 
 
 @torch.no_grad()

@@ -80,7 +80,7 @@ class HQGS(Plain):
             if "exposure" in kinds:
                 gains = log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
-            self._cameras = LearnedCameras(scene, "shake" in kinds, gains, seed)
+            self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
         self._plateau = Plateau(len(scene.train)) if self._knee else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
         self._since = 0  # the iteration after which they were computed
