@@ -135,6 +135,7 @@ def test_diagnose_prints_and_writes_what_it_found(
     assert [part["name"] for part in written["parts"]] == [
         "exposure",
         "shake",
+        "focus",
         "blur",
         "lowres",
         "noise",

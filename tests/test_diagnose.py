@@ -59,10 +59,16 @@ def degraded_scene(text: str, photos: int = PHOTOS, keep_low: bool = True) -> Sc
     return Scene("leaves", views, [], np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), "test")
 
 
+def half_noisy_scene() -> Scene:
+    """Noise of 25 levels in every second photo of six."""
+    clean, noisy = degraded_scene("none", 6), degraded_scene("noise:25", 6)
+    return replace(clean, train=[(noisy if k % 2 else clean).train[k] for k in range(6)])
+
+
 def steps_of(diagnosis: Diagnosis) -> dict[str, float]:
-    """The formation as {kind: value}."""
+    """The formation as {kind: value}; NaN for what each photo has its own of."""
     steps = parse_degradation(diagnosis.formation).steps
-    return {step.kind: step.value for step in steps if step.value is not None}
+    return {step.kind: np.nan if step.value is None else step.value for step in steps}
 
 
 TRUTH: dict[str, dict[str, tuple[float, float]]] = {  # what is found: kind, value and tolerance
@@ -92,6 +98,10 @@ def test_formation_is_found(text: str) -> None:
     assert found.keys() == TRUTH[text].keys()
     for kind, (value, tolerance) in TRUTH[text].items():
         assert found[kind] == pytest.approx(value, abs=tolerance + 1e-9), kind
+
+
+def test_noise_of_some_photos_is_each_photos_own() -> None:
+    assert steps_of(diagnose_scene(half_noisy_scene())).keys() == {"grain"}
 
 
 def test_strong_noise_shows_through_jpeg() -> None:

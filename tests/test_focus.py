@@ -154,5 +154,7 @@ def test_lenses_are_learned_and_the_scene_gets_sharper() -> None:
 def test_where_it_cannot_stand() -> None:
     with pytest.raises(ValueError, match="focus"):
         hqgs.degrade(textured_scene(), "focus")
+    with pytest.raises(ValueError, match="noise of its own"):
+        hqgs.degrade(textured_scene(), "grain")
     with pytest.raises(ValueError, match="write focus"):
         parse_formation("focus:0")

@@ -12,6 +12,7 @@ import pytest
 import torch
 from example_method import loss_of
 from scipy.fft import dctn
+from test_diagnose import half_noisy_scene
 from test_srgs import fine_scene
 from tiny_scene import tiny_config, tiny_scene
 
@@ -124,6 +125,21 @@ def test_noise_counts_by_its_square_without_dssim() -> None:
     expected = 2 / knee * torch.nn.functional.huber_loss(difference[mask], torch.zeros(()), delta=knee)
     assert float(loss_of(method, render, view)) == pytest.approx(float(expected), rel=1e-6)
     assert HQGS(scene, fixed("jpeg:10+noise:25")).prepare(view).mask is None
+
+
+def test_photos_with_noise_of_their_own_are_told_from_the_others() -> None:
+    train = half_noisy_scene().train
+    method = HQGS(half_noisy_scene(), fixed("grain"))
+    for k, view in enumerate(train):
+        render, photo = render_like(view.image), torch.from_numpy(as_floats(view.image))
+        noise, loss = method.prepare(view).noise, float(loss_of(method, render, view))
+        if not k % 2:
+            assert noise == 0
+            assert loss == pytest.approx(float(photometric_loss(render, photo)), rel=1e-6)
+        else:
+            assert noise == pytest.approx(25 / 255, rel=0.1)
+            huber = torch.nn.functional.huber_loss(render, photo, delta=2 * noise)
+            assert loss == pytest.approx(float(huber) / noise, rel=1e-5)
 
 
 def test_jpeg_forgives_what_the_file_leaves_open() -> None:

@@ -17,6 +17,7 @@ from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
 PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
+UNLIKE_NOISE = 2.5  # times the noise of the quieter photos in the noisier ones: each has its own
 VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
 
 
@@ -104,7 +105,7 @@ class Inspector:
         everyone = tuple(map(id, scene.train))
         if everyone not in self._differences:
             shake = _shake(scene)
-            self._differences[everyone] = _exposure(scene), shake, _focus(scene, shake.needed)
+            self._differences[everyone] = _exposure(scene, photos), shake, _focus(scene, shake.needed)
         exposure, shake, focus = self._differences[everyone]
         blur = _blur(photos)
         if own := [part.name for part in (shake, focus) if part.needed]:
@@ -126,13 +127,16 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     return Inspector().diagnose(scene, max_photos)
 
 
-def _exposure(scene: Scene) -> Part:
+def _exposure(scene: Scene, photos: Sequence[PhotoDiagnosis]) -> Part:
     spread = gain_spread(scene)
     if spread is None:
         return Part("exposure", False, None, None, None, "the photos share too few points to tell")
     reason = f"gains differ by {spread:.1%} from photo to photo"
-    if spread < UNLIKE_GAINS:
-        return Part("exposure", False, spread, None, None, f"{reason} (needed from {UNLIKE_GAINS:.0%})")
+    # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
+    noises = [photo.noise for photo in photos if photo.noise is not None and photo.noise >= photo.noise_limit]
+    least = UNLIKE_GAINS + (0.5 * max(noises) / 255 if noises else 0.0)
+    if spread < least:
+        return Part("exposure", False, spread, None, None, f"{reason} (needed from {least:.0%})")
     return Part("exposure", True, spread, None, "exposure", reason)
 
 
@@ -206,6 +210,11 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
         return Part("noise", False, None, None, None, "the photos are too small or too clipped to tell")
     level, limit = (float(value) for value in np.median(told, axis=0))
     spread = None if _pooled(photos) else _spread_of([noise for noise, _ in told])
+    noisy = sum(noise >= least for noise, least in told)
+    quiet, loud = np.quantile([max(noise, 0.5 * least) for noise, least in told], [0.1, 0.9])
+    if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:
+        reason = f"white noise of {quiet:.1f} levels in some photos and {loud:.1f} in others"
+        return Part("noise", True, level, spread, "grain", reason)
     if level >= limit:
         return Part("noise", True, level, spread, f"noise:{level:.0f}", f"white noise of {level:.1f} levels")
     if spread is None:

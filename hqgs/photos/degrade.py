@@ -241,6 +241,10 @@ def _focus(image: Float32, value: float, rng: np.random.Generator) -> _Own:
     )
 
 
+def _grain(image: Float32, value: float, rng: np.random.Generator) -> _Own:
+    raise ValueError("grain says that each photo has noise of its own; some:noise:SIGMA makes such photos")
+
+
 def _chat(image: Float32, side: float, rng: np.random.Generator) -> _Own:
     quality = int(rng.integers(CHAT_QUALITIES[0], CHAT_QUALITIES[1] + 1))
     height, width = _chat_size(image.shape[0], image.shape[1], int(side))
@@ -254,6 +258,7 @@ _OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], _Own]] = {
     "motion": _motion,
     "shake": _shake,
     "focus": _focus,
+    "grain": _grain,
     "exposure": _exposure,
     "chat": _chat,
 }

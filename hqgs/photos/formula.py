@@ -29,6 +29,7 @@ KINDS = {
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
     "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0),
     "focus": Kind(0, 0, "no value", default=0, some=False),
+    "grain": Kind(0, 0, "no value", default=0, some=False),
     "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
     "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
@@ -39,6 +40,7 @@ NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
 VIDEOS = ("video", "video265")
 LEARNED = ("shake", "focus", "exposure")  # of each photo its own, which is learned with the scene
+OWN = (*LEARNED, "grain")  # of each photo its own; grain is noise, which is measured before
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,8 @@ def parse_degradation(text: str) -> Degradation:
 def parse_formation(text: str) -> Degradation:
     """Read what a method is told of the photos: as `parse_degradation`, and ValueError for other kinds.
 
-    `shake` and `exposure` stand without a value: what each photo's camera did is learned with the scene.
+    `shake`, `focus`, `exposure` and `grain` (noise) stand without a value: each photo has its own, which is
+    learned with the scene, or, as noise, measured before.
     """
     return check_formation(parse_degradation(text))
 
@@ -168,8 +171,8 @@ def check_formation(degradation: Degradation) -> Degradation:
                 f"{step} differs from photo to photo and has no operator in the loss; a formation is made of "
                 f"{known}"
             )
-        if step.kind in LEARNED and step.value is not None:
-            raise ValueError(f"{step}: a formation learns what each photo has of it; write {step.kind}")
+        if step.kind in OWN and step.value is not None:
+            raise ValueError(f"{step}: each photo has its own of it, which is found; write {step.kind}")
     return degradation
 
 

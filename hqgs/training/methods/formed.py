@@ -33,6 +33,7 @@ class FormedTarget(Target):
     cells: JpegCells | None  # that the photo's file leaves open
     centres: Coefficients | None  # of these cells
     held: HeldPixels | None = None  # which the mask leaves out too
+    noise: float = 0.0  # of this photo, where photos differ in it: standard deviation, where 1 is white
 
     @property
     def kept(self) -> int:
@@ -43,15 +44,20 @@ class FormedTarget(Target):
 class Formation:
     """How a scene's photos were made."""
 
-    def __init__(self, degradation: Degradation, directions: Mapping[str, float]) -> None:
-        """`directions`: of each photo's motion, radians from x towards y (down), where it is known."""
+    def __init__(
+        self, degradation: Degradation, directions: Mapping[str, float], noises: Mapping[str, float]
+    ) -> None:
+        """`directions`: of each photo's motion, radians from x towards y (down), where it is known.
+
+        `noises`: of the photos that have noise of their own, where 1 is white.
+        """
         self.degradation = degradation
         kinds = {step.kind: step.value for step in degradation.steps}
         self.kinds: frozenset[str] = frozenset(kinds)
         self.noise: float = float(kinds.get("noise") or 0.0) / 255  # standard deviation, where 1 is white
         self.factor: int = int(kinds.get("lowres") or 1)  # by which the photos were enlarged
         self._quality = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
-        self._directions = directions
+        self._directions, self._noises = directions, noises
         self._operators: dict[tuple[int, int, float | None], Operator | None] = {}
         self._cells: dict[tuple[int, int], JpegCells] = {}
 
@@ -84,6 +90,7 @@ class Formation:
             operator,
             cells,
             centres,
+            noise=self._noises.get(view.name, 0.0),
         )
 
 
@@ -106,7 +113,12 @@ def find_formation(scene: Scene, text: str, inspector: Inspector) -> tuple[Forma
         if unknown := [view.name for view in scene.train if view.name not in directions]:
             what = f"motion in the loss of {len(unknown)} of {len(scene.train)} photos"
             left_out.append(LeftOut(what, f"no direction is told from {some(unknown)}"))
-    return Formation(degradation, directions), left_out
+    noises: dict[str, float] = {}
+    if any(step.kind == "grain" for step in degradation.steps):
+        noises = _noises(scene, inspector)
+        what = f"D-SSIM in the loss of {len(noises)} of {len(scene.train)} photos"
+        left_out.append(LeftOut(what, "it asks for the noise that they have"))
+    return Formation(degradation, directions, noises), left_out
 
 
 def _motion_directions(scene: Scene, inspector: Inspector) -> dict[str, float]:
@@ -115,6 +127,15 @@ def _motion_directions(scene: Scene, inspector: Inspector) -> dict[str, float]:
         photo.name: math.radians(photo.blur.direction)
         for photo in inspector.diagnose(scene, max_photos=len(scene.train)).photos
         if photo.blur is not None and photo.blur.direction is not None
+    }
+
+
+def _noises(scene: Scene, inspector: Inspector) -> dict[str, float]:
+    """Standard deviations by photo, where 1 is white, of those whose noise is told from texture."""
+    return {
+        photo.name: photo.noise / 255
+        for photo in inspector.diagnose(scene, max_photos=len(scene.train)).photos
+        if photo.noise is not None and photo.noise >= photo.noise_limit
     }
 
 

@@ -15,7 +15,7 @@ from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.smoothing import enlarge
-from hqgs.photos.formula import LEARNED
+from hqgs.photos.formula import LEARNED, OWN
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
@@ -46,8 +46,10 @@ class HQGS(Plain):
       parts.
     - Noise: differences count by their square up to two standard deviations of the noise (Huber's function).
       The mean of Gaussian noise over the views is nearer to the truth than their median, which L1 asks for.
-    - Shake and exposure, each photo its own: what its camera did is learned with the scene
+    - Shake, focus and exposure, each photo its own: what its camera did is learned with the scene
       (`LearnedCameras`), and the render is taken like that. With nothing else, the rest is 3DGS's.
+    - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
+      Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
@@ -107,7 +109,7 @@ class HQGS(Plain):
             config, why = _without_held_photos(config)
             left_out += why
             self._cameras.schedule(config.iterations)
-        if self.formation.kinds <= set(LEARNED):
+        if self.formation.kinds <= set(OWN):
             plain = self.as_photographed and config.method == AUTO
             wanted = start_points(scene.train, min(config.start_points, config.densify.max_gaussians))
             points, colors, _ = first_points(scene, wanted, config.seed)
@@ -136,6 +138,9 @@ class HQGS(Plain):
         return render if target.operator is None else target.operator(render)
 
     def loss(self, image: Tensor, target: FormedTarget) -> Tensor:
+        if target.noise:
+            pixels = photometric_loss(image, target.photo, target.mask, 0.0, KNEE * target.noise)
+            return STEEPER * pixels
         pixels = photometric_loss(image, target.photo, target.mask, self._dssim, self._knee)
         if target.cells is None or target.centres is None:
             return STEEPER * pixels if self._knee else pixels
