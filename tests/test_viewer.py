@@ -446,6 +446,24 @@ def test_looking_on_does_not_change_a_run(tmp_path: Path) -> None:
         assert torch.equal(tensor, watched.model.named()[name]), name
 
 
+def test_while_it_trains_the_page_says_what_a_photo_suffers_from(tmp_path: Path) -> None:
+    scene, facts = tiny_scene(), list[dict[str, Any]]()
+    live = view.LiveView(scene, tmp_path / "missing", port=0)
+    try:
+
+        def look(now: hqgs.Progress) -> None:
+            live(now)
+            facts.append(dict(live.viewer._facts))
+
+        done = hqgs.train(scene, config=tiny_config(method="hqgs"), progress=look)
+    finally:
+        live.viewer.close()
+    assert facts[0].keys() == {photo.name for photo in scene.train}
+    told = facts_of_photos(done.report)
+    assert all(rows.items() <= told[name].items() for name, rows in facts[0].items())
+    assert all(rows["size"] == "24 x 16" for rows in facts[0].values())
+
+
 class Looking:
     """A page that wants a picture after each step."""
 

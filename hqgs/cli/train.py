@@ -19,7 +19,7 @@ from hqgs.base.left_out import format_left_out
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
-from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, heard, ready, tell_notes
+from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
@@ -242,6 +242,7 @@ def run(options: Train) -> int:
                 resume=options.resume,
                 overwrite=options.overwrite,
                 progress=show,
+                told=bar.stage,
             )
     except KeyboardInterrupt:
         if (options.out / CHECKPOINT).exists():
@@ -263,8 +264,8 @@ def run(options: Train) -> int:
         print(
             f"stopped at iteration {done.iterations} of {done.length}; go on with: {command}", file=sys.stderr
         )
-    elif live is not None:
-        live.stay()
+    if live is not None:
+        live.stay() if done.finished else live.close()
     return 0 if done.finished else 130
 
 
@@ -282,7 +283,7 @@ def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
         **(before | asked | {"path": options.scene, "seed": config.seed}),
         skip_unreadable="photos" in config.leave_out,
         cache=options.out,
-        told=heard(screen),
+        told=screen.stage,
     )
 
 

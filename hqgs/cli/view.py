@@ -74,7 +74,7 @@ class LiveView:
 
     def __init__(self, scene: Scene, out: Path, *, port: int = PORT, open_browser: bool = False) -> None:
         self._scene, self._out, self._port, self._open = scene, out, port, open_browser
-        self._copied = -EVERY
+        self._copied = -EVERY  # when; below 0: nothing has been shown
 
     @cached_property
     def viewer(self) -> Viewer:
@@ -92,8 +92,12 @@ class LiveView:
 
     def __call__(self, now: Progress) -> None:
         """Show the scene as it is, every two seconds, and answer the page after each step."""
-        first, last = now.iteration == 1, now.iteration == now.length
+        first, last = self._copied < 0, now.iteration == now.length
         due = self.viewer.watched and time.monotonic() - self._copied > EVERY
+        if first and now.diagnosis is not None:
+            from hqgs.evaluation.photo_facts import facts_of_diagnosis
+
+            self.viewer.set_facts(facts_of_diagnosis(now.diagnosis.photos))
         if first or last or due:
             rows = [("iteration", f"{now.iteration} of {now.length}"), ("Gaussians", f"{now.gaussians:,}")]
             if now.evaluated is not None and now.evaluated["psnr"] is not None:
@@ -114,6 +118,11 @@ class LiveView:
         except KeyboardInterrupt:
             print()
         finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close the page, if there is one."""
+        if "viewer" in vars(self):
             self.viewer.close()
 
 

@@ -98,8 +98,8 @@ def rasterization(
             the last channel.
         absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
-        covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then. The
-            entries on and above the diagonal count, those beside it for two, and get the gradient, as gsplat's.
+        covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then. As for
+            gsplat, the entries on and above the diagonal count, those above it for two, and get the gradient.
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
 
     Any number of leading batch dimensions, the same for all tensors (but a `backgrounds` [D]), gives as many
