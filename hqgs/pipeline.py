@@ -32,9 +32,9 @@ from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
-from hqgs.page.page import Page, summary_html, write_page
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Scene
+from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.clock import fitting
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.cameras import Found

@@ -97,7 +97,7 @@ def test_depth_and_alpha(folder: Path, tmp_path: Path) -> None:
 
 
 def test_near_is_red_and_far_is_blue() -> None:
-    from hqgs.export.frames import depth_picture, depth_range
+    from hqgs.show.frames import depth_picture, depth_range
 
     depth = np.linspace(2, 10, 101, dtype=np.float32)[None]
     alpha = np.ones_like(depth)

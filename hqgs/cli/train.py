@@ -23,9 +23,9 @@ from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, t
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
+from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
 from hqgs.training.settings import PRESETS, read_config, with_iterations, with_plan
-from hqgs.viewer.guard import PORT, check
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run

@@ -13,12 +13,12 @@ import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.model.formats.files import scene_file
-from hqgs.viewer.guard import PORT, check
+from hqgs.show.viewer.guard import PORT, check
 
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
+    from hqgs.show.viewer.viewer import Viewer
     from hqgs.training.progress import Progress
-    from hqgs.viewer.viewer import Viewer
 
 EVERY = 2.0  # seconds between copies of the scene while it trains
 
@@ -48,7 +48,7 @@ def run(options: View, seconds: float | None = None) -> int:
         from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.camera_files import CAMERAS, load_cameras
-        from hqgs.viewer.viewer import Viewer
+        from hqgs.show.viewer.viewer import Viewer
 
         gaussians = Gaussians.load(file)
         folder = file.parent
@@ -83,7 +83,7 @@ class LiveView:
         ValueError without viser, the extra `view`.
         """
         from hqgs.scene.camera_files import CAMERAS, load_cameras
-        from hqgs.viewer.viewer import Viewer
+        from hqgs.show.viewer.viewer import Viewer
 
         known = load_cameras(self._out) if (self._out / CAMERAS).is_file() else None
         viewer = Viewer(known, self._out, port=self._port, title=self._scene.name)
