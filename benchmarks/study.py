@@ -16,7 +16,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import product
@@ -26,12 +25,13 @@ from typing import Any
 from pandas import DataFrame
 
 import hqgs
-from benchmarks.measure import Estimate, Run, duration
+from benchmarks.measure import Estimate, Run
 from benchmarks.output import Report
 from benchmarks.protocol import Protocol, Row, narrowed
 from benchmarks.scenes import degraded, load_scenes
 from hqgs.base.files import KEPT, write_json
 from hqgs.base.machine import machine_facts, version_facts
+from hqgs.cli.progress import duration
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
@@ -205,9 +205,6 @@ class Study:
         estimate = Estimate()
         for cell, run in self.runs.items():
             estimate.add(cell, run)
-        for cell in pending:
-            with suppress(ValueError, TrainingError):  # the run itself will say it
-                estimate.probe(cell, self.photos)
         self.say(f"{len(self.cells)} runs, {len(pending)} left{_about(estimate.seconds(pending))}")
         facts = {"sources": sources(), "machine": machine_facts(), "versions": version_facts()}
         for k, cell in enumerate(pending, 1):
