@@ -166,4 +166,6 @@ def test_films_of_mixed_sizes_and_unknown_kinds(folder: Path, tmp_path: Path) ->
         hqgs.render_frames(model, [small], tmp_path / "a.png", show="normals")
     with pytest.raises(ValueError, match="there is no camera"):
         hqgs.render_frames(model, [], tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"a\.mov is no folder; films are \.mp4 or \.gif, a single picture"):
+        hqgs.render_frames(model, [small], tmp_path / "a.mov")
     assert list(tmp_path.iterdir()) == []

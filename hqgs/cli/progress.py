@@ -61,7 +61,8 @@ class Screen:
             return
         self.show(stage.what, stage.done, stage.total)
         if not self.live and time.perf_counter() - self._said > _SILENT:
-            self.say(f"{stage.what}: {stage.done}" + (f" of {stage.total}" if stage.total else ""))
+            count = f": {stage.done}" if stage.done else ""
+            self.say(f"{stage.what}{count}" + (f" of {stage.total}" if count and stage.total else ""))
 
     def show(self, what: str, done: int, total: int, more: str = "") -> None:
         """Where the work is; other words begin another bar."""

@@ -162,6 +162,11 @@ def config_of(options: Train) -> TrainConfig:
         raise ValueError(f"only one of --{' and --'.join(given)} can be given")
     if file is not None:
         config = read_config(file)
+        if file == kept and iterations is not None and iterations < config.iterations:
+            raise ValueError(
+                f"iterations is {iterations}, and the run in {options.out} has {config.iterations}: --resume "
+                "can make it longer, not shorter"
+            )
         if iterations is not None and iterations != config.iterations:
             config = replace(with_iterations(config, iterations), seconds=None, turn=None)
     else:
