@@ -104,6 +104,10 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
             ["train", "x", "--out", "y", "--iteratons", "100"],
             "there is no option --iteratons - did you mean --iterations N",
         ),
+        (
+            ["degrade", "x", "--out", "y", "--degrade", "blur:2"],
+            "missing: --kind KIND; there is no option --degrade (h",
+        ),
         (["train", "x"], "missing: --out DIR"),
         (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick',"),
         (["--iterations", "3"], "there is no option '--iterations'"),

@@ -74,6 +74,17 @@ def part(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 
+SCENE = "scene "  # the prefix of a fingerprint
+OTHER = {  # what is other where a part of the fingerprint is
+    "views": "its photos had other names, or others were held out (--test-every)",
+    "cameras": "its photos had another size (--downscale, --preset) or other poses (--sfm)",
+    "photos": "its photos had other pixels (--degrade, --restore, --downscale)",
+    "low": "its photos had other pixels (--degrade, --restore, --downscale)",
+    "masks": "its photos had other masks",
+    "points": "it began with other points (--sfm)",
+}
+
+
 def check_same(
     path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any], longer: bool = False
 ) -> None:
@@ -89,6 +100,10 @@ def check_same(
         if isinstance(old, dict) and isinstance(new, dict):
             check_same(path, f"{prefix}{name}.", old, new, longer)
         elif old != new and name not in free:
+            if prefix == SCENE:
+                raise ValueError(
+                    f"{path} is of another scene: {OTHER[name]}; ask for the same, or for another folder"
+                )
             raise ValueError(
                 f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
                 "use the same one, or another folder"

@@ -218,7 +218,9 @@ class Trainer:
         lists = {k: list(v) for k, v in vars(self.config).items() if isinstance(v, tuple)}  # as JSON has them
         try:
             # The scene first: methods fit the configuration to it.
-            checkpoint.check_same(path, "scene ", meta["scene"], checkpoint.scene_fingerprint(self.scene))
+            checkpoint.check_same(
+                path, checkpoint.SCENE, meta["scene"], checkpoint.scene_fingerprint(self.scene)
+            )
             self.lengthened = checkpoint.lengthened(meta, self.config.iterations)
             longer = self.lengthened is not None
             checkpoint.check_same(path, "", meta["config"], asdict(self.config) | lists, longer)
