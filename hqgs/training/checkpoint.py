@@ -74,7 +74,6 @@ def part(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 
-SCENE = "scene "  # the prefix of a fingerprint
 OTHER = {  # what is other where a part of the fingerprint is
     "views": "its photos had other names, or others were held out (--test-every)",
     "cameras": "its photos had another size (--downscale, --preset) or other poses (--sfm)",
@@ -100,14 +99,20 @@ def check_same(
         if isinstance(old, dict) and isinstance(new, dict):
             check_same(path, f"{prefix}{name}.", old, new, longer)
         elif old != new and name not in free:
-            if prefix == SCENE:
-                raise ValueError(
-                    f"{path} is of another scene: {OTHER[name]}; ask for the same, or for another folder"
-                )
             raise ValueError(
                 f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
                 "use the same one, or another folder"
             )
+
+
+def check_scene(path: str | Path, saved: object, scene: Scene) -> None:
+    """ValueError, in the words of the options, where a fingerprint is not that of the scene."""
+    if not isinstance(saved, dict):
+        raise ValueError(f"{path} is damaged: scene is {saved!r:.80}")
+    for name, digest in scene_fingerprint(scene).items():
+        if saved.get(name) != digest:
+            why = OTHER[name]
+            raise ValueError(f"{path} is of another scene: {why}; ask for the same, or for another folder")
 
 
 def scene_fingerprint(scene: Scene) -> dict[str, str]:

@@ -61,8 +61,7 @@ class Trainer:
     judged, and its frugality what may be left out from then on."""
 
     def __init__(self, scene: Scene, config: TrainConfig, told: OnStage = untold) -> None:
-        """`told` hears how far the preparation is. ValueError if the scene or the configuration cannot be
-        trained."""
+        """`told` hears of the preparation. ValueError if scene or configuration cannot be trained."""
         scene.check_trainable()
         inspector = Inspector(told)  # for all that looks at the photos before the first step
         self.photos_left_out: list[LeftOut] = []
@@ -218,9 +217,7 @@ class Trainer:
         lists = {k: list(v) for k, v in vars(self.config).items() if isinstance(v, tuple)}  # as JSON has them
         try:
             # The scene first: methods fit the configuration to it.
-            checkpoint.check_same(
-                path, checkpoint.SCENE, meta["scene"], checkpoint.scene_fingerprint(self.scene)
-            )
+            checkpoint.check_scene(path, meta["scene"], self.scene)
             self.lengthened = checkpoint.lengthened(meta, self.config.iterations)
             longer = self.lengthened is not None
             checkpoint.check_same(path, "", meta["config"], asdict(self.config) | lists, longer)
