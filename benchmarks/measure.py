@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Step, Trainer
-
-if TYPE_CHECKING:
-    from benchmarks.study import Cell
 
 Run = dict[str, Any]  # plain JSON values
 
@@ -80,19 +74,3 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
     if evaluate:
         trainer.evaluate()
     return done
-
-
-class Estimate:
-    """Seconds per step by scene and row, from finished runs."""
-
-    def __init__(self) -> None:
-        self._finished: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
-
-    def add(self, cell: Cell, run: dict[str, Any]) -> None:
-        """Learn from a finished run."""
-        self._finished[cell.kind].append(run["wall_seconds"] / max(run["iterations"], 1))
-
-    def seconds(self, cells: Iterable[Cell]) -> float:
-        """What these cells will take together, as far as they are known."""
-        known = {kind: float(np.mean(done)) for kind, done in self._finished.items()}
-        return sum(cell.config.iterations * known.get(cell.kind, 0.0) for cell in cells)

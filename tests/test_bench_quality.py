@@ -18,7 +18,6 @@ from scipy import ndimage
 
 import hqgs
 from benchmarks import cli, study
-from benchmarks.measure import Estimate
 from benchmarks.protocol import Protocol, narrowed
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality
@@ -26,7 +25,7 @@ from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
 from benchmarks.quality.tables import courses, equal_time_gain, means, metrics, psnr_at, spread, with_degraded
 from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
-from benchmarks.study import Cell, Store, Study, grid, key_of
+from benchmarks.study import Cell, Store, Study, about, grid, key_of
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.scene import Camera, Scene, SfmReport, View
@@ -591,11 +590,13 @@ def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
     assert courses(frame.loc[frame["row"] == "x"]).count("–, 8 s") == 1
 
 
-def test_estimates_learn_from_finished_runs() -> None:
+def test_the_time_left_follows_from_finished_runs() -> None:
     scene = replace(tiny_scene(), name="a")
     first, second, third = grid(replace(PROTOCOLS["smoke"], iterations=100), [scene])[:3]
-    estimate = Estimate()
-    assert estimate.seconds([first, second]) == 0  # nothing is known
-    estimate.add(first, {"iterations": 100, "wall_seconds": 15.0})
-    estimate.add(first, {"iterations": 100, "wall_seconds": 60.0})
-    assert estimate.seconds([first, third]) == pytest.approx((15 + 60) / 2)
+    assert about([first, second], {}) == ""  # nothing is known
+    runs = {first: {"iterations": 100, "wall_seconds": 15.0}}
+    assert about([first, third], runs) == ", about 15 s"
+    again = replace(first, degradation="blur:2")
+    runs[again] = {"iterations": 100, "wall_seconds": 60.0}
+    assert about([first, second, again], runs) == ", about 75 s"
+    assert about([], runs) == ""
