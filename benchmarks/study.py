@@ -287,7 +287,7 @@ def begin(
 
 
 def about(cells: Sequence[Cell], runs: Mapping[Cell, Run]) -> str:
-    """How long these cells will take, by the runs of the same scene and row, in words; "" where none is known."""
+    """How long these cells will take by the runs of the same scene and row, in words; "" if none is known."""
     known: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
     for cell, run in runs.items():
         known[cell.kind].append(run["wall_seconds"] / max(run["iterations"], 1))
