@@ -21,11 +21,11 @@ from benchmarks.study import Cell, begin
 from hqgs.base.files import PLY
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.evaluation.metrics import psnr
-from hqgs.export.export import export
-from hqgs.export.options import ExportOptions
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
+from hqgs.show.export import export
+from hqgs.show.export_options import ExportOptions
 
 NORMALS = 3 * 4  # bytes a Gaussian: what 3DGS writes and `Gaussians.save` does not
 FILE = Path(__file__).with_suffix(".toml")

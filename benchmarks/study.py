@@ -16,22 +16,23 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import product
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 from pandas import DataFrame
 
 import hqgs
-from benchmarks.measure import Estimate, Run, duration
+from benchmarks.measure import Run
 from benchmarks.output import Report
 from benchmarks.protocol import Protocol, Row, narrowed
 from benchmarks.scenes import degraded, load_scenes
 from hqgs.base.files import KEPT, write_json
 from hqgs.base.machine import machine_facts, version_facts
+from hqgs.cli.progress import duration
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
@@ -202,13 +203,7 @@ class Study:
         if self.args.finished:
             return
         pending = [cell for cell in self.cells if cell not in self.runs]
-        estimate = Estimate()
-        for cell, run in self.runs.items():
-            estimate.add(cell, run)
-        for cell in pending:
-            with suppress(ValueError, TrainingError):  # the run itself will say it
-                estimate.probe(cell, self.photos)
-        self.say(f"{len(self.cells)} runs, {len(pending)} left{_about(estimate.seconds(pending))}")
+        self.say(f"{len(self.cells)} runs, {len(pending)} left{about(pending, self.runs)}")
         facts = {"sources": sources(), "machine": machine_facts(), "versions": version_facts()}
         for k, cell in enumerate(pending, 1):
             key, started = self.keys[cell], time.perf_counter()
@@ -224,9 +219,8 @@ class Study:
             self.runs[cell] = run | {"wall_seconds": wall, **facts}
             self.store.write(self.runs[cell])
             self.failures.pop(cell, None)
-            estimate.add(cell, self.runs[cell])
             value = run["history"][-1]["psnr"] if run["history"] else None
-            left = _about(estimate.seconds(pending[k:])) if k < len(pending) else ""
+            left = about(pending[k:], self.runs)
             self.say(
                 f"[{k}/{len(pending)}] {cell}: {'no PSNR' if value is None else f'{value:.2f} dB'}, "
                 f"{run['gaussians']:,} Gaussians, {duration(wall)}; {len(pending) - k} left{left}"
@@ -292,5 +286,10 @@ def begin(
     return Study(args, name, protocol, scenes, labelled)
 
 
-def _about(seconds: float) -> str:
+def about(cells: Sequence[Cell], runs: Mapping[Cell, Run]) -> str:
+    """How long these cells will take by the runs of the same scene and row, in words; "" if none is known."""
+    known: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+    for cell, run in runs.items():
+        known[cell.kind].append(run["wall_seconds"] / max(run["iterations"], 1))
+    seconds = sum(cell.config.iterations * mean(known[cell.kind]) for cell in cells if cell.kind in known)
     return f", about {duration(seconds)}" if seconds else ""

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from hqgs.base.files import FolderBusyError
     from hqgs.diagnosis.scene import Diagnosis
     from hqgs.diagnosis.scene import diagnose_scene as diagnose
-    from hqgs.export.frames import render_frames
     from hqgs.model.gaussians import Gaussians
     from hqgs.model.orbit import orbit
     from hqgs.model.rasterization import RasterizationMeta, rasterization
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from hqgs.scene.paths import camera_path, look_at
     from hqgs.scene.scene import Camera, Scene, View
     from hqgs.scene.source import degrade, load
+    from hqgs.show.frames import render_frames
     from hqgs.training.config import TrainConfig
     from hqgs.training.progress import Progress
     from hqgs.training.trainer import TrainingError
@@ -81,7 +81,7 @@ _HOMES = {
     "orbit": "hqgs.model.orbit",
     "picture": "hqgs.photos.pixels",
     "rasterization": "hqgs.model.rasterization",
-    "render_frames": "hqgs.export.frames",
+    "render_frames": "hqgs.show.frames",
     "set_num_threads": "hqgs._rust",
     "train": "hqgs.pipeline",
 }

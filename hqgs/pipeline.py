@@ -25,15 +25,16 @@ from hqgs.base.files import (
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
+from hqgs.base.stages import OnStage, untold
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
-from hqgs.page.page import Page, summary_html, write_page
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Scene
+from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.clock import fitting
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.cameras import Found
@@ -85,6 +86,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     progress: OnProgress | None = None,
+    told: OnStage = untold,
 ) -> Run:
     """Train a scene on the CPU. Same seed, same bits, for any number of threads, interrupted or not.
 
@@ -114,6 +116,7 @@ def train(
             where `iterations` is larger, with the schedule of the longer run from there on.
         overwrite: begin anew in a folder that holds a run.
         progress: is called after each step.
+        told: hears what is being done before the first step, and how far it is.
 
     Raises:
         ValueError: a scene or a setting that cannot be trained, a damaged checkpoint, or one of another run.
@@ -137,7 +140,7 @@ def train(
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
-    with open_run(scene, config or asked, out, resume, seconds) as trainer:
+    with open_run(scene, config or asked, out, resume, seconds, told) as trainer:
         return run_to_end(trainer, out, progress)
 
 
@@ -148,6 +151,7 @@ def open_run(
     out: str | Path | None = None,
     resume: bool = False,
     seconds: float | None = None,
+    told: OnStage = untold,
 ) -> Iterator[Trainer]:
     """A trainer that holds the folder `out`: fresh, or with `resume` where the checkpoint there ends.
 
@@ -159,15 +163,15 @@ def open_run(
     if seconds is not None:
         config = replace(config, seconds=seconds)
     if out is None:
-        yield Trainer(scene, fitted(scene, config))
+        yield Trainer(scene, fitted(scene, config, told), told)
         return
     checkpoint = Path(out) / CHECKPOINT
     with lock_folder(out):
         for file in (CHECKPOINT, PLY):
             remove_leftovers(Path(out) / file)
         going_on = resume and checkpoint.exists()
-        config = config if going_on else fitted(scene, config)
-        trainer = Trainer(scene, config)
+        config = config if going_on else fitted(scene, config, told)
+        trainer = Trainer(scene, config, told)
         if not resume:
             checkpoint.unlink(missing_ok=True)
         elif checkpoint.exists():
@@ -177,11 +181,11 @@ def open_run(
         yield trainer
 
 
-def fitted(scene: Scene, config: TrainConfig) -> TrainConfig:
+def fitted(scene: Scene, config: TrainConfig, told: OnStage = untold) -> TrainConfig:
     """The configuration with the iterations that fit into its seconds, if it has any."""
     if config.seconds is None or config.turn is not None:
         return config
-    trainer = Trainer(scene, config)
+    trainer = Trainer(scene, config, told)
     return with_iterations(config, fitting(trainer, config.seconds))
 
 

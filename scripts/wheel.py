@@ -28,7 +28,7 @@ MATURIN = ">=1.9,<2"
 EXTRAS = "view"
 STEPS = 50
 PATIENCE = 60.0  # seconds, for the server to answer
-INSIDE = {"hqgs/_rust.abi3.so", "hqgs/py.typed", "hqgs/page/templates/splats.js"}  # and much else
+INSIDE = {"hqgs/_rust.abi3.so", "hqgs/py.typed", "hqgs/show/page/templates/splats.js"}  # and much else
 OUTSIDE = ("tests/", "benchmarks/", "docs/", "rust/")  # what users do not need
 
 

@@ -16,6 +16,7 @@ from tiny_scene import DEPTH, tiny_config, tiny_scene
 
 import hqgs
 from hqgs.base.files import CHECKPOINT, PLY
+from hqgs.base.stages import Stage
 from hqgs.cli import main as cli
 from hqgs.evaluation.report import read_report
 from hqgs.scene import source
@@ -113,6 +114,16 @@ def test_progress_is_told_each_step() -> None:
     error = np.square(last.render.clip(0, 1) - view.image / 255.0).mean()
     assert last.psnr() == pytest.approx(-10 * np.log10(error), abs=1e-6)
     assert all(a.seconds <= b.seconds for a, b in pairwise(told))
+
+
+def test_the_preparation_is_told() -> None:
+    scene, stages = tiny_scene(), list[Stage]()
+    seen = {view.name: np.arange(5) for view in scene.train}
+    scene = replace(scene, points=scene.points[:5], point_colors=scene.point_colors[:5], seen=seen)
+    hqgs.train(scene, config=tiny_config(2, method="hqgs"), told=stages.append)
+    counts = [(stage.what, stage.done, stage.total) for stage in stages]
+    assert counts[:5] == [("photos diagnosed", k, 5) for k in range(1, 6)]
+    assert counts[5:] == [("first points, from photos", k, 5) for k in range(1, 6)]
 
 
 def test_the_first_ctrl_c_returns_what_there_is() -> None:

@@ -21,7 +21,6 @@ import hqgs
 from benchmarks import cli
 from benchmarks.output import command_line
 from benchmarks.speed.inputs import make_inputs
-from benchmarks.speed.rasterizer import find_gsplat
 from benchmarks.speed.timing import StageClock, exponent, interleaved, median_ratio
 from benchmarks.speed.training import make_trainer
 from benchmarks.speed.work import count_work
@@ -122,11 +121,6 @@ def test_speed_up_growth_and_memory(quick: dict[str, Any]) -> None:
         assert curve["exponent"] <= curve["steepest"] + 1e-9
     memory = results["memory"]
     assert 50 < memory["imports_mb"] <= memory["scene_mb"] <= memory["peak_mb"]
-
-
-def test_a_peer_that_is_missing_is_named(quick: dict[str, Any]) -> None:
-    if "gsplat" not in quick["results"]:
-        assert [entry["what"] for entry in quick["left_out"]] == ["gsplat"]
 
 
 def test_parts_can_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -282,23 +276,6 @@ def test_the_scene_stays_what_it_is_while_it_is_timed() -> None:
     assert grad is not None
     assert (grad[:, -7:] != 0).any()  # degree 3 is trained
     assert trainer.state.densifier.count.max() == 8
-
-
-def test_gsplat_is_left_out_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    import importlib.util
-    from importlib.machinery import ModuleSpec
-
-    find = importlib.util.find_spec
-    specs: dict[str, ModuleSpec | None] = {"gsplat": None}
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: specs[name] if name in specs else find(name, *rest)
-    )
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(RuntimeError, match="gsplat is not installed"):
-        find_gsplat()
-    specs["gsplat"] = ModuleSpec("gsplat", None)
-    with pytest.raises(RuntimeError, match="CUDA"):
-        find_gsplat()
 
 
 def test_command_line_holds_no_paths() -> None:

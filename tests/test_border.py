@@ -77,7 +77,7 @@ def test_gradients_of_another_frame_are_refused() -> None:
     v_means2d = np.zeros_like(arrays[0]).reshape(1, 40, 2)
     cotangents = (v_means2d, None, None, None, None, None)
     with pytest.raises(ValueError, match=r"^means: expected shape \[7, 3\], got \[40, 3\]$"):
-        _rust.project_backward(other, (means, quats, scales, opacities), cotangents, [True] * 7)
+        _rust.project_backward(other, (means, quats, scales, opacities), cotangents, [True] * 8)
 
 
 def test_the_constants_are_those_of_the_oracles() -> None:
@@ -333,7 +333,7 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
 
     def project_backward(**arrays: Any) -> Any:
         values = list(arrays.values())
-        return _rust.project_backward(differentiable, tuple(values[:4]), tuple(values[4:]), [True] * 7)
+        return _rust.project_backward(differentiable, tuple(values[:4]), tuple(values[4:]), [True] * 8)
 
     shaded = {**harmonics, "viewmats": forward["viewmats"], "ks": forward["ks"]}
     differentiable = _rust.project_forward(**shaded)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.base.files import CHECKPOINT
 from hqgs.pipeline import open_run, train
 from hqgs.scene.scene import Scene, View
-from hqgs.training.checkpoint import load_checkpoint, save_checkpoint, scene_fingerprint
+from hqgs.training.checkpoint import OTHER, load_checkpoint, save_checkpoint, scene_fingerprint
 from hqgs.training.config import DensifyConfig
 from hqgs.training.trainer import Trainer
 
@@ -110,7 +111,7 @@ def test_another_scene_is_refused_by_field(tmp_path: Path) -> None:
         "views": Scene(s.name, s.train + s.test, [], s.points, s.point_colors, s.source),
     }
     for field, scene in others.items():
-        with pytest.raises(ValueError, match=f"another scene {field}:"):
+        with pytest.raises(ValueError, match=f"another scene: {re.escape(OTHER[field])}; ask for the same"):
             Trainer(scene, tiny_config()).restore(path)
 
 

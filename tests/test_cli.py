@@ -95,6 +95,7 @@ def test_sfm_replaces_poses_and_points_once(
     monkeypatch.setattr(source, "sfm_scene", sfm)
     options = ["--sfm", "--degrade", kind, "--iterations", "2"]
     (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.png").touch()
     assert call("train", tmp_path / "photos", "--out", tmp_path, *options) == 0
     written, printed = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     if (form, kind) == ("photos", "none"):
@@ -219,6 +220,9 @@ def test_a_run_goes_on_with_resume_only(
     capsys.readouterr()
     assert call(*command, "--resume", "--seed", "1") == 2
     assert "another seed: 0 there, 1 in this run" in one_line(capsys)
+    assert call(*command[:-1], "19", "--resume") == 2
+    wanted = f"iterations is 19, and the run in {tmp_path} has 20: --resume can make it longer, not shorter"
+    assert one_line(capsys) == f"hqgs: {wanted}"
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
     assert call(*command, "--resume") == 2
     assert f"the checkpoint {tmp_path / CHECKPOINT} is damaged" in one_line(capsys)
@@ -322,6 +326,7 @@ def test_a_resumed_run_has_the_scene_that_it_had(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(source, "load_scene", load)
     (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.png").touch()
     command = ["train", tmp_path / "photos", "--out", tmp_path / "run"]
     options = ["--preset", "quick", "--iterations", "3", "--test-every", "5", "--degrade", "noise:9"]
     assert call(*command, *options) == 0

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from hqgs.base.stages import Stage
 from hqgs.cli import progress
-from hqgs.cli.progress import TrainingScreen
+from hqgs.cli.progress import LoadingScreen, TrainingScreen
 
 
 @pytest.fixture
@@ -60,3 +61,28 @@ def test_evaluations_say_on_how_many_views_and_what_is_left(clock: list[float]) 
         ),
         (100, "iteration 100: 9 Gaussians, 100 s, 2 of the held-out views 20.00 dB, SSIM 0.5000"),
     ]
+
+
+def test_before_the_first_step_no_silence_lasts(clock: list[float]) -> None:
+    """A line every few seconds while something is done, of whatever it is; none where it is quick."""
+    lines = list[tuple[float, str]]()
+    screen = LoadingScreen()
+    screen.live = False
+    say = screen.say
+    screen.say = lambda text: (lines.append((clock[0] - 100, text)), say(text))[0]
+    screen.stage(Stage("COLMAP", 0, 9, "It takes long."))
+    for what, step in (("photos read", 0.1), ("COLMAP: features", 2.0), ("COLMAP: matches", 0.1)):
+        for k in range(1, 10):
+            clock[0] += step
+            screen.stage(Stage(what, k, 9))
+    clock[0] += 10
+    screen.stage(Stage("frames", 4, 0))
+    told = [(round(when), text) for when, text in lines]
+    assert told == [
+        (0, "It takes long."),
+        (7, "COLMAP: features: 3 of 9"),
+        (13, "COLMAP: features: 6 of 9"),
+        (19, "COLMAP: features: 9 of 9"),
+        (30, "frames: 4"),
+    ]
+    assert screen.colmap_seconds == pytest.approx(18.9)

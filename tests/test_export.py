@@ -15,19 +15,19 @@ from tiny_scene import tiny_scene
 
 from hqgs.cli import main as cli
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
-from hqgs.export.export import (
+from hqgs.model.formats.spz import encode_spz
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import render_view
+from hqgs.scene import source as scene_source
+from hqgs.scene.scene import Camera
+from hqgs.show.export import (
     along_a_curve,
     export,
     file_degree,
     needed_degrees,
     reduce_gaussians,
 )
-from hqgs.export.options import ExportOptions
-from hqgs.model.formats.spz import encode_spz
-from hqgs.model.gaussians import Gaussians
-from hqgs.model.render import render_view
-from hqgs.scene import source as scene_source
-from hqgs.scene.scene import Camera
+from hqgs.show.export_options import ExportOptions
 
 CAMERA = Camera(48, 32, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), np.eye(4))
 

@@ -420,7 +420,7 @@ def test_a_photo_that_is_gone_or_changed_is_named_and_the_run_is_kept(
     assert "view_03.png" in last_line(capsys)
     shutil.copy(scene / "images" / "view_04.png", photo)
     assert call(*command, "--resume") == 2
-    assert "another scene photos" in last_line(capsys)
+    assert "is of another scene: its photos had other pixels (--degrade" in last_line(capsys)
     assert (out / CHECKPOINT).read_bytes() == checkpoint
     photo.write_bytes(content)
     assert call(*command, "--resume") == 0

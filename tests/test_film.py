@@ -61,7 +61,7 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
 
 def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "no.mp4").write_text("a text")
-    with pytest.raises(ValueError, match=r"no\.mp4 cannot be read"):
+    with pytest.raises(ValueError, match=r"no\.mp4 cannot be read: it is no film, or damaged$"):
         load(tmp_path / "no.mp4")
     with pytest.raises(ValueError, match="frames is 2, wanted at least 3"):
         film_frames(tmp_path / "no.mp4", tmp_path, 2)

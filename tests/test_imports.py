@@ -98,3 +98,13 @@ def test_every_public_name_is_there() -> None:
     assert all(getattr(hqgs, name) is not None for name in hqgs.__all__)
     with pytest.raises(AttributeError, match="module 'hqgs' has no attribute 'trian'"):
         hqgs.trian  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_house_of_few_rooms_and_small_files() -> None:
+    house = ROOT / "hqgs"
+    inside = {path.name for path in house.iterdir() if path.suffix not in (".so", ".pyd", ".pyi", ".typed")}
+    assert len(inside - {"__pycache__"}) <= 12
+    for path in house.rglob("*.py"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        assert len(lines) <= 350, path
+        assert lines[0].startswith('"""'), f"{path} does not say what lives there"

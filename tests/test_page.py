@@ -16,9 +16,9 @@ from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from hqgs.page.charts import line_chart
-from hqgs.page.packing import BLOCK, pack_scene
-from hqgs.page.page import Page, page_text, told_verdict
+from hqgs.show.page.charts import line_chart
+from hqgs.show.page.packing import BLOCK, pack_scene
+from hqgs.show.page.page import Page, page_text, told_verdict
 
 
 @pytest.fixture(scope="module")

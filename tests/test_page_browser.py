@@ -16,9 +16,9 @@ from PIL import Image
 from tiny_scene import tiny_scene
 
 import hqgs
-from hqgs.page.page import Page, write_page
 from hqgs.scene.paths import resized
 from hqgs.scene.scene import Scene
+from hqgs.show.page.page import Page, write_page
 
 SIZE = (120, 80)
 

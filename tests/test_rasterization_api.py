@@ -50,7 +50,6 @@ def test_signature_is_that_of_gsplat() -> None:
         ("camera_model", "fisheye"),
         ("camera_model", "ortho"),
         ("camera_model", "ftheta"),
-        ("covars", torch.zeros(8, 3, 3).requires_grad_()),
         ("with_ut", True),
         ("with_eval3d", True),
         ("radial_coeffs", torch.zeros(1, 4)),
@@ -89,11 +88,6 @@ def test_unsupported_arguments_may_be_passed_as_absent() -> None:
         ("backgrounds", (0, 0), "backgrounds: expected shape [1, 3], got [1, 2]"),
         ("backgrounds", torch.zeros(2, 3), "backgrounds: expected shape [1, 3], got [2, 3]"),
         ("covars", torch.eye(3).expand(7, 3, 3), "covars: expected shape [8, 3, 3], got [7, 3, 3]"),
-        (
-            "covars",
-            torch.zeros(8, 3, 3).requires_grad_(),
-            "covars: no gradient with respect to covariances; train quats and scales",
-        ),
         ("quats", None, "quats: expected a torch tensor, got None"),
         (
             "rolling_shutter",

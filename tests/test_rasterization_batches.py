@@ -1,4 +1,4 @@
-"""Backgrounds of any kind, covariances, and leading batch dimensions: what the plain call gives."""
+"""Backgrounds of any kind and leading batch dimensions: what the plain call gives."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from scenes import GaussianScene, random_scene
-from torch import Tensor
 
 import hqgs
 
@@ -97,59 +96,3 @@ def test_black_is_black_however_it_is_written(value: Any) -> None:
     assert torch.equal(hqgs.rasterization(**scene.arguments(backgrounds=value))[0], black)
     white = hqgs.rasterization(**scene.arguments(backgrounds=(1, 1, 1)))[0]
     assert not torch.equal(white, black)
-
-
-def covariances(scene: GaussianScene) -> Tensor:
-    """R S S^T R^T, with the rotation matrix of each quaternion written out."""
-    w, x, y, z = torch.nn.functional.normalize(scene.quats, dim=-1).unbind(-1)
-    R = torch.stack(
-        [
-            w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z,
-        ], -1
-    ).unflatten(-1, (3, 3))  # fmt: skip
-    M = R * scene.scales[..., None, :]
-    return M @ M.mT
-
-
-@pytest.mark.parametrize(("dtype", "error"), [(F64, 1e-9), (F32, 2e-4)])
-@pytest.mark.parametrize("batch", [False, True])
-def test_covariances_give_the_picture_of_their_quats_and_scales(
-    dtype: torch.dtype, error: float, batch: bool
-) -> None:
-    scene = random_scene(60, 24, 18, seed=5, dtype=dtype, anisotropy=20.0)
-    arguments = scene.arguments(quats=None, scales=None)
-    covars = covariances(scene)
-    if batch:
-        arguments |= {name: t[None] for name, t in arguments.items() if isinstance(t, Tensor)}
-        covars = covars[None]
-    plain = hqgs.rasterization(**scene.arguments())[0]
-    image = hqgs.rasterization(**arguments, covars=covars)[0]
-    assert (image - plain).abs().max() < error
-    assert plain.std() > 0.05
-
-
-def test_round_flat_and_broken_covariances() -> None:
-    scene = random_scene(4, 24, 18, seed=5, dtype=F64)
-    matrices = torch.stack(
-        [
-            0.04 * torch.eye(3, dtype=F64),
-            torch.diag(torch.tensor([0.04, 0.01, 0.0], dtype=F64)),
-            -torch.eye(3, dtype=F64),
-            torch.full((3, 3), torch.nan, dtype=F64),
-        ]
-    )
-    image, _, meta = hqgs.rasterization(**scene.arguments(), covars=matrices)
-    plain, _, known = hqgs.rasterization(
-        **scene.arguments(
-            quats=torch.tensor([1.0, 0, 0, 0]).double().expand(4, 4),
-            scales=torch.tensor([[0.2] * 3, [0.2, 0.1, 0.0], [0.0] * 3, [torch.nan] * 3], dtype=F64),
-        )
-    )
-    assert torch.equal(meta["radii"], known["radii"])
-    assert (image - plain).abs().max() < 1e-9
-    gradients = scene.with_grad("means", "colors")
-    hqgs.rasterization(**gradients.arguments(), covars=matrices)[0].sum().backward()
-    assert gradients.means.grad is not None
-    assert gradients.means.grad.isfinite().all()

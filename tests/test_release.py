@@ -100,5 +100,5 @@ def test_a_wheel_that_lacks_a_part_is_refused(tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel, "w") as file:
         file.writestr("hqgs/_rust.abi3.so", "")
         file.writestr("tests/x.py", "")
-    with pytest.raises(SystemExit, match=r"lacks \['hqgs/page/templates/splats.js', 'hqgs/py.typed'\]"):
+    with pytest.raises(SystemExit, match=r"lacks \['hqgs/py.typed', 'hqgs/show/page/templates/splats.js'\]"):
         check_contents(wheel)

@@ -97,7 +97,7 @@ def test_depth_and_alpha(folder: Path, tmp_path: Path) -> None:
 
 
 def test_near_is_red_and_far_is_blue() -> None:
-    from hqgs.export.frames import depth_picture, depth_range
+    from hqgs.show.frames import depth_picture, depth_range
 
     depth = np.linspace(2, 10, 101, dtype=np.float32)[None]
     alpha = np.ones_like(depth)
@@ -166,4 +166,6 @@ def test_films_of_mixed_sizes_and_unknown_kinds(folder: Path, tmp_path: Path) ->
         hqgs.render_frames(model, [small], tmp_path / "a.png", show="normals")
     with pytest.raises(ValueError, match="there is no camera"):
         hqgs.render_frames(model, [], tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"a\.mov is no folder; films are \.mp4 or \.gif, a single picture"):
+        hqgs.render_frames(model, [small], tmp_path / "a.mov")
     assert list(tmp_path.iterdir()) == []

@@ -99,6 +99,15 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
     [
         (["train", "x", "--out", "y", "--device", "cuda"], "there is no --device: hqgs trains on the CPU"),
         (["train", "x", "--out", "y", "--iterations", "many"], "--iterations is many, wanted a whole number"),
+        (["train", "x", "--out", "y", "--foo", "1", "2"], "there is no option --foo (hqgs train --help)"),
+        (
+            ["train", "x", "--out", "y", "--iteratons", "100"],
+            "there is no option --iteratons - did you mean --iterations N",
+        ),
+        (
+            ["degrade", "x", "--out", "y", "--degrade", "blur:2"],
+            "missing: --kind KIND; there is no option --degrade (h",
+        ),
         (["train", "x"], "missing: --out DIR"),
         (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick',"),
         (["--iterations", "3"], "there is no option '--iterations'"),

@@ -33,11 +33,11 @@ from hqgs.evaluation.report import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import resized
-from hqgs.viewer import guard
-from hqgs.viewer.guard import MAX_MESSAGE, allowed, start_server
-from hqgs.viewer.pictures import Pose, beside, same_view
-from hqgs.viewer.splats import browser_splats
-from hqgs.viewer.viewer import BROWSER, RASTERIZER, Viewer
+from hqgs.show.viewer import guard
+from hqgs.show.viewer.guard import MAX_MESSAGE, allowed, start_server
+from hqgs.show.viewer.pictures import Pose, beside, same_view
+from hqgs.show.viewer.splats import browser_splats
+from hqgs.show.viewer.viewer import BROWSER, RASTERIZER, Viewer
 
 
 @pytest.fixture(scope="module")
@@ -450,6 +450,24 @@ def test_looking_on_does_not_change_a_run(tmp_path: Path) -> None:
         live.viewer.close()
     for name, tensor in alone.model.named().items():
         assert torch.equal(tensor, watched.model.named()[name]), name
+
+
+def test_while_it_trains_the_page_says_what_a_photo_suffers_from(tmp_path: Path) -> None:
+    scene, facts = tiny_scene(), list[dict[str, Any]]()
+    live = view.LiveView(scene, tmp_path / "missing", port=0)
+    try:
+
+        def look(now: hqgs.Progress) -> None:
+            live(now)
+            facts.append(dict(live.viewer._facts))
+
+        done = hqgs.train(scene, config=tiny_config(method="hqgs"), progress=look)
+    finally:
+        live.viewer.close()
+    assert facts[0].keys() == {photo.name for photo in scene.train}
+    told = facts_of_photos(done.report)
+    assert all(rows.items() <= told[name].items() for name, rows in facts[0].items())
+    assert all(rows["size"] == "24 x 16" for rows in facts[0].values())
 
 
 class Looking:

@@ -100,18 +100,6 @@ def errors_table(result: dict[str, Any]) -> str:
     return table(f"{result['inputs']}: {size}, forward and backward", lines, COLUMNS["errors"])
 
 
-def gradient_table(result: dict[str, Any]) -> str:
-    """The relative error of each input's gradient against the exact result."""
-    lines = []
-    for row in result["rows"]:
-        found = row["errors"]["exact"]["gradients"]
-        lines.append(row | {name: error["relative"] for name, error in found.items()})
-    names = list(result["rows"][0]["errors"]["exact"]["gradients"])
-    columns = {n: COLUMNS["errors"][n] for n in ("knob", "value")} | {n: (n, ".1e") for n in names}
-    title = f"{result['inputs']}: relative error of the gradients against the exact result"
-    return table(title, lines, columns)
-
-
 def chart(result: dict[str, Any]) -> Figure:
     """Error against time on log axes: rows are what is held against, columns are image and gradients."""
     figure, grid = panels(11, 8, len(ORACLES), len(ERRORS), sharex=True)
@@ -213,7 +201,7 @@ def run(args: argparse.Namespace) -> Report:
     for name, x in inputs.items():
         print(f"accuracy: {name}", file=sys.stderr)
         results.append(measure(name, x, sizes["repeats"]))
-        report.tables += [errors_table(results[-1]), gradient_table(results[-1])]
+        report.tables.append(errors_table(results[-1]))
     name, largest = max(inputs.items(), key=lambda item: len(item[1]))
     if len(thread_counts()) > 1:
         rows = report.results["threads"] = measure_by_threads(largest, sizes["repeats"])

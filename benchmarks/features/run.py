@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.charts import LEGEND, color, panels, title
 from benchmarks.data import read_toml
 from benchmarks.features.switches import DEFAULT, PROTOCOLS, Feature
 from benchmarks.measure import Run, train
@@ -208,24 +206,6 @@ def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
     return table(title, lines, COLUMNS["of_all"])
 
 
-def chart(scene: dict[str, Any]) -> Figure:
-    """Held-out PSNR over training seconds, a curve for each run of the first seed."""
-    figure, (axes,) = panels(8, 5)
-    curves = {DEFAULT.label: scene["default"][0]}
-    curves |= {f"{r['feature']}: {r['other']}": r["runs"][0] for r in scene["features"]}
-    for k, (name, run) in enumerate(curves.items()):
-        points = [(h["seconds"], h["psnr"]) for h in run["history"] if h["psnr"] is not None]
-        first = name == DEFAULT.label
-        axes.plot(
-            *zip(*points, strict=True), label=name, lw=2.4 if first else 1.1, zorder=3 if first else 2,
-            color="black" if first else color(k - 1), marker="o", markersize=2.5,
-        )  # fmt: skip
-    axes.set(xlabel="training (s)", ylabel="held-out PSNR (dB)")
-    title(axes, scene["scene"])
-    axes.legend(**LEGEND)
-    return figure
-
-
 def run(args: argparse.Namespace) -> Report:
     """Train every scene with every feature switched, then time steps of all of them in turn."""
     rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
@@ -235,7 +215,6 @@ def run(args: argparse.Namespace) -> Report:
     results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
     for result in results:
         report.tables.append(scene_table(result))
-        report.figures[result["scene"]] = chart(result)
     report.results = {"scenes": results, "verdicts": verdicts(features.rows[1:], results) if results else []}
     if results:
         report.tables.append(verdict_table(report.results["verdicts"]))

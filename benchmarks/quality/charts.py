@@ -1,4 +1,4 @@
-"""Charts of the quality benchmark: error against time, gains, where the Gaussians are; and picture sheets."""
+"""Charts of the quality benchmark: error against time, gains; and picture sheets."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from benchmarks.charts import LEGEND, color, panels, title
 from benchmarks.quality.cell import render_path
-from benchmarks.quality.tables import means, with_degraded
 from benchmarks.scenes import degraded_view
 from benchmarks.study import Store
 from hqgs.base.files import atomic_path
 from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.report import AMPLIFICATION, MASKED
 from hqgs.photos.pixels import to_uint8
+from hqgs.photos.sheet import printable, sheet
 from hqgs.scene.scene import Scene
 
 ACROSS = 3  # panels in a row
-GAP = 6  # pixels between the panels of a sheet
 Uint8 = NDArray[np.uint8]
 
 
@@ -85,26 +84,6 @@ def gain_chart(frame: DataFrame, baseline: str) -> Figure:
     return figure
 
 
-def region_chart(frame: DataFrame) -> Figure:
-    """Gaussians per 1,000 pixels on edges and in flat parts, for each degradation and method."""
-    heights = means(with_degraded(frame), ["row", "degradation"], ["edge_density", "flat_density"])
-    labels, kinds = (list(heights.index.unique(level)) for level in ("row", "degradation"))
-    figure, (axes,) = panels(2 + 1.3 * len(kinds), 3.4)
-    axes.grid(visible=False, axis="x")
-    width = 0.8 / (2 * len(labels))
-    for k, label in enumerate(labels):
-        for r, (region, name) in enumerate((("edge", "edges"), ("flat", "flat"))):
-            axes.bar(
-                np.arange(len(kinds)) - 0.4 + (2 * k + r + 0.5) * width,
-                heights.loc[label].reindex(kinds)[f"{region}_density"],
-                width, color=color(k), alpha=(1.0, 0.45)[r], label=f"{label}, {name}",
-            )  # fmt: skip
-    axes.set_xticks(range(len(kinds)), kinds, parse_math=False)
-    axes.set_ylabel("Gaussians per 1,000 pixels")
-    figure.legend(loc="outside right upper", **LEGEND)
-    return figure
-
-
 def write_sheet(
     path: Path, store: Store, clean: Scene, runs: Mapping[str, dict[str, Any]], number: int
 ) -> bool:
@@ -120,7 +99,7 @@ def write_sheet(
     view = clean.test[number]
     bad = degraded_view(clean, view, first["degradation"], first["seed"]).image
     photo = _uint8(view.image)
-    above = [(f"photo {view.name}", photo)]
+    above = [(printable(f"photo {view.name}"), photo)]
     above.append((_caption(first["degradation"], psnr(bad, photo, view.mask)), _uint8(bad)))
     for label, run in runs.items():
         with Image.open(files[label]) as image:
@@ -132,30 +111,12 @@ def write_sheet(
             error[~view.mask] = MASKED
         below.append((f"difference x{AMPLIFICATION}", error))
     with atomic_path(path) as tmp:
-        _grid([above, below]).save(tmp)
+        sheet([above, below]).save(tmp)
     return True
 
 
 def _caption(label: str, value: float | None) -> str:
-    return label if value is None else f"{label}  {value:.2f} dB"
-
-
-def _grid(rows: list[list[tuple[str, Uint8]]]) -> Image.Image:
-    """Panels of one size, a caption above each, cut off where it is too long."""
-    height, width = rows[0][0][1].shape[:2]
-    size = min(max(height // 20, 10), 28)
-    line = round(1.7 * size)
-    font = ImageFont.load_default(size)
-    across, down = len(rows[0]), len(rows)
-    sheet = Image.new("RGB", (across * (width + GAP) - GAP, down * (height + line + GAP) - GAP), "white")
-    for r, row in enumerate(rows):
-        for c, (caption, panel) in enumerate(row):
-            strip = Image.new("RGB", (width, line), "white")  # a caption never runs into the next panel
-            text = caption.encode("ascii", "replace").decode()
-            ImageDraw.Draw(strip).text((2, line // 2), text, fill=(25, 25, 25), font=font, anchor="lm")
-            sheet.paste(strip, (c * (width + GAP), r * (height + line + GAP)))
-            sheet.paste(Image.fromarray(panel), (c * (width + GAP), r * (height + line + GAP) + line))
-    return sheet
+    return printable(label if value is None else f"{label}  {value:.2f} dB")
 
 
 def _uint8(image: NDArray[Any]) -> Uint8:

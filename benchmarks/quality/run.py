@@ -13,7 +13,7 @@ from benchmarks.output import Benchmark, Report
 from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
 from benchmarks.quality.cell import edge_robustness, run_cell
-from benchmarks.quality.charts import gain_chart, region_chart, time_chart, write_sheet
+from benchmarks.quality.charts import gain_chart, time_chart, write_sheet
 from benchmarks.quality.tables import frame_of, summary
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
@@ -99,7 +99,6 @@ class Quality:
         if self.args.sfm:
             report.tables.append(tables.reconstructions(frame))
         report.figures["psnr_vs_time"] = time_chart(frame, what)
-        report.figures["regions"] = region_chart(frame)
         for metric, why in sorted({item for run in frame["run"] for item in run["reasons"].items()}):
             report.leave_out(metric, why)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -18,7 +16,6 @@ from matplotlib.figure import Figure
 import hqgs
 from benchmarks import charts
 from benchmarks.charts import BLUE, LEGEND, ORANGE, panels
-from benchmarks.output import UnavailableError
 from benchmarks.places import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
 from benchmarks.speed.timing import (
@@ -41,31 +38,24 @@ BIN = "bin"  # the part of "bin and composite" before the first pixel
 
 class RasterPass:
     """`hqgs.rasterization` with harmonics of degree 3 and its backward pass, timed; all gradients but the
-    camera's. Works the same way on another `device` with another implementation of the function, and with
-    the same numbers in another `dtype`."""
+    camera's. The same numbers in any `dtype`."""
 
-    def __init__(
-        self,
-        inputs: RasterInputs,
-        rasterize: Callable[..., Any] = hqgs.rasterization,
-        device: str = "cpu",
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
+    def __init__(self, inputs: RasterInputs, dtype: torch.dtype = torch.float32) -> None:
         tensors = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
-        self.leaves = [tensor.to(device, dtype).requires_grad_() for tensor in tensors]
-        viewmat, K = (torch.from_numpy(m[None]).float().to(device) for m in (inputs.viewmat, inputs.K))
-        self.view = (viewmat, K, inputs.width, inputs.height)
-        self.background = torch.from_numpy(inputs.background[None]).to(device, dtype)
-        self.v_image = torch.from_numpy(inputs.v_image[None]).to(device, dtype)
-        self.rasterize = rasterize
+        self.leaves = [tensor.to(dtype).requires_grad_() for tensor in tensors]
+        viewmat, K = (torch.from_numpy(m[None]).float() for m in (inputs.viewmat, inputs.K))
+        self.arguments: dict[str, Any] = dict(zip((*LEAVES[:4], "colors"), self.leaves, strict=True))
+        self.arguments |= {"viewmats": viewmat, "Ks": K, "width": inputs.width, "height": inputs.height}
+        self.arguments |= {"backgrounds": torch.from_numpy(inputs.background[None]).to(dtype), "sh_degree": 3}
+        self.v_image = torch.from_numpy(inputs.v_image[None]).to(dtype)
         self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change
         self.blended = 0  # (Gaussian, pixel) pairs of the last pass that was timed
 
     def run(self) -> torch.Tensor:
         """One pass; returns the image [1, H, W, 3], the gradients are in the leaves."""
-        image, _, meta = self.rasterize(*self.leaves, *self.view, sh_degree=3, backgrounds=self.background)
+        image, _, meta = hqgs.rasterization(**self.arguments)
         image.backward(self.v_image)
-        self.work = meta.get("work", self.work)
+        self.work = meta["work"]
         return image.detach()
 
     def __call__(self) -> Seconds:
@@ -155,44 +145,6 @@ def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> li
         line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}
         rows.append(line | {"speedup": median_ratio(measured[f"{name}/1"], rounds)})
     return rows
-
-
-def find_gsplat() -> Callable[..., Any]:
-    """gsplat's rasterization. UnavailableError says why there is none here."""
-    if importlib.util.find_spec("gsplat") is None:
-        raise UnavailableError("gsplat is not installed")
-    if not torch.cuda.is_available():
-        raise UnavailableError("gsplat rasterizes on CUDA devices only, and torch finds none")
-    return importlib.import_module("gsplat").rasterization
-
-
-def measure_gsplat(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
-    """Forward and backward of gsplat on the GPU beside ours on the CPU; UnavailableError as `find_gsplat`."""
-    rasterization, rows = find_gsplat(), []
-    for x in inputs:
-        cases = {"hqgs": RasterPass(x), "gsplat": _on_cuda(RasterPass(x, rasterization, "cuda"))}
-        ours, theirs = interleaved(cases, repeats).values()
-        line = {
-            "gaussians": len(x),
-            "device": torch.cuda.get_device_name(),
-            "ratio": median_ratio(ours, theirs),
-        }
-        rows.append(line | {"seconds": theirs["total"].median(), "hqgs_seconds": ours["total"].median()})
-    return rows
-
-
-def _on_cuda(raster_pass: RasterPass) -> Callable[[], Seconds]:
-    def run() -> None:
-        raster_pass.run()
-        torch.cuda.synchronize()
-
-    def call() -> Seconds:
-        torch.cuda.synchronize()
-        seconds = StageClock().seconds(run, [])
-        raster_pass.clear()
-        return seconds
-
-    return call
 
 
 def measure_scaling(

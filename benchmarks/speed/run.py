@@ -17,7 +17,6 @@ from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import (
     RasterPass,
     measure,
-    measure_gsplat,
     measure_scaling,
     measure_threads,
     scaling_chart,
@@ -29,8 +28,7 @@ from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import Trainer
 
 DATA = read_toml(Path(__file__).with_name("speed.toml"))
-PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory", "peers")
-NAMES = {"peers": "gsplat"}  # in the results
+PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory")
 
 
 class Speed:
@@ -87,15 +85,11 @@ class Speed:
     def scaling(self) -> tuple[Any, list[str]]:
         scaling = measure_scaling(**self.config["scaling"], repeats=self.repeats, seed=self.config["seed"])
         self.report.figures["scaling"] = scaling_chart(scaling)
-        return scaling, tables.scaling(scaling)
+        return scaling, [tables.scaling(scaling)]
 
     def memory(self) -> tuple[Any, list[str]]:
         result = measure_memory(self.config["memory"])
         return result, [tables.memory(result)]
-
-    def peers(self) -> tuple[Any, list[str]]:
-        rows = measure_gsplat(self.inputs, self.repeats)
-        return rows, [tables.gsplat(rows)]
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -107,12 +101,11 @@ def run(args: argparse.Namespace) -> Report:
     speed = Speed(report.settings, report)
     for part in args.parts:
         print(f"speed: {part}", file=sys.stderr)
-        name = NAMES.get(str(part), str(part))
         try:
-            report.results[name], found = getattr(speed, part)()
+            report.results[part], found = getattr(speed, part)()
             report.tables += found
         except UnavailableError as error:
-            report.leave_out(name, str(error))
+            report.leave_out(part, str(error))
     return report
 
 

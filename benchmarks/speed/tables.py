@@ -11,6 +11,7 @@ from benchmarks.output import number, span, table
 from hqgs.base.text import markdown_table
 
 Rows = Sequence[dict[str, Any]]
+AGAINST = {"gaussians": "Gaussians", "pixels": "pixels"}
 COLUMNS = read_toml(Path(__file__).with_name("speed.toml"))["columns"]
 
 
@@ -44,18 +45,13 @@ def threads(rows: Rows) -> str:
     return table("Threads", lines, COLUMNS["threads"])
 
 
-def scaling(result: dict[str, Any]) -> list[str]:
-    """The powers, and the points that they were fitted to."""
-    size, pixels = result["gaussians"], result["pixels"]
+def scaling(result: dict[str, Any]) -> str:
+    """The powers; the points that they were fitted to are in the chart."""
     title = "Power with which the time of forward and backward grows"
-    names = {"against": "Gaussians"}, {"against": "pixels"}
-    powers = [curve | name for curve, name in zip((size, pixels), names, strict=True)]
-    powers = [curve | {"target": result["target_exponent"]} for curve in powers]
-    area = size["width"] * size["height"]
-    points = [(n, area, s) for n, s in zip(size["x"], size["seconds"], strict=True)]
-    points += [(pixels["gaussians"], a, s) for a, s in zip(pixels["x"], pixels["seconds"], strict=True)]
-    lines = [{"gaussians": n, "megapixels": a / 1e6, "seconds": s} for n, a, s in points]
-    return [table(title, powers, COLUMNS["powers"]), table("The points", lines, COLUMNS["points"])]
+    powers = [result[name] | {"against": what} for name, what in AGAINST.items()]
+    return table(
+        title, [curve | {"target": result["target_exponent"]} for curve in powers], COLUMNS["powers"]
+    )
 
 
 def memory(result: dict[str, Any]) -> str:
@@ -65,11 +61,6 @@ def memory(result: dict[str, Any]) -> str:
         f"{result['photos']} photos of {megapixels:.2f} MP, {result['steps']} steps"
     )
     return table(title, [result], COLUMNS["memory"])
-
-
-def gsplat(rows: Rows) -> str:
-    title = f"gsplat on {rows[0]['device']}, the same inputs, forward and backward (ms, medians)"
-    return table(title, rows, COLUMNS["gsplat"])
 
 
 def _quartiles(row: dict[str, Any]) -> str:

@@ -51,7 +51,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def existing_folder(path: str | Path) -> Path:
-    """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file."""
+    """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file, or where
+    nothing is in it."""
     folder = Path(path).resolve()
     if not folder.exists():
         near = ""
@@ -61,6 +62,8 @@ def existing_folder(path: str | Path) -> Path:
             near = f"; did you mean {folder.parent / alike[0]}?" if alike else ""
         raise FileNotFoundError(f"there is no scene folder {folder}{near}")
     if folder.is_dir():
+        if all(entry.name.startswith(".") for entry in folder.iterdir()):
+            raise ValueError(f"{folder} is empty: give a folder with photos")
         return folder
     if folder.name.lower().endswith(ARCHIVE_SUFFIXES):
         raise ValueError(f"{folder} is an archive: unpack it, and give the folder with the photos")

@@ -1,4 +1,4 @@
-"""What takes long before a run trains, told while it happens."""
+"""What takes long before the first step of a run, told while it happens."""
 
 from __future__ import annotations
 

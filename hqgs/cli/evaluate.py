@@ -49,12 +49,12 @@ def run(options: Evaluate) -> int:
 
         with LoadingScreen() as screen:
             if options.scene is None:
-                scene = load_again(options.source, told=screen)
+                scene = load_again(options.source, told=screen.stage)
             else:
                 scene = load(
                     options.scene,
                     downscale=1.0 if options.downscale is None else options.downscale,
-                    told=screen,
+                    told=screen.stage,
                 )
         if not scene.test:
             raise ValueError(f"{scene.name} has no held-out photo to measure with")

@@ -12,12 +12,12 @@ from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Photos, load, ready
-from hqgs.export.options import ExportOptions
 from hqgs.model.formats.files import READERS, format_of, scene_file
+from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
-    from hqgs.export.export import Export
     from hqgs.model.gaussians import Gaussians
+    from hqgs.show.export import Export
 
 DEFAULTS = ExportOptions("ply")
 
@@ -65,8 +65,8 @@ def run(args: ExportScene) -> int:
         if args.out.exists() and args.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is left out would be lost")
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
-        from hqgs.export.export import export
         from hqgs.model.gaussians import Gaussians
+        from hqgs.show.export import export
 
         gaussians = Gaussians.load(source)
         scene = None

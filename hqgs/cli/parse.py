@@ -20,6 +20,8 @@ WORDS = {  # tyro's, and ours
     r"Unrecognized options?:": "there is no option",
     r"Missing from hqgs \w+:": "missing:",
     r"Perhaps you meant:": "- did you mean",
+    r"(?<=\S) (?=there is no option|missing:)": "; ",
+    r"(there is no option --?[\w-]+)(?:,? [^-\s;]+)+": r"\1",  # what followed it is none of its own
     r"Error parsing (\S+): no type matching \{?(.+?)\}? could be .*? from \['?(.*?)'?\]\.": (
         r"\1 is \3, wanted \2"
     ),

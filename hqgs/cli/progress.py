@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from hqgs.training.progress import Progress
 
 _NUMBERS_EVERY = 10  # steps between updates of the bar
-_LINES_EVERY = 5.0  # s between lines without a terminal
-_OFTEN_QUICK = ("photos read", "photos looked at")  # worth a line only once they have taken as long as that
+_SILENT = 5.0  # s without a line before a run trains, where there is no terminal
 _TOLD_EVERY = 60.0  # s between lines of the training without a terminal
 _WARM_UP, _MEASURED = 5, 30  # steps: before any are timed, and until the time that is left is told,
 _SOON = 5.0  # s of steps after which it is told in any case
@@ -39,6 +38,7 @@ class Screen:
         )
         self._bars = Bars(*columns, console=self.console, transient=True, disable=not self.live)
         self._task: TaskID | None = None
+        self._said = time.perf_counter()
 
     def __enter__(self: Self) -> Self:
         self._bars.start()
@@ -51,7 +51,18 @@ class Screen:
 
     def say(self, text: str) -> None:
         """A line that stays."""
+        self._said = time.perf_counter()
         self.console.print(text, markup=False)
+
+    def stage(self, stage: Stage) -> None:
+        """Where the work before the first step is; a note stays."""
+        if stage.note:
+            self.say(stage.note)
+            return
+        self.show(stage.what, stage.done, stage.total)
+        if not self.live and time.perf_counter() - self._said > _SILENT:
+            count = f": {stage.done}" if stage.done else ""
+            self.say(f"{stage.what}{count}" + (f" of {stage.total}" if count and stage.total else ""))
 
     def show(self, what: str, done: int, total: int, more: str = "") -> None:
         """Where the work is; other words begin another bar."""
@@ -63,26 +74,18 @@ class Screen:
 
 
 class LoadingScreen(Screen):
-    """What happens before a run trains; `seconds` tells how long each stage took."""
+    """What happens until a scene is loaded; `seconds` tells how long each stage took."""
 
     def __init__(self) -> None:
         super().__init__()
         self.seconds: dict[str, float] = {}
-        self._now = ""
-        self._since = self._said = time.perf_counter()
+        self._since = time.perf_counter()
 
-    def __call__(self, stage: Stage) -> None:
-        """Show a stage."""
+    def stage(self, stage: Stage) -> None:
         now = time.perf_counter()
         self.seconds[stage.what] = self.seconds.get(stage.what, 0.0) + now - self._since
         self._since = now
-        self.show(stage.what, stage.done, stage.total)
-        if stage.what != self._now and stage.what in _OFTEN_QUICK:
-            self._said, self._now = now, stage.what
-        if not self.live and (stage.what != self._now or now - self._said > _LINES_EVERY):
-            self._said = now
-            self.say(f"{stage.what}: {stage.done}" + (f" of {stage.total}" if stage.total else ""))
-        self._now = stage.what
+        super().stage(stage)
 
     @property
     def colmap_seconds(self) -> float:

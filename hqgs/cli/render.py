@@ -61,9 +61,9 @@ def run(options: Render) -> int:
     source, out, size = options.source, options.out, options.size
     try:
         file = scene_file(source)
-        from hqgs.export.frames import render_frames  # here: they load torch
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.paths import resized
+        from hqgs.show.frames import render_frames  # here: they load torch
 
         gaussians = Gaussians.load(file)
         names, cameras, rate = _cameras(options, gaussians)
@@ -96,10 +96,10 @@ def run(options: Render) -> int:
 
 def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
-    from hqgs.export.frames import FPS
     from hqgs.model.orbit import orbit
     from hqgs.scene.camera_files import load_path
     from hqgs.scene.paths import UP, camera_path
+    from hqgs.show.frames import FPS
 
     source, views, path, frames = options.source, options.views, options.path, options.frames
     known = _known(source)

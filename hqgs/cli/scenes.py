@@ -18,7 +18,6 @@ from hqgs.base.files import existing_folder, is_film, is_room
 from hqgs.cli.errors import fail
 
 if TYPE_CHECKING:
-    from hqgs.base.stages import OnStage, Stage
     from hqgs.cli.progress import LoadingScreen
     from hqgs.scene.scene import Scene
 
@@ -82,21 +81,9 @@ def tell_notes(scene: Scene) -> None:
     sys.stdout.flush()
 
 
-def heard(screen: LoadingScreen) -> OnStage:
-    """The screen, which says notes in lines that stay."""
-
-    def told(stage: Stage) -> None:
-        if stage.note:
-            screen.say(stage.note)
-        else:
-            screen(stage)
-
-    return told
-
-
 def load(photos: Photos, screen: LoadingScreen) -> Scene:
     """The scene of a command that takes no more than the photos."""
     from hqgs.scene.source import load as load_source  # here: it loads torch
 
     downscale = 1.0 if photos.downscale is None else photos.downscale
-    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, told=heard(screen))
+    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, told=screen.stage)

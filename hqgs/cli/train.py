@@ -19,13 +19,13 @@ from hqgs.base.left_out import format_left_out
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
-from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, heard, ready, tell_notes
+from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
+from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
 from hqgs.training.settings import PRESETS, read_config, with_iterations, with_plan
-from hqgs.viewer.guard import PORT, check
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run
@@ -162,6 +162,11 @@ def config_of(options: Train) -> TrainConfig:
         raise ValueError(f"only one of --{' and --'.join(given)} can be given")
     if file is not None:
         config = read_config(file)
+        if file == kept and iterations is not None and iterations < config.iterations:
+            raise ValueError(
+                f"iterations is {iterations}, and the run in {options.out} has {config.iterations}: --resume "
+                "can make it longer, not shorter"
+            )
         if iterations is not None and iterations != config.iterations:
             config = replace(with_iterations(config, iterations), seconds=None, turn=None)
     else:
@@ -242,6 +247,7 @@ def run(options: Train) -> int:
                 resume=options.resume,
                 overwrite=options.overwrite,
                 progress=show,
+                told=bar.stage,
             )
     except KeyboardInterrupt:
         if (options.out / CHECKPOINT).exists():
@@ -263,8 +269,8 @@ def run(options: Train) -> int:
         print(
             f"stopped at iteration {done.iterations} of {done.length}; go on with: {command}", file=sys.stderr
         )
-    elif live is not None:
-        live.stay()
+    if live is not None:
+        live.stay() if done.finished else live.close()
     return 0 if done.finished else 130
 
 
@@ -282,7 +288,7 @@ def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
         **(before | asked | {"path": options.scene, "seed": config.seed}),
         skip_unreadable="photos" in config.leave_out,
         cache=options.out,
-        told=heard(screen),
+        told=screen.stage,
     )
 
 

@@ -13,12 +13,12 @@ import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.model.formats.files import scene_file
-from hqgs.viewer.guard import PORT, check
+from hqgs.show.viewer.guard import PORT, check
 
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
+    from hqgs.show.viewer.viewer import Viewer
     from hqgs.training.progress import Progress
-    from hqgs.viewer.viewer import Viewer
 
 EVERY = 2.0  # seconds between copies of the scene while it trains
 
@@ -48,7 +48,7 @@ def run(options: View, seconds: float | None = None) -> int:
         from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.camera_files import CAMERAS, load_cameras
-        from hqgs.viewer.viewer import Viewer
+        from hqgs.show.viewer.viewer import Viewer
 
         gaussians = Gaussians.load(file)
         folder = file.parent
@@ -74,7 +74,7 @@ class LiveView:
 
     def __init__(self, scene: Scene, out: Path, *, port: int = PORT, open_browser: bool = False) -> None:
         self._scene, self._out, self._port, self._open = scene, out, port, open_browser
-        self._copied = -EVERY
+        self._copied = -EVERY  # when; below 0: nothing has been shown
 
     @cached_property
     def viewer(self) -> Viewer:
@@ -83,7 +83,7 @@ class LiveView:
         ValueError without viser, the extra `view`.
         """
         from hqgs.scene.camera_files import CAMERAS, load_cameras
-        from hqgs.viewer.viewer import Viewer
+        from hqgs.show.viewer.viewer import Viewer
 
         known = load_cameras(self._out) if (self._out / CAMERAS).is_file() else None
         viewer = Viewer(known, self._out, port=self._port, title=self._scene.name)
@@ -92,8 +92,12 @@ class LiveView:
 
     def __call__(self, now: Progress) -> None:
         """Show the scene as it is, every two seconds, and answer the page after each step."""
-        first, last = now.iteration == 1, now.iteration == now.length
+        first, last = self._copied < 0, now.iteration == now.length
         due = self.viewer.watched and time.monotonic() - self._copied > EVERY
+        if first and now.diagnosis is not None:
+            from hqgs.evaluation.photo_facts import facts_of_diagnosis
+
+            self.viewer.set_facts(facts_of_diagnosis(now.diagnosis.photos))
         if first or last or due:
             rows = [("iteration", f"{now.iteration} of {now.length}"), ("Gaussians", f"{now.gaussians:,}")]
             if now.evaluated is not None and now.evaluated["psnr"] is not None:
@@ -114,6 +118,11 @@ class LiveView:
         except KeyboardInterrupt:
             print()
         finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close the page, if there is one."""
+        if "viewer" in vars(self):
             self.viewer.close()
 
 

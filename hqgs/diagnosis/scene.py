@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
 from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
@@ -63,10 +64,12 @@ class Diagnosis:
 class Inspector:
     """Looks at photos, at each once however often it is asked for.
 
-    It holds what it has seen of their pixels: keep it no longer than a run needs to start.
+    It holds what it has seen of their pixels: keep it no longer than a run needs to start. `told` hears of
+    each photo.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, told: OnStage = untold) -> None:
+        self.told: OnStage = told
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
@@ -98,6 +101,7 @@ class Inspector:
                 if view.image.shape[:2] == (first.height, first.width):
                     known = first.enlargement
             found.append(self.inspect(view, known))
+            self.told(Stage("photos diagnosed", len(found), len(chosen)))
         key = tuple(map(id, found))
         if key not in self._concluded:
             self._concluded[key] = tuple(conclude(found))

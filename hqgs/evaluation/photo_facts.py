@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,11 @@ def learned_words(record: LearnedRecord) -> dict[str, str]:
     if record["focus"] is not None:
         focus += f", sharp at {record['focus']:.2g} of the median depth"
     return {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
+
+
+def facts_of_diagnosis(photos: Iterable[PhotoDiagnosis]) -> dict[str, dict[str, str]]:
+    """What photos were found to suffer from, by their names."""
+    return {found.name: photo_words(photo_record(found)) for found in photos}
 
 
 def facts_of_photos(report: Mapping[str, Any]) -> dict[str, dict[str, str]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.left_out import LeftOutRecord
@@ -33,6 +33,7 @@ from hqgs.evaluation.records import (
     alike,
 )
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.sheet import printable, sheet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
 REPORT, CHART, PICTURES = "report.json", "error_vs_time.png", "comparison"
 AMPLIFICATION = 4  # of the difference in the pictures
-GAP = 8  # pixels between the panels of a picture
 MASKED = (
     150,
     158,
@@ -135,7 +135,7 @@ def read_report(path: str | Path) -> Report:
 def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     """Photo, render and absolute difference (times 4, cut at white) side by side, a caption above each.
 
-    The size is 3 W + 16 by H plus the height of the caption, of the view as it is shown upright.
+    Of the view as it is shown upright.
     """
     photo = view.photo / 255.0 if view.photo.dtype == np.uint8 else view.photo.clip(0, 1)
     render = np.clip(view.render.astype(np.float64), 0.0, 1.0)
@@ -147,20 +147,10 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
         amplified += ", grey: masked out"
     numbers = [] if metrics.psnr is None else [f"{metrics.psnr:.2f} dB"]
     numbers += [] if metrics.ssim is None else [f"SSIM {metrics.ssim:.3f}"]
-    captions = [f"photo  {_printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]
+    captions = [f"photo  {printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]
 
     panels = [np.ascontiguousarray(np.rot90(panel, -view.turn)) for panel in panels]
-    height, width = panels[0].shape[:2]
-    font, line = _caption_font(captions, width, height)
-    picture = Image.new("RGB", (3 * width + 2 * GAP, height + line), "white")
-    for i, (panel, caption) in enumerate(zip(panels, captions, strict=True)):
-        strip = Image.new("RGB", (width, line), "white")  # a caption never runs into the next panel
-        while len(caption) > 4 and font.getlength(caption) > width - 4:  # cut where it shows
-            caption = f"{caption[:-4]}..."
-        ImageDraw.Draw(strip).text((2, line // 2), caption, fill=(25, 25, 25), font=font, anchor="lm")
-        picture.paste(strip, (i * (width + GAP), 0))
-        picture.paste(Image.fromarray(panel), (i * (width + GAP), line))
-    return picture
+    return sheet([list(zip(captions, panels, strict=True))])
 
 
 def error_chart(result: RunResult) -> Figure:
@@ -172,7 +162,7 @@ def error_chart(result: RunResult) -> Figure:
     some = {entry["views"] for entry in result.history if "views" in entry}
     views = f"{max(some)} of {len(result.views)} held-out views" if some else "held-out views"
     title = f"{result.scene}, {result.method}, seed {result.seed}: {views} while training"
-    top.set_title(_printable(title, 90), fontsize=11, loc="left", parse_math=False)
+    top.set_title(printable(title, 90), fontsize=11, loc="left", parse_math=False)
     _curve(top, result.history, "psnr", "PSNR (dB)", "{:.2f} dB", "#1f6fb2")
     _curve(bottom, result.history, "ssim", "SSIM", "{:.3f}", "#c2571a")
     bottom.set_xlabel("training time (s)")
@@ -259,21 +249,3 @@ def _file_names(views: list[str]) -> list[str]:
         taken.add(name.lower())
         names.append(f"{name}.png")
     return names
-
-
-def _printable(text: str, longest: int = 60) -> str:
-    """The text with everything but printable ASCII replaced (fonts lack the rest), cut to `longest`."""
-    text = re.sub(r"[^ -~]", "?", text)
-    return text if len(text) <= longest else text[: longest - 3] + "..."
-
-
-def _caption_font(
-    captions: list[str], width: int, height: int
-) -> tuple[ImageFont.FreeTypeFont | ImageFont.ImageFont, int]:
-    """The largest font, in proportion to the picture, in which all captions fit; and the line's height."""
-    size = min(max(height // 26, 14), 40)
-    font = ImageFont.load_default(size)
-    while size > 9 and max(font.getlength(caption) for caption in captions) > width - 4:
-        size -= 1
-        font = ImageFont.load_default(size)
-    return font, round(1.8 * size)

@@ -27,12 +27,15 @@ def _tensor(array: np.ndarray[Any, Any] | None, *shape: int) -> Tensor | None:
 
 class _Project(torch.autograd.Function):
     """Gaussians to splats. `link` has no values of interest: its cotangent carries the gradient of the 2D
-    covariance in whitened form, which stays of order 1 however thin a Gaussian is."""
+    covariance in whitened form, which stays of order 1 however thin a Gaussian is. Nor have `covars`, [N, 6]
+    or None: they get the gradient of what `quats` and `scales` stand for."""
 
     @staticmethod
-    def forward(ctx: Any, means, quats, scales, opacities, colors, rest, viewmats, Ks, config, enabled):
+    def forward(
+        ctx: Any, means, quats, scales, opacities, covars, colors, rest, viewmats, Ks, config, enabled
+    ):
         width, height, options, sh_degree = config
-        needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:7]
+        needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:8]
         colors_vary = needs_means or needs_viewmats or needs_harmonics or needs_rest
         options = (*options, enabled and colors_vary)
         inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
@@ -65,7 +68,7 @@ class _Project(torch.autograd.Function):
         _, v_means2d, v_link, v_depths, v_conics, _, v_alphas, v_colors = grads
         means, quats, scales, opacities = ctx.saved_tensors
         n, c = ctx.shapes
-        needs = list(ctx.needs_input_grad[:7])
+        needs = list(ctx.needs_input_grad[:8])
         if not ctx.has_harmonics:
             v_colors = None
         *v_inputs, counts = _rust.project_backward(
@@ -83,10 +86,10 @@ class _Project(torch.autograd.Function):
         )
         if is_counting():
             add_gradients(v_inputs, counts)
-        if v_inputs[6] is not None:  # computed in f64; stay finite in the dtype of the inputs
+        if v_inputs[7] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
-            v_inputs[6].clip(-limit, limit, out=v_inputs[6])
-        shapes = [(n, 3), (n, 4), (n, 3), (n,), *ctx.sh_shapes, (c, 4, 4)]
+            v_inputs[7].clip(-limit, limit, out=v_inputs[7])
+        shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, 6), *ctx.sh_shapes, (c, 4, 4)]
         return (*(_tensor(v, *shape) for v, shape in zip(v_inputs, shapes, strict=True)), None, None, None)
 
 

@@ -20,7 +20,7 @@ from hqgs.model.arguments import (
     short,
 )
 from hqgs.model.autograd import _Composite, _Project
-from hqgs.model.covariances import quats_and_scales
+from hqgs.model.covariances import quats_and_scales, upper_entries
 
 __all__ = ["RasterizationMeta", "rasterization"]
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -98,8 +98,8 @@ def rasterization(
             the last channel.
         absgrad: also leave the sum over pixels of `|d loss / d means2d|` in `meta["means2d"].absgrad`.
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
-        covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then; they get
-            no gradient.
+        covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then. As for
+            gsplat, the entries on and above the diagonal count, those above it for two, and get the gradient.
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
 
     Any number of leading batch dimensions, the same for all tensors (but a `backgrounds` [D]), gives as many
@@ -112,16 +112,19 @@ def rasterization(
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
         NotImplementedError: an argument of gsplat that hqgs leaves out (other camera models, distortion,
-            rolling shutter, distributed rendering, gradients of Ks and covars, absgrad of a batch).
+            rolling shutter, distributed rendering, gradients of Ks, absgrad of a batch).
     """
     refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
     colors, rest = colors if isinstance(colors, tuple) else (colors, None)
-    if covars is not None:
-        quats, scales = quats_and_scales(covars, means)
+    upper = None if covars is None else upper_entries(covars, means)
+    if upper is not None:
+        quats, scales = quats_and_scales(upper)
     tensors: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     tensors["colors"] = colors
     if rest is not None:
         tensors["colors[1]"] = rest
+    if upper is not None:
+        tensors["covars"] = upper
     batch = batch_of({**tensors, "viewmats": viewmats, "Ks": Ks})
     if backgrounds is not None:
         c = viewmats.shape[len(batch)] if viewmats.dim() > len(batch) else 0
@@ -194,6 +197,7 @@ def _project(scene: dict[str, Tensor], config: tuple[Any, ...]) -> dict[str, Any
         scene["quats"],
         scene["scales"],
         scene["opacities"],
+        scene.get("covars"),
         colors if sh_degree is not None else colors.detach(),
         scene.get("colors[1]"),
         scene["viewmats"].to(torch.float64),

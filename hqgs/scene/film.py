@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 import shutil
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +49,8 @@ def film_frames(
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
+            with suppress(OSError):  # nothing is left of a film that cannot be read
+                folder.rmdir()
     return (
         target,
         f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval",
@@ -81,7 +86,9 @@ def _sharpest(
                     best = number, np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
                 told(Stage("frames of the film looked at", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
-        raise ValueError(f"the film {path} cannot be read: {error}") from error
+        known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
+        why = os.strerror(error.errno or 0) if known else "it is no film, or damaged"
+        raise ValueError(f"the film {path} cannot be read: {why}") from error
     if best is None:
         raise ValueError(f"the film {path} holds no frame that can be read")
     yield best

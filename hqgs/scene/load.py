@@ -176,8 +176,6 @@ def _broken(root: Path) -> str | None:
 def _nothing(root: Path) -> str:
     """What is wrong with a folder in which no format is recognised."""
     entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
-    if not entries:
-        return f"{root} is empty: give a folder with photos"
     for suffixes, advice in (
         (ARCHIVE_SUFFIXES, "unpack it, and give the folder with the photos"),
         (FILM_SUFFIXES, "give the film itself in place of the folder"),

@@ -74,6 +74,16 @@ def part(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
 
 
+OTHER = {  # what is other where a part of the fingerprint is
+    "views": "its photos had other names, or others were held out (--test-every)",
+    "cameras": "its photos had another size (--downscale, --preset) or other poses (--sfm)",
+    "photos": "its photos had other pixels (--degrade, --restore, --downscale)",
+    "low": "its photos had other pixels (--degrade, --restore, --downscale)",
+    "masks": "its photos had other masks",
+    "points": "it began with other points (--sfm)",
+}
+
+
 def check_same(
     path: str | Path, prefix: str, saved: dict[str, Any], here: dict[str, Any], longer: bool = False
 ) -> None:
@@ -93,6 +103,16 @@ def check_same(
                 f"{path} was made with another {prefix}{name}: {old!r} there, {new!r} in this run; "
                 "use the same one, or another folder"
             )
+
+
+def check_scene(path: str | Path, saved: object, scene: Scene) -> None:
+    """ValueError, in the words of the options, where a fingerprint is not that of the scene."""
+    if not isinstance(saved, dict):
+        raise ValueError(f"{path} is damaged: scene is {saved!r:.80}")
+    for name, digest in scene_fingerprint(scene).items():
+        if saved.get(name) != digest:
+            why = OTHER[name]
+            raise ValueError(f"{path} is of another scene: {why}; ask for the same, or for another folder")
 
 
 def scene_fingerprint(scene: Scene) -> dict[str, str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
@@ -26,6 +27,7 @@ class Progress:
     view: str  # the training view of the step
     render: NDArray[np.float32]  # of that view, [H, W, 3], not clamped; may be smaller than the photo
     evaluated: HistoryEntry | None  # where the held-out views were measured after this step
+    diagnosis: Diagnosis | None = field(repr=False)  # of the photos; None: the method asked for none
     _step: Step = field(repr=False)
     _shown: Callable[[], Gaussians] = field(repr=False)
 
@@ -53,6 +55,7 @@ def progress_of(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) ->
         view=step.view.name,
         render=step.render.numpy(),
         evaluated=evaluated,
+        diagnosis=trainer.diagnosis,
         _step=step,
         _shown=trainer.shown,
     )

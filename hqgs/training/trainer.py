@@ -15,6 +15,7 @@ from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
+from hqgs.base.stages import OnStage, untold
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
@@ -59,10 +60,10 @@ class Trainer:
     """A run: its schedule says what a step does, its state what it starts from, its method how a render is
     judged, and its frugality what may be left out from then on."""
 
-    def __init__(self, scene: Scene, config: TrainConfig) -> None:
-        """ValueError if the scene or the configuration cannot be trained."""
+    def __init__(self, scene: Scene, config: TrainConfig, told: OnStage = untold) -> None:
+        """`told` hears of the preparation. ValueError if scene or configuration cannot be trained."""
         scene.check_trainable()
-        inspector = Inspector()  # for all that looks at the photos before the first step
+        inspector = Inspector(told)  # for all that looks at the photos before the first step
         self.photos_left_out: list[LeftOut] = []
         if "photos" in config.leave_out:
             scene, self.photos_left_out = choose_photos(scene, inspector)
@@ -216,7 +217,7 @@ class Trainer:
         lists = {k: list(v) for k, v in vars(self.config).items() if isinstance(v, tuple)}  # as JSON has them
         try:
             # The scene first: methods fit the configuration to it.
-            checkpoint.check_same(path, "scene ", meta["scene"], checkpoint.scene_fingerprint(self.scene))
+            checkpoint.check_scene(path, meta["scene"], self.scene)
             self.lengthened = checkpoint.lengthened(meta, self.config.iterations)
             longer = self.lengthened is not None
             checkpoint.check_same(path, "", meta["config"], asdict(self.config) | lists, longer)

@@ -106,18 +106,17 @@ impl<T: Real> Cotangents<T> {
         }
     }
 
-    /// Gradients of the geometry `g` of the Gaussians `at..`, and of their opacities; `opacity`: these, if they
-    /// are compensated.
+    /// What arrives at the geometry `g` of the Gaussians `at..`, and the gradient of their opacities; `opacity`:
+    /// these, if they are compensated.
     #[inline(always)]
-    fn pull<S: Simd>(
+    fn gather<S: Simd>(
         &self,
         simd: S,
         at: usize,
         g: &Geometry<S>,
         opacity: Option<Wide<S>>,
         camera: &CameraLanes<S>,
-        camera_grad: Option<&mut CameraGradLanes<S>>,
-    ) -> (GeometryGrad<S>, Wide<S>) {
+    ) -> (Cotangent<S>, Wide<S>) {
         let v_splat_opacity = self.opacities.wide(simd, at);
         let mut v_opacity = v_splat_opacity;
         let mut whitened = wide3(simd, &self.whitened, at);
@@ -135,7 +134,7 @@ impl<T: Real> Cotangents<T> {
             whitened,
             depth: self.depths.wide(simd, at),
         };
-        (g.vjp(simd, &cotangent, camera, camera_grad), v_opacity)
+        (cotangent, v_opacity)
     }
 
     /// Gaussians of the group with a cotangent that is not 0.
@@ -175,6 +174,8 @@ pub struct Wanted {
     pub scales: bool,
     /// Of the opacities.
     pub opacities: bool,
+    /// Of the covariances that the quaternions and scales stand for.
+    pub covars: bool,
     /// Of `Harmonics::coefficients`.
     pub harmonics: bool,
     /// Of `Harmonics::rest`.
@@ -195,6 +196,8 @@ pub struct GaussianGrads<T> {
     pub scales: Vec<T>,
     /// `[N]`
     pub opacities: Vec<T>,
+    /// [N, 6]: entries xx, xy, xz, yy, yz, zz; those beside the diagonal stand for two.
+    pub covars: Vec<T>,
     /// As `Harmonics::coefficients`.
     pub harmonics: Vec<T>,
     /// As `Harmonics::rest`.
@@ -207,21 +210,21 @@ pub struct GaussianGrads<T> {
 
 /// What one job fills of it: empty where not wanted.
 struct BackwardChunk<'a, T> {
-    /// Of the means, quaternions, scales, opacities, harmonics and their rest.
-    outs: [UninitPiece<'a, T>; 6],
+    /// Of the means, quaternions, scales, opacities, covariances, harmonics and their rest.
+    outs: [UninitPiece<'a, T>; 7],
     /// Numbers per Gaussian, in that order.
-    rows: [usize; 6],
+    rows: [usize; 7],
 }
 
 impl<T: Real> BackwardChunk<'_, T> {
     /// A buffer for the rows of one group for each output.
-    fn buffers(&self) -> [Vec<T>; 6] {
+    fn buffers(&self) -> [Vec<T>; 7] {
         self.rows.map(|row| vec![T::ZERO; GROUP * row])
     }
 
     /// Give out the first `rows` rows of the buffers.
     #[inline(always)]
-    fn put(&mut self, buffers: &[Vec<T>; 6], rows: usize) {
+    fn put(&mut self, buffers: &[Vec<T>; 7], rows: usize) {
         for ((out, buffer), row) in self.outs.iter_mut().zip(buffers).zip(self.rows) {
             out.put(&buffer[..row * rows]);
         }
@@ -263,27 +266,29 @@ pub fn backward<T: Real>(
         (wanted.quats, 4),
         (wanted.scales, 3),
         (wanted.opacities, 1),
+        (wanted.covars, 6),
         (wanted.harmonics, row),
         (wanted.harmonics_rest, rest_row),
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
     let mut arrays = UninitVec::<T>::several(rows.map(|row| row * n), "gradients")?;
-    let [means, quats, scales, opacities, sh, rest] = &mut arrays;
+    let [means, quats, scales, opacities, covars, sh, rest] = &mut arrays;
     let jobs: Vec<_> = chunks(means, n, rows[0])
         .into_iter()
         .zip(chunks(quats, n, rows[1]))
         .zip(chunks(scales, n, rows[2]))
         .zip(chunks(opacities, n, rows[3]))
-        .zip(chunks(sh, n, rows[4]))
-        .zip(chunks(rest, n, rows[5]))
+        .zip(chunks(covars, n, rows[4]))
+        .zip(chunks(sh, n, rows[5]))
+        .zip(chunks(rest, n, rows[6]))
         .collect();
     let level = projection.level.token;
     let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, (((((means, quats), scales), opacities), sh), rest))| {
+        .map(|(chunk, ((((((means, quats), scales), opacities), covars), sh), rest))| {
             let out = BackwardChunk {
-                outs: [means, quats, scales, opacities, sh, rest],
+                outs: [means, quats, scales, opacities, covars, sh, rest],
                 rows,
             };
             dispatch!(level, simd => backward_chunk(
@@ -296,12 +301,13 @@ pub fn backward<T: Real>(
         camera_grad.add(part);
         counts = counts.plus(*more);
     }
-    let [means, quats, scales, opacities, sh, rest] = arrays.map(UninitVec::finish);
+    let [means, quats, scales, opacities, covars, sh, rest] = arrays.map(UninitVec::finish);
     Ok(GaussianGrads {
         means,
         quats,
         scales,
         opacities,
+        covars,
         harmonics: sh,
         harmonics_rest: rest,
         camera: camera_grad,
@@ -345,7 +351,8 @@ fn backward_chunk<S: Simd, T: Real>(
     let mut colors = ColorGroup::ZERO;
     let mut out = Columns::<T>::ZERO;
     let (mut buffers, zeros) = (chunk.buffers(), chunk.buffers());
-    let [_, _, _, _, row, rest_row] = chunk.rows;
+    let mut covars = [Column::<T>::ZERO; 6];
+    let [_, _, _, _, covar_row, row, rest_row] = chunk.rows;
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
     for first in (begin..end).step_by(GROUP) {
         let rows = GROUP.min(end - first);
@@ -384,8 +391,15 @@ fn backward_chunk<S: Simd, T: Real>(
                     None
                 };
                 let camera_grad = camera_wanted.then_some(&mut *camera_grad);
-                (grad, v_opacity) =
-                    cotangents.pull(simd, at, &g, opacity, &camera_lanes, camera_grad);
+                let cotangent;
+                (cotangent, v_opacity) = cotangents.gather(simd, at, &g, opacity, &camera_lanes);
+                grad = g.vjp(simd, &cotangent, &camera_lanes, camera_grad);
+                if covar_row > 0 {
+                    let v_covar = g.covar_vjp(&cotangent.whitened, &camera_lanes);
+                    for (column, v) in covars.iter_mut().zip(v_covar) {
+                        column.saturate(simd, at, valid.select(v, zero));
+                    }
+                }
             }
             if shading.is_some() {
                 let v_mean = colors.mean_vjp(simd, at, valid);
@@ -394,8 +408,9 @@ fn backward_chunk<S: Simd, T: Real>(
             }
             out.set(simd, at, &grad, v_opacity, valid, zero);
         }
-        let [means, quats, scales, alphas, coefficients, rest] = &mut buffers;
+        let [means, quats, scales, alphas, covar, coefficients, rest] = &mut buffers;
         out.write([means, quats, scales, alphas]);
+        groups::write(covars.each_ref().map(|column| &column.0), covar);
         if let Some(shading) = shading {
             colors.write(simd, shading, [coefficients, rest], [row, rest_row]);
         }

@@ -113,6 +113,16 @@ fn rotation_matrix<S: Simd>(simd: S, [w, x, y, z]: [Wide<S>; 4], k: Wide<S>) -> 
     ])
 }
 
+/// A whitened gradient E times two rows.
+#[inline(always)]
+fn times_whitened<S: Simd>(e: &V3<Wide<S>>, rows: &[V3<Wide<S>>; 2]) -> [V3<Wide<S>>; 2] {
+    let (euu, euv, evv) = (e.x, e.y, e.z);
+    [
+        rows[0].by(euu) + rows[1].by(euv),
+        rows[0].by(euv) + rows[1].by(evv),
+    ]
+}
+
 impl<S: Simd> Geometry<S> {
     /// Project Gaussians of type T. Each test of `valid` is written so that NaN fails it.
     #[inline(always)]
@@ -246,23 +256,8 @@ impl<S: Simd> Geometry<S> {
     ) -> GeometryGrad<S> {
         let (zero, two) = (splat(simd, 0.0), splat(simd, 2.0));
         let [s, m, t] = self.factors;
-        let (euu, euv, evv) = (v.whitened.x, v.whitened.y, v.whitened.z);
-        // Whitened rows: B = L^T A, on the unscaled axes. B B^T = I - eps L^T L, and no term of an entry of B
-        // exceeds 1.
-        let area = self.rows[1]
-            .by(t)
-            .times(self.scale)
-            .cross(self.minors)
-            .by(t * self.f[0])
-            .by(self.f[1]);
-        let white = [
-            (area + self.axes[0].by(camera.eps2d * t * t)).by(s),
-            self.axes[1].by(t),
-        ];
-        let half = [
-            white[0].by(euu) + white[1].by(euv),
-            white[0].by(euv) + white[1].by(evv),
-        ];
+        let white = self.whitened_axes(camera);
+        let half = times_whitened::<S>(&v.whitened, &white);
         // d cov = L E L^T gives dA = 2 L E B and, along each scale, 2 s_k B_k^T E B_k without cancellation. The
         // scales come one at a time: the square of one may overflow.
         let half = [half[0].times(self.scale), half[1].times(self.scale)];
@@ -316,6 +311,41 @@ impl<S: Simd> Geometry<S> {
             quat: self.quat_vjp(simd, &v_axes),
             scale,
         }
+    }
+
+    /// Gradient of the covariance `R S S^T R^T` itself, entries xx, xy, xz, yy, yz, zz; those beside the diagonal
+    /// stand for two. `d cov2d = L E L^T` gives `P^T E P` with `P = L^T J W`, here the whitened axes turned back
+    /// by `R`: the scales are not divided by, and equal ones are like any others.
+    #[inline(always)]
+    pub fn covar_vjp(&self, whitened: &V3<Wide<S>>, camera: &CameraLanes<S>) -> [Wide<S>; 6] {
+        let white = self.whitened_axes(camera);
+        let [p, q] = [0, 1].map(|i| self.rotation.times(white[i]));
+        let [u, v] = times_whitened::<S>(whitened, &[p, q]);
+        [
+            p.x * u.x + q.x * v.x,
+            p.x * u.y + q.x * v.y + p.y * u.x + q.y * v.x,
+            p.x * u.z + q.x * v.z + p.z * u.x + q.z * v.x,
+            p.y * u.y + q.y * v.y,
+            p.y * u.z + q.y * v.z + p.z * u.y + q.z * v.y,
+            p.z * u.z + q.z * v.z,
+        ]
+    }
+
+    /// Rows of `L^T J W R`. With the scales they are `B = L^T A`: `B B^T = I - eps L^T L`, and no term of an entry
+    /// of B exceeds 1.
+    #[inline(always)]
+    fn whitened_axes(&self, camera: &CameraLanes<S>) -> [V3<Wide<S>>; 2] {
+        let [s, _, t] = self.factors;
+        let area = self.rows[1]
+            .by(t)
+            .times(self.scale)
+            .cross(self.minors)
+            .by(t * self.f[0])
+            .by(self.f[1]);
+        [
+            (area + self.axes[0].by(camera.eps2d * t * t)).by(s),
+            self.axes[1].by(t),
+        ]
     }
 
     /// The whitened gradient of the covariance that stands for a gradient of the conic: `-L^T V L`.

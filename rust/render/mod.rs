@@ -212,6 +212,7 @@ pub fn backward<T: Real>(
         quats: wanted.quats,
         scales: wanted.scales,
         opacities: wanted.opacities,
+        covars: false,
         harmonics: *harmonics && wanted.colors,
         harmonics_rest: *harmonics && wanted.colors,
         camera: wanted.viewmat,

@@ -174,6 +174,7 @@ impl Scene {
             quats: true,
             scales: true,
             opacities: true,
+            covars: false,
             harmonics: harmonics.is_some(),
             harmonics_rest: false,
             camera: true,

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from hqgs.base.left_out import LeftOut
+from hqgs.base.stages import OnStage, untold
 from hqgs.model.consistency import Agreement
 from hqgs.model.first_points import Colors, Points, points_along_edges
 from hqgs.scene.scene import Scene, View
@@ -65,9 +66,11 @@ def start_points(views: Sequence[View], most: int) -> int:
     return min(most, sum(view.camera.width * view.camera.height for view in views) // PIXELS)
 
 
-def first_points(scene: Scene, wanted: int, seed: int) -> tuple[Points, Colors, list[LeftOut]]:
+def first_points(
+    scene: Scene, wanted: int, seed: int, told: OnStage = untold
+) -> tuple[Points, Colors, list[LeftOut]]:
     """The scene's points and more along the photos' edges that other photos agree with, at most `wanted` in
-    all; and why there are no more."""
+    all; and why there are no more. `told` hears of each photo."""
     what, points, colors = "first points along edges", scene.points, scene.point_colors
     if not wanted:
         return points, colors, []
@@ -78,7 +81,7 @@ def first_points(scene: Scene, wanted: int, seed: int) -> tuple[Points, Colors, 
         why = f"it has {len(points)} points for {wanted} that are called for"
         return points, colors, [LeftOut(what, why)]
     agreement = Agreement(scene.train, scene.seen)
-    more = points_along_edges(scene.train, points, scene.seen, wanted - len(points), seed, agreement)
+    more = points_along_edges(scene.train, points, scene.seen, wanted - len(points), seed, agreement, told)
     return np.concatenate([points, more[0]]), np.concatenate([colors, more[1]]), []
 
 

@@ -66,7 +66,9 @@ class HQGS(Plain):
     ) -> None:
         """`inspector`: what diagnoses the scene's photos where the formation is not given."""
         self.config = config
-        found = find_formation(scene, config.formation, inspector or Inspector())
+        inspector = inspector or Inspector()
+        self._told = inspector.told
+        found = find_formation(scene, config.formation, inspector)
         self.formation: Formation = found[0]
         self._left_out: list[LeftOut] = found[1]
         kinds, jpeg = self.formation.kinds, "jpeg" in self.formation.kinds
@@ -112,7 +114,7 @@ class HQGS(Plain):
         if self.formation.kinds <= set(OWN):
             plain = self.as_photographed and config.method == AUTO
             wanted = start_points(scene.train, min(config.start_points, config.densify.max_gaussians))
-            points, colors, _ = first_points(scene, wanted, config.seed)
+            points, colors, _ = first_points(scene, wanted, config.seed, self._told)
             if self.as_photographed and len(points) > len(scene.points):
                 config = _coarse_first(config)
             scene = replace(scene, points=points, point_colors=colors)
@@ -123,7 +125,7 @@ class HQGS(Plain):
         if densify.reset_every < densify.stop:
             left_out.append(LeftOut("resets of the opacities", "a budget of Gaussians bears none"))
         wanted = int(self.config.first_points * budget.max_gaussians)
-        points, colors, why = first_points(scene, wanted, config.seed)
+        points, colors, why = first_points(scene, wanted, config.seed, self._told)
         gaussians = Gaussians.from_points(points, colors, config.sh_degree)
         self._measure(gaussians, 0)
         return Start(self.named(replace(config, densify=budget)), gaussians, left_out + why)

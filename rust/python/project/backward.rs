@@ -20,7 +20,7 @@ pub(super) fn project_backward<'py>(
     frame: &Bound<'py, Frame>,
     inputs: Inputs<'py>,
     cotangents: Cotangents<'py>,
-    wanted: [bool; 7],
+    wanted: [bool; 8],
 ) -> BindingResult<Bound<'py, PyAny>> {
     by_dtype!(
         "means",
@@ -103,6 +103,7 @@ fn add<T: Real>(sums: &mut GaussianGrads<T>, grads: &GaussianGrads<T>) {
     accumulate(&mut sums.quats, &grads.quats);
     accumulate(&mut sums.scales, &grads.scales);
     accumulate(&mut sums.opacities, &grads.opacities);
+    accumulate(&mut sums.covars, &grads.covars);
     accumulate(&mut sums.harmonics, &grads.harmonics);
     accumulate(&mut sums.harmonics_rest, &grads.harmonics_rest);
     sums.counts = sums.counts.plus(grads.counts);
@@ -119,7 +120,7 @@ fn project_backward_as<'py, T: Scalar>(
     frame: &Bound<'py, Frame>,
     inputs: &Inputs<'py>,
     v: Cotangents<'py>,
-    wanted: [bool; 7],
+    wanted: [bool; 8],
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = frame.py();
     let frame = &frame.get().0;
@@ -141,6 +142,7 @@ fn project_backward_as<'py, T: Scalar>(
         quats,
         scales,
         opacities,
+        covars,
         harmonics_wanted,
         harmonics_rest,
         camera,
@@ -150,6 +152,7 @@ fn project_backward_as<'py, T: Scalar>(
         quats,
         scales,
         opacities,
+        covars,
         harmonics: harmonics_wanted,
         harmonics_rest,
         camera,
@@ -183,6 +186,7 @@ fn project_backward_as<'py, T: Scalar>(
         wanted.quats.then(|| grads.quats.into_pyarray(py)),
         wanted.scales.then(|| grads.scales.into_pyarray(py)),
         wanted.opacities.then(|| grads.opacities.into_pyarray(py)),
+        wanted.covars.then(|| grads.covars.into_pyarray(py)),
         wanted.harmonics.then(|| grads.harmonics.into_pyarray(py)),
         wanted
             .harmonics_rest

@@ -14,11 +14,12 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path
+from hqgs.base.files import FILM_SUFFIXES, atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
+from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.scene import Camera
 
 SHOWN = ("color", "depth", "alpha")
@@ -26,6 +27,7 @@ FILMS = (".mp4", ".gif")
 FPS = 30.0
 CRF = "18"  # of x264: no difference that an eye finds
 SAMPLES = 8  # frames that say which depths a film shows
+OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
 DEPTHS = (2, 98)  # percentiles of the depths that get the ends of the colour scale
 Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], None]
@@ -59,8 +61,8 @@ def render_frames(
         `out`.
 
     Raises:
-        ValueError: no camera, several for a .png, several sizes for a film, an unknown `show`, a background
-            that is no three numbers, or .mp4 without PyAV.
+        ValueError: no camera, a film or picture of another kind, several cameras for a .png, several sizes
+            for a film, an unknown `show`, a background that is no three numbers, or .mp4 without PyAV.
         OSError: a file cannot be written; what was there before stays.
     """
     out = Path(out)
@@ -89,8 +91,8 @@ def render_frames(
         with atomic_path(out) as tmp:
             Image.fromarray(next(pictures)).save(tmp)
     else:
-        if out.exists() and not out.is_dir():
-            raise ValueError(f"{out} is a file; wanted a folder, or a path that ends in .mp4, .gif or .png")
+        if suffix in OTHERS or (out.exists() and not out.is_dir()):
+            raise ValueError(f"{out} is no folder; films are .mp4 or .gif, a single picture is .png")
         places = [f"{k:05}" for k in range(len(cameras))] if names is None else names
         for name, picture in zip(places, pictures, strict=True):
             with atomic_path(out / f"{name}.png") as tmp:

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from hqgs.export.frames import Activated
 from hqgs.model.content import content
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
-from hqgs.viewer.client import SHARP, Client
-from hqgs.viewer.guard import PORT, start_server
-from hqgs.viewer.pictures import Pose, beside, same_view, shown
-from hqgs.viewer.splats import browser_splats
+from hqgs.show.frames import Activated
+from hqgs.show.viewer.client import SHARP, Client
+from hqgs.show.viewer.guard import PORT, start_server
+from hqgs.show.viewer.pictures import Pose, beside, same_view, shown
+from hqgs.show.viewer.splats import browser_splats
 
 FRUSTUMS = 150  # training cameras that are drawn, evenly chosen
 THUMB = 160  # px, of the photos at the cameras

@@ -22,11 +22,11 @@ from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
 from hqgs.evaluation.records import HistoryEntry, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import verdict
 from hqgs.model.gaussians import Gaussians
-from hqgs.page.charts import line_chart
-from hqgs.page.packing import pack_scene
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.paths import focus, world_up
 from hqgs.scene.scene import Camera, Scene
+from hqgs.show.page.charts import line_chart
+from hqgs.show.page.packing import pack_scene
 
 TEMPLATES = Path(__file__).parent / "templates"
 SCRIPTS = ("splat_shaders.js", "splats.js")

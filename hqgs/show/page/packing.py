@@ -26,9 +26,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hqgs.export.export import along_a_curve
 from hqgs.model.constants import SH_C0
 from hqgs.model.gaussians import Gaussians
+from hqgs.show.export import along_a_curve
 
 BLOCK = 256
 MOST = 400_000  # Gaussians in a page

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
-from hqgs.export.options import ExportOptions
 from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.spz import encode_spz, write_spz
 from hqgs.model.gaussians import Gaussians
+from hqgs.show.export_options import ExportOptions
 
 BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
 

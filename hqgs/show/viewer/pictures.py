@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.export.frames import Activated, depth_picture, depth_range
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
+from hqgs.show.frames import Activated, depth_picture, depth_range
 
 MAX_SIDE = 2048  # px of a streamed picture
 MOVED = 0.02  # radians, and of the distance: a camera nearer than that to a photo's sees the same

@@ -1,1 +1,0 @@
-"""Smaller scene files: fewer Gaussians, fewer bands of the harmonics, fewer bits."""
