@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -179,7 +180,7 @@ class _Joined(Ranks):
         heads = {self.rank: (kind, len(data))}
         mine = torch.tensor([kind, len(data)])
         others = {k: torch.empty(2, dtype=torch.int64) for k in self._others}
-        self._swap(dict.fromkeys(self._others, mine), others)
+        self._swap({k: mine for k in self._others}, others)
         heads |= {k: (int(head[0]), int(head[1])) for k, head in others.items()}
         kinds = {head[0] for head in heads.values()}
         if FAILED not in kinds and NOTHING in kinds:
@@ -190,7 +191,7 @@ class _Joined(Ranks):
         talks = {k for k, head in heads.items() if head[1] and (not failed or head[0] == FAILED)}
         out = torch.frombuffer(bytearray(data), dtype=torch.uint8) if self.rank in talks else None
         others = {k: torch.empty(heads[k][1], dtype=torch.uint8) for k in self._others if k in talks}
-        self._swap({} if out is None else dict.fromkeys(self._others, out), others)
+        self._swap({} if out is None else {k: out for k in self._others}, others)
         said = {k: tensor.numpy().tobytes() for k, tensor in others.items()} | {self.rank: data}
         if failed:
             k = min(k for k, head in heads.items() if head[0] == FAILED)
@@ -225,10 +226,15 @@ def joined() -> Iterator[Ranks]:
         raise RankError(f"the ranks did not find each other: {' '.join(str(error).split())[:200]}") from error
     try:
         yield ranks
-    except RankError:
+    except KeyboardInterrupt:
+        ranks.fail("it was stopped")
         raise
-    except BaseException as error:
-        ranks.fail("it was stopped" if isinstance(error, KeyboardInterrupt) else str(error))
+    except Exception as error:
+        if threading.current_thread() is threading.main_thread():
+            # torchrun ends a rank as soon as another one has failed; this one is to say why, and then ends.
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        if not isinstance(error, RankError):
+            ranks.fail(str(error))
         raise
     else:
         ranks.end()
