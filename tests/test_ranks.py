@@ -26,7 +26,7 @@ from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.ranks import ALONE, RankError, joined
 from hqgs.cli.main import main
 from hqgs.training.adam import Adam
-from hqgs.training.batch import ROW_BYTES, Part, Sum, part_of, to_rasterize
+from hqgs.training.batch import ROW_BYTES, Part, give_mean, part_of, to_rasterize
 from hqgs.training.config import TrainConfig
 from hqgs.training.guard import Fault
 from hqgs.training.looks import Looks
@@ -195,7 +195,7 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     plans = trainer.schedule.batch(26, trainer.state.decisions)
     assert len(plans) == 4
     assert plans[0].degree == 3
-    looks, total = Looks(scene.train, ThreeDGS(), config.background), Sum(gaussians, gaussians)
+    looks, parts = Looks(scene.train, ThreeDGS(), config.background), list[Part]()
     for plan in plans:
         look = looks.at(plan, to_rasterize(gaussians, gaussians))
         optimizer.zero_grad()
@@ -203,8 +203,8 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
         assert gaussians.shN.grad is None  # it is made of sh0's
         part = part_of(look, None, gaussians, optimizer)
         assert len(part.packed()) == pytest.approx(ROW_BYTES * len(part.rows), abs=1_000)
-        total.add(Part.unpacked(part.packed()), None)
-    assert set(total.give(optimizer).values()) == {4}
+        parts.append(Part.unpacked(part.packed()))
+    assert set(give_mean(parts, gaussians, gaussians, optimizer).values()) == {4}
     ours = {name: tensor.grad for name, tensor in gaussians.named().items()}
     optimizer.zero_grad()
     torch.stack([looks.at(plan, gaussians).loss for plan in plans]).mean().backward()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,10 +16,9 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
+from hqgs import _rust
 from hqgs.base.ranks import Ranks
-from hqgs.model.constants import SH_C0
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.harmonics import sh_basis
 from hqgs.training.adam import Adam
 from hqgs.training.densify import Densifier, gradient_norms
 from hqgs.training.guard import Fault
@@ -117,53 +116,51 @@ def exchanged(ranks: Ranks, count: int, make: Callable[[int], Part]) -> list[Par
     return [Part.unpacked(data) for answer in answers for data in answer() if data]
 
 
-class Sum:
-    """Of the parts of a step, added one after the other."""
+def give_mean(
+    parts: Sequence[Part], trained: Gaussians, modulated: Gaussians, optimizer: Adam
+) -> dict[Tensor, int]:
+    """Put the mean of the parts' gradients, added in their order, where Adam looks for it.
 
-    def __init__(self, trained: Gaussians, modulated: Gaussians) -> None:
-        n = len(trained)
-        self._trained, self._modulated = trained, modulated.means.detach()
-        self._low = torch.zeros(n, OBSERVED)
-        self._high = torch.zeros(n, *trained.shN.shape[1:])
-        self._own: dict[str, Tensor] = {}
-        self._counts: dict[str, int] = {}  # parts with a gradient, by the tensor's name
-        self.visible: Tensor = torch.zeros(n, dtype=torch.bool)
-
-    def add(self, part: Part, observes: Densifier | None) -> None:
-        """`observes`: what notes the gradients for growth; None: they do not count."""
-        rows, values = part.rows.long(), part.values
-        self._low[rows] += values[:, :OBSERVED]
-        number = (part.degree + 1) ** 2 - 1
+    Returns of how many views each tensor's mean is: those that have a gradient of it.
+    """
+    n = len(trained)
+    low, high = torch.empty(n, OBSERVED), torch.empty(n, *trained.shN.shape[1:])
+    views = [
+        (p.rows.numpy(), p.values.numpy(), p.center.tolist(), 0 if p.higher is not None else p.degree)
+        for p in parts
+    ]
+    scale = 1 / len(parts)
+    _rust.add_rows(views, modulated.means.detach().numpy(), low.numpy(), high.numpy(), scale)
+    for part in parts:
         if part.higher is not None:
-            self._high[rows] += part.higher
-        elif number:
-            offsets = (self._modulated[rows].double() - part.center).float()
-            directions = torch.nn.functional.normalize(offsets, dim=1)
-            colors = values[:, OBSERVED - 3 : OBSERVED] / SH_C0
-            basis = sh_basis(directions, part.degree)[:, 1:]
-            self._high[rows, :number] += basis[:, :, None] * colors[:, None, :]
-        seen = values[:, OBSERVED] != UNSEEN
-        self.visible[rows[seen]] = True
-        if observes is not None:
-            observes.note(rows[seen], values[seen, OBSERVED])
-        for name in self._trained.named():
-            self._counts[name] = self._counts.get(name, 0) + (name != "shN" or number > 0)
-        for name, gradient in part.own.items():
-            self._own[name] = self._own[name] + gradient if name in self._own else gradient.clone()
-            self._counts[name] = self._counts.get(name, 0) + 1
+            high[part.rows.long()] += scale * part.higher
+    gradients = dict(zip(WIDTHS, low.split(list(WIDTHS.values()), dim=1), strict=True))
+    if any(part.degree for part in parts):
+        gradients["shN"] = high
+    optimizer.zero_grad()
+    views_of = dict[Tensor, int]()
+    for name, gradient in gradients.items():
+        param = getattr(trained, name)
+        param.grad, views_of[param] = gradient.reshape(param.shape).contiguous(), len(parts)
+    for name, param in _own(optimizer).items():
+        if own := [part.own[name] for part in parts if name in part.own]:
+            param.grad, views_of[param] = torch.stack(own).sum(0) / len(own), len(own)
+    return views_of
 
-    def give(self, optimizer: Adam) -> Mapping[Tensor, int]:
-        """Put each tensor's mean gradient where Adam looks for it; how many views each mean is of."""
-        gradients = dict(zip(WIDTHS, self._low.split(list(WIDTHS.values()), dim=1), strict=True))
-        gradients["shN"] = self._high
-        named, counts = self._trained.named() | _own(optimizer), dict[Tensor, int]()
-        optimizer.zero_grad()
-        for name, gradient in (gradients | self._own).items():
-            if count := self._counts.get(name, 0):
-                param = named[name]
-                param.grad = (gradient / count).reshape(param.shape)
-                counts[param] = count
-        return counts
+
+def note_views(parts: Sequence[Part], densifier: Densifier) -> None:
+    """What growth goes by."""
+    for part in parts:
+        seen = part.values[:, OBSERVED] != UNSEEN
+        densifier.note(part.rows[seen].long(), part.values[seen, OBSERVED])
+
+
+def visible_in(parts: Sequence[Part], count: int) -> Tensor:
+    """Which of `count` Gaussians any of the views shows, bool."""
+    visible = torch.zeros(count, dtype=torch.bool)
+    for part in parts:
+        visible[part.rows[part.values[:, OBSERVED] != UNSEEN].long()] = True
+    return visible
 
 
 def _own(optimizer: Adam) -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, cut_harmonics, reset_opacities
-from hqgs.training.batch import Part, Sum, exchanged, part_of, to_rasterize
+from hqgs.training.batch import Part, exchanged, give_mean, note_views, part_of, to_rasterize, visible_in
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
@@ -265,13 +265,13 @@ class Trainer:
         parts = exchanged(self.ranks, len(plans), make)
         views = [looks.views[plan.view] for plan in plans]
         if self._sound(views, [part.fault for part in parts], parts[-1].loss):
+            sound = [part for part in parts if part.fault is None]
+            if plans[0].observes:  # the end of growth ends a step: none of it grows any more
+                note_views(sound, state.densifier)
             with torch.no_grad():
-                total = Sum(state.gaussians, self.method.modulate(state.gaussians))
-                for plan, part in zip(plans, parts, strict=True):
-                    if part.fault is None:
-                        total.add(part, state.densifier if plan.observes else None)
-                views_of = total.give(state.optimizer)
-            visible = total.visible if self.config.selective_adam else None
+                modulated = self.method.modulate(state.gaussians)
+            views_of = give_mean(sound, state.gaussians, modulated, state.optimizer)
+            visible = visible_in(sound, len(state.gaussians)) if self.config.selective_adam else None
             state.optimizer.step(visible=visible, views=views_of)
         step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
         return step, [part.seen for part in parts]
