@@ -178,7 +178,8 @@ def open_run(
             for file in (CHECKPOINT, PLY):
                 remove_leftovers(folder / file)
         going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
-        trainer = Trainer(scene, config if going_on else fitted(scene, config, ranks), ranks)
+        config = config if going_on else fitted(scene, config, ranks)
+        trainer = Trainer(scene, config, ranks)
         if going_on:
             with _for_all(checkpoint, ranks) as path:
                 trainer.restore(path)

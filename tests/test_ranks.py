@@ -221,7 +221,7 @@ def test_a_part_comes_back_with_the_same_bits() -> None:
     part = Part(
         loss=0.1 + 0.2,
         degree=2,
-        seen=torch.tensor([math.pi], dtype=torch.float64),
+        measured=torch.tensor([math.pi], dtype=torch.float64),
         fault=Fault("gradient", ["means", "sh0"], rows, 3),
         center=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64),
         rows=torch.tensor([1, 5], dtype=torch.int32),
@@ -234,7 +234,7 @@ def test_a_part_comes_back_with_the_same_bits() -> None:
     assert back.fault is not None
     assert (back.fault.what, back.fault.tensors, back.fault.values) == ("gradient", ["means", "sh0"], 3)
     assert torch.equal(back.fault.rows, rows)
-    for name in ("seen", "center", "rows", "values"):
+    for name in ("measured", "center", "rows", "values"):
         there, here = getattr(back, name), getattr(part, name)
         assert there.dtype == here.dtype
         assert there.numpy().tobytes() == here.numpy().tobytes()

@@ -36,7 +36,7 @@ class Part:
 
     loss: float
     degree: int  # of the harmonics
-    seen: Tensor  # what the method notes of it, float64 [K]
+    measured: Tensor  # what the method goes by after the step, float64 [K]
     fault: Fault | None  # with one there are no gradients
     center: Tensor  # of the camera, float64 [3]
     rows: Tensor  # int32 [M]: the Gaussians that the view shows, or that have a gradient
@@ -46,7 +46,7 @@ class Part:
 
     def packed(self) -> bytes:
         """As bytes; `unpacked` gives the same bits back."""
-        tensors = {"seen": self.seen, "center": self.center, "rows": self.rows, "values": self.values}
+        tensors = {"measured": self.measured, "center": self.center, "rows": self.rows, "values": self.values}
         tensors |= {f"own.{name}": gradient.contiguous() for name, gradient in self.own.items()}
         if self.higher is not None:
             tensors["higher"] = self.higher
@@ -64,7 +64,7 @@ class Part:
         return Part(
             loss=meta["loss"],
             degree=meta["degree"],
-            seen=tensors["seen"],
+            measured=tensors["measured"],
             fault=None if fault is None else Fault(fault[0], fault[1], tensors["culled"], fault[2]),
             center=tensors["center"],
             rows=tensors["rows"],
@@ -83,7 +83,7 @@ def part_of(look: Look, fault: Fault | None, trained: Gaussians, optimizer: Adam
     """What a look gives after its backward pass, which left its gradients in the trained tensors."""
     empty = torch.zeros(0, dtype=torch.int32), torch.zeros(0, OBSERVED + 1)
     center = torch.from_numpy(look.camera.center.copy()).double()
-    part = Part(float(look.loss.detach()), look.plan.degree, look.seen, fault, center, *empty, None, {})
+    part = Part(float(look.loss.detach()), look.plan.degree, look.measured, fault, center, *empty, None, {})
     if fault is not None:
         return part
     n, gradients = len(trained), {name: tensor.grad for name, tensor in trained.named().items()}

@@ -205,11 +205,11 @@ class TrainConfig:
     """
 
     iterations: int = 30_000  # training views seen
-    batch: int = 1  # of them in a step, at most
     method: str = AUTO  # one of METHODS
     seed: int = 0  # of everything random
     seconds: float | None = None  # of training that the number of iterations was chosen for
     turn: tuple[int, int] | None = None  # the iteration after which the run gets another length, and that
+    batch: int = 1  # views in a step, at most
     sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
     lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to

@@ -35,7 +35,7 @@ class Look:
     meta: RasterizationMeta
     photo: Tensor  # the developed render, [H, W, 3]
     loss: Tensor
-    seen: Tensor  # what the method notes of it, [K]
+    measured: Tensor  # what the method goes by after the step, [K]
 
     def backward(self, trained: Gaussians, optimizer: Adam) -> Fault | None:
         """Compute the gradients of all that is trained; what is not finite of them or of the loss, if
@@ -81,7 +81,9 @@ class Looks:
         photo = shot.develop(render)
         image = method.compare(photo, target)
         loss = method.loss(image, target)
-        return Look(plan, view, shot.camera, render, meta, photo, loss, method.seen(image.detach(), target))
+        return Look(
+            plan, view, shot.camera, render, meta, photo, loss, method.measured(image.detach(), target)
+        )
 
     @torch.no_grad()
     def psnr(

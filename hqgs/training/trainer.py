@@ -245,7 +245,7 @@ class Trainer:
                 state.densifier.observe(gradient[0], radii, camera.width, camera.height)
             visible = (radii > 0).all(dim=1) if self.config.selective_adam else None
             state.optimizer.step(visible=visible)
-        return Step(float(look.loss.detach()), look.photo.detach(), look.view), [look.seen]
+        return Step(float(look.loss.detach()), look.photo.detach(), look.view), [look.measured]
 
     def _together(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
         """Train on several views, of which each rank renders its share; all add up what all have found."""
@@ -274,7 +274,7 @@ class Trainer:
             visible = visible_in(sound, len(state.gaussians)) if self.config.selective_adam else None
             state.optimizer.step(visible=visible, views=views_of)
         step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
-        return step, [part.seen for part in parts]
+        return step, [part.measured for part in parts]
 
     def _grow(self, plan: Plan) -> Growth:
         """Add and remove Gaussians."""

@@ -49,8 +49,8 @@ class Method(Protocol[T]):
     """The replaceable part of a training step.
 
     The trainer calls `prepare` for each training view and then `start`, once. A step is, for each of its
-    views, `modulate`, `shot`, rasterization, the shot's `develop`, `compare`, `loss` and `seen`, which change
-    nothing; then Adam, `rows_changed` where Gaussians came or went, and `after_step`.
+    views, `modulate`, `shot`, rasterization, the shot's `develop`, `compare`, `loss` and `measured`, which
+    change nothing; then Adam, `rows_changed` where Gaussians came or went, and `after_step`.
     """
 
     @property
@@ -99,7 +99,7 @@ class Method(Protocol[T]):
         """Gaussians were added or removed: row i stems from row `parents[i]` of those before, [N]."""
         ...
 
-    def seen(self, image: Tensor, target: T) -> Tensor:
+    def measured(self, image: Tensor, target: T) -> Tensor:
         """What `after_step` is to know of the image that the loss is of: a few numbers, float64 [K]."""
         ...
 
@@ -165,7 +165,7 @@ class Plain:
     def rows_changed(self, state: TrainState, parents: Tensor) -> None:
         pass
 
-    def seen(self, image: Tensor, target: Any) -> Tensor:
+    def measured(self, image: Tensor, target: Any) -> Tensor:
         return torch.zeros(0, dtype=torch.float64)
 
     def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:

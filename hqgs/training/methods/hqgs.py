@@ -147,9 +147,9 @@ class HQGS(Plain):
         if self._smallest is not None:
             self._measure(state.gaussians, state.iteration)
 
-    def seen(self, image: Tensor, target: FormedTarget) -> Tensor:
+    def measured(self, image: Tensor, target: FormedTarget) -> Tensor:
         """The error at the held pixels, if there are any."""
-        return super().seen(image, target) if target.held is None else target.held.error(image)[None]
+        return super().measured(image, target) if target.held is None else target.held.error(image)[None]
 
     def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
         """The smallest sizes and the cameras' depths age, and the held pixels decide on the rates."""
