@@ -226,6 +226,7 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     """Train to the end or to the first Ctrl-C and write everything into `out`, which the caller holds."""
     config, ranks = trainer.config, trainer.ranks
     out = Path(out) if out is not None and ranks.first else None
+    ranks.count_anew()
     with deferred_interrupt() as interrupted:
         if out is not None:
             save_cameras(out, trainer.scene)

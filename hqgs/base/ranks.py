@@ -41,6 +41,10 @@ class Ranks:
     local: int = 1  # of them on this machine
 
     def __init__(self) -> None:
+        self.count_anew()
+
+    def count_anew(self) -> None:
+        """What `record` tells begins now."""
         self.worked: float = 0.0  # s, on its share of the views
         self.waited: float = 0.0  # s, for others
         self.sent: int = 0  # bytes
@@ -80,7 +84,7 @@ class Ranks:
             )
 
     def record(self) -> dict[str, Any]:
-        """What this rank has done so far, as the report has it."""
+        """What this rank has done since, as the report has it."""
         return {
             "rank": self.rank,
             "view_seconds": self.worked,
