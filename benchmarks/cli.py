@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hqgs
-from benchmarks import endurance, export, frugality, time
+from benchmarks import endurance, export, frugality, ranks, time
 from benchmarks.accuracy import run as accuracy
 from benchmarks.features import run as features
 from benchmarks.output import Benchmark, command_line, write_results
@@ -20,7 +20,7 @@ from benchmarks.stability import run as stability
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.training.trainer import TrainingError
 
-MODULES = (accuracy, endurance, export, features, frugality, quality, speed, stability, time)
+MODULES = (accuracy, endurance, export, features, frugality, quality, ranks, speed, stability, time)
 BENCHMARKS: dict[str, Benchmark] = {m.__name__.split(".")[1]: m.BENCHMARK for m in MODULES}
 
 

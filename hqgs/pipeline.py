@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import cast
-
-import numpy as np
 
 from hqgs import __version__
 from hqgs.base.files import (
@@ -25,19 +24,21 @@ from hqgs.base.files import (
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
+from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, untold
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.photo_facts import photo_record
-from hqgs.evaluation.records import HistoryEntry, LearnedRecord, Report, SfmRecord
+from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
+from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.clock import fitting
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
-from hqgs.training.methods.cameras import Found
+from hqgs.training.notes import learned_record, run_notes
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values, with_iterations
 from hqgs.training.trainer import Trainer
@@ -74,6 +75,7 @@ def train(
     *,
     out: str | Path | None = None,
     iterations: int | None = None,
+    batch: int = 1,
     seconds: float | None = None,
     method: str = AUTO,
     leave_out: str = AUTO,
@@ -87,6 +89,7 @@ def train(
     overwrite: bool = False,
     progress: OnProgress | None = None,
     told: OnStage = untold,
+    ranks: Ranks = ALONE,
 ) -> Run:
     """Train a scene on the CPU. Same seed, same bits, for any number of threads, interrupted or not.
 
@@ -98,7 +101,8 @@ def train(
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
         out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, report.html,
             `comparison/*.png`, error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
-        iterations: training steps; None: at most 30,000, fewer where the scene has stopped improving.
+        iterations: training views to see; None: at most 30,000, fewer where the scene has stopped improving.
+        batch: of them in a step: one after the other in one process, shared out by several.
         seconds: of training, in place of `iterations`: as many as fit in, by the steps of this machine before
             the run and once more after growth. `iterations` and `turn` of the configuration in the report,
             and plan.json, tell what that came to: a run with these makes the same bits again.
@@ -111,21 +115,25 @@ def train(
         guidance: of hqgs: "formation", or "paper", its published form.
         formation: what hqgs takes for the photos' degradation, as `hqgs.degrade` reads it; "auto": it looks.
         eval_every: iterations between evaluations; None: a tenth of the run.
-        config: the whole configuration, in place of the seven before it.
+        config: the whole configuration, in place of what before it is part of it.
         resume: go on from the checkpoint in `out`, if there is one; a run that has come to its end goes on
             where `iterations` is larger, with the schedule of the longer run from there on.
         overwrite: begin anew in a folder that holds a run.
         progress: is called after each step.
         told: hears what is being done before the first step, and how far it is.
+        ranks: of `hqgs.base.ranks.joined`, where torchrun has started several processes that make the same
+            call. The result does not depend on their number; the first one writes and reports.
 
     Raises:
         ValueError: a scene or a setting that cannot be trained, a damaged checkpoint, or one of another run.
         FileExistsError: `out` holds a run, and neither `resume` nor `overwrite` is set.
         FolderBusyError: another run writes into `out`.
         TrainingError: the training cannot go on; the message says at which iteration and why.
+        RankError: another of the ranks has failed or gone.
     """
     asked = run_config(
         iterations=iterations,
+        batch=batch,
         method=method,
         leave_out=leave_out,
         seed=seed,
@@ -136,11 +144,12 @@ def train(
     )
     if config is not None and asked != run_config():
         raise ValueError("config is the whole configuration: nothing of it can be given beside it")
-    if out is not None and (Path(out) / CHECKPOINT).exists() and not (resume or overwrite):
+    taken = ranks.first and out is not None and (Path(out) / CHECKPOINT).exists()
+    if taken and not (resume or overwrite):
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
-    with open_run(scene, config or asked, out, resume, seconds, told) as trainer:
+    with open_run(scene, config or asked, out, resume, seconds, told, ranks) as trainer:
         return run_to_end(trainer, out, progress)
 
 
@@ -152,59 +161,94 @@ def open_run(
     resume: bool = False,
     seconds: float | None = None,
     told: OnStage = untold,
+    ranks: Ranks = ALONE,
 ) -> Iterator[Trainer]:
     """A trainer that holds the folder `out`: fresh, or with `resume` where the checkpoint there ends.
 
-    With `seconds` a fresh one has as many iterations as fit in.
+    With `seconds` a fresh one has as many iterations as fit in. Of several `ranks` the first one holds the
+    folder, and sends the others the checkpoint.
 
     Without a checkpoint `resume` starts fresh (the run may have been killed before its first one). A fresh
     run removes an older checkpoint. See `train` for the errors.
     """
     if seconds is not None:
         config = replace(config, seconds=seconds)
-    if out is None:
-        yield Trainer(scene, fitted(scene, config, told), told)
-        return
-    checkpoint = Path(out) / CHECKPOINT
-    with lock_folder(out):
-        for file in (CHECKPOINT, PLY):
-            remove_leftovers(Path(out) / file)
-        going_on = resume and checkpoint.exists()
-        config = config if going_on else fitted(scene, config, told)
-        trainer = Trainer(scene, config, told)
-        if not resume:
+    folder = Path(out) if out is not None and ranks.first else None
+    with nullcontext() if folder is None else lock_folder(folder):
+        checkpoint = None
+        if folder is not None:
+            checkpoint = folder / CHECKPOINT
+            for file in (CHECKPOINT, PLY):
+                remove_leftovers(folder / file)
+        going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
+        config = config if going_on else fitted(scene, config, told, ranks)
+        trainer = Trainer(scene, config, told, ranks)
+        if going_on:
+            with _for_all(checkpoint, ranks) as path:
+                trainer.restore(path)
+        elif checkpoint is not None:
             checkpoint.unlink(missing_ok=True)
-        elif checkpoint.exists():
-            trainer.restore(checkpoint)
-        asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
-        write_json(Path(out) / CONFIG, asked)
+        if ranks.count > 1:
+            ranks.agree(scene_fingerprint(trainer.scene), "the scene")
+            ranks.agree(trainer.config, "the configuration")
+        _check_agreement(trainer)
+        if folder is not None:
+            asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
+            write_json(folder / CONFIG, asked)
         yield trainer
 
 
-def fitted(scene: Scene, config: TrainConfig, told: OnStage = untold) -> TrainConfig:
+@contextmanager
+def _for_all(file: Path | None, ranks: Ranks) -> Iterator[Path]:
+    """The first rank's file, on each rank: the others, which have None, get a copy for a while."""
+    data = ranks.begin(file.read_bytes() if file is not None and ranks.count > 1 else b"")()[0]
+    if file is not None:
+        yield file
+        return
+    with TemporaryDirectory() as name:
+        copy = Path(name) / CHECKPOINT
+        copy.write_bytes(data)
+        yield copy
+
+
+def _check_agreement(trainer: Trainer) -> None:
+    """RankError where a rank has come to another state than the first one."""
+    if trainer.ranks.count > 1:
+        trainer.ranks.agree(checksum(trainer.state.tensors()), f"the state at iteration {trainer.iteration}")
+
+
+def fitted(scene: Scene, config: TrainConfig, told: OnStage = untold, ranks: Ranks = ALONE) -> TrainConfig:
     """The configuration with the iterations that fit into its seconds, if it has any."""
     if config.seconds is None or config.turn is not None:
         return config
-    trainer = Trainer(scene, config, told)
-    return with_iterations(config, fitting(trainer, config.seconds))
+    trainer = Trainer(scene, config, told, ranks)
+    return with_iterations(config, ranks.tell(fitting(trainer, config.seconds))[0])
 
 
 def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProgress | None = None) -> Run:
     """Train to the end or to the first Ctrl-C and write everything into `out`, which the caller holds."""
-    out = None if out is None else Path(out)
-    config = trainer.config
+    config, ranks = trainer.config, trainer.ranks
+    out = Path(out) if out is not None and ranks.first else None
+    ranks.count_anew()
     with deferred_interrupt() as interrupted:
         if out is not None:
             save_cameras(out, trainer.scene)
-        while trainer.iteration < trainer.length and not interrupted.is_set():
+        while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):
+            before = trainer.iteration
             step = trainer.step()
-            evaluate = trainer.iteration % config.eval_every == 0
+
+            def due(every: int, before: int = before) -> bool:
+                return trainer.iteration // every > before // every
+
+            evaluate = due(config.eval_every)
             if evaluate:
                 trainer.evaluate()
             if progress is not None:
                 progress(progress_of(trainer, step, trainer.history[-1] if evaluate else None))
-            if out is not None and trainer.iteration % config.checkpoint_every == 0:
-                trainer.save(out / CHECKPOINT)
+            if due(config.checkpoint_every):
+                _check_agreement(trainer)
+                if out is not None:
+                    trainer.save(out / CHECKPOINT)
         views = trainer.held_out()
         trainer.evaluate(views)
         if out is not None:
@@ -213,8 +257,11 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
 
 
 def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
-    """Measure the trained scene; write scene.ply and the report into `out`, if there is one."""
-    scene, guard = trainer.scene, trainer.guard
+    """Measure the trained scene; write scene.ply and the report into `out`, if there is one.
+
+    Of several ranks the first one measures, and tells the others.
+    """
+    scene, guard, ranks = trainer.scene, trainer.guard, trainer.ranks
     config, decisions = trainer.config, trainer.state.decisions
     if decisions.turned:
         config = replace(config, turn=(decisions.turned, decisions.length))
@@ -232,11 +279,36 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
         left_out.append(LeftOut(what, "the run was stopped"))
     if not views:
         left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
-    culled = views.culled()
+    records = cast(list[RankRecord], ranks.tell(ranks.record()) if ranks.count > 1 else [])
+    report = _report(trainer, views, model, left_out, config, records, out) if ranks.first else None
+    return Run(
+        model=model,
+        report=cast(Report, ranks.tell(report)[0]),
+        history=trainer.history,
+        left_out=left_out,
+        iterations=trainer.iteration,
+        length=trainer.length,
+        seconds=trainer.seconds,
+        views=views,
+        out=out,
+    )
+
+
+def _report(
+    trainer: Trainer,
+    views: HeldOutViews,
+    model: Gaussians,
+    left_out: list[LeftOut],
+    config: TrainConfig,
+    ranks: list[RankRecord],
+    out: Path | None,
+) -> Report:
+    """The report, written into `out`, if there is one; what made it is in `trainer`."""
+    scene, culled = trainer.scene, views.culled()
     result = RunResult(
         scene=scene.name,
         source=scene.source,
-        notes=[*scene.notes, *_notes(trainer)],
+        notes=[*scene.notes, *run_notes(trainer)],
         method=config.method,
         seed=config.seed,
         iterations=trainer.iteration,
@@ -250,11 +322,12 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
         scene_bytes=None if out is None else (out / PLY).stat().st_size,
         config=asdict(config),
         sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
-        guard=guard.summary(),
+        guard=trainer.guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
         views=views,
-        learned=[_learned(found) for found in trainer.method.found()],
+        learned=[learned_record(found) for found in trainer.method.found()],
         photos=[] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
+        ranks=ranks,
     )
     learned = None
     if out is not None and result.learned:
@@ -266,68 +339,4 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
         write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, learned))
-    return Run(
-        model=model,
-        report=report,
-        history=trainer.history,
-        left_out=left_out,
-        iterations=trainer.iteration,
-        length=trainer.length,
-        seconds=trainer.seconds,
-        views=views,
-        out=out,
-    )
-
-
-def _learned(found: Found) -> LearnedRecord:
-    return {
-        "name": found.name,
-        "shake_px": found.extent,
-        "way_px": found.way.tolist(),
-        "defocus_px": found.defocus,
-        "focus": found.focus,
-        "gains": found.gains.tolist(),
-    }
-
-
-def _notes(trainer: Trainer) -> list[str]:
-    own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
-    if more := trainer.first_points - own:
-        notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
-    if some := [entry["views"] for entry in trainer.history if "views" in entry]:
-        notes.append(
-            f"while it trained, {max(some)} of {len(trainer.scene.test)} held-out views were measured, which "
-            "are evenly spread, to save time; the last values are of all"
-        )
-    if (seconds := trainer.config.seconds) is not None:
-        text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
-        if at := trainer.state.decisions.turned:
-            text += f"; after iteration {at}, {trainer.length} in all"
-        notes.append(f"{text}. `--plan` with plan.json trains the same again, bit for bit")
-    if trainer.lengthened is not None:
-        notes.append(
-            f"the run had ended at iteration {trainer.lengthened}; from there on its schedule is that of "
-            f"{trainer.config.iterations} iterations: learning rates rose again"
-        )
-    if left < 1:
-        why = "pixels held back from the noisy photos showed no gain any more"
-        notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
-    if found := trainer.method.found():
-        ways = sorted(photo.extent for photo in found)
-        if moved := sum(way > 0 for way in ways):
-            notes.append(
-                f"{moved} of {len(ways)} photos are shaken, by {ways[len(ways) // 2]:.1f} px in the median "
-                f"and {ways[-1]:.1f} px at most; held-out photos that are shaken themselves measure a sharp "
-                "scene as worse than it is"
-            )
-        discs = sorted(photo.defocus for photo in found)
-        if soft := sum(disc > 0 for disc in discs):
-            notes.append(
-                f"{soft} of {len(discs)} photos are out of focus somewhere, with discs of up to "
-                f"{discs[-1]:.1f} px radius; held-out photos that are so themselves measure a sharp scene as "
-                "worse than it is"
-            )
-        gains = np.log2([photo.gains for photo in found])
-        if gains.any():
-            notes.append(f"photos are up to {np.abs(gains).max():.2f} stops brighter or darker than the mean")
-    return notes
+    return report

@@ -113,6 +113,9 @@ pub mod internals {
         pub mod jpeg_cells {
             pub use crate::training::jpeg_cells::*;
         }
+        pub mod rows {
+            pub use crate::training::rows::*;
+        }
         pub mod separable {
             pub use crate::training::separable::*;
         }

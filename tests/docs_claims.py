@@ -36,7 +36,7 @@ FOLDERS = (
 )  # whose paths are checked
 SOURCES = (".py", ".rs", ".toml", ".md")  # a name with such an end is a path from the repository's top
 CLASSES = ("hqgs", "hqgs.model.gaussians", "hqgs.scene.scene", "hqgs.training.config")  # of `Scene.extent`
-TOOLS = ("pip", "pytest", "ruff", "sphinx-build")  # of others, whose flags are not checked
+TOOLS = ("pip", "pytest", "ruff", "sphinx-build", "torchrun")  # of others, whose flags are not checked
 
 
 @lru_cache(maxsize=1)
@@ -208,6 +208,8 @@ def _commands(line: str) -> Iterator[list[str]]:
             continue
         if command[:2] == ["uv", "run"]:
             command = command[2:]
+        if command[:1] == ["torchrun"] and "-m" in command:
+            command = ["python", *command[command.index("-m") :]]
         if command[:1] == ["python"] and command[1:2] != ["-m"]:
             command = command[1:]
         if command:

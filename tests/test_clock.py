@@ -18,6 +18,7 @@ from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock
+from hqgs.training import schedule as schedule_module
 from hqgs.training.config import AUTOMATIC, DensifyConfig, TrainConfig, run_config
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import with_iterations, with_plan
@@ -41,7 +42,7 @@ def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
 
 
 def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
-    at = STOP + clock.TAIL
+    at = STOP + schedule_module.TAIL
     assert turned_at(seconds=30.0, step=0.1) == (at, 300)
     assert turned_at(seconds=35.0, step=0.1) == (at, 350)
     assert turned_at(seconds=27.0, step=0.1) == (at, 270)
@@ -56,17 +57,15 @@ def test_as_many_iterations_as_fit() -> None:
     large = [replace(view, camera=replace(view.camera, width=64, height=64)) for view in tiny_scene().train]
 
     class Fake:
-        seconds, first_points, scene = 0.0, 2, SimpleNamespace(points=[0, 0])
+        seconds, iteration, first_points, scene = 0.0, 0, 2, SimpleNamespace(points=[0, 0])
         schedule = Schedule.of(config, large, as_photographed=True)
 
         def __init__(self, config: TrainConfig) -> None:
             self.config = config
 
-        def next_plan(self) -> Any:
-            return self.schedule.plan(1, self.schedule.start())
-
-        def step(self, plan: Any) -> None:
-            self.seconds += 0.02 if plan.coarse else 0.1
+        def step(self, coarse: bool) -> None:
+            self.iteration += 1
+            self.seconds += 0.02 if coarse else 0.1
 
     fits = clock.fitting(Fake(config), 60.0)  # type: ignore[arg-type]
     assert (0.6 * 0.02 + 0.4 * 0.1) * clock.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
@@ -75,7 +74,7 @@ def test_as_many_iterations_as_fit() -> None:
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, "TAIL", 3)
+    monkeypatch.setattr(schedule_module, "TAIL", 3)
     monkeypatch.setattr(clock, "FEWEST", 30)
     monkeypatch.setattr(clock, "MOST", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")

@@ -18,13 +18,14 @@ from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
 import hqgs
-import hqgs.training.trainer as train_module
 from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.interrupt import ENDINGS
+from hqgs.evaluation import held_out
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
 from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.scene import Scene, View
+from hqgs.training import looks
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method
 from hqgs.training.methods.base import Target, ThreeDGS, photo_tensors
 from hqgs.training.trainer import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
@@ -134,13 +135,13 @@ def test_the_learning_rates_of_3dgs() -> None:
 
 def test_the_sh_degree_rises_by_one_per_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     degrees = []
-    real = train_module.render_view
+    real = looks.render_view
 
     def spy(gaussians: Gaussians, camera: Any, sh_degree: int, background: Any) -> Any:
         degrees.append(sh_degree)
         return real(gaussians, camera, sh_degree, background)
 
-    monkeypatch.setattr(train_module, "render_view", spy)
+    monkeypatch.setattr(looks, "render_view", spy)
     trainer = Trainer(tiny_scene(), tiny_config(sh_interval=4, sh_degree=2, densify=ONLY_TRAIN))
     steps(trainer, 14)
     assert degrees == [0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 2, 2, 2]
@@ -151,7 +152,7 @@ def test_evaluation_takes_no_training_time(monkeypatch: pytest.MonkeyPatch, tmp_
         time.sleep(0.3)
         return 0.5
 
-    monkeypatch.setattr(train_module, "ssim", slow_ssim)
+    monkeypatch.setattr(held_out, "ssim", slow_ssim)
     trainer = Trainer(tiny_scene(), tiny_config())
     trainer.step()
     before = trainer.seconds

@@ -138,8 +138,8 @@ class TrainingScreen(Screen):
         if self._first is None:
             self._first = now.iteration + _WARM_UP, 0.0
         start, seconds = self._first
-        if now.iteration == start:
-            self._first = start, now.seconds
+        if not seconds and now.iteration >= start:
+            self._first = now.iteration, now.seconds
         elif now.iteration >= start + _MEASURED or (now.iteration > start and now.seconds - seconds >= _SOON):
             self._told = True
             step, left = (now.seconds - seconds) / (now.iteration - start), now.length - now.iteration

@@ -16,20 +16,28 @@ import tyro
 import hqgs
 from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, PAGE, PLY
 from hqgs.base.left_out import format_left_out
+from hqgs.base.ranks import RankError, Ranks, joined
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
+from hqgs.cli.ranks import restarted, told_by_the_first
 from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
-from hqgs.training.settings import PRESETS, read_config, with_iterations, with_plan
+from hqgs.training.settings import (
+    PRESETS,
+    config_of_values,
+    config_values,
+    read_config,
+    with_iterations,
+    with_plan,
+)
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run
-    from hqgs.scene.scene import Scene
     from hqgs.training.progress import Progress
 
 EXPERT = "--config."
@@ -47,7 +55,9 @@ class Train(Photos):
     """quick: 1,000 iterations on small photos, a first look. standard: until the scene has stopped improving,
     photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
     iterations: Number = None
-    """Training steps (standard: at most 30,000, fewer where the scene has stopped improving)."""
+    """Training views to see (standard: at most 30,000, fewer where the scene has stopped improving)."""
+    batch: Number = None
+    """Views in a step (1). Several processes of torchrun share them out: docs/ranks.md."""
     seconds: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
     """Train for S seconds, in place of --iterations: the best scene that this machine makes in them."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint="")] = None
@@ -175,7 +185,7 @@ def config_of(options: Train) -> TrainConfig:
     asked = run_config(iterations=config.iterations, leave_out=options.leave_out or AUTO)
     changes: dict[str, Any] = {
         name: value
-        for name in ("method", "seed", "eval_every")
+        for name in ("method", "seed", "eval_every", "batch")
         if (value := getattr(options, name)) is not None
     }
     if options.leave_out is not None and file is not None:
@@ -204,78 +214,101 @@ def scene_of_run(out: Path) -> dict[str, Any]:
 
 def run(options: Train) -> int:
     """Train what the options say; return the exit code."""
-    started = time.perf_counter()
+    started, out = time.perf_counter(), options.out
     try:
-        config = options.expert if isinstance(options, Whole) else config_of(options)
-        parse_degradation(options.degrade)
-        if (options.out / CHECKPOINT).exists() and not (options.resume or options.overwrite):
-            raise FileExistsError(
-                f"{options.out} holds a run; continue it with --resume, begin anew with --overwrite, or "
-                "choose another --out"
-            )
-        if options.out.exists() and not options.out.is_dir():
-            raise ValueError(f"--out {options.out} is a file: name a folder for the run")
-        if options.threads is not None:
-            hqgs.set_num_threads(options.threads)
-        if options.view:
-            check(options.port)
-        ready(options.scene)
-        with LoadingScreen() as screen:
-            scene = _load(options, config, screen)
-        tell_notes(scene)
-        loaded = time.perf_counter()
-        length = f"at most {config.iterations:,} iterations"
-        if options.seconds is not None:
-            length = f"{duration(options.seconds)} of training"
-        print(f"looking at the photos, then {length}", flush=True)
-        live = (
-            LiveView(scene, options.out, port=options.port, open_browser=options.open)
-            if options.view
-            else None
-        )
-        with TrainingScreen() as bar:
-
-            def show(now: Progress) -> None:
-                bar(now)
-                if live is not None:
-                    live(now)
-
-            done = hqgs.train(
-                scene,
-                out=options.out,
-                config=config,
-                resume=options.resume,
-                overwrite=options.overwrite,
-                progress=show,
-                told=bar.stage,
-            )
+        with joined() as ranks, told_by_the_first(ranks):
+            done, live, screen, bar, loaded = _train(restarted(options, ranks), ranks)
     except KeyboardInterrupt:
-        if (options.out / CHECKPOINT).exists():
+        if (out / CHECKPOINT).exists():
             return fail(130, "stopped at once; --resume goes on from the last checkpoint")
-        found = (
-            " The same command goes on with what COLMAP has found" if (options.out / KEPT).exists() else ""
-        )
+        found = " The same command goes on with what COLMAP has found" if (out / KEPT).exists() else ""
         return fail(130, f"stopped before the first checkpoint.{found}")
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
-        return fail(1, f"{options.out}: {error}")
-    except hqgs.TrainingError as error:
+        return fail(1, f"{out}: {error}")
+    except (hqgs.TrainingError, RankError) as error:
         return fail(1, str(error))
+    code = 0 if done.finished else 130
+    if not ranks.first:
+        return code
     times = Times(started, loaded, bar.began or loaded, bar.ended or loaded, time.perf_counter())
     _summary(options, done, screen.colmap_seconds, times)
     if not done.finished:
-        command = shlex.join(["hqgs", "train", options.scene, "--out", str(options.out), "--resume"])
+        command = shlex.join(["hqgs", "train", options.scene, "--out", str(out), "--resume"])
         print(
             f"stopped at iteration {done.iterations} of {done.length}; go on with: {command}", file=sys.stderr
         )
     if live is not None:
         live.stay() if done.finished else live.close()
-    return 0 if done.finished else 130
+    return code
 
 
-def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
-    """The scene; where a run goes on, as it was, but for what the options say otherwise."""
+def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingScreen, TrainingScreen, float]:
+    """The run, what has shown it, and when its scene was loaded."""
+    config = _checked(options) if ranks.first else None
+    config = config_of_values(ranks.tell(config and config_values(config))[0], "rank 0")
+    if options.threads is not None:
+        hqgs.set_num_threads(options.threads)
+    elif ranks.local > 1:
+        hqgs.set_num_threads(max(1, hqgs.get_num_threads() // ranks.local))
+    ready(options.scene)
+    asked = ranks.tell(_asked(options, config) if ranks.first else None)[0]
+    with LoadingScreen() as screen:
+        if not ranks.first:
+            ranks.tell(None)  # what COLMAP finds for the first one, the others read
+        scene = hqgs.load(
+            **asked, skip_unreadable="photos" in config.leave_out, cache=options.out, told=screen.stage
+        )
+        if ranks.first:
+            ranks.tell(None)
+    tell_notes(scene)
+    loaded = time.perf_counter()
+    length = f"at most {config.iterations:,} iterations"
+    if options.seconds is not None:
+        length = f"{duration(options.seconds)} of training"
+    print(f"looking at the photos, then {length}", flush=True)
+    live = None
+    if options.view and ranks.first:
+        live = LiveView(scene, options.out, port=options.port, open_browser=options.open)
+    with TrainingScreen() as bar:
+
+        def show(now: Progress) -> None:
+            bar(now)
+            if live is not None:
+                live(now)
+
+        done = hqgs.train(
+            scene,
+            out=options.out,
+            config=config,
+            resume=options.resume,
+            overwrite=options.overwrite,
+            progress=show,
+            told=bar.stage,
+            ranks=ranks,
+        )
+    return done, live, screen, bar, loaded
+
+
+def _checked(options: Train) -> TrainConfig:
+    """The configuration of options that can be used."""
+    config = options.expert if isinstance(options, Whole) else config_of(options)
+    parse_degradation(options.degrade)
+    if (options.out / CHECKPOINT).exists() and not (options.resume or options.overwrite):
+        raise FileExistsError(
+            f"{options.out} holds a run; continue it with --resume, begin anew with --overwrite, or "
+            "choose another --out"
+        )
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"--out {options.out} is a file: name a folder for the run")
+    if options.view:
+        check(options.port)
+    return config
+
+
+def _asked(options: Train, config: TrainConfig) -> dict[str, Any]:
+    """What `hqgs.load` is to give; where a run goes on, as it was, but for what the options say otherwise."""
     asked: dict[str, Any] = {
         name: value for name in LOADING if (value := getattr(options, name)) != getattr(Train, name)
     }
@@ -284,12 +317,9 @@ def _load(options: Train, config: TrainConfig, screen: LoadingScreen) -> Scene:
     if sized or not before:
         asked["longest"] = PRESETS[options.preset].longest if options.downscale is None else None
         before.pop("downscale", None)
-    return hqgs.load(
-        **(before | asked | {"path": options.scene, "seed": config.seed}),
-        skip_unreadable="photos" in config.leave_out,
-        cache=options.out,
-        told=screen.stage,
-    )
+    if "restore" in asked:
+        asked["restore"] = str(asked["restore"])
+    return before | asked | {"path": options.scene, "seed": config.seed}
 
 
 def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:

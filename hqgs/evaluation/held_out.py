@@ -10,8 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hqgs.base.machine import peak_rss_mb
+from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.metrics import psnr
+from hqgs.evaluation.metrics import psnr, ssim
+from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
@@ -96,16 +99,42 @@ def held_out_renders(
     )
 
 
+def history_entry(
+    views: HeldOutViews, of: int, iteration: int, seconds: float, gaussians: int, ranks: Ranks
+) -> HistoryEntry:
+    """The means of some of `of` held-out views at a moment of a run; `ranks` share them."""
+    means = held_out_means([psnr, ssim], views, ranks)
+    entry: HistoryEntry = {
+        "iteration": iteration,
+        "seconds": seconds,
+        "psnr": means[0],
+        "ssim": means[1],
+        "gaussians": gaussians,
+        "memory_mb": peak_rss_mb(),
+    }
+    if len(views) < of:
+        entry["views"] = len(views)
+    return entry
+
+
 def names_of(views: Sequence[RenderedView]) -> list[str]:
     """The views' names, without rendering any."""
     return views.names if isinstance(views, HeldOutViews) else [view.name for view in views]
 
 
 def held_out_means(
-    metrics: Sequence[Callable[..., float | None]], views: Sequence[RenderedView]
+    metrics: Sequence[Callable[..., float | None]], views: Sequence[RenderedView], ranks: Ranks = ALONE
 ) -> list[float | None]:
-    """Mean of each `metric(render, photo, mask)`; None where there is no view, or one without a value."""
-    rows: list[Any] = [[metric(view.render, view.photo, view.mask) for metric in metrics] for view in views]
+    """Mean of each `metric(render, photo, mask)`; None where there is no view, or one without a value.
+
+    `ranks` share the views.
+    """
+
+    def row(number: int) -> list[float | None]:
+        view = views[number]
+        return [metric(view.render, view.photo, view.mask) for metric in metrics]
+
+    rows: list[Any] = ranks.divide(range(len(views)), row)
     columns: list[Any] = [[row[k] for row in rows] for k in range(len(metrics))]
     return [float(np.mean(values)) if values and None not in values else None for values in columns]
 

@@ -127,6 +127,15 @@ class LearnedRecord(TypedDict):
     gains: list[float]  # of red, green and blue in linear light; their logarithms' mean over photos is 0
 
 
+class RankRecord(TypedDict):
+    """One process of a run that several have trained."""
+
+    rank: int
+    view_seconds: float  # on its share of the views: renders, gradients, and sending them meanwhile
+    waiting_seconds: float  # for the others
+    sent_bytes: int
+
+
 class RunRecord(TypedDict):
     """A run without its metrics."""
 
@@ -148,6 +157,7 @@ class RunRecord(TypedDict):
     guard: GuardRecord
     sfm: SfmRecord | None  # None: poses and points are the scene's own
     photos: list[PhotoRecord]  # those that were looked at; empty where the method does not ask for it
+    ranks: list[RankRecord]  # empty where one process did all
     learned: list[LearnedRecord]  # of the photos' cameras; empty where nothing of them is learned
     config: dict[str, Json]  # `TrainConfig`, as the method has fitted it to the scene
 

@@ -27,6 +27,7 @@ from hqgs.evaluation.records import (
     MetricsRecord,
     MetricValues,
     PhotoRecord,
+    RankRecord,
     Report,
     RunRecord,
     SfmRecord,
@@ -73,6 +74,7 @@ class RunResult:
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
     photos: list[PhotoRecord] = field(default_factory=list)
+    ranks: list[RankRecord] = field(default_factory=list)
 
 
 def measure(result: RunResult) -> Report:

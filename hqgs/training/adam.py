@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,10 @@ class Adam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's base says None)
-        self, closure: Callable[[], Tensor] | None = None, visible: Tensor | None = None
+        self,
+        closure: Callable[[], Tensor] | None = None,
+        visible: Tensor | None = None,
+        views: Mapping[Tensor, int] | None = None,
     ) -> Tensor | None:
         """Update every parameter that has a gradient.
 
@@ -77,6 +80,8 @@ class Adam(torch.optim.Optimizer):
             visible: bool [N] for parameters [N, ...]: rows where it is False are left as they are, moments
                 included (the selective Adam of Taming 3DGS, Mallick et al. 2024). None: all rows. Groups with
                 `every_row` take no notice of it.
+            views: of how many views a parameter's gradient is the mean, where not of one. With n the rate is
+                sqrt(n) times as high and the moments decay by betas^n, as in Grendel (arXiv 2406.18533).
         """
         loss = None
         if closure is not None:
@@ -91,10 +96,12 @@ class Adam(torch.optim.Optimizer):
             chosen = None if group.get("every_row") else rows
             for param in group["params"]:
                 if param.grad is not None or group.get("used") == 0:
-                    self._update(param, group, chosen)
+                    self._update(param, group, chosen, 1 if views is None else views.get(param, 1))
         return loss
 
-    def _update(self, param: Tensor, group: dict[str, Any], rows: np.ndarray[Any, Any] | None) -> None:
+    def _update(
+        self, param: Tensor, group: dict[str, Any], rows: np.ndarray[Any, Any] | None, views: int
+    ) -> None:
         state = self.state[param]
         if not state:
             state["step"] = torch.tensor(0.0)
@@ -102,11 +109,11 @@ class Adam(torch.optim.Optimizer):
             state["exp_avg_sq"] = torch.zeros_like(param)
         step = state["step"] + 1
         if group.get("used") != 0:
-            self._write(param, int(step), group, rows)
+            self._write(param, int(step), group, rows, views)
         state["step"] = step  # a new tensor: a loaded state dict may share the old one
 
     def _write(
-        self, param: Tensor, step: int, group: dict[str, Any], rows: np.ndarray[Any, Any] | None
+        self, param: Tensor, step: int, group: dict[str, Any], rows: np.ndarray[Any, Any] | None, views: int
     ) -> None:
         grad = param.grad
         assert grad is not None
@@ -118,7 +125,7 @@ class Adam(torch.optim.Optimizer):
         moments = self.state[param]["exp_avg"], self.state[param]["exp_avg_sq"]
         values, first, second = (t.detach().numpy() for t in (param, *moments))
         beta1, beta2 = group["betas"]
-        options = (float(group["lr"]), beta1, beta2, group["eps"])
+        options = (float(group["lr"]) * math.sqrt(views), beta1**views, beta2**views, group["eps"])
         used = group.get("used")
         _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, rows, used)
         for tensor in (param, *moments):

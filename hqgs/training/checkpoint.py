@@ -144,6 +144,11 @@ def scene_fingerprint(scene: Scene) -> dict[str, str]:
     }
 
 
+def checksum(tensors: dict[str, Tensor]) -> int:
+    """Of each tensor's name, type, shape and bytes."""
+    return _crc32("", {name: tensor.detach().contiguous() for name, tensor in tensors.items()})
+
+
 def _crc32(text: str, tensors: dict[str, Tensor]) -> int:
     """Checksum of the JSON text and of each tensor's name, type, shape and bytes."""
     crc = zlib.crc32(text.encode())

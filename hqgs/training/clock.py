@@ -19,7 +19,6 @@ WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start th
 GROWTH, GROWTH_DENSE = 2.0, 1.0
 DENSE = 2  # times the scene's own points
 FEWEST, MOST = 50, 30_000  # iterations
-TAIL = 50  # steps after the end of growth that tell what the rest costs
 SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
 
 
@@ -51,10 +50,10 @@ def turned(config: TrainConfig, schedule: Schedule, state: TrainState, step: flo
     decisions, iteration = state.decisions, state.iteration
     if decisions.turned:
         return decisions
+    at = schedule.turn_at(decisions)
     if config.turn is not None:
-        at, length = config.turn
+        length = config.turn[1]
     elif config.seconds is not None:
-        at = schedule.growth_end(decisions) + TAIL
         rest = config.iterations - at
         left = (config.seconds - state.seconds) / step if step > 0 else rest
         length = at + round(min(max(left, SHORTEST * rest), LONGEST * rest))
@@ -66,12 +65,12 @@ def turned(config: TrainConfig, schedule: Schedule, state: TrainState, step: flo
 
 
 def _timed(trainer: Trainer, coarse: bool) -> float:
-    """Mean seconds of a step at the smaller or at full size."""
+    """Mean seconds of a step's view at the smaller or at full size."""
     if coarse and not trainer.schedule.coarse_end:
         return 0.0
     for _ in range(WARM):
-        trainer.step(replace(trainer.next_plan(), coarse=coarse))
-    started = trainer.seconds
+        trainer.step(coarse)
+    started, before = trainer.seconds, trainer.iteration
     for _ in range(TIMED):
-        trainer.step(replace(trainer.next_plan(), coarse=coarse))
-    return (trainer.seconds - started) / TIMED
+        trainer.step(coarse)
+    return (trainer.seconds - started) / (trainer.iteration - before)

@@ -204,11 +204,12 @@ class TrainConfig:
     configuration of a run as a user asks for it.
     """
 
-    iterations: int = 30_000  # training steps
+    iterations: int = 30_000  # training views seen
     method: str = AUTO  # one of METHODS
     seed: int = 0  # of everything random
     seconds: float | None = None  # of training that the number of iterations was chosen for
     turn: tuple[int, int] | None = None  # the iteration after which the run gets another length, and that
+    batch: int = 1  # views in a step, at most
     sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
     lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
@@ -232,7 +233,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_method(self.method)
         check_items(set(self.leave_out))
-        for name in ("iterations", "sh_interval", "eval_every", "checkpoint_every"):
+        for name in ("iterations", "batch", "sh_interval", "eval_every", "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
         if self.seconds is not None and not 0 < self.seconds < math.inf:
@@ -267,6 +268,7 @@ class TrainConfig:
 def run_config(
     *,
     iterations: int | None = None,
+    batch: int = 1,
     method: str = AUTO,
     leave_out: str = AUTO,
     seed: int = 0,
@@ -278,6 +280,7 @@ def run_config(
     """The configuration of a run as users ask for it, its schedule fitted to its length.
 
     Args:
+        batch: training views in a step; rates and moments follow it (docs/ranks.md).
         iterations: None: at most 30,000, with `leave_out` "auto" fewer where the scene has stopped improving.
         method: one of METHODS.
         leave_out: "auto", "none" or some of ITEMS with commas.
@@ -294,6 +297,7 @@ def run_config(
         items = (*items, "iterations")
     config = TrainConfig(
         iterations=TrainConfig.iterations if iterations is None else iterations,
+        batch=batch,
         leave_out=items,
         method=method,
         seed=seed,

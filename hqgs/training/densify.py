@@ -57,11 +57,15 @@ class Densifier:
 
     def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
-        # A pixel is 2 / width of normalised device coordinates, in which the threshold is published.
-        norm = torch.hypot(means2d_grad[:, 0] * (width / 2), means2d_grad[:, 1] * (height / 2))
+        norm = gradient_norms(means2d_grad, width, height)
         visible = (radii > 0).all(dim=1)
         self.grad_sum += torch.where(visible, norm, 0.0)
         self.count += visible
+
+    def note(self, rows: Tensor, norms: Tensor) -> None:
+        """Add one view that shows the Gaussians of these rows, [M], with `gradient_norms` [M]."""
+        self.grad_sum[rows] += norms
+        self.count[rows] += 1
 
     def update(
         self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, finest: Tensor | None = None
@@ -138,6 +142,12 @@ class Densifier:
         select_rows(gaussians, optimizer, kept, old=len(kept))
         parents = kept if growth.parents is None else growth.parents[kept]
         return replace(growth, pruned=pruned, parents=parents)
+
+
+def gradient_norms(means2d_grad: Tensor, width: int, height: int) -> Tensor:
+    """Of gradients of 2D means, [N, 2] in loss per pixel, in loss per half image, [N]."""
+    # A pixel is 2 / width of normalised device coordinates, in which the threshold is published.
+    return torch.hypot(means2d_grad[:, 0] * (width / 2), means2d_grad[:, 1] * (height / 2))
 
 
 def quats_to_matrices(quats: Tensor) -> Tensor:

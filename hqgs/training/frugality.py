@@ -23,6 +23,7 @@ from hqgs.scene.scene import View
 from hqgs.training.schedule import (
     BAND_CHECK,
     BAND_INTERVAL,
+    CHECKS,
     COARSE_FACTOR,
     COARSE_MOST,
     COARSE_PART,
@@ -41,7 +42,7 @@ from hqgs.training.state import TrainState
 from hqgs.training.trials import FOLDED, TOLERANCE, WEIGHTS, FewerBands, fewest_bands, fewest_gaussians
 
 TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
-BETTER, PATIENCE, CHECKS = 0.05, 2_000, 500  # dB, iterations, iterations: when a run has stopped improving
+BETTER, PATIENCE = 0.05, 2_000  # dB, iterations: when a run has stopped improving
 WINDOW = 50  # steps before and after a decision that tell what it saves
 RULES: dict[str, object] = {  # what a result depends on beside the configuration
     "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),

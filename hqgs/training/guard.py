@@ -47,6 +47,12 @@ class Guard:
         if len(self.events) < KEPT:
             self.events.append(cast(GuardEvent, asdict(event)))
 
+    def note(self, iteration: int, view: View, fault: Fault) -> None:
+        """Add what one look has found."""
+        indices = torch.nonzero(fault.rows)[:, 0]
+        count, listed = fault.values + len(indices), indices[:LISTED].tolist()
+        self.add(Event(iteration, view.name, fault.what, fault.tensors, count, listed))
+
     def summary(self) -> GuardRecord:
         """For report.json."""
         return {
@@ -61,9 +67,10 @@ class Guard:
 class Fault:
     """What was not finite in one look."""
 
-    what: str  # "gradient" or "parameter"
+    what: str  # as that of an `Event`
     tensors: list[str]
     rows: Tensor  # bool [N], the Gaussians at fault
+    values: int = 0  # of a photo
 
 
 def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -> Fault | None:

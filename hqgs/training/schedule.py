@@ -23,6 +23,8 @@ BAND_CHECK = 0.3  # of the run: when the harmonics are tried
 EARLIEST = 2_000  # iterations before which they cannot tell yet
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
 EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
+CHECKS = 500  # iterations from one look at whether the run still improves to the next
+TAIL = 50  # steps after the end of growth that tell what the rest costs
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 
 
@@ -102,6 +104,31 @@ class Schedule:
             grows=densify.start < iteration < stop and iteration % densify.every == 0,
             finest=FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in self.items else None,
         )
+
+    def batch(self, iteration: int, decisions: Decisions) -> list[Plan]:
+        """The plans of the views that one step takes together, from number `iteration` on.
+
+        As many as the configuration says, and fewer where something is due between two of them, or where a
+        view would come again. So they follow from the iteration, and growth from the views seen.
+        """
+        plans = [self.plan(iteration, decisions)]
+        while len(plans) < self.config.batch and not self._pauses(plans[-1], decisions):
+            following = self.plan(plans[-1].iteration + 1, decisions)
+            if following.resets or following.view in {plan.view for plan in plans}:
+                break
+            plans.append(following)
+        return plans
+
+    def _pauses(self, plan: Plan, decisions: Decisions) -> bool:
+        """Whether something is due, or may be decided, after this plan's view."""
+        iteration, growth_end = plan.iteration, self.growth_end(decisions)
+        due = {decisions.length, growth_end, self.config.densify.stop, self.coarse_end, self.band_check}
+        due.add(self.turn_at(decisions))
+        return plan.grows or iteration in due or ("iterations" in self.items and iteration % CHECKS == 0)
+
+    def turn_at(self, decisions: Decisions) -> int:
+        """The iteration after which the clock may give the run another length."""
+        return self.growth_end(decisions) + TAIL if self.config.turn is None else self.config.turn[0]
 
     def holds(self, decisions: Decisions) -> bool:
         """Whether photos are held back."""

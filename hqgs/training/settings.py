@@ -53,7 +53,12 @@ def read_config(path: str | Path) -> TrainConfig:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
     if isinstance(values, dict) and isinstance(values.get("train"), dict):
         values = values["train"]
-    return _build(TrainConfig, values, str(path))
+    return config_of_values(values, str(path))
+
+
+def config_of_values(values: Any, where: str) -> TrainConfig:
+    """The configuration of JSON values, of `where`. ValueError that names the field."""
+    return _build(TrainConfig, values, where)
 
 
 def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:

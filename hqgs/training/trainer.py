@@ -2,42 +2,38 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
-from hqgs.base.machine import peak_rss_mb
+from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, untold
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
-from hqgs.evaluation.held_out import HeldOutViews, held_out_means
-from hqgs.evaluation.metrics import psnr, ssim
+from hqgs.evaluation.held_out import HeldOutViews, history_entry
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.rasterization import RasterizationMeta
-from hqgs.model.render import render_view
-from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, cut_harmonics, reset_opacities
+from hqgs.training.batch import Part, exchanged, give_mean, note_views, part_of, to_rasterize, visible_in
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
 from hqgs.training.frugality import Frugality
-from hqgs.training.guard import LISTED, Event, Fault, Guard, bad_values, gradient_fault, parameter_fault
+from hqgs.training.guard import Fault, Guard, parameter_fault
+from hqgs.training.looks import Looks
 from hqgs.training.methods import make_method
-from hqgs.training.methods.base import Method, Target
-from hqgs.training.schedule import Plan, Schedule, learning_rates, on_the_way, smaller
+from hqgs.training.methods.base import Method
+from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
 from hqgs.training.state import TrainState
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
@@ -60,10 +56,14 @@ class Trainer:
     """A run: its schedule says what a step does, its state what it starts from, its method how a render is
     judged, and its frugality what may be left out from then on."""
 
-    def __init__(self, scene: Scene, config: TrainConfig, told: OnStage = untold) -> None:
-        """`told` hears of the preparation. ValueError if scene or configuration cannot be trained."""
+    def __init__(
+        self, scene: Scene, config: TrainConfig, told: OnStage = untold, ranks: Ranks = ALONE
+    ) -> None:
+        """`told` hears of the preparation; `ranks`: the processes that train together. ValueError if scene or
+        configuration cannot be trained."""
         scene.check_trainable()
         inspector = Inspector(told)  # for all that looks at the photos before the first step
+        self.ranks = ranks
         self.photos_left_out: list[LeftOut] = []
         if "photos" in config.leave_out:
             scene, self.photos_left_out = choose_photos(scene, inspector)
@@ -71,21 +71,19 @@ class Trainer:
         self.extent: float = scene.extent
         self.method: Method[Any] = make_method(scene, config, inspector)
         self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
+        self._looks = Looks(scene.train, self.method, config.background)
         with one_torch_thread():
-            self._targets = [self.method.prepare(view) for view in scene.train]
-            start = self.method.start(scene, self._targets, config)
+            start = self.method.start(scene, self._looks.targets, config)
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
-        self._small: dict[int, tuple[View, Target]] = {}
         self.config: TrainConfig = start.config
-        config = start.config
         self.method_left_out: list[LeftOut] = start.left_out
         self.first_points: int = len(start.gaussians)
-        self.schedule: Schedule = Schedule.of(config, scene.train, self.method.as_photographed)
+        self.schedule: Schedule = Schedule.of(self.config, scene.train, self.method.as_photographed)
         self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
         self.state: TrainState = TrainState(
             start.gaussians,
             self._optimizer(start.gaussians),
-            Densifier(config.densify, self.extent, scene.reach, config.seed, self.first_points),
+            Densifier(self.config.densify, self.extent, scene.reach, self.config.seed, self.first_points),
             self.schedule.start(),
         )
 
@@ -118,42 +116,36 @@ class Trainer:
         """Iterations of the run, as far as it is known: those of the configuration, or fewer."""
         return self.state.decisions.length
 
-    def next_plan(self) -> Plan:
-        """What the next step is to do."""
-        return self.schedule.plan(self.iteration + 1, self.state.decisions)
+    def step(self, coarse: bool | None = None) -> Step:
+        """Train on the next views, `batch` of the configuration and fewer where something is due between two.
 
-    def step(self, plan: Plan | None = None) -> Step:
-        """Train on one view; `plan`: None: the next one."""
+        `coarse`: at the smaller size or not; None: as the schedule says.
+        """
         started = time.perf_counter()
         state, method = self.state, self.method
-        plan = self.next_plan() if plan is None else plan
-        if plan.resets:
+        plans = self.schedule.batch(self.iteration + 1, state.decisions)
+        if coarse is not None:
+            plans = [replace(plan, coarse=coarse) for plan in plans]
+        if plans[0].resets:
             reset_opacities(state.gaussians, state.optimizer, self.config.densify.reset_opacity)
-        state.iteration = plan.iteration
-        view, target = self._seen(plan.view, plan.coarse)
-        self._set_rates(plan)
+        last = plans[-1]
+        state.iteration = last.iteration
+        self._set_rates(last)
 
         with one_torch_thread():
-            gaussians = method.modulate(state.gaussians)
-            shot = method.shot(view, target)
-            render, meta = render_view(gaussians, shot.camera, plan.degree, self.config.background)
-            meta["means2d"].retain_grad()  # [1, N, 2]
-            photo = shot.develop(render)
-            image = method.compare(photo, target)
-            loss = method.loss(image, target)
-            state.optimizer.zero_grad()
-            if self._backward(loss, render, view):
-                self._update(plan, meta, view)
-            growth = self._grow(plan) if plan.grows else Growth()
-            self._cull(view, parameter_fault(state.gaussians, growth.parents is not None))
+            step, seen = self._one(last) if self.config.batch == 1 else self._together(plans)
+            growth = self._grow(last) if last.grows else Growth()
+            self._cull(step.view, parameter_fault(state.gaussians, growth.parents is not None))
             if not len(state.gaussians):
                 raise TrainingError(state.none_left())
-            method.after_step(state, view, image, target)
-            self._leave_out(growth, time.perf_counter() - started)
+            for plan, noted in zip(plans, seen, strict=True):
+                state.iteration = plan.iteration
+                method.after_step(state, self._looks.target(plan.view, plan.coarse)[0], noted)
+            self._leave_out(growth, (time.perf_counter() - started) / len(plans))
 
         state.seconds += time.perf_counter() - started
-        state.decisions = turned(self.config, self.schedule, state, self.frugality.step_seconds)
-        return Step(float(loss.detach()), photo.detach(), view)
+        state.decisions = self._turned()
+        return step
 
     def shown(self) -> Gaussians:
         """The Gaussians that are rasterized, without a gradient history."""
@@ -183,17 +175,7 @@ class Trainer:
             if self.history[-1].get("views", of) >= len(views):
                 return
             self.history.pop()  # it was of fewer views
-        means = held_out_means([psnr, ssim], views)
-        entry: HistoryEntry = {
-            "iteration": self.iteration,
-            "seconds": self.seconds,
-            "psnr": means[0],
-            "ssim": means[1],
-            "gaussians": len(self.gaussians),
-            "memory_mb": peak_rss_mb(),
-        }
-        if len(views) < of:
-            entry["views"] = len(views)
+        entry = history_entry(views, of, self.iteration, self.seconds, len(self.gaussians), self.ranks)
         self.history.append(entry)
 
     def save(self, path: str | Path) -> None:
@@ -240,16 +222,6 @@ class Trainer:
         own = [group | {"every_row": True} for group in self.method.param_groups()]
         return Adam(groups + own, lr=0.0, eps=self.config.adam_eps)
 
-    def _seen(self, number: int, coarse: bool) -> tuple[View, Target]:
-        """A training view and its target, at full size or at the smaller one."""
-        view = self.scene.train[number]
-        if not coarse:
-            return view, self._targets[number]
-        if number not in self._small:
-            small = smaller(view)
-            self._small[number] = small, self.method.prepare(small)
-        return self._small[number]
-
     def _set_rates(self, plan: Plan) -> None:
         """As far as the method leaves them. Adam passes harmonics above the degree in use over: they never
         had a gradient."""
@@ -260,15 +232,50 @@ class Trainer:
             groups[name]["lr"] = rate
         groups["shN"]["used"] = (plan.degree + 1) ** 2 - 1
 
-    def _update(self, plan: Plan, meta: RasterizationMeta, view: View) -> None:
-        """Note the gradients of the 2D means and let Adam take its step."""
-        state, radii = self.state, meta["radii"][0]
-        if plan.observes:
-            gradient = meta["means2d"].grad
-            assert gradient is not None  # the backward pass was sound
-            state.densifier.observe(gradient[0], radii, view.camera.width, view.camera.height)
-        visible = (radii > 0).all(dim=1) if self.config.selective_adam else None
-        state.optimizer.step(visible=visible)
+    def _one(self, plan: Plan) -> tuple[Step, list[Tensor]]:
+        """Train on one view."""
+        state = self.state
+        look = self._looks.at(plan, self.method.modulate(state.gaussians))
+        state.optimizer.zero_grad()
+        fault, loss = look.backward(state.gaussians, state.optimizer), float(look.loss.detach())
+        if self._sound([look.view], [fault], loss):
+            radii, gradient = look.meta["radii"][0], look.meta["means2d"].grad
+            if plan.observes:
+                assert gradient is not None  # the backward pass was sound
+                camera = look.view.camera
+                state.densifier.observe(gradient[0], radii, camera.width, camera.height)
+            visible = (radii > 0).all(dim=1) if self.config.selective_adam else None
+            state.optimizer.step(visible=visible)
+        return Step(loss, look.photo.detach(), look.view), [look.measured]
+
+    def _together(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
+        """Train on several views, of which each rank renders its share; all add up what all have found."""
+        state, looks = self.state, self._looks
+        step: Step | None = None
+
+        def make(k: int) -> Part:
+            nonlocal step
+            modulated = self.method.modulate(state.gaussians)
+            look = looks.at(plans[k], to_rasterize(state.gaussians, modulated))
+            state.optimizer.zero_grad()
+            fault = look.backward(state.gaussians, state.optimizer)
+            found = part_of(look, fault, state.gaussians, state.optimizer)
+            step = step or Step(found.loss, look.photo.detach(), look.view)
+            return found
+
+        parts = exchanged(self.ranks, len(plans), make)
+        views = [looks.views[plan.view] for plan in plans]
+        if self._sound(views, [part.fault for part in parts], parts[-1].loss):
+            sound = [part for part in parts if part.fault is None]
+            if plans[0].observes:  # the end of growth ends a step: none of it grows any more
+                note_views(sound, state.densifier)
+            with torch.no_grad():
+                modulated = self.method.modulate(state.gaussians)
+            views_of = give_mean(sound, state.gaussians, modulated, state.optimizer)
+            visible = visible_in(sound, len(state.gaussians)) if self.config.selective_adam else None
+            state.optimizer.step(visible=visible, views=views_of)
+        step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
+        return step, [part.measured for part in parts]
 
     def _grow(self, plan: Plan) -> Growth:
         """Add and remove Gaussians."""
@@ -295,55 +302,50 @@ class Trainer:
         state = self.state
         self.method.rows_changed(state, state.densifier.remove(rows, state.gaussians, state.optimizer))
 
+    def _turned(self) -> Decisions:
+        """The decisions after a step, by the clock of the first rank."""
+        state = self.state
+        decisions = turned(self.config, self.schedule, state, self.frugality.step_seconds)
+        if self.config.seconds is None or self.ranks.count == 1:
+            return decisions
+        return Decisions(**self.ranks.tell(asdict(decisions))[0])
+
     def _psnr(self, gaussians: Gaussians, numbers: Sequence[int]) -> float:
-        """Of training photos as the method compares them, of `gaussians` to rasterize; known noise does not
-        count."""
-        state, errors = self.state, []
-        degree = min(gaussians.sh_degree, self.schedule.degree(state.iteration, state.decisions))
-        with torch.no_grad():
-            for number in numbers:
-                view, target = self._seen(number, self.schedule.is_coarse(state.iteration))
-                shot = self.method.shot(view, target)
-                render, _ = render_view(gaussians, shot.camera, degree, self.config.background)
-                image = self.method.compare(shot.develop(render), target)
-                difference = (image - floats(target.photo)).square()
-                if target.mask is not None:
-                    difference = difference[target.mask]
-                errors.append(float(difference.double().mean()))
-        return -10 * math.log10(max(float(np.mean(errors)) - self.method.noise**2, 1e-10))
+        """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize."""
+        iteration = self.state.iteration
+        degree = min(gaussians.sh_degree, self.schedule.degree(iteration, self.state.decisions))
+        return self._looks.psnr(gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks)
 
-    def _backward(self, loss: Tensor, render: Tensor, view: View) -> bool:
-        """Compute the gradients. Where the loss or a gradient is not finite: False, and the guard knows.
+    def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], loss: float) -> bool:
+        """Whether the step has gradients to go by, of one view at least; the guard notes its faults.
 
-        Gaussians whose gradient is not finite are removed.
+        Gaussians whose gradient is not finite are removed, and then no row is where the others' gradients
+        have it: the whole step is skipped.
         """
         state, guard = self.state, self.state.guard
-        finite = math.isfinite(loss.detach())
-        if finite:
-            render.retain_grad()
-            loss.backward()
-            fault = gradient_fault(state.gaussians, state.optimizer, render)
-            self._cull(view, fault)
-            finite = fault is None
-        else:
-            count = bad_values(view)
-            guard.add(Event(state.iteration, view.name, "photo" if count else "loss", [], count, []))
-        guard.skipped += not finite
-        guard.skipped_in_a_row = 0 if finite else guard.skipped_in_a_row + 1
+        found = [(view, fault) for view, fault in zip(views, faults, strict=True) if fault is not None]
+        for view, fault in found:
+            guard.note(state.iteration, view, fault)
+        bad = torch.stack([fault.rows for _, fault in found]).any(dim=0) if found else None
+        removes = bad is not None and bool(bad.any())
+        if bad is not None and removes:
+            self._remove(bad)
+            guard.culled += int(bad.sum())
+        skipped = len(views) if removes else len(found)
+        guard.skipped += skipped
+        guard.skipped_in_a_row = guard.skipped_in_a_row + skipped if skipped == len(views) else 0
         if guard.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
                 f"the loss or a gradient was not finite in {guard.skipped_in_a_row} steps in a row, up to "
-                f"iteration {state.iteration}; the last loss is {float(loss.detach())}, of view {view.name!r}"
+                f"iteration {state.iteration}; the last loss is {loss}, of view {views[-1].name!r}"
             )
-        return finite
+        return skipped < len(views)
 
     def _cull(self, view: View, fault: Fault | None) -> None:
         """Note what was not finite, and remove the Gaussians at fault."""
         if fault is None:
             return
-        state, indices = self.state, torch.nonzero(fault.rows)[:, 0]
-        listed = indices[:LISTED].tolist()
-        state.guard.add(Event(state.iteration, view.name, fault.what, fault.tensors, len(indices), listed))
-        if len(indices):
+        self.state.guard.note(self.state.iteration, view, fault)
+        if count := int(fault.rows.sum()):
             self._remove(fault.rows)
-            state.guard.culled += len(indices)
+            self.state.guard.culled += count

@@ -9,6 +9,7 @@ use hqgs::internals::{
     training::{
         adam::{self, AdamArrays, AdamOptions, Selection},
         loss::{self, LossScratch, Sample},
+        rows::{self, ADDED, ViewRows, WIDTH},
     },
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn};
@@ -19,7 +20,8 @@ use std::cell::RefCell;
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(photometric, m)?)?;
     m.add_function(wrap_pyfunction!(ssim, m)?)?;
-    m.add_function(wrap_pyfunction!(adam_step, m)?)
+    m.add_function(wrap_pyfunction!(adam_step, m)?)?;
+    m.add_function(wrap_pyfunction!(add_rows, m)?)
 }
 
 /// A scalar type with buffers that last as long as the calling thread, so that a step allocates none.
@@ -228,6 +230,55 @@ fn adam_step_as<T: Real + Element>(
         exp_avg_sq: exp_avg_sq.as_slice_mut()?,
     };
     Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
+}
+
+/// Views as `(rows [M] i32, values [M, WIDTH], centre, degree)`; see [`rows::add`]. Everything is f32.
+#[pyfunction]
+fn add_rows(
+    views: Vec<(Bound<'_, PyAny>, Bound<'_, PyAny>, [f64; 3], usize)>,
+    means: &Bound<'_, PyAny>,
+    low: &Bound<'_, PyAny>,
+    high: &Bound<'_, PyAny>,
+    scale: f32,
+) -> BindingResult<()> {
+    let (means_of, n) = Array::<f32>::new("means", means)?.of_width(3)?;
+    let shape = Array::<f32>::new("high", high)?.shape().to_vec();
+    let coefficients = shape.get(1).copied().unwrap_or(0);
+    let mut low = writable::<f32>("low", &[n, ADDED], low)?;
+    let mut high = writable::<f32>("high", &[n, coefficients, 3], high)?;
+    let held = views
+        .iter()
+        .map(|(rows, values, center, degree)| {
+            let (values, m) = Array::<f32>::new("values", values)?.of_width(WIDTH)?;
+            let rows = Array::<i32>::new("rows", rows)?.of_shape(&[m])?;
+            Ok((rows, values, *center, *degree))
+        })
+        .collect::<BindingResult<Vec<_>>>()?;
+    let views = held
+        .iter()
+        .map(|(rows, values, center, degree)| {
+            Ok(ViewRows {
+                rows: rows.slice()?,
+                values: values.slice()?,
+                center: *center,
+                degree: *degree,
+            })
+        })
+        .collect::<BindingResult<Vec<_>>>()?;
+    let mut read = vec![place("means", means_of.slice()?)];
+    read.extend(views.iter().map(|view| place("values", view.values)));
+    check_apart(
+        &[
+            place("low", low.as_slice()?),
+            place("high", high.as_slice()?),
+        ],
+        &read,
+    )?;
+    let (low, high) = (low.as_slice_mut()?, high.as_slice_mut()?);
+    let means_of = means_of.slice()?;
+    Ok(means
+        .py()
+        .detach(|| threads::install(|| rows::add(&views, means_of, low, high, scale)))??)
 }
 
 /// Borrow a C-contiguous array of `shape` to write to it.

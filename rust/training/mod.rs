@@ -4,4 +4,5 @@ pub mod adam;
 pub(crate) mod exposure;
 pub(crate) mod jpeg_cells;
 pub mod loss;
+pub(crate) mod rows;
 pub(crate) mod separable;

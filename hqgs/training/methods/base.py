@@ -48,9 +48,9 @@ T = TypeVar("T", bound=Target)
 class Method(Protocol[T]):
     """The replaceable part of a training step.
 
-    The trainer calls `prepare` for each training view and then `start`, once. A step is `modulate`, `shot`,
-    rasterization, the shot's `develop`, `compare`, `loss`, which change nothing; then Adam, `rows_changed`
-    where Gaussians came or went, and `after_step`.
+    The trainer calls `prepare` for each training view and then `start`, once. A step is, for each of its
+    views, `modulate`, `shot`, rasterization, the shot's `develop`, `compare`, `loss` and `measured`, which
+    change nothing; then Adam, `rows_changed` where Gaussians came or went, and `after_step`.
     """
 
     @property
@@ -99,8 +99,12 @@ class Method(Protocol[T]):
         """Gaussians were added or removed: row i stems from row `parents[i]` of those before, [N]."""
         ...
 
-    def after_step(self, state: TrainState, view: View, image: Tensor, target: T) -> None:
-        """What ages, and what is decided for the next step; `image` is what the loss was computed of."""
+    def measured(self, image: Tensor, target: T) -> Tensor:
+        """What `after_step` is to know of the image that the loss is of: a few numbers, float64 [K]."""
+        ...
+
+    def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
+        """What ages, and what is decided for the next step; for each view of the step, in their order."""
         ...
 
     def found(self) -> list[Found]:
@@ -161,7 +165,10 @@ class Plain:
     def rows_changed(self, state: TrainState, parents: Tensor) -> None:
         pass
 
-    def after_step(self, state: TrainState, view: View, image: Tensor, target: Any) -> None:
+    def measured(self, image: Tensor, target: Any) -> Tensor:
+        return torch.zeros(0, dtype=torch.float64)
+
+    def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
         pass
 
     def found(self) -> list[Found]:

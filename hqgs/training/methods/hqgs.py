@@ -154,12 +154,16 @@ class HQGS(Plain):
         if self._smallest is not None:
             self._measure(state.gaussians, state.iteration)
 
-    def after_step(self, state: TrainState, view: View, image: Tensor, target: FormedTarget) -> None:
+    def measured(self, image: Tensor, target: FormedTarget) -> Tensor:
+        """The error at the held pixels, if there are any."""
+        return super().measured(image, target) if target.held is None else target.held.error(image)[None]
+
+    def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
         """The smallest sizes and the cameras' depths age, and the held pixels decide on the rates."""
         if self._smallest is not None and state.iteration - self._since >= REFRESH:
             self._measure(state.gaussians, state.iteration)
-        if self._plateau is not None and target.held is not None:
-            self._plateau.see(target.held.photo, target.held.error(image))
+        if self._plateau is not None and len(seen):
+            self._plateau.see(self._numbers[view.name], seen[0])
         if self._cameras is not None:
             self._cameras.after_step(state.iteration, view, self.modulate(state.gaussians))
 

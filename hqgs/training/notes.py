@@ -1,0 +1,65 @@
+"""What a reader of a run's report should know of it, in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hqgs.evaluation.records import LearnedRecord
+from hqgs.training.methods.cameras import Found
+from hqgs.training.trainer import Trainer
+
+
+def run_notes(trainer: Trainer) -> list[str]:
+    """Sentences, one for each thing."""
+    own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
+    if more := trainer.first_points - own:
+        notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+    if some := [entry["views"] for entry in trainer.history if "views" in entry]:
+        notes.append(
+            f"while it trained, {max(some)} of {len(trainer.scene.test)} held-out views were measured, which "
+            "are evenly spread, to save time; the last values are of all"
+        )
+    if (seconds := trainer.config.seconds) is not None:
+        text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
+        if at := trainer.state.decisions.turned:
+            text += f"; after iteration {at}, {trainer.length} in all"
+        notes.append(f"{text}. `--plan` with plan.json trains the same again, bit for bit")
+    if trainer.lengthened is not None:
+        notes.append(
+            f"the run had ended at iteration {trainer.lengthened}; from there on its schedule is that of "
+            f"{trainer.config.iterations} iterations: learning rates rose again"
+        )
+    if left < 1:
+        why = "pixels held back from the noisy photos showed no gain any more"
+        notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
+    if found := trainer.method.found():
+        ways = sorted(photo.extent for photo in found)
+        if moved := sum(way > 0 for way in ways):
+            notes.append(
+                f"{moved} of {len(ways)} photos are shaken, by {ways[len(ways) // 2]:.1f} px in the median "
+                f"and {ways[-1]:.1f} px at most; held-out photos that are shaken themselves measure a sharp "
+                "scene as worse than it is"
+            )
+        discs = sorted(photo.defocus for photo in found)
+        if soft := sum(disc > 0 for disc in discs):
+            notes.append(
+                f"{soft} of {len(discs)} photos are out of focus somewhere, with discs of up to "
+                f"{discs[-1]:.1f} px radius; held-out photos that are so themselves measure a sharp scene as "
+                "worse than it is"
+            )
+        gains = np.log2([photo.gains for photo in found])
+        if gains.any():
+            notes.append(f"photos are up to {np.abs(gains).max():.2f} stops brighter or darker than the mean")
+    return notes
+
+
+def learned_record(found: Found) -> LearnedRecord:
+    """What was learned of a photo's camera, for the report."""
+    return {
+        "name": found.name,
+        "shake_px": found.extent,
+        "way_px": found.way.tolist(),
+        "defocus_px": found.defocus,
+        "focus": found.focus,
+        "gains": found.gains.tolist(),
+    }
