@@ -223,8 +223,7 @@ class Trainer:
         return Adam(groups + own, lr=0.0, eps=self.config.adam_eps)
 
     def _set_rates(self, plan: Plan) -> None:
-        """As far as the method leaves them. Adam passes harmonics above the degree in use over: they never
-        had a gradient."""
+        """As far as the method leaves them; harmonics above the degree in use never had a gradient."""
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
         for name, rate in learning_rates(self.config, self.extent, plan.part).items():
             groups[name]["lr"] = self.method.rate_left * rate
