@@ -8,14 +8,14 @@ import torch
 
 from hqgs import _rust
 from hqgs.model import render
-from hqgs.training import trainer
+from hqgs.training import looks, trainer
 from hqgs.training.methods import base
 from hqgs.training.trainer import Trainer
 
 Place = tuple[Any, str]  # a module or class, and the name that its users look up there
 
 # Replaced by benchmarks/features.
-RENDER_VIEW: Place = (trainer, "render_view")
+RENDER_VIEW: Place = (looks, "render_view")
 RASTERIZATION: Place = (render, "rasterization")
 ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
 ADAM: Place = (trainer, "Adam")
