@@ -61,6 +61,8 @@ class Step:
                 f"{SOME}:KIND, and steps joined by +"
             )
         kind = KINDS[self.kind]
+        if not kind.highest and self.value:
+            raise ValueError(f"{self}: each photo has its own of it, which is found; write {self.kind}")
         wanted = f"{kind.unit}, {'an integer in ' if kind.integer else ''}{kind.lowest:g}..{kind.highest:g}"
         if self.value is None:
             if kind.at_504 is None and kind.default is None:
