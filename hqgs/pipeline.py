@@ -26,6 +26,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, untold
+from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.photo_facts import photo_record
@@ -181,8 +182,10 @@ def open_run(
             for file in (CHECKPOINT, PLY):
                 remove_leftovers(folder / file)
         going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
-        config = config if going_on else fitted(scene, config, told, ranks)
-        trainer = Trainer(scene, config, told, ranks)
+        inspector = Inspector(told)
+        config = config if going_on else fitted(scene, config, inspector, ranks)
+        trainer = Trainer(scene, config, inspector, ranks)
+        del inspector  # it holds what it has seen of the photos
         if going_on:
             with _for_all(checkpoint, ranks) as path:
                 trainer.restore(path)
@@ -217,11 +220,13 @@ def _check_agreement(trainer: Trainer) -> None:
         trainer.ranks.agree(checksum(trainer.state.tensors()), f"the state at iteration {trainer.iteration}")
 
 
-def fitted(scene: Scene, config: TrainConfig, told: OnStage = untold, ranks: Ranks = ALONE) -> TrainConfig:
+def fitted(
+    scene: Scene, config: TrainConfig, inspector: Inspector | None = None, ranks: Ranks = ALONE
+) -> TrainConfig:
     """The configuration with the iterations that fit into its seconds, if it has any."""
     if config.seconds is None or config.turn is not None:
         return config
-    trainer = Trainer(scene, config, told, ranks)
+    trainer = Trainer(scene, config, inspector, ranks)
     return with_iterations(config, ranks.tell(fitting(trainer, config.seconds))[0])
 
 

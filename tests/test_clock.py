@@ -15,6 +15,7 @@ from tiny_scene import tiny_config, tiny_scene
 import hqgs
 from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
+from hqgs.diagnosis import scene as diagnosis
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock
@@ -92,6 +93,23 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
     assert (other.iterations == run.iterations) == (length == 30)
     kept = json.loads((tmp_path / "a" / CONFIG).read_text())["train"]
     assert (kept["iterations"], kept["seconds"]) == (30, 0.5)  # a resumed run is not planned anew
+
+
+def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although it is prepared twice: to be timed, and to be trained."""
+    seen: list[str] = []
+    real = diagnosis.inspect_photo
+
+    def spy(name: str, *arguments: Any, **options: Any) -> Any:
+        seen.append(name)
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(diagnosis, "inspect_photo", spy)
+    monkeypatch.setattr(clock, "FEWEST", 5)
+    monkeypatch.setattr(clock, "MOST", 6)
+    scene = tiny_scene()
+    hqgs.train(scene, seconds=0.1)
+    assert sorted(seen) == sorted(view.name for view in scene.train)
 
 
 def test_bad_plans_and_seconds_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

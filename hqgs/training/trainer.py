@@ -13,7 +13,6 @@ from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.ranks import ALONE, Ranks
-from hqgs.base.stages import OnStage, untold
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
@@ -57,12 +56,12 @@ class Trainer:
     judged, and its frugality what may be left out from then on."""
 
     def __init__(
-        self, scene: Scene, config: TrainConfig, told: OnStage = untold, ranks: Ranks = ALONE
+        self, scene: Scene, config: TrainConfig, inspector: Inspector | None = None, ranks: Ranks = ALONE
     ) -> None:
-        """`told` hears of the preparation; `ranks`: the processes that train together. ValueError if scene or
-        configuration cannot be trained."""
+        """`inspector`: what looks at the photos before the first step; `ranks`: the processes that train
+        together. ValueError if scene or configuration cannot be trained."""
         scene.check_trainable()
-        inspector = Inspector(told)  # for all that looks at the photos before the first step
+        inspector = inspector or Inspector()
         self.ranks = ranks
         self.photos_left_out: list[LeftOut] = []
         if "photos" in config.leave_out:

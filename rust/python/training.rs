@@ -232,10 +232,13 @@ fn adam_step_as<T: Real + Element>(
     Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
 
-/// Views as `(rows [M] i32, values [M, WIDTH], centre, degree)`; see [`rows::add`]. Everything is f32.
+/// `(rows [M] i32, values [M, WIDTH] f32, centre, degree)`
+type RowsOfView<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, [f64; 3], usize);
+
+/// See [`rows::add`]. Everything but the rows' numbers is f32.
 #[pyfunction]
 fn add_rows(
-    views: Vec<(Bound<'_, PyAny>, Bound<'_, PyAny>, [f64; 3], usize)>,
+    views: Vec<RowsOfView<'_>>,
     means: &Bound<'_, PyAny>,
     low: &Bound<'_, PyAny>,
     high: &Bound<'_, PyAny>,
