@@ -116,14 +116,24 @@ class _Joined(Ranks):
     def __init__(self) -> None:
         import torch  # here: seconds of loading for those who need it
         import torch.distributed as dist
+        from torch.distributed.distributed_c10d import PrefixStore
+        from torch.distributed.rendezvous import rendezvous
 
         super().__init__()
         self._dist, self._torch = dist, torch
         for name in TORCHRUN:
             if not os.environ.get(name):
                 raise ValueError(f"{name} is not set: start several processes with torchrun")
-        dist.init_process_group("gloo", timeout=timedelta(seconds=SILENCE))
-        self.rank, self.count = dist.get_rank(), dist.get_world_size()
+        store, self.rank, self.count = next(rendezvous("env://", timeout=timedelta(seconds=SILENCE)))
+        # torchrun's store outlives a restart, with the addresses of those who were there before.
+        store = PrefixStore(f"start {_restarts()}", store)
+        dist.init_process_group(
+            "gloo",
+            store=store,
+            rank=self.rank,
+            world_size=self.count,
+            timeout=timedelta(seconds=SILENCE),
+        )
         self.local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
         self._others = [k for k in range(self.count) if k != self.rank]
         self._items: queue.Queue[_Item] = queue.Queue()
@@ -246,4 +256,8 @@ def joined() -> Iterator[Ranks]:
 
 def was_restarted() -> bool:
     """Whether torchrun has started this process in the place of one that failed."""
-    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT") or 0) > 0
+    return _restarts() > 0
+
+
+def _restarts() -> int:
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT") or 0)
