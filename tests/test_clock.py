@@ -9,13 +9,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from test_diagnose import inspected
 from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
-from hqgs.diagnosis import scene as diagnosis
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock
@@ -97,14 +97,7 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
 
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although it is prepared twice: to be timed, and to be trained."""
-    seen: list[str] = []
-    real = diagnosis.inspect_photo
-
-    def spy(name: str, *arguments: Any, **options: Any) -> Any:
-        seen.append(name)
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(diagnosis, "inspect_photo", spy)
+    seen = inspected(monkeypatch)
     monkeypatch.setattr(clock, "FEWEST", 5)
     monkeypatch.setattr(clock, "MOST", 6)
     scene = tiny_scene()

@@ -238,8 +238,8 @@ def test_photos_are_spread_over_the_scene() -> None:
     assert [photo.name for photo in diagnose_scene(scene, max_photos=3).photos] == ["0.png", "2.png", "4.png"]
 
 
-def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The choice of photos, the formation and the motion's directions share what was seen."""
+def inspected(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Gets the name of each photo that is inspected from now on."""
     seen: list[str] = []
     real = module.inspect_photo
 
@@ -248,6 +248,12 @@ def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None
         return real(name, *arguments, **options)
 
     monkeypatch.setattr(module, "inspect_photo", spy)
+    return seen
+
+
+def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The choice of photos, the formation and the motion's directions share what was seen."""
+    seen = inspected(monkeypatch)
     scene = degraded_scene("motion:9", photos=4)
     inspector = Inspector()
     find_formation(scene, "auto", inspector)

@@ -92,7 +92,7 @@ def _averaged(views: Sequence[View], inspector: Inspector) -> str | None:
     """What several photos of the same picture average away, by the diagnosis of a few of them."""
     chosen = np.unique(np.linspace(0, len(views) - 1, PROBES).round().astype(np.int64))
     found = [inspector.inspect(views[k]).diagnosis for k in chosen]
-    noises = [photo.noise for photo in found if photo.noise is not None and photo.noise >= photo.noise_limit]
+    noises = [noise for photo in found if (noise := photo.told_noise) is not None]
     if 2 * len(noises) > len(found):
         return f"noise of {np.median(noises):.0f} levels"
     qualities = [photo.jpeg.quality for photo in found if photo.jpeg.quality is not None]

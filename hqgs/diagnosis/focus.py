@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.photos.resize import area_downscale
-from hqgs.scene.geometry import project
+from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
@@ -52,11 +52,7 @@ def focus_signs(scene: Scene) -> FocusSigns | None:
         return None
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.train[k] for k in chosen]
-    shown = np.zeros(len(scene.points), np.int64)
-    for view in views:
-        shown[scene.seen.get(view.name, [])] += 1
-    points = np.sort(np.argsort(-shown, kind="stable")[:MOST_POINTS])
-    points = points[shown[points] >= SHARED]
+    points = most_shown(len(scene.points), scene.seen, views, MOST_POINTS)
     sharp, depths = (np.full((len(views), len(points)), np.nan) for _ in range(2))
     for k, view in enumerate(views):
         rows = np.flatnonzero(np.isin(points, scene.seen.get(view.name, [])))

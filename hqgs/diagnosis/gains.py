@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates, uniform_filter
 
 from hqgs.photos.light import to_linear
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.geometry import project
+from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
@@ -60,13 +60,7 @@ def log_gains(scene: Scene) -> Floats | None:
 
 def _chosen_points(scene: Scene, seen: Mapping[str, NDArray[np.intp]]) -> NDArray[np.intp]:
     """Rows of the points to look at, rising: all, or where memory is short those that most photos show."""
-    count = MOST_VALUES // len(scene.train)
-    if len(scene.points) <= count:
-        return np.arange(len(scene.points))
-    shown = np.zeros(len(scene.points), np.int64)
-    for view in scene.train:
-        shown[seen.get(view.name, [])] += 1
-    return np.sort(np.argsort(-shown, kind="stable")[:count])
+    return most_shown(len(scene.points), seen, scene.train, MOST_VALUES // len(scene.train))
 
 
 def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Floats) -> None:

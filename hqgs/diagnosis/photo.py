@@ -43,6 +43,11 @@ class PhotoDiagnosis:
     blur_limit: float  # px of the full-size photo, a Gaussian's sigma: sharp photos can look as soft
 
     @property
+    def told_noise(self) -> float | None:
+        """Its noise, levels, where that is told from texture."""
+        return self.noise if self.noise is not None and self.noise >= self.noise_limit else None
+
+    @property
     def hiding(self) -> bool:
         """Whether its JPEG hides the photo's noise and blur from all but the coefficients."""
         return self.jpeg.quality is not None and self.jpeg.quality < HIDING_QUALITY

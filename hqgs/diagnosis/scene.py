@@ -137,7 +137,7 @@ def _exposure(scene: Scene, photos: Sequence[PhotoDiagnosis]) -> Part:
         return Part("exposure", False, None, None, None, "the photos share too few points to tell")
     reason = f"gains differ by {spread:.1%} from photo to photo"
     # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
-    noises = [photo.noise for photo in photos if photo.noise is not None and photo.noise >= photo.noise_limit]
+    noises = [noise for photo in photos if (noise := photo.told_noise) is not None]
     least = UNLIKE_GAINS + (0.5 * max(noises) / 255 if noises else 0.0)
     if spread < least:
         return Part("exposure", False, spread, None, None, f"{reason} (needed from {least:.0%})")
@@ -214,7 +214,7 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
         return Part("noise", False, None, None, None, "the photos are too small or too clipped to tell")
     level, limit = (float(value) for value in np.median(told, axis=0))
     spread = None if _pooled(photos) else _spread_of([noise for noise, _ in told])
-    noisy = sum(noise >= least for noise, least in told)
+    noisy = sum(photo.told_noise is not None for photo in photos)
     quiet, loud = np.quantile([max(noise, 0.5 * least) for noise, least in told], [0.1, 0.9])
     if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:
         reason = f"white noise of {quiet:.1f} levels in some photos and {loud:.1f} in others"

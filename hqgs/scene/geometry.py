@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -35,6 +37,16 @@ def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.flo
     x, y, depths = (sum(points[:, j] * V[i, j] for j in range(3)) + V[i, 3] for i in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.stack([x * K[0, 0] / depths + K[0, 2], y * K[1, 1] / depths + K[1, 2]], axis=1), depths
+
+
+def most_shown(
+    points: int, seen: Mapping[str, NDArray[np.intp]], views: Sequence[View], count: int
+) -> NDArray[np.intp]:
+    """Rows, rising, of those of so many points that most of the views show, at most `count`."""
+    shown = np.zeros(points, np.int64)
+    for view in views:
+        shown[seen.get(view.name, [])] += 1
+    return np.sort(np.argsort(-shown, kind="stable")[:count])
 
 
 def median_depth(scene: Scene, view: View) -> float:

@@ -19,6 +19,7 @@ from torch import Tensor
 from hqgs import _rust
 from hqgs.base.ranks import Ranks
 from hqgs.model.gaussians import Gaussians
+from hqgs.training import checkpoint
 from hqgs.training.adam import Adam
 from hqgs.training.densify import Densifier, gradient_norms
 from hqgs.training.guard import Fault
@@ -70,7 +71,7 @@ class Part:
             rows=tensors["rows"],
             values=tensors["values"],
             higher=tensors.get("higher"),
-            own={name[4:]: tensor for name, tensor in tensors.items() if name.startswith("own.")},
+            own=checkpoint.part("own.", tensors),
         )
 
 

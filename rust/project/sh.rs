@@ -15,7 +15,7 @@ pub const MAX_DEGREE: usize = 3;
 /// Coefficients of degree 3.
 pub const MAX_COUNT: usize = count(MAX_DEGREE);
 
-const C0: f64 = 0.282_094_791_773_878_14; // sqrt(1 / 4 pi)
+pub(crate) const C0: f64 = 0.282_094_791_773_878_14; // sqrt(1 / 4 pi)
 const C1: f64 = 0.488_602_511_902_919_9; // sqrt(3 / 4 pi)
 const C2A: f64 = 1.092_548_430_592_079_2; // sqrt(15 / 4 pi)
 const C2B: f64 = 0.315_391_565_252_520_05; // sqrt(5 / 16 pi)

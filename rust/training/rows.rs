@@ -21,8 +21,6 @@ pub const ADDED: usize = 14;
 pub const WIDTH: usize = ADDED + 1;
 /// Gaussians per task: their sums fit in the second-level cache.
 const CHUNK: usize = 2048;
-/// Of the harmonics of degree 0, 1 / sqrt(4 pi).
-const C0: f32 = 0.282_094_8;
 
 /// What one view gives.
 #[derive(Debug, Clone, Copy)]
@@ -131,7 +129,7 @@ fn add_view<S: Simd>(
             for k in 0..ADDED {
                 sums[k] += values[k];
             }
-            let color = [0, 1, 2].map(|k| values[ADDED - 3 + k] / C0);
+            let color = [0, 1, 2].map(|k| values[ADDED - 3 + k] / sh::C0 as f32);
             let sums = &mut high[width * at..][..3 * (count - 1)];
             for (sums, basis) in sums.chunks_exact_mut(3).zip(&basis[1..]) {
                 for k in 0..3 {

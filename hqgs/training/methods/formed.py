@@ -133,9 +133,9 @@ def _motion_directions(scene: Scene, inspector: Inspector) -> dict[str, float]:
 def _noises(scene: Scene, inspector: Inspector) -> dict[str, float]:
     """Standard deviations by photo, where 1 is white, of those whose noise is told from texture."""
     return {
-        photo.name: photo.noise / 255
+        photo.name: noise / 255
         for photo in inspector.diagnose(scene, max_photos=len(scene.train)).photos
-        if photo.noise is not None and photo.noise >= photo.noise_limit
+        if (noise := photo.told_noise) is not None
     }
 
 
