@@ -43,7 +43,7 @@ from hqgs.training.trainer import TrainingError
 FORMAT = 1  # raised when a run records something else
 KEY = r"[A-Za-z0-9_][A-Za-z0-9._-]*"  # what a run's name looks like: no path
 KNOWN = "known"  # the folder of runs from elsewhere
-NO_RESULT = ("cli", "pipeline.py")  # of the package: what no result depends on
+NO_RESULT = "cli"  # of the package: what no result depends on
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Store:
 def sources() -> str:
     """A digest of the files that make a result: of hqgs, and of the crate where there is a checkout."""
     package = Path(hqgs.__file__).parent
-    files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] not in NO_RESULT]
+    files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] != NO_RESULT]
     if (package.parent / "Cargo.toml").is_file():
         files += [*(package.parent / "rust").rglob("*.rs"), package.parent / "Cargo.lock"]
     sha = hashlib.sha256()
