@@ -21,7 +21,6 @@ from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
 
 PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml")
-SMOKE = "smoke"
 
 
 class Quality:
@@ -125,8 +124,8 @@ def run(args: argparse.Namespace) -> Report:
     """Run and compare what was asked for."""
     if args.pictures < 0:
         raise ValueError(f"pictures is {args.pictures}, wanted at least 0")
-    name = SMOKE if args.quick else args.protocol
-    study = begin(args, "quality", PROTOCOLS[name], labelled=False)
+    name = "quick" if args.quick else args.protocol
+    study = begin(args, PROTOCOLS, labelled=False)
     quality = Quality(study, "_".join([name, *reversed(study.tags)]))
     quality.report.settings["protocol"] = name
     quality.tables()

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from benchmarks.output import number
 from benchmarks.places import parts_of_step
 from benchmarks.speed.timing import Seconds, StageClock, interleaved, median_ratio, whole
+from hqgs.base.text import markdown_table
 from hqgs.training.trainer import Trainer
 
 # In the order of a step. Each is without the others that run inside it.
@@ -70,3 +72,18 @@ def measure_steps(
             }
         )
     return rows
+
+
+def steps_table(rows: list[dict[str, Any]]) -> str:
+    """One column for each case."""
+    first = rows[0]
+    body = [
+        ["whole step (ms)", *(number(r["seconds"], "ms") for r in rows)],
+        ["quartiles (ms)", *(number(r["seconds_quartiles"], "ms") for r in rows)],
+        [f"over {first['case']}", *(f"{r['over_first']:.2f}" for r in rows)],
+        ["target (ms)", *(str(r["target_ms"] or "") for r in rows)],
+        *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
+        ["with clocks / without", *(f"{r['clocked']:.2f}" for r in rows)],
+    ]
+    title = f"One training step, {first['width']} x {first['height']}"
+    return markdown_table(title, ["", *(r["case"] for r in rows)], body)
