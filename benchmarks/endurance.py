@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from benchmarks.charts import LEGEND, color, panels
+from benchmarks.charts import LEGEND, draw, panels
 from benchmarks.data import read_toml
 from benchmarks.measure import Run, Training
 from benchmarks.output import Benchmark, Report, table
@@ -173,8 +173,7 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
     what = {"psnr": "held-out PSNR (dB)", "gaussians": "Gaussians", "peak_rss_mb": "peak memory (MB)"}
     for axes, (name, label) in zip(grid, what.items(), strict=True):
         for k, result in enumerate(results):
-            points = DataFrame(result["records"], columns=["iteration", name]).dropna().to_numpy().T
-            axes.plot(*points, label=result["case"], color=color(k), lw=1.4, marker="o", ms=2)
+            draw(axes, DataFrame(result["records"], columns=["iteration", name]), k, result["case"])
         axes.set_ylabel(label)
     if results:
         grid[0].legend(**LEGEND)

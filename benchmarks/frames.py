@@ -7,13 +7,11 @@ from typing import Any
 
 from pandas import DataFrame
 
-PAIR = ["scene", "seed"]  # what a run shares with the one that it is held against
 
-
-def paired(runs: DataFrame, label: str) -> DataFrame:
-    """Each run beside that of row `label` of the same scene and seed (`_base`), where there is one."""
-    base = runs.loc[runs["row"] == label].set_index(PAIR).add_suffix("_base")
-    return runs.join(base, on=PAIR, how="inner")
+def paired(runs: DataFrame, label: str, by: Sequence[str] = ("scene", "seed")) -> DataFrame:
+    """Each run beside that of row `label` with the same values of `by` (`_base`), where there is one."""
+    base = runs.loc[runs["row"] == label].set_index(list(by)).add_suffix("_base")
+    return runs.join(base, on=list(by), how="inner")
 
 
 def means(frame: DataFrame, by: Sequence[str], values: Sequence[str]) -> DataFrame:

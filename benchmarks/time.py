@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.charts import GREY, LEGEND, color, panels, title
+from benchmarks.charts import GREY, LEGEND, draw, panels, title
 from benchmarks.data import read_toml
 from benchmarks.frames import means
 from benchmarks.measure import Run, train
@@ -75,8 +75,7 @@ def chart(runs: DataFrame) -> Figure:
             axes.plot(points["seconds"], points["psnr"], color=GREY, label=BASE)
         mine = DataFrame([line for line in lines(runs) if line["name"] == scene])
         for k, (key, label) in enumerate((("psnr", "hqgs --seconds"), ("own", "from its own points"))):
-            points = mine.dropna(subset=key)
-            axes.plot(points["seconds"], points[key], "o-", color=color(k), label=label)
+            draw(axes, mine[["seconds", key]], k, label)
         axes.set(xscale="log", xlabel="training (s)", ylabel="held-out PSNR (dB)")
         axes.set_xticks(TICKS, list(map(str, TICKS)))
         axes.set_xticks([], minor=True)

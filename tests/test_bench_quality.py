@@ -18,12 +18,13 @@ from scipy import ndimage
 
 import hqgs
 from benchmarks import cli, study
+from benchmarks.frames import means
 from benchmarks.protocol import Protocol, narrowed
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality
 from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
-from benchmarks.quality.tables import courses, equal_time_gain, means, metrics, psnr_at, spread, with_degraded
+from benchmarks.quality.tables import courses, equal_time_gain, metrics, psnr_at, spread, with_degraded
 from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
 from benchmarks.study import Cell, Store, Study, about, grid, key_of
 from hqgs.evaluation.metrics import psnr
@@ -535,20 +536,19 @@ def test_edge_maps_are_those_of_the_photos_that_are_trained_on() -> None:
     assert found == pytest.approx(np.mean([value for value in values if value is not None]))
 
 
-def fake(*points: tuple[float, float], **fields: Any) -> dict[str, Any]:
-    history = [{"iteration": k, "seconds": t, "psnr": v, "ssim": None} for k, (t, v) in enumerate(points)]
-    return {"history": history, "metrics": {"psnr": points[-1][1]}, **fields}
+def history(*points: tuple[float, float | None]) -> list[dict[str, Any]]:
+    return [{"iteration": k, "seconds": t, "psnr": v, "ssim": None} for k, (t, v) in enumerate(points)]
 
 
 def test_gain_at_equal_time() -> None:
-    slow, fast = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
+    slow, fast = history((10, 20), (20, 24), (40, 30)), history((5, 18), (15, 26))
     assert psnr_at(slow, 15) == 22
     assert psnr_at(slow, 9) is None
     assert psnr_at(slow, 41) is None
     assert equal_time_gain(fast, slow) == 26 - 22  # at 15 s, where the fast one ends
     assert equal_time_gain(slow, fast) == 22 - 26
-    assert equal_time_gain(fake((1, 18), (2, 26)), slow) is None  # the slow one was not evaluated by then
-    assert equal_time_gain(fake((5, 18), (15, None)), slow) is None  # type: ignore[arg-type]
+    assert equal_time_gain(history((1, 18), (2, 26)), slow) is None  # the slow one was not evaluated by then
+    assert equal_time_gain(history((5, 18), (15, None)), slow) is None
 
 
 def test_means_over_groups() -> None:
@@ -577,16 +577,15 @@ def test_each_scene_has_a_table_of_its_own() -> None:
 
 
 def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
-    runs = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
-    frame = DataFrame(
-        [{"row": label, "run": run} for first in runs for label, run in (("x", first), ("y", runs[0]))]
-    )
+    first, second = history((10, 20), (20, 24), (40, 30)), history((5, 18), (15, 26))
+    lines = [("x", first), ("y", first), ("x", second), ("y", first)]
+    frame = DataFrame([{"row": label, "history": one} for label, one in lines])
     way = table(courses(frame), "PSNR (dB) and seconds of training on the way, means over all runs")
     assert way == {
         "x": {"0": "19.00, 8 s", "1": "25.00, 18 s"},
         "y": {"0": "20.00, 10 s", "1": "24.00, 20 s"},
     }
-    runs[1]["history"][0]["psnr"] = None
+    second[0]["psnr"] = None
     assert courses(frame.loc[frame["row"] == "x"]).count("–, 8 s") == 1
 
 

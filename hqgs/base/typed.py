@@ -13,8 +13,8 @@ def build(kind: type[T], values: Any, where: str, base: T | None = None) -> T:
     """A dataclass of the values of its fields, objects with fields for the dataclasses within it.
 
     Lists become tuples, and whole numbers floats where the field is one. With `base`: a copy of it, with
-    other values for what `values` names. ValueError for an unknown, missing or mistyped field, and for one that the
-    class refuses; it begins with `where`.
+    other values for what `values` names. ValueError, which begins with `where`, for an unknown, missing or
+    mistyped field, and for one that the class refuses.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{where}: wanted an object with fields, got {values!r:.60}")
