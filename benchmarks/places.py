@@ -33,13 +33,22 @@ CRATE: dict[Place, str] = {
 
 
 def parts_of_step(trainer: Trainer) -> dict[Place, str]:
-    """The functions that a training step calls, with the part of the step that they make up."""
-    return CRATE | {
-        RENDER_VIEW: "activations",
-        (type(trainer.method), "modulate"): "method",
-        (type(trainer.method), "loss"): "loss",
-        (torch.Tensor, "backward"): "autograd",
-        (type(trainer.state.densifier), "observe"): "density statistics",
-        (type(trainer.state.densifier), "update"): "density statistics",
-        (type(trainer.state.optimizer), "step"): "Adam",
-    }
+    """The functions that a training step calls, in its order, with the part of the step that they make up.
+
+    Each part is without the others that run inside it.
+    """
+    state, (project, composite, *backward) = trainer.state, CRATE.items()
+    return dict(
+        [
+            (RENDER_VIEW, "activations"),  # of the Gaussians, and the checks of hqgs.rasterization
+            ((type(trainer.method), "modulate"), "method"),  # before they are rasterized
+            project,
+            composite,
+            ((type(trainer.method), "loss"), "loss"),
+            ((torch.Tensor, "backward"), "autograd"),  # of the activations, and torch's own work
+            *backward,
+            ((type(state.densifier), "observe"), "density statistics"),
+            ((type(state.densifier), "update"), "density statistics"),
+            ((type(state.optimizer), "step"), "Adam"),
+        ]
+    )

@@ -42,12 +42,13 @@ def then(history: list[dict[str, Any]], seconds: float) -> float | None:
 def lines(runs: DataFrame) -> list[dict[str, Any]]:
     """A line for each scene and number of seconds, means over the seeds."""
     found, mean = [], means(runs, ["scene", "row"], MEANS)
-    base = runs.loc[runs["row"] == BASE].set_index("scene")["history"]
+    base = runs.loc[runs["row"] == BASE]
     for (scene, row), line in mean.to_dict("index").items():
         if row == BASE or row.endswith(OWN):
             continue
         asked = float(row.removesuffix(" s"))
-        known = [value for history in base.loc[[scene]] if (value := then(history, asked)) is not None]
+        histories = base.loc[base["scene"] == scene, "history"]
+        known = [value for history in histories if (value := then(history, asked)) is not None]
         line |= {"name": scene, "asked": asked, "own": mean["psnr"].get((scene, f"{row}{OWN}"))}
         found.append(line | {"reference": sum(known) / len(known) if known else None})
     return found

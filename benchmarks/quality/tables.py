@@ -37,7 +37,7 @@ def crossed(
     down: str = "row",
     corner: str = "",
 ) -> str:
-    """A row for each value of `down`, a column for each of `across`, and the text of the runs that have both."""
+    """A row for each value of `down`, a column for each of `across`, the text of the runs that have both."""
     cells: dict[Any, str] = {key: text(part) for key, part in frame.groupby([down, across], sort=False)}
     labels, heads = (list(dict.fromkeys(key[k] for key in cells)) for k in (0, 1))
     body = [[label, *(cells.get((label, head), NOTHING) for head in heads)] for label in labels]

@@ -11,20 +11,6 @@ from benchmarks.speed.timing import Seconds, StageClock, interleaved, median_rat
 from hqgs.base.text import markdown_table
 from hqgs.training.trainer import Trainer
 
-# In the order of a step. Each is without the others that run inside it.
-PARTS = (
-    "activations",  # of the Gaussians, and the checks of hqgs.rasterization
-    "method",  # what it makes of the Gaussians before they are rasterized
-    "project",
-    "bin and composite",
-    "loss",
-    "autograd",  # the backward pass of the activations, and torch's own work
-    "composite backward",
-    "project backward",
-    "density statistics",
-    "Adam",
-)
-
 
 def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
     """A step of which only the whole is timed."""
@@ -33,11 +19,11 @@ def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
 
 def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
     """A step with a clock around each part."""
-    clock = StageClock()
+    clock, parts = StageClock(), parts_of_step(trainer)
 
     def call() -> Seconds:
-        with clock.watching(parts_of_step(trainer)):
-            return clock.seconds(trainer.step, PARTS)
+        with clock.watching(parts):
+            return clock.seconds(trainer.step, parts.values())
 
     return call
 
@@ -58,7 +44,7 @@ def measure_steps(
         camera = trainer.scene.train[0].camera
         method, n = trainer.config.method, len(trainer.gaussians)
         rounds, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
-        stages = parts[[*PARTS, "rest"]].median()
+        stages = parts.drop(columns="total").median()
         rows.append(
             {"case": name, "method": method, "gaussians": n, "width": camera.width, "height": camera.height}
             | whole(rounds)
