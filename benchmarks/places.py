@@ -14,14 +14,14 @@ from hqgs.training.trainer import Trainer
 
 Place = tuple[Any, str]  # a module or class, and the name that its users look up there
 
-# Replaced by benchmarks/features.
+# Replaced by benchmarks/switches.py.
 RENDER_VIEW: Place = (looks, "render_view")
 RASTERIZATION: Place = (render, "rasterization")
 ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
 ADAM: Place = (trainer, "Adam")
 LOSS: Place = (base, "photometric_loss")
 
-# Replaced by benchmarks/accuracy, and timed by benchmarks/speed with the stage that they make up.
+# Replaced by benchmarks/accuracy.py, and timed by benchmarks/speed with the stage that they make up.
 PROJECT: Place = (_rust, "project_forward")
 COMPOSITE: Place = (_rust, "composite_forward")
 CRATE: dict[Place, str] = {
