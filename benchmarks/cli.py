@@ -9,9 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hqgs
-from benchmarks import endurance, export, frugality, ranks, time
-from benchmarks.accuracy import run as accuracy
-from benchmarks.features import run as features
+from benchmarks import accuracy, endurance, export, features, frugality, ranks, time
 from benchmarks.output import Benchmark, command_line, write_results
 from benchmarks.protocol import add_options
 from benchmarks.quality import run as quality

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,11 +11,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pandas import DataFrame
 
-from benchmarks.charts import LEGEND, color, panels
+from benchmarks.charts import LEGEND, draw, panels
 from benchmarks.data import read_toml
 from benchmarks.measure import Run, Training
-from benchmarks.output import NOTHING, Benchmark, Report, table
+from benchmarks.output import Benchmark, Report, table
 from benchmarks.protocol import Protocol, Row, read_protocols
 from benchmarks.study import Cell, begin
 from hqgs.scene.scene import Scene
@@ -78,7 +79,8 @@ class Case(Row):
 
 
 FILE = Path(__file__).with_suffix(".toml")
-PROTOCOLS = read_protocols(FILE, Case)
+PROTOCOLS, COLUMNS = read_protocols(FILE, Case), read_toml(FILE)["columns"]
+JUDGED = ["iteration", "gaussians", "values_not_finite", "losses_not_finite", "peak_rss_mb"]  # of each record
 
 
 def measure(cell: Cell, scene: Scene) -> Run:
@@ -97,7 +99,7 @@ def run_case(scene: Scene, config: TrainConfig) -> Run:
     def after(step: Step) -> None:
         losses.append(step.loss)
         if trainer.iteration % interval == 0 or trainer.iteration == config.iterations:
-            records.append(_so_far(done, losses))
+            records.append(_so_far(done, np.array(losses)))
             losses.clear()
             done.peak_rss_mb()  # what the evaluation needed is no part of the next one
 
@@ -109,14 +111,15 @@ def run_case(scene: Scene, config: TrainConfig) -> Run:
     return result | verdict(result, config)
 
 
-def _so_far(done: Training, losses: Sequence[float]) -> dict[str, Any]:
+def _so_far(done: Training, losses: NDArray[np.float64]) -> dict[str, Any]:
+    """`losses`: of the steps since the last record."""
     trainer, peak = done.trainer, done.peak_rss_mb()
     trainer.evaluate()
-    finite = [loss for loss in losses if math.isfinite(loss)]
+    finite = losses[np.isfinite(losses)]
     return {
         "iteration": trainer.iteration,
         "seconds": trainer.seconds,
-        "loss": float(np.mean(finite)) if finite else None,  # mean over the steps since the last record
+        "loss": float(finite.mean()) if len(finite) else None,
         "losses_not_finite": len(losses) - len(finite),
         "values_not_finite": sum(int((~torch.isfinite(t)).sum()) for t in trainer.gaussians.named().values()),
         "events": trainer.guard.num_events,
@@ -131,37 +134,37 @@ def verdict(result: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
 
     `slope_mb`: growth of the peak memory per 1,000 iterations in the second half, by least squares.
     """
-    records = result["records"]
-    late = [r for r in records if r["iteration"] > config.iterations // 2 and r["peak_rss_mb"] is not None]
+    records = DataFrame(result["records"], columns=JUDGED)
+    late = (
+        records.loc[records["iteration"] > config.iterations // 2]
+        .dropna(subset=["peak_rss_mb"])
+        .astype(float)
+    )
     slope = None
-    if len(late) > 2 and late[-1]["iteration"] - late[0]["iteration"] >= SHORTEST:
-        iterations, peaks = zip(*((r["iteration"] / 1_000, r["peak_rss_mb"]) for r in late), strict=True)
-        slope = float(np.polyfit(iterations, peaks, 1)[0])
+    if len(late) > 2 and np.ptp(late["iteration"]) >= SHORTEST:
+        slope = float(np.polyfit(late["iteration"] / 1_000, late["peak_rss_mb"], 1)[0])
+    bad = records[["values_not_finite", "losses_not_finite"]].to_numpy().any()
     conditions = {
-        "finite": result["failure"] is None
-        and not any(r["values_not_finite"] or r["losses_not_finite"] for r in records),
+        "finite": result["failure"] is None and not bad,
         "memory_flat": None if slope is None else slope <= LIMIT_MB,
-        "within_budget": all(r["gaussians"] <= config.densify.max_gaussians for r in records),
+        "within_budget": bool((records["gaussians"] <= config.densify.max_gaussians).all()),
     }
     return conditions | {"slope_mb": slope, "passed": False not in conditions.values()}
 
 
 def cases_table(results: Sequence[dict[str, Any]], protocol: Protocol) -> str:
     """One line for each case, with the last record's numbers."""
-    shown = {True: "yes", False: "NO", None: NOTHING}
     lines = []
     for result in results:
         most = max((r["gaussians"] for r in result["records"]), default=None)
-        line = dict.fromkeys(("loss", "psnr", "peak_rss_mb")) | result | (result["records"] or [{}])[-1]
-        line |= {name: shown[result[name]] for name in ("finite", "memory_flat", "within_budget")}
-        line |= {"most": most, "events": result["guard"]["num_events"]}
-        lines.append(line | {"verdict": "pass" if result["passed"] else "FAIL"})
+        last = (result["records"] or [dict.fromkeys(("loss", "psnr", "peak_rss_mb"))])[-1]
+        lines.append(result | last | {"most": most})
     title = (
         f"Photos at 1/{protocol.downscale:g}, {protocol.iterations:,} iterations, at most "
         f"{protocol.config['densify']['max_gaussians']:,} Gaussians; memory may grow by {LIMIT_MB:g} MB per "
         "1,000 iterations"
     )
-    return table(title, lines, read_toml(FILE)["columns"]["cases"])
+    return table(title, lines, COLUMNS)
 
 
 def chart(results: Sequence[dict[str, Any]]) -> Figure:
@@ -170,11 +173,7 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
     what = {"psnr": "held-out PSNR (dB)", "gaussians": "Gaussians", "peak_rss_mb": "peak memory (MB)"}
     for axes, (name, label) in zip(grid, what.items(), strict=True):
         for k, result in enumerate(results):
-            points = [(r["iteration"], r[name]) for r in result["records"] if r[name] is not None]
-            if points:
-                axes.plot(
-                    *zip(*points, strict=True), label=result["case"], color=color(k), lw=1.4, marker="o", ms=2
-                )
+            draw(axes, DataFrame(result["records"], columns=["iteration", name]), k, result["case"])
         axes.set_ylabel(label)
     if results:
         grid[0].legend(**LEGEND)
@@ -184,7 +183,7 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
 
 def run(args: argparse.Namespace) -> Report:
     """Run the cases that are not finished, in their order; each is written as soon as it is done."""
-    study = begin(args, "endurance", PROTOCOLS["quick" if args.quick else "standard"])
+    study = begin(args, PROTOCOLS)
     study.train(measure)
     alone = len(study.scenes) == len(study.protocol.seeds) == 1
     names = {cell: cell.row.label if alone else str(cell) for cell in study.cells}
@@ -198,6 +197,5 @@ def run(args: argparse.Namespace) -> Report:
     return report
 
 
-BENCHMARK = Benchmark(
-    "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size", run, PROTOCOLS
-)
+HELP = "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size"
+BENCHMARK = Benchmark(HELP, run, PROTOCOLS)

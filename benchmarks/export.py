@@ -13,12 +13,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.charts import GREY, LEGEND, color, panels, title, unbeaten
-from benchmarks.data import build, read_toml
+from benchmarks.data import read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
 from benchmarks.protocol import read_protocols
 from benchmarks.study import Cell, begin
 from hqgs.base.files import PLY
+from hqgs.base.typed import build
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
@@ -59,7 +60,6 @@ def files_table(result: dict[str, Any]) -> str:
         row
         | {"mb": row["bytes"] / 1e6, "share": 100 * row["bytes"] / result["ply_of_3dgs_bytes"]}
         | {"change": 0.0 - row["cost_db"], "levels": 255 * row["largest_change"]}
-        | {"best": "yes" if row["pareto"] else ""}
         | ({"psnr_to_original": "same"} if row["psnr_to_original"] is None else {})
         for row in result["files"]
     ]
@@ -67,7 +67,7 @@ def files_table(result: dict[str, Any]) -> str:
         f"{result['scene']}, {result['width']} x {result['height']}: {result['gaussians']:,} Gaussians of "
         f"degree {result['sh_degree']}, {result['psnr']:.3f} dB; MB = 10^6 bytes"
     )
-    return table(title, lines, DATA["columns"]["files"])
+    return table(title, lines, DATA["columns"])
 
 
 def chart(result: dict[str, Any]) -> Figure:
@@ -92,13 +92,12 @@ def chart(result: dict[str, Any]) -> Figure:
 
 def trained(args: argparse.Namespace) -> tuple[Scene, Path, dict[str, Any]]:
     """The scene, the folder that keeps its Gaussians, and the settings: trained, or of a given run."""
-    protocol = PROTOCOLS["quick" if args.quick else "standard"]
     if len(args.scenes) > 1 or len(args.seeds or ()) > 1:
         raise ValueError("one scene and one seed are written")
     if args.run_folder is not None:
-        downscale = args.downscale or protocol.downscale
+        downscale = args.downscale or PROTOCOLS["quick" if args.quick else "standard"].downscale
         return load_scene(args.scenes[0], downscale), args.run_folder, {"downscale": downscale}
-    study = begin(args, "export", protocol, labelled=False)
+    study = begin(args, PROTOCOLS, labelled=False)
     (cell,) = study.cells
 
     def run_cell(cell: Cell, photos: Scene) -> Run:

@@ -12,10 +12,11 @@ from pandas import DataFrame
 
 from benchmarks.charts import GREY, LEGEND, color, panels
 from benchmarks.data import read_toml
+from benchmarks.frames import paired
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
 from benchmarks.protocol import Protocol, read_protocols
-from benchmarks.study import Cell, begin
+from benchmarks.study import Cell, finished
 from hqgs.base.files import PLY
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, NONE
@@ -23,23 +24,21 @@ from hqgs.training.config import AUTO, NONE
 FILE = Path(__file__).with_suffix(".toml")
 PROTOCOLS, DATA = read_protocols(FILE), read_toml(FILE)
 TARGETS, COLUMNS = DATA["targets"], DATA["columns"]
+SHARES = ("cpu_seconds", "bytes", "gaussians")  # of the run that left nothing out
 
 
 def run_cell(cell: Cell, photos: Scene) -> Run:
     """Train one row; what came of it, as plain JSON values."""
     done = train(photos, cell.config, evaluate=False)
     trainer, peak = done.trainer, done.peak_rss_mb()
-    trainer.evaluate()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / PLY
         trainer.shown().save(path)
         size = path.stat().st_size
-    last, camera = trainer.history[-1], photos.test[0].camera
+    camera = photos.test[0].camera
     left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
-    return done.record() | {
+    return done.judged() | {
         "photo": [camera.width, camera.height],
-        "psnr": last["psnr"],
-        "ssim": last["ssim"],
         "cpu_seconds": done.setup_cpu_seconds + done.cpu_seconds,  # with the choice of photos
         "decision_seconds": trainer.frugality.memory.seconds,
         "peak_rss_mb": peak,
@@ -49,10 +48,12 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
     }
 
 
-def paired(runs: DataFrame, row: str) -> DataFrame:
-    """The runs of a row beside those (`_none`) of the same scene and seed that left nothing out."""
-    base, mine = (runs.loc[runs["row"] == label].set_index(["scene", "seed"]) for label in (NONE, row))
-    return mine.join(base.add_suffix("_none"), how="inner")
+def compared(runs: DataFrame) -> DataFrame:
+    """Each run beside that of the same scene and seed which left nothing out, with its shares and gains."""
+    pairs = paired(runs, NONE)
+    shares = {f"{name}_share": pairs[name] / pairs[f"{name}_base"] for name in SHARES}
+    gains = {f"{name}_gain": pairs[name] - pairs[f"{name}_base"] for name in ("psnr", "ssim")}
+    return pairs.assign(**shares, **gains)
 
 
 def against_none(runs: DataFrame, row: str) -> dict[str, Any] | None:
@@ -60,18 +61,17 @@ def against_none(runs: DataFrame, row: str) -> dict[str, Any] | None:
 
     The worst scene is the one whose mean over the seeds is lowest.
     """
-    pairs = paired(runs, row)
+    pairs = compared(runs).loc[lambda pairs: pairs["row"] == row]
     if not len(pairs):
         return None
-    gains = (pairs["psnr"] - pairs["psnr_none"]).groupby("scene").mean()
-    shares = {n: float((pairs[n] / pairs[f"{n}_none"]).mean()) for n in ("cpu_seconds", "bytes", "gaussians")}
+    gains = pairs.groupby("scene")["psnr_gain"].mean()
     return {
         "scenes": len(gains),
         "runs": len(pairs),
-        **shares,
+        **{name: float(pairs[f"{name}_share"].mean()) for name in SHARES},
         "psnr": float(gains.mean()),
         "worst_psnr": float(gains.min()),
-        "ssim": float((pairs["ssim"] - pairs["ssim_none"]).mean()),
+        "ssim": float(pairs["ssim_gain"].mean()),
         "decision_share": float((pairs["decision_seconds"] / pairs["seconds"]).mean()),
     }
 
@@ -87,11 +87,10 @@ def runs_table(runs: DataFrame, protocol: Protocol) -> str:
     """One line for each scene and row, means over the seeds."""
     lines = []
     for _, same in runs.groupby(["scene", "row"], sort=False):
-        scene, row = same[["scene", "row"]].iloc[0]
-        mean, psnr = same.mean(numeric_only=True), same["psnr"].astype(float)
+        mean, first, psnr = same.mean(numeric_only=True), same.iloc[0], same["psnr"].astype(float)
         half = f" ± {(psnr.max() - psnr.min()) / 2:.2f}" if len(same) > 1 else ""
         words = {
-            "name": f"{scene}, {row}",
+            "name": f"{first['scene']}, {first['row']}",
             "psnr": number(psnr.mean(skipna=False), ".2f") + half,
             "decisions": mean["decision_seconds"] / mean["seconds"],
             "peak_rss_mb": mean.get("peak_rss_mb"),  # what no system told is no number
@@ -104,29 +103,27 @@ def runs_table(runs: DataFrame, protocol: Protocol) -> str:
     return table(title + many, lines, COLUMNS["runs"])
 
 
-def chart(runs: DataFrame, rows: list[str]) -> Figure:
+def chart(runs: DataFrame) -> Figure:
     """PSNR gained against the share of the CPU time, and against the share of the bytes; a mark a run."""
     figure, grid = panels(9, 4.2, 1, 2, sharey=True)
+    parts = compared(runs).loc[lambda pairs: pairs["row"] != NONE].groupby("row", sort=False)
     for axes, (name, label) in zip(grid, (("cpu_seconds", "CPU time"), ("bytes", "bytes")), strict=True):
-        for k, row in enumerate(rows):
-            pairs = paired(runs, row)
-            share, gain = pairs[name] / pairs[f"{name}_none"], pairs["psnr"] - pairs["psnr_none"]
-            axes.scatter(share, gain, label=row, s=60 if row == AUTO else 30, color=color(k))
+        for k, (row, pairs) in enumerate(parts):
+            size = 60 if row == AUTO else 30
+            axes.scatter(pairs[f"{name}_share"], pairs["psnr_gain"], label=str(row), s=size, color=color(k))
         axes.axhline(0, color=GREY, linewidth=0.8)
         axes.axvline(1, color=GREY, linewidth=0.8)
         axes.set_xlabel(f"{label}, nothing left out = 1")
         axes.set_xlim(left=0)
     grid[0].set_ylabel("held-out PSNR gained (dB)")
-    if rows:
+    if len(parts):
         grid[0].legend(title="left out", **LEGEND)
     return figure
 
 
 def run(args: argparse.Namespace) -> Report:
     """Train what is not finished, row after row of a scene; each is kept as soon as it is done."""
-    study = begin(args, "frugality", PROTOCOLS["quick" if args.quick else "standard"])
-    study.train(run_cell)
-    report, runs = study.report_of_runs()
+    study, report, runs = finished(args, PROTOCOLS, run_cell)
     if not len(runs):
         return report
     labels = [label for label in study.protocol.labels if label != NONE]
@@ -141,7 +138,7 @@ def run(args: argparse.Namespace) -> Report:
         reached = report.results["targets"] = verdict(summaries[AUTO])
         words = [f"{name}: {'reached' if ok else 'MISSED'}" for name, ok in reached.items()]
         report.tables.append(f"Targets of {AUTO}: {', '.join(words)}.")
-    report.figures["gains"] = chart(runs, list(summaries))
+    report.figures["gains"] = chart(runs)
     return report
 
 

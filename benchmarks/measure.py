@@ -56,6 +56,12 @@ class Training:
             "config": asdict(self.trainer.config),
         }
 
+    def judged(self) -> Run:
+        """The record with the held-out means of where it is."""
+        self.trainer.evaluate(self.trainer.held_out())
+        last = self.trainer.history[-1]
+        return self.record() | {"psnr": last["psnr"], "ssim": last["ssim"]}
+
 
 def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training:
     """Train to the end. With `evaluate` the held-out views are measured as the configuration asks and there.

@@ -7,6 +7,8 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from benchmarks.protocol import Protocol
 
 NOTHING = "–"  # in the place of a number that there is not
+UNTOLD = ("benchmark", "command", "out", "page")  # what of the arguments is no option, or changes no result
 
 
 class UnavailableError(RuntimeError):
@@ -104,12 +107,7 @@ def command_line(args: argparse.Namespace) -> str:
     """The command that gives these results again, every option written out, folders by their name alone."""
     words = ["python", "-m", "benchmarks", args.benchmark]
     for name, value in sorted(vars(args).items()):
-        if (
-            name in ("benchmark", "command", "out", "page")
-            or value is None
-            or value is False
-            or callable(value)
-        ):
+        if name in UNTOLD or value is None or value is False or callable(value):
             continue
         values = value if isinstance(value, list) else [] if value is True else [value]
         words += [f"--{name.replace('_', '-')}", *(v.name if isinstance(v, Path) else str(v) for v in values)]
@@ -117,22 +115,28 @@ def command_line(args: argparse.Namespace) -> str:
 
 
 def number(value: Any, form: str) -> str:
-    """A value in a format, `ms` for seconds as milliseconds; NOTHING for None and NaN."""
+    """A value in a format, NOTHING for None and NaN; of a list each one: `1.02 to 1.05`.
+
+    Beside Python's formats there are `ms`, which takes seconds, and `yes|no`, the words for True and False.
+    """
     if value is None or value != value:
         return NOTHING
     if isinstance(value, str):
         return value
+    if isinstance(value, list):
+        return " to ".join(number(one, form) for one in value)
+    if "|" in form:
+        return form.split("|")[not value]
     if form == "ms":
         return f"{1000 * value:.3g}" if value < 0.1 else f"{1000 * value:.0f}"
     return format(value, form)
 
 
-def span(values: Iterable[float], form: str) -> str:
-    """`1.02 to 1.05`: quartiles, in a format of `number`."""
-    return " to ".join(number(value, form) for value in values)
-
-
 def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, Sequence[str]]) -> str:
-    """A Markdown table of rows. `columns`: the head and the format of each by its key."""
-    body = [[number(row[key], form) for key, (_, form) in columns.items()] for row in rows]
+    """A Markdown table of rows. `columns`: the head and the format of each by its key.
+
+    The key `a/b` is that of what a row holds at `b` of its `a`.
+    """
+    paths = [(key.split("/"), form) for key, (_, form) in columns.items()]
+    body = [[number(reduce(getitem, path, row), form) for path, form in paths] for row in rows]
     return markdown_table(title, [head for head, _ in columns.values()], body)

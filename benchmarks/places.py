@@ -14,14 +14,14 @@ from hqgs.training.trainer import Trainer
 
 Place = tuple[Any, str]  # a module or class, and the name that its users look up there
 
-# Replaced by benchmarks/features.
+# Replaced by benchmarks/switches.py.
 RENDER_VIEW: Place = (looks, "render_view")
 RASTERIZATION: Place = (render, "rasterization")
 ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
 ADAM: Place = (trainer, "Adam")
 LOSS: Place = (base, "photometric_loss")
 
-# Replaced by benchmarks/accuracy, and timed by benchmarks/speed with the stage that they make up.
+# Replaced by benchmarks/accuracy.py, and timed by benchmarks/speed with the stage that they make up.
 PROJECT: Place = (_rust, "project_forward")
 COMPOSITE: Place = (_rust, "composite_forward")
 CRATE: dict[Place, str] = {
@@ -33,13 +33,22 @@ CRATE: dict[Place, str] = {
 
 
 def parts_of_step(trainer: Trainer) -> dict[Place, str]:
-    """The functions that a training step calls, with the part of the step that they make up."""
-    return CRATE | {
-        RENDER_VIEW: "activations",
-        (type(trainer.method), "modulate"): "method",
-        (type(trainer.method), "loss"): "loss",
-        (torch.Tensor, "backward"): "autograd",
-        (type(trainer.state.densifier), "observe"): "density statistics",
-        (type(trainer.state.densifier), "update"): "density statistics",
-        (type(trainer.state.optimizer), "step"): "Adam",
-    }
+    """The functions that a training step calls, in its order, with the part of the step that they make up.
+
+    Each part is without the others that run inside it.
+    """
+    state, (project, composite, *backward) = trainer.state, CRATE.items()
+    return dict(
+        [
+            (RENDER_VIEW, "activations"),  # of the Gaussians, and the checks of hqgs.rasterization
+            ((type(trainer.method), "modulate"), "method"),  # before they are rasterized
+            project,
+            composite,
+            ((type(trainer.method), "loss"), "loss"),
+            ((torch.Tensor, "backward"), "autograd"),  # of the activations, and torch's own work
+            *backward,
+            ((type(state.densifier), "observe"), "density statistics"),
+            ((type(state.densifier), "update"), "density statistics"),
+            ((type(state.optimizer), "step"), "Adam"),
+        ]
+    )

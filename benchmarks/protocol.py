@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from benchmarks.data import build, read_toml
+from benchmarks.data import read_toml
 from benchmarks.scenes import BUILT_IN, EMBEDDED
+from hqgs.base.typed import build
 from hqgs.photos.formula import parse_degradation
 from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_leave_out
 from hqgs.training.frugality import RULES

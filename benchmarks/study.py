@@ -43,7 +43,7 @@ from hqgs.training.trainer import TrainingError
 FORMAT = 1  # raised when a run records something else
 KEY = r"[A-Za-z0-9_][A-Za-z0-9._-]*"  # what a run's name looks like: no path
 KNOWN = "known"  # the folder of runs from elsewhere
-NO_RESULT = ("cli", "pipeline.py")  # of the package: what no result depends on
+NO_RESULT = "cli"  # of the package: what no result depends on
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Store:
 def sources() -> str:
     """A digest of the files that make a result: of hqgs, and of the crate where there is a checkout."""
     package = Path(hqgs.__file__).parent
-    files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] not in NO_RESULT]
+    files = [p for p in package.rglob("*.py") if p.relative_to(package).parts[0] != NO_RESULT]
     if (package.parent / "Cargo.toml").is_file():
         files += [*(package.parent / "rust").rglob("*.rs"), package.parent / "Cargo.lock"]
     sha = hashlib.sha256()
@@ -250,12 +250,6 @@ class Study:
         missing = [cell for cell in self.cells if cell not in self.runs]
         return [{"what": f"run {c}", "why": self.failures.get(c, "not finished")} for c in missing]
 
-    def report_of_runs(self) -> tuple[Report, DataFrame]:
-        """A report that holds the finished runs, and these as a table."""
-        report = self.report()
-        report.results["runs"] = runs = self.results()
-        return report, DataFrame(runs)
-
     def results(self) -> list[Run]:
         """The finished runs with the labels of their rows, in the order of the cells."""
         return [self.runs[c] | {"row": c.row.label} for c in self.cells if c in self.runs]
@@ -275,15 +269,28 @@ class Study:
 
 
 def begin(
-    args: argparse.Namespace, name: str, protocol: Protocol, labelled: bool = True, **changes: Any
+    args: argparse.Namespace, protocols: Mapping[str, Protocol], labelled: bool = True, **changes: Any
 ) -> Study:
-    """The study of a protocol that the options of `add_options`, and then `changes`, narrow."""
+    """The study of one of the protocols, which the options of `add_options`, and then `changes`, narrow."""
+    name = "quick" if args.quick else vars(args).get("protocol", "standard")
     options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats")
-    protocol = narrowed(protocol, **{option: vars(args).get(option) for option in options} | changes)
+    given = {option: vars(args).get(option) for option in options} | changes
+    protocol = narrowed(protocols[name], **given)
     sources = args.scenes[:1] if protocol.one_scene else args.scenes
     cache = args.out / "scenes"
     scenes = load_scenes(sources, protocol.downscale, protocol.embedded, cache, args.validate)
-    return Study(args, name, protocol, scenes, labelled)
+    return Study(args, args.benchmark, protocol, scenes, labelled)
+
+
+def finished(
+    args: argparse.Namespace, protocols: Mapping[str, Protocol], measure: Callable[[Cell, Scene], Run]
+) -> tuple[Study, Report, DataFrame]:
+    """The study of `begin`, trained; a report that holds its finished runs, and these as a table."""
+    study = begin(args, protocols)
+    study.train(measure)
+    report = study.report()
+    report.results["runs"] = study.results()
+    return study, report, DataFrame(study.results())
 
 
 def about(cells: Sequence[Cell], runs: Mapping[Cell, Run]) -> str:

@@ -9,18 +9,19 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.charts import GREY, LEGEND, color, panels, title
+from benchmarks.charts import GREY, LEGEND, draw, panels, title
 from benchmarks.data import read_toml
+from benchmarks.frames import means
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
 from benchmarks.protocol import read_protocols
-from benchmarks.study import Cell, begin
+from benchmarks.study import Cell, finished
 from hqgs.pipeline import fitted
 from hqgs.scene.scene import Scene
 
 FILE = Path(__file__).with_suffix(".toml")
-PROTOCOLS, DATA = read_protocols(FILE), read_toml(FILE)
-OWN = ", own points"
+PROTOCOLS, COLUMNS = read_protocols(FILE), read_toml(FILE)["columns"]
+BASE, OWN = "3dgs", ", own points"
 MEANS = ("seconds", "iterations", "gaussians", "psnr", "ssim")  # over the seeds
 TICKS = (3, 10, 30, 60, 180, 600)  # s
 SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
@@ -29,10 +30,7 @@ SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
 def run_cell(cell: Cell, photos: Scene) -> Run:
     """Train one row; what came of it, as plain JSON values."""
     config = fitted(photos, cell.config)
-    done = train(photos, config, evaluate=config.seconds is None)
-    done.trainer.evaluate(done.trainer.held_out())
-    last = done.trainer.history[-1]
-    return done.record() | {"psnr": last["psnr"], "ssim": last["ssim"]}
+    return train(photos, config, evaluate=config.seconds is None).judged()
 
 
 def then(history: list[dict[str, Any]], seconds: float) -> float | None:
@@ -43,51 +41,42 @@ def then(history: list[dict[str, Any]], seconds: float) -> float | None:
 
 def lines(runs: DataFrame) -> list[dict[str, Any]]:
     """A line for each scene and number of seconds, means over the seeds."""
-    found = []
-    timed = runs[(runs["row"] != "3dgs") & ~runs["row"].str.endswith(OWN)]
-    for scene, row in dict.fromkeys(zip(timed["scene"], timed["row"], strict=True)):
-        same = timed[(timed["scene"] == scene) & (timed["row"] == row)]
+    found, mean = [], means(runs, ["scene", "row"], MEANS)
+    base = runs.loc[runs["row"] == BASE]
+    for (scene, row), line in mean.to_dict("index").items():
+        if row == BASE or row.endswith(OWN):
+            continue
         asked = float(row.removesuffix(" s"))
-        own = runs[(runs["scene"] == scene) & (runs["row"] == f"{row}{OWN}")]
-        base = runs[(runs["scene"] == scene) & (runs["row"] == "3dgs")]
-        reference = [value for h in base["history"] if (value := then(h, asked)) is not None]
-        found.append(
-            {key: float(same[key].mean()) for key in MEANS}
-            | {"name": scene, "asked": asked, "own": float(own["psnr"].mean()) if len(own) else None}
-            | {"reference": sum(reference) / len(reference) if reference else None}
-        )
+        histories = base.loc[base["scene"] == scene, "history"]
+        known = [value for history in histories if (value := then(history, asked)) is not None]
+        line |= {"name": scene, "asked": asked, "own": mean["psnr"].get((scene, f"{row}{OWN}"))}
+        found.append(line | {"reference": sum(known) / len(known) if known else None})
     return found
 
 
 def levels(runs: DataFrame) -> list[str]:
     """How long it takes to come within SHORT of where 3DGS ends, in words, a line for each scene."""
-    words = []
-    for scene, base in runs[runs["row"] == "3dgs"].groupby("scene", sort=False):
-        level = float(base["psnr"].mean()) - SHORT
-        mine = [line for line in lines(runs) if line["name"] == scene and line["psnr"] >= level]
-        needs = min((line["seconds"] for line in mine), default=None)
-        took = f"{needs:.0f} s" if needs is not None else "more than were tried"
-        words.append(
-            f"{scene}: {level:.2f} dB take {took}, 3dgs {float(base['seconds'].mean()):.0f} s to its end."
-        )
+    words, found = [], lines(runs)
+    base = means(runs.loc[runs["row"] == BASE], ["scene"], MEANS).to_dict("index")
+    for scene, reference in base.items():
+        level = reference["psnr"] - SHORT
+        enough = [line["seconds"] for line in found if line["name"] == scene and line["psnr"] >= level]
+        took = f"{min(enough):.0f} s" if enough else "more than were tried"
+        words.append(f"{scene}: {level:.2f} dB take {took}, 3dgs {reference['seconds']:.0f} s to its end.")
     return words
 
 
 def chart(runs: DataFrame) -> Figure:
     """Held-out PSNR against seconds of training, a panel for each scene."""
-    scenes = list(dict.fromkeys(runs["scene"]))
+    scenes = list(runs["scene"].unique())
     figure, grid = panels(5 * len(scenes), 4, 1, len(scenes))
     for axes, scene in zip(grid, scenes, strict=True):
-        for _, run in runs[(runs["scene"] == scene) & (runs["row"] == "3dgs")].iterrows():
-            axes.plot(
-                *zip(*[(h["seconds"], h["psnr"]) for h in run["history"]], strict=True),
-                color=GREY,
-                label="3dgs",
-            )
-        mine = [line for line in lines(runs) if line["name"] == scene]
+        for history in runs.loc[(runs["scene"] == scene) & (runs["row"] == BASE), "history"]:
+            points = DataFrame(history)
+            axes.plot(points["seconds"], points["psnr"], color=GREY, label=BASE)
+        mine = DataFrame([line for line in lines(runs) if line["name"] == scene])
         for k, (key, label) in enumerate((("psnr", "hqgs --seconds"), ("own", "from its own points"))):
-            points = [(m["seconds"], m[key]) for m in mine if m[key] is not None]
-            axes.plot([x for x, _ in points], [y for _, y in points], "o-", color=color(k), label=label)
+            draw(axes, mine[["seconds", key]], k, label)
         axes.set(xscale="log", xlabel="training (s)", ylabel="held-out PSNR (dB)")
         axes.set_xticks(TICKS, list(map(str, TICKS)))
         axes.set_xticks([], minor=True)
@@ -100,15 +89,10 @@ def chart(runs: DataFrame) -> Figure:
 
 def run(args: argparse.Namespace) -> Report:
     """Train what is not finished; each run is kept as soon as it is done."""
-    study = begin(args, "time", PROTOCOLS["quick" if args.quick else "standard"])
-    study.train(run_cell)
-    report, runs = study.report_of_runs()
+    _, report, runs = finished(args, PROTOCOLS, run_cell)
     if len(runs) and (found := lines(runs)):
         report.results["lines"] = found
-        report.tables += [
-            table("Held-out error against seconds of training", found, DATA["columns"]),
-            *levels(runs),
-        ]
+        report.tables += [table("Held-out error against seconds of training", found, COLUMNS), *levels(runs)]
         report.figures["error"] = chart(runs)
     return report
 

@@ -26,6 +26,13 @@ pub(crate) fn filled<T: Clone>(value: T, len: usize, name: &str) -> Result<Vec<T
     Ok(vector)
 }
 
+/// A copy of a slice.
+pub(crate) fn copied<T: Copy>(from: &[T], name: &str) -> Result<Vec<T>, Error> {
+    let mut vector = with_capacity(from.len(), name)?;
+    vector.extend_from_slice(from);
+    Ok(vector)
+}
+
 #[cold]
 fn no_memory<T>(len: usize, name: &str) -> Error {
     Error::OutOfMemory {
@@ -41,6 +48,7 @@ mod tests {
     #[test]
     fn what_cannot_be_had_is_an_error() {
         assert_eq!(filled(7u8, 3, "few").unwrap(), [7; 3]);
+        assert_eq!(copied(&[1u8, 2], "few").unwrap(), [1, 2]);
         let expected = Error::OutOfMemory {
             name: "image".into(),
             bytes: 1 << 60,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import signal
 from dataclasses import replace
@@ -54,6 +55,17 @@ def test_a_bare_configuration_has_the_defaults_too() -> None:
     assert set(asked.leave_out) == {"photos", "growth", "weight", "harmonics", "iterations"}
     assert "iterations" not in run_config(iterations=30_000).leave_out
     assert run_config(leave_out="none").leave_out == ()
+
+
+def test_train_and_run_config_have_the_same_options() -> None:
+    """They are written out twice, so that signatures show them."""
+    train, config = (inspect.signature(f).parameters for f in (hqgs.train, run_config))
+    assert {name: (p.annotation, p.default) for name, p in config.items()} == {
+        name: (p.annotation, p.default) for name, p in train.items() if name in config
+    }
+    assert set(train) - set(config) == {
+        "scene", "out", "seconds", "config", "resume", "overwrite", "progress", "told", "ranks"
+    }  # fmt: skip
 
 
 def test_without_a_folder_nothing_is_written(tmp_path: Path) -> None:

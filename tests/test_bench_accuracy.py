@@ -19,8 +19,7 @@ from scenes import random_scene
 
 import hqgs
 from benchmarks import cli
-from benchmarks.accuracy.knobs import CASES, ORACLES, Knobs, TunedPass
-from benchmarks.accuracy.run import beats, errors_against
+from benchmarks.accuracy import CASES, ORACLES, Knobs, TunedPass, beats, errors_against
 from benchmarks.charts import unbeaten
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass
@@ -168,7 +167,7 @@ def test_the_exact_oracle_has_no_cutoffs_left() -> None:
 def test_default_knobs_are_the_default() -> None:
     inputs = make_inputs(300, 48, 36, seed=2)
     plain, default = RasterPass(inputs), TunedPass(inputs, Knobs())
-    assert CASES[0] == ("default", "", Knobs())
+    assert next(iter(CASES.items())) == (("default", ""), Knobs())
     assert ORACLES["defined"] == Knobs(dtype="float64")
     assert tuple(asdict(default.knobs).values())[1:] == DEFAULT
     assert torch.equal(plain.run(), default.run())

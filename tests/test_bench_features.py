@@ -14,10 +14,9 @@ from pandas import DataFrame
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from benchmarks import cli, places
-from benchmarks.features import run as features
-from benchmarks.features.run import still_trainer
-from benchmarks.features.switches import DEFAULT, FEATURES, PROTOCOLS, TorchAdam, torch_loss
+from benchmarks import cli, features, places
+from benchmarks.features import DEFAULT, FEATURES, PROTOCOLS, still_trainer
+from benchmarks.switches import TorchAdam, torch_loss
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 

@@ -18,12 +18,13 @@ from scipy import ndimage
 
 import hqgs
 from benchmarks import cli, study
+from benchmarks.frames import means
 from benchmarks.protocol import Protocol, narrowed
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality
 from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
-from benchmarks.quality.tables import courses, equal_time_gain, means, metrics, psnr_at, spread, with_degraded
+from benchmarks.quality.tables import courses, equal_time_gain, metrics, psnr_at, spread, with_degraded
 from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
 from benchmarks.study import Cell, Store, Study, about, grid, key_of
 from hqgs.evaluation.metrics import psnr
@@ -129,7 +130,7 @@ def test_methods_of_a_cell_see_the_same_photos(runs: dict[Any, dict[str, Any]]) 
 
 
 def test_tables_follow_from_the_files(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
-    text = (out / "quality_smoke.md").read_text(encoding="utf-8")
+    text = (out / "quality_quick.md").read_text(encoding="utf-8")
     main = table(text, "PSNR/SSIM/HaarPSI, held-out test views of embedded; 5 iterations")
     gain = table(text, "PSNR gain over 3dgs (dB)")
     cost = table(text, "Cost")
@@ -160,15 +161,15 @@ def test_tables_follow_from_the_files(out: Path, runs: dict[Any, dict[str, Any]]
 
 
 def test_one_file_holds_everything(out: Path, runs: dict[Any, dict[str, Any]]) -> None:
-    whole = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))
+    whole = json.loads((out / "quality_quick.json").read_text(encoding="utf-8"))
     labelled = [run | {"row": run["method"]} for run in runs.values()]
     assert {run["key"]: run for run in whole["results"]["runs"]} == {run["key"]: run for run in labelled}
-    assert whole["settings"]["protocol"] == "smoke"
+    assert whole["settings"]["protocol"] == "quick"
     assert whole["settings"]["validation"] is False
     assert {entry["what"] for entry in whole["left_out"]} == {"lpips", "lpips_vgg"}
     assert set(whole["results"]["summary"]) == set(ROWS)
     for what in ("gains", "psnr_vs_time"):
-        with Image.open(out / f"quality_smoke_{what}.png") as chart:
+        with Image.open(out / f"quality_quick_{what}.png") as chart:
             assert len(np.unique(np.asarray(chart.convert("RGB")).reshape(-1, 3), axis=0)) > 10
 
 
@@ -213,7 +214,7 @@ def test_finished_cells_are_not_repeated(
     (Store(out).here / name).unlink()
     assert call(out, "--finished", *OPTIONS) == 0
     assert not (Store(out).here / name).exists()
-    left_out = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))["left_out"]
+    left_out = json.loads((out / "quality_quick.json").read_text(encoding="utf-8"))["left_out"]
     assert {"what": "run embedded, lowres:2, hqgs, seed 1", "why": "not finished"} in left_out
 
     assert call(out, *OPTIONS) == 0
@@ -228,7 +229,7 @@ def test_finished_cells_are_not_repeated(
 def test_a_run_serves_other_protocols_and_filters(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
     assert call(out, "--degradations", "noise:25.0", "--rows", "hqgs", "3dgs", "--iterations", "5") == 0
-    whole = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))
+    whole = json.loads((out / "quality_quick.json").read_text(encoding="utf-8"))
     assert [run["method"] for run in whole["results"]["runs"]] == ["3dgs", "hqgs"]  # the protocol's order
 
 
@@ -239,10 +240,10 @@ def test_known_runs_of_another_machine_are_not_repeated(
     monkeypatch.setattr(quality, "run_cell", lambda *rest: pytest.fail("nothing is left to train"))
     known = tmp_path / "known.json"
     assert call(out, *OPTIONS, "--finished") == 0
-    known.write_bytes((out / "quality_smoke.json").read_bytes())
+    known.write_bytes((out / "quality_quick.json").read_bytes())
     assert call(tmp_path / "elsewhere", *OPTIONS, "--known", str(known)) == 0
     here, there = (
-        json.loads((folder / "quality_smoke.json").read_text(encoding="utf-8"))["results"]
+        json.loads((folder / "quality_quick.json").read_text(encoding="utf-8"))["results"]
         for folder in (out, tmp_path / "elsewhere")
     )
     assert here["runs"] == there["runs"]
@@ -258,7 +259,7 @@ def test_known_runs_of_another_machine_are_not_repeated(
     assert "'../outside'" in capsys.readouterr().err
     assert not (tmp_path / "outside.json").exists()
     assert call(out, *OPTIONS) == 0
-    kept = json.loads((out / "quality_smoke.json").read_text(encoding="utf-8"))["results"]["runs"][0]
+    kept = json.loads((out / "quality_quick.json").read_text(encoding="utf-8"))["results"]["runs"][0]
     assert kept == here["runs"][0]
     known.write_text("[]", encoding="utf-8")
     assert call(out, *OPTIONS, "--known", str(known)) == 2
@@ -278,13 +279,13 @@ def test_validation_never_sees_a_test_view(out: Path, tmp_path: Path) -> None:
 
     options = ("--degradations", "noise:25", "--rows", "3dgs", "--iterations", "2", "--validate")
     assert call(out, *options) == 0
-    whole = json.loads((out / "quality_smoke_validation.json").read_text(encoding="utf-8"))
+    whole = json.loads((out / "quality_quick_validation.json").read_text(encoding="utf-8"))
     assert whole["settings"]["validation"] is True
     (run,) = whole["results"]["runs"]
     assert "-validation-" in run["key"]
     assert [v["name"] for v in run["views"]] == ["view_01.png", "view_09.png"]  # 00 and 08 are test views
     assert "for tuning" in run["notes"][1]
-    text = (out / "quality_smoke_validation.md").read_text(encoding="utf-8")
+    text = (out / "quality_quick_validation.md").read_text(encoding="utf-8")
     assert "VALIDATION" in text.splitlines()[0]
 
 
@@ -301,7 +302,7 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
         return replace(scene, sfm=report, points=scene.points + np.float32(0.01))
 
     monkeypatch.setattr(study, "sfm_scene", sfm)
-    protocol = narrowed(PROTOCOLS["smoke"], degradations=["noise:25"], rows=["3dgs", "hqgs"], iterations=2)
+    protocol = narrowed(PROTOCOLS["quick"], degradations=["noise:25"], rows=["3dgs", "hqgs"], iterations=2)
     scene = tiny_scene()
     bench = bench_of(tmp_path, protocol, [scene], sfm=True)
     bench.tables()
@@ -323,7 +324,7 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
 def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene()
     protocol = narrowed(
-        PROTOCOLS["smoke"], degradations=["none", "noise:25"], rows=["3dgs", "srgs"], iterations=2
+        PROTOCOLS["quick"], degradations=["none", "noise:25"], rows=["3dgs", "srgs"], iterations=2
     )
     real = quality_cell.run_cell
 
@@ -363,7 +364,7 @@ def test_a_kill_or_a_failure_costs_one_cell(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_the_key_covers_what_a_result_depends_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = grid(PROTOCOLS["smoke"], [tiny_scene()])[0]
+    base = grid(PROTOCOLS["quick"], [tiny_scene()])[0]
 
     def key(cell: Cell, **options: Any) -> str:
         """With other options of the methods."""
@@ -407,10 +408,10 @@ def test_runs_of_other_sources_do_not_count(
 
 def test_the_sources_are_those_that_make_a_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
-    for changed in ("", "hqgs/cli/main.py", "hqgs/training/loop.py", "rust/lib.rs", "Cargo.lock"):
+    made_of = ("hqgs/pipeline.py", "hqgs/training/loop.py", "rust/lib.rs", "Cargo.lock")
+    for changed in ("", "hqgs/cli/main.py", *made_of):
         root = tmp_path / f"at {changed}".replace("/", "_")
-        names = ("hqgs/__init__.py", "hqgs/cli/main.py", "hqgs/training/loop.py", "rust/lib.rs")
-        for name in (*names, "Cargo.lock", "Cargo.toml"):
+        for name in ("hqgs/__init__.py", "hqgs/cli/main.py", *made_of, "Cargo.toml"):
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             (root / name).write_text("2" if name == changed else "1", encoding="utf-8")
         monkeypatch.setattr(hqgs, "__file__", str(root / "hqgs" / "__init__.py"))
@@ -418,7 +419,7 @@ def test_the_sources_are_those_that_make_a_result(tmp_path: Path, monkeypatch: p
         found.append(study.sources())
     study.sources.cache_clear()
     assert found[0] == found[1]  # the command line makes no result
-    assert len(set(found)) == 4
+    assert len(set(found)) == 1 + len(made_of)
 
 
 def test_protocols() -> None:
@@ -535,20 +536,19 @@ def test_edge_maps_are_those_of_the_photos_that_are_trained_on() -> None:
     assert found == pytest.approx(np.mean([value for value in values if value is not None]))
 
 
-def fake(*points: tuple[float, float], **fields: Any) -> dict[str, Any]:
-    history = [{"iteration": k, "seconds": t, "psnr": v, "ssim": None} for k, (t, v) in enumerate(points)]
-    return {"history": history, "metrics": {"psnr": points[-1][1]}, **fields}
+def history(*points: tuple[float, float | None]) -> list[dict[str, Any]]:
+    return [{"iteration": k, "seconds": t, "psnr": v, "ssim": None} for k, (t, v) in enumerate(points)]
 
 
 def test_gain_at_equal_time() -> None:
-    slow, fast = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
+    slow, fast = history((10, 20), (20, 24), (40, 30)), history((5, 18), (15, 26))
     assert psnr_at(slow, 15) == 22
     assert psnr_at(slow, 9) is None
     assert psnr_at(slow, 41) is None
     assert equal_time_gain(fast, slow) == 26 - 22  # at 15 s, where the fast one ends
     assert equal_time_gain(slow, fast) == 22 - 26
-    assert equal_time_gain(fake((1, 18), (2, 26)), slow) is None  # the slow one was not evaluated by then
-    assert equal_time_gain(fake((5, 18), (15, None)), slow) is None  # type: ignore[arg-type]
+    assert equal_time_gain(history((1, 18), (2, 26)), slow) is None  # the slow one was not evaluated by then
+    assert equal_time_gain(history((5, 18), (15, None)), slow) is None
 
 
 def test_means_over_groups() -> None:
@@ -577,22 +577,21 @@ def test_each_scene_has_a_table_of_its_own() -> None:
 
 
 def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
-    runs = fake((10, 20), (20, 24), (40, 30)), fake((5, 18), (15, 26))
-    frame = DataFrame(
-        [{"row": label, "run": run} for first in runs for label, run in (("x", first), ("y", runs[0]))]
-    )
+    first, second = history((10, 20), (20, 24), (40, 30)), history((5, 18), (15, 26))
+    lines = [("x", first), ("y", first), ("x", second), ("y", first)]
+    frame = DataFrame([{"row": label, "history": one} for label, one in lines])
     way = table(courses(frame), "PSNR (dB) and seconds of training on the way, means over all runs")
     assert way == {
         "x": {"0": "19.00, 8 s", "1": "25.00, 18 s"},
         "y": {"0": "20.00, 10 s", "1": "24.00, 20 s"},
     }
-    runs[1]["history"][0]["psnr"] = None
+    second[0]["psnr"] = None
     assert courses(frame.loc[frame["row"] == "x"]).count("–, 8 s") == 1
 
 
 def test_the_time_left_follows_from_finished_runs() -> None:
     scene = replace(tiny_scene(), name="a")
-    first, second, third = grid(replace(PROTOCOLS["smoke"], iterations=100), [scene])[:3]
+    first, second, third = grid(replace(PROTOCOLS["quick"], iterations=100), [scene])[:3]
     assert about([first, second], {}) == ""  # nothing is known
     runs = {first: {"iterations": 100, "wall_seconds": 15.0}}
     assert about([first, third], runs) == ", about 15 s"

@@ -21,9 +21,9 @@ import hqgs
 from benchmarks import cli
 from benchmarks.output import command_line
 from benchmarks.speed.inputs import make_inputs
+from benchmarks.speed.rasterizer import RasterPass, count_work
 from benchmarks.speed.timing import StageClock, exponent, interleaved, median_ratio
 from benchmarks.speed.training import make_trainer
-from benchmarks.speed.work import count_work
 from hqgs import _rust
 from hqgs.base.text import markdown_table
 
@@ -253,14 +253,15 @@ def test_exponent_of_a_power_law() -> None:
     assert exponent([1, 10, 100], [2, 2 * 10**1.3, 2 * 100**1.3]) == pytest.approx(1.3)
 
 
-def test_operations_and_limit_of_a_hand_made_case() -> None:
+def test_work_of_a_hand_made_case() -> None:
     # 80 Gaussians blend in two pixels: 40 each. 10 pairs with tiles, 8 blocks of 16 lanes.
-    work = count_work(80, 2, 10, 8, 6)
+    case = RasterPass(make_inputs(20, 30, 20))
+    case.blended, case.work = 80, (10, 8, 6)
+    work = count_work(case, 2)
     assert work["blended_pairs"] == 80
     assert work["blended_per_pixel"] == 40
     assert work["lane_use"] == 80 / 128
-    assert work["operations"] == (46 + 75) * 128 + (12 + 239 + 185) * 10
-    assert work["bytes"] == 312 * 10 + 12 * 8
+    assert work["changed_share"] == 6 / 8
     assert work["limit_core_seconds"] == pytest.approx(136e-9)
 
 

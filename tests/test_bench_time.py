@@ -32,5 +32,7 @@ def test_lines_and_levels_by_hand() -> None:
     assert (first["own"], first["reference"]) == (24.0, 20.0)
     assert (second["own"], second["reference"]) == (None, 25.0)
     assert levels(runs) == ["desk: 27.90 dB take 61 s, 3dgs 100 s to its end."]
+    (alone,) = lines(DataFrame([one("30 s", 29.0, 26.0)]))
+    assert alone["reference"] is None  # 3dgs is not finished there
     (short,) = levels(DataFrame([reference, *seeds]))
     assert "more than were tried" in short

@@ -277,6 +277,12 @@ CALLS = {
         "o.apply(np.ones((4, 4, 3)), False)",
         "image",
     ),
+    "operator": ("m = np.ones((8192, 8192)); limit(300); _rust.Separable(m, np.eye(4), None)", "rows"),
+    "agreeing": (
+        "g = np.zeros((32, 32), np.float32); "
+        "_rust.agreed_depths(g, [g], np.zeros((1, 3, 4)), np.full((1, 2), 9.0), np.ones((1, 2)), 1 << 50)",
+        "agreeing",
+    ),
 }
 
 

@@ -171,9 +171,12 @@ def test_a_mistake_in_the_catalogue_is_named(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(module, "FILE", tmp_path / "cases.toml")
     for text, message in (
-        ('a = [{ name = "b", why = "c", firts = { means = [0.0, 0.0, 1.0] } }]', "'b': there is no 'firts'"),
+        (
+            'a = [{ name = "b", why = "c", firts = { means = [0.0, 0.0, 1.0] } }]',
+            "'b': there is no field 'firts'",
+        ),
         ('a = [{ name = "b" }]', "'b': .* missing 1 required .*: 'why'"),
-        ('a = [{ name = "b", why = "c", culled = [0.5] }]', r"'b', culled\[0\]: 0.5 is not of the type int"),
+        ('a = [{ name = "b", why = "c", culled = [0.5] }]', r"'b': culled\[0\] is 0.5, wanted int"),
         ("a = [", "cases.toml: "),
     ):
         (tmp_path / "cases.toml").write_text(text, encoding="utf-8")

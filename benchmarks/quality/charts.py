@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from PIL import Image
 
-from benchmarks.charts import LEGEND, color, panels, title
+from benchmarks.charts import LEGEND, draw, panels, title
 from benchmarks.quality.cell import render_path
 from benchmarks.scenes import degraded_view
 from benchmarks.study import Store
@@ -39,13 +40,9 @@ def time_chart(frame: DataFrame, what: str) -> Figure:
     for axes in grid[len(parts) :]:
         axes.set_visible(False)
     for axes, (kind, part) in zip(grid, parts, strict=False):
-        for k, (label, runs) in enumerate(part.groupby("row", sort=False)["run"]):
-            points = [h for h in zip(*(run["history"] for run in runs), strict=True)]
-            points = [h for h in points if all(p["psnr"] is not None for p in h)]
-            seconds, values = (
-                [np.mean([p[name] for p in point]) for point in points] for name in ("seconds", "psnr")
-            )
-            axes.plot(seconds, values, color=color(k), marker="o", markersize=3, lw=1.5, label=str(label))
+        for k, (label, histories) in enumerate(part.groupby("row", sort=False)["history"]):
+            points = [DataFrame(history)[["seconds", "psnr"]].astype(float) for history in histories]
+            draw(axes, reduce(DataFrame.add, points) / len(points), k, str(label))
         title(axes, str(kind))
         axes.set_xlim(left=0)
     grid[0].legend(**LEGEND)

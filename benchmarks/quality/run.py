@@ -14,14 +14,12 @@ from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
 from benchmarks.quality.cell import edge_robustness, run_cell
 from benchmarks.quality.charts import gain_chart, time_chart, write_sheet
-from benchmarks.quality.tables import frame_of, summary
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
 
 PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml")
-SMOKE = "smoke"
 
 
 class Quality:
@@ -45,9 +43,8 @@ class Quality:
 
     def sheets(self, group: list[Cell]) -> None:
         """The picture sheets of a group, if they are not there yet."""
-        cell, keys = group[0], [self.study.keys[cell] for cell in group]
-        runs = {cell.row.label: self.study.runs[cell] for cell in group}
-        digest = hashlib.sha256(" ".join(keys).encode()).hexdigest()[:8]
+        cell, runs = group[0], {cell.row.label: self.study.runs[cell] for cell in group}
+        digest = hashlib.sha256(" ".join(run["key"] for run in runs.values()).encode()).hexdigest()[:8]
         for number in range(min(self.args.pictures, len(cell.scene.test))):
             kind = cell.degradation.replace(":", "_")
             name = f"{cell.scene.name}-{kind}-s{cell.seed}-{number}-{digest}.png"
@@ -78,28 +75,27 @@ class Quality:
             if group[0].seed == self.protocol.seeds[0]:
                 self.sheets(group)
         baseline = self.protocol.baseline if self.protocol.baseline in labels and len(labels) > 1 else None
-        frame = frame_of(((cell, self.study.runs[cell]) for group in groups for cell in group), baseline)
-        report.results["summary"] = summary(frame, baseline)
+        runs = [self.study.runs[cell] | {"row": cell.row.label} for group in groups for cell in group]
+        frame = tables.frame_of(runs, baseline)
+        report.results["summary"] = tables.summary(frame, baseline)
         what = self.what(frame)
         report.tables.append(tables.metrics(frame, what))
         if baseline is not None:
             over = f"PSNR gain over {baseline}"
-            timed = f"{over} when the faster of the two ends"
-            report.tables.append(tables.gains(frame, "gain", over, baseline))
-            report.tables.append(tables.gains(frame, "equal_time_gain", timed, baseline))
+            for name, when in zip(tables.GAINS, ("", " when the faster of the two ends"), strict=True):
+                report.tables.append(tables.gains(frame, name, f"{over}{when}", baseline))
             report.figures["gains"] = gain_chart(frame, baseline)
-        scenes = list(frame["scene"].unique())
-        for scene in scenes if len(scenes) > 1 else ():
-            part = frame.loc[frame["scene"] == scene]
+        parts = frame.groupby("scene", sort=False)
+        for _, part in parts if len(parts) > 1 else ():
             report.tables.append(tables.metrics(part, self.what(part), ("psnr", "ssim")))
         report.tables += [tables.training_times(frame), tables.courses(frame)]
         report.tables += [tables.costs(frame, self.circumstances()), tables.regions(frame)]
-        guessing = [n for n in labels if any(run["formation"] for run in frame["run"][frame["row"] == n])]
-        report.tables += [tables.formations(frame, label) for label in guessing]
+        guessing = frame.loc[frame["formation"].notna(), "row"].unique()
+        report.tables += [tables.formations(frame, label) for label in labels if label in guessing]
         if self.args.sfm:
             report.tables.append(tables.reconstructions(frame))
         report.figures["psnr_vs_time"] = time_chart(frame, what)
-        for metric, why in sorted({item for run in frame["run"] for item in run["reasons"].items()}):
+        for metric, why in sorted({item for reasons in frame["reasons"] for item in reasons.items()}):
             report.leave_out(metric, why)
 
     def what(self, frame: DataFrame) -> str:
@@ -125,8 +121,8 @@ def run(args: argparse.Namespace) -> Report:
     """Run and compare what was asked for."""
     if args.pictures < 0:
         raise ValueError(f"pictures is {args.pictures}, wanted at least 0")
-    name = SMOKE if args.quick else args.protocol
-    study = begin(args, "quality", PROTOCOLS[name], labelled=False)
+    name = "quick" if args.quick else args.protocol
+    study = begin(args, PROTOCOLS, labelled=False)
     quality = Quality(study, "_".join([name, *reversed(study.tags)]))
     quality.report.settings["protocol"] = name
     quality.tables()

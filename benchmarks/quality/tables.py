@@ -5,7 +5,7 @@ A mean is that of all runs of its group: where one of them lacks the number, the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 from pandas import DataFrame, Series, concat
 
 from benchmarks.data import read_toml
+from benchmarks.frames import means, paired, records
 from benchmarks.measure import Run
 from benchmarks.output import NOTHING, number, table
-from benchmarks.study import Cell
 from hqgs.base.text import markdown_table
 from hqgs.evaluation.metrics import METRICS
 from hqgs.photos.formula import NONE
@@ -29,24 +29,30 @@ KEPT = ("seconds", "cpu_seconds", "setup_seconds", "render_ms", "initial_points"
 COSTS = (*KEPT, "ms_per_step", "edge_density", "flat_density")
 
 
-def by_degradation(title: str, frame: DataFrame, text: Callable[[DataFrame], str]) -> str:
-    """A table with a row for each method and a column for each degradation."""
-    parts = with_degraded(frame).groupby(["row", "degradation"], sort=False)
-    cells: dict[Any, str] = {key: text(part) for key, part in parts}
-    labels, kinds = (list(dict.fromkeys(key[k] for key in cells)) for k in (0, 1))
-    body = [[label, *(cells[label, kind] for kind in kinds)] for label in labels]
-    return markdown_table(title, ["", *kinds], body)
+def crossed(
+    title: str,
+    frame: DataFrame,
+    text: Callable[[DataFrame], str],
+    across: str = "degradation",
+    down: str = "row",
+    corner: str = "",
+) -> str:
+    """A row for each value of `down`, a column for each of `across`, the text of the runs that have both."""
+    cells: dict[Any, str] = {key: text(part) for key, part in frame.groupby([down, across], sort=False)}
+    labels, heads = (list(dict.fromkeys(key[k] for key in cells)) for k in (0, 1))
+    body = [[label, *(cells.get((label, head), NOTHING) for head in heads)] for label in labels]
+    return markdown_table(title, [corner, *heads], body)
 
 
 def metrics(frame: DataFrame, what: str, names: Sequence[str] = ("psnr", "ssim", "haarpsi", "lpips")) -> str:
     """Those of the metrics that all runs have. `what`: which runs they are."""
-    shown = [name for name in names if frame[name].notna().all()]
-    title = "/".join(COLUMNS["metrics"][name][0] for name in shown)
-
-    def text(part: DataFrame) -> str:
-        return "/".join(number(part[name].mean(), COLUMNS["metrics"][name][1]) for name in shown)
-
-    return by_degradation(f"{title}, {what}", frame, text)
+    shown = {name: COLUMNS["metrics"][name] for name in names if frame[name].notna().all()}
+    title = f"{'/'.join(head for head, _ in shown.values())}, {what}"
+    return crossed(
+        title,
+        with_degraded(frame),
+        lambda part: "/".join(number(part[name].mean(), form) for name, (_, form) in shown.items()),
+    )
 
 
 def gains(frame: DataFrame, name: str, title: str, baseline: str) -> str:
@@ -59,45 +65,45 @@ def gains(frame: DataFrame, name: str, title: str, baseline: str) -> str:
         return f"{over['mean']:+.2f} ± {over['std']:.2f} ({over['min']:+.2f})"
 
     title = f"{title} (dB): mean ± std over scenes and seeds (worst)"
-    return by_degradation(title, frame.loc[frame["row"] != baseline], text)
+    return crossed(title, with_degraded(frame.loc[frame["row"] != baseline]), text)
 
 
 def costs(frame: DataFrame, facts: str) -> str:
     """Time, size and memory: means over all runs."""
-    hours = sum(run["wall_seconds"] for run in frame["run"]) / 3600
+    hours = frame["wall_seconds"].sum() / 3600
     title = f"Cost, means over all {len(frame)} runs, which took {hours:.1f} h; {facts}"
-    return table(title, _records(means(frame, ["row"], COSTS)), LABEL | COLUMNS["costs"])
+    return table(title, records(means(frame, ["row"], COSTS)), LABEL | COLUMNS["costs"])
 
 
 def training_times(frame: DataFrame) -> str:
     """Seconds of training and number of Gaussians by degradation."""
-
-    def text(part: DataFrame) -> str:
-        return f"{part['seconds'].mean():.0f} s, {part['gaussians'].mean():,.0f}"
-
-    return by_degradation("Training time, Gaussians", frame, text)
+    return crossed(
+        "Training time, Gaussians",
+        with_degraded(frame),
+        lambda part: f"{part['seconds'].mean():.0f} s, {part['gaussians'].mean():,.0f}",
+    )
 
 
 def courses(frame: DataFrame) -> str:
     """Held-out PSNR and seconds of training at the evaluations that all runs have, means over the runs."""
-    histories = [{h["iteration"]: h for h in run["history"]} for run in frame["run"]]
-    shared = sorted(set.intersection(*map(set, histories)))
-    body = []
-    for label, part in frame.assign(history=histories).groupby("row", sort=False)["history"]:
-        cells = []
-        for k in shared:
-            psnr, seconds = (Series([h[k][n] for h in part], dtype=float) for n in ("psnr", "seconds"))
-            cells.append(f"{number(psnr.mean(skipna=False), '.2f')}, {seconds.mean():.0f} s")
-        body.append([str(label), *cells])
+    histories = zip(frame["row"], frame["history"], strict=True)
+    way = DataFrame([entry | {"row": row} for row, history in histories for entry in history])
+    shared = way.groupby("iteration")["row"].transform("size") == len(frame)
+    way = way.loc[shared].astype({"psnr": float, "seconds": float}).sort_values("iteration", kind="stable")
+
+    def text(part: DataFrame) -> str:
+        return f"{number(part['psnr'].mean(skipna=False), '.2f')}, {part['seconds'].mean():.0f} s"
+
     title = "PSNR (dB) and seconds of training on the way, means over all runs"
-    return markdown_table(title, ["iterations", *(f"{k:,}" for k in shared)], body)
+    way["iteration"] = way["iteration"].map("{:,}".format)
+    return crossed(title, way, text, across="iteration", corner="iterations")
 
 
 def regions(frame: DataFrame) -> str:
     """Gaussians per 1,000 pixels on edges and in flat parts of the clean photos, means over all runs."""
     edge, flat = frame["edge_density"], frame["flat_density"]
     frame = frame.assign(edge=edge, flat=flat, ratio=edge / flat.where(flat > 0))
-    rows = _records(means(frame, ["row"], list(COLUMNS["regions"])))
+    rows = records(means(frame, ["row"], list(COLUMNS["regions"])))
     return table("Gaussians per 1,000 pixels of a training view", rows, LABEL | COLUMNS["regions"])
 
 
@@ -117,63 +123,54 @@ def edge_maps(rows: Sequence[dict[str, Any]]) -> str:
 def formations(frame: DataFrame, label: str) -> str:
     """What a method took for the photos' degradation, by scene; several where the seeds differ."""
     mine = frame.loc[frame["row"] == label]
-    found = mine.assign(text=[run["formation"] or NOTHING for run in mine["run"]])
-    kinds = list(dict.fromkeys(mine["degradation"]))
-    lines = []
-    for scene, part in found.groupby("scene", sort=False):
-        texts = part.groupby("degradation", sort=False)["text"].agg(lambda t: ", ".join(dict.fromkeys(t)))
-        lines.append({"row": scene} | {kind: texts.get(kind, NOTHING) for kind in kinds})
-    columns = LABEL | {kind: (kind, "") for kind in kinds}
-    return table(f"What {label} took for the degradation", lines, columns)
+    return crossed(
+        f"What {label} took for the degradation",
+        mine.assign(formation=[formation or NOTHING for formation in mine["formation"]]),
+        lambda part: ", ".join(dict.fromkeys(part["formation"])),
+        down="scene",
+    )
 
 
 def reconstructions(frame: DataFrame) -> str:
     """Poses and points from the degraded photos against the scenes' own; all rows of a group share them."""
     lines = []
-    for line in frame.drop_duplicates(["scene", "degradation", "seed"]).to_dict("records"):
-        s = line["run"]["sfm"]
+    for line in frame.drop_duplicates(GROUP).to_dict("records"):
+        s = line["sfm"]
         rotation, translation = s["rotation_error_deg"], s["translation_error"]
-        lines.append(
-            s
-            | {
-                "row": f"{line['scene']}, {line['degradation']}, seed {line['seed']}",
-                "registered": f"{s['photos'] - len(s['not_registered'])} / {s['photos']}",
-                "rotation": f"{rotation['median']:.3f} / {rotation['max']:.3f}",
-                "translation": f"{translation['median']:.2%} / {translation['max']:.2%}",
-                "points": f"{s['points']:,} ({s['own_points']:,})",
-                "track_length": f"{s['track_length']:.1f} ({number(s['own_track_length'], '.1f')})",
-                "reprojection": f"{s['reprojection_error_px']:.2f} "
-                f"({number(s['own_reprojection_error_px'], '.2f')})",
-            }
-        )
+        own_error = number(s["own_reprojection_error_px"], ".2f")
+        words = {
+            "row": f"{line['scene']}, {line['degradation']}, seed {line['seed']}",
+            "registered": f"{s['photos'] - len(s['not_registered'])} / {s['photos']}",
+            "rotation": f"{rotation['median']:.3f} / {rotation['max']:.3f}",
+            "translation": f"{translation['median']:.2%} / {translation['max']:.2%}",
+            "points": f"{s['points']:,} ({s['own_points']:,})",
+            "track_length": f"{s['track_length']:.1f} ({number(s['own_track_length'], '.1f')})",
+            "reprojection": f"{s['reprojection_error_px']:.2f} ({own_error})",
+        }
+        lines.append(s | words)
     title = "Poses and points from the degraded photos (the scene's own); distances in scene extents"
     return table(title, lines, LABEL | COLUMNS["sfm"])
 
 
-def _records(frame: DataFrame) -> list[dict[str, Any]]:
-    return frame.reset_index().to_dict("records")
-
-
-def frame_of(runs: Iterable[tuple[Cell, Run]], baseline: str | None = None) -> DataFrame:
-    """A line for each run with all numbers of the tables, NaN where there is none; the runs are in `run`.
+def frame_of(runs: Sequence[Run], baseline: str | None = None) -> DataFrame:
+    """The runs with the numbers of the tables beside what they hold, NaN where there is none.
 
     Gains are over the run of the `baseline` in the same group; without one there are none.
     """
-    pairs = list(runs)
-    base = {cell.group: run for cell, run in pairs if cell.row.label == baseline}
-    lines = []
-    for cell, run in pairs:
-        line = dict(zip(GROUP, cell.group, strict=True)) | {"row": cell.row.label, "run": run}
-        line |= {name: run["metrics"][name] for name in METRICS}
-        line |= {name: run[name] for name in KEPT}
-        line["ms_per_step"] = 1_000 * run["seconds"] / run["iterations"]
-        line |= {f"{name}_density": region["density"] for name, region in run["regions"].items()}
-        if baseline is not None:
-            line["gain"] = psnr_gain(run, base[cell.group])
-            line["equal_time_gain"] = equal_time_gain(run, base[cell.group])
-        lines.append(line)
-    frame = DataFrame(lines)
-    return frame.astype({name: float for name in frame.columns if name not in ("row", "run", *GROUP)})
+    frame = DataFrame(runs)
+    frame = frame.join(
+        DataFrame([[run["metrics"][name] for name in METRICS] for run in runs], columns=METRICS)
+    )
+    frame["ms_per_step"] = 1_000 * frame["seconds"] / frame["iterations"]
+    for name in ("edge", "flat"):
+        frame[f"{name}_density"] = [run["regions"][name]["density"] for run in runs]
+    frame = frame.astype(dict.fromkeys([*METRICS, *COSTS], float))
+    if baseline is not None:
+        pairs = paired(frame, baseline, GROUP)
+        frame["gain"] = pairs["psnr"] - pairs["psnr_base"]
+        both = zip(pairs["history"], pairs["history_base"], strict=True)
+        frame["equal_time_gain"] = Series([equal_time_gain(*two) for two in both], pairs.index, dtype=float)
+    return frame
 
 
 def with_degraded(frame: DataFrame) -> DataFrame:
@@ -184,12 +181,6 @@ def with_degraded(frame: DataFrame) -> DataFrame:
     return concat([frame, bad.assign(degradation=DEGRADED)], ignore_index=True)
 
 
-def means(frame: DataFrame, by: Sequence[str], values: Sequence[str]) -> DataFrame:
-    """Means over the runs that share `by`, in their order; NaN where one of them lacks the number."""
-    parts = frame.groupby(list(by), sort=False)[list(values)]
-    return DataFrame(parts.agg(lambda v: v.mean(skipna=False)))
-
-
 def spread(values: Series) -> dict[str, float | None] | None:
     """Mean, sample standard deviation (None for one value), range and number; None where a value lacks."""
     if values.isna().any():
@@ -198,25 +189,18 @@ def spread(values: Series) -> dict[str, float | None] | None:
     return found | {"std": found["std"] if len(values) > 1 else None, "count": len(values)}
 
 
-def psnr_gain(run: Run, base: Run) -> float | None:
-    """PSNR of a run over that of the baseline, dB."""
-    values = run["metrics"]["psnr"], base["metrics"]["psnr"]
-    return None if None in values else values[0] - values[1]
-
-
-def psnr_at(run: Run, seconds: float) -> float | None:
+def psnr_at(history: Sequence[dict[str, Any]], seconds: float) -> float | None:
     """Held-out PSNR of a run when it had trained for so long, between two evaluations by a straight line.
 
     None before the first evaluation and after the end.
     """
-    times = [h["seconds"] for h in run["history"]]
-    values = [h["psnr"] for h in run["history"]]
+    times, values = ([entry[name] for entry in history] for name in ("seconds", "psnr"))
     if None in values or not times[0] <= seconds <= times[-1]:
         return None
     return float(np.interp(seconds, times, values))
 
 
-def equal_time_gain(run: Run, base: Run) -> float | None:
+def equal_time_gain(history: Sequence[dict[str, Any]], base: Sequence[dict[str, Any]]) -> float | None:
     """PSNR over that of the baseline at the moment when the faster of the two ends.
 
     The slower one is judged in the middle of its schedule, its learning rate still high: what it would reach
@@ -224,20 +208,18 @@ def equal_time_gain(run: Run, base: Run) -> float | None:
     machine moves this number: between two runs of one method it should be 0. None where the slower one had
     not been evaluated by then.
     """
-    moment = min(r["history"][-1]["seconds"] for r in (run, base))
-    mine, other = psnr_at(run, moment), psnr_at(base, moment)
+    moment = min(history[-1]["seconds"], base[-1]["seconds"])
+    mine, other = psnr_at(history, moment), psnr_at(base, moment)
     return None if mine is None or other is None else mine - other
 
 
 def summary(frame: DataFrame, baseline: str | None) -> dict[str, Any]:
     """All means and gains by row and degradation, as JSON values. `baseline` None: no gains."""
-    numbers = means(with_degraded(frame), ["row", "degradation"], [*METRICS, *COSTS])
-    rows: dict[str, Any] = {}
-    for label, of_row in with_degraded(frame).groupby("row", sort=False):
-        kinds = rows[str(label)] = {}
-        for kind, part in of_row.groupby("degradation", sort=False):
-            line = numbers.loc[(label, kind)].items()
-            kinds[str(kind)] = {"runs": len(part)} | {n: None if v != v else float(v) for n, v in line}
-            if baseline is not None and label != baseline:
-                kinds[str(kind)] |= {name: spread(part[name]) for name in GAINS}
+    rows, frame = dict[str, Any](), with_degraded(frame)
+    parts = frame.groupby(["row", "degradation"], sort=False)
+    for line in records(means(frame, ["row", "degradation"], [*METRICS, *COSTS])):
+        label, kind = line.pop("row"), line.pop("degradation")
+        part = parts.get_group((label, kind))
+        over = {name: spread(Series(part[name])) for name in GAINS} if baseline not in (None, label) else {}
+        rows.setdefault(label, {})[kind] = {"runs": len(part), **line, **over}
     return rows

@@ -1,4 +1,8 @@
-"""Forward and backward of the rasterizer, stage by stage, against the limit of its arithmetic."""
+"""Forward and backward of the rasterizer, stage by stage, against the limit of its arithmetic.
+
+The limit is a lane of an AVX-512 core that does nothing but blend, with all lanes in use and all data in
+cache (measured with a probe of the arithmetic).
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,10 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks import charts
-from benchmarks.charts import BLUE, LEGEND, ORANGE, panels
+from benchmarks.charts import LEGEND, color, panels, title
 from benchmarks.places import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
 from benchmarks.speed.timing import (
@@ -27,13 +29,15 @@ from benchmarks.speed.timing import (
     using_threads,
     whole,
 )
-from benchmarks.speed.work import count_work
 from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
 Size = tuple[int, int]  # width, height
 TARGET = 1.05  # the largest exponent that is good
+AGAINST = {"gaussians": "Gaussians", "pixels": "pixels"}  # what the time grows with
 BIN = "bin"  # the part of "bin and composite" before the first pixel
+BLOCK_PIXELS = 16  # lanes of a block of 4 x 4 pixels
+LIMIT_NS = 0.65 + 1.05  # of one core, for a pair that blends: forward, backward
 
 
 class RasterPass:
@@ -96,13 +100,29 @@ def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
     return call
 
 
+def count_work(case: RasterPass, pixels: int) -> dict[str, Any]:
+    """What the crate counted in the last pass: (Gaussian, pixel) pairs that changed one of so many pixels,
+    (Gaussian, tile) pairs, (Gaussian, block) pairs that each pass evaluates, those that changed a pixel."""
+    tile_pairs, blocks, changed_blocks = case.work
+    return {
+        "blended_per_pixel": case.blended / pixels,
+        "blended_pairs": case.blended,
+        "tile_pairs": tile_pairs,
+        "blocks": blocks,
+        "changed_blocks": changed_blocks,
+        "changed_share": changed_blocks / blocks,
+        "lane_use": case.blended / (BLOCK_PIXELS * blocks),
+        "limit_core_seconds": case.blended * LIMIT_NS * 1e-9,
+    }
+
+
 def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
     """Time and work of each of the inputs."""
     passes = [RasterPass(x) for x in inputs]
     measured = interleaved({str(k): warmed(case) for k, case in enumerate(passes)}, repeats)
     rows = []
     for x, case, rounds in zip(inputs, passes, measured.values(), strict=True):
-        work = count_work(case.blended, x.width * x.height, *case.work)
+        work = count_work(case, x.width * x.height)
         limit = work["limit_core_seconds"] / hqgs.get_num_threads()
         compositing = (rounds["bin and composite"] - rounds[BIN] + rounds["composite backward"]).median()
         rows.append(
@@ -143,7 +163,8 @@ def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> li
     for key, rounds in measured.items():
         name, count = key.rsplit("/", 1)
         line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}
-        rows.append(line | {"speedup": median_ratio(measured[f"{name}/1"], rounds)})
+        speedup = median_ratio(measured[f"{name}/1"], rounds)
+        rows.append(line | {"speedup": speedup, "share": speedup / int(count)})
     return rows
 
 
@@ -155,45 +176,43 @@ def measure_scaling(
     The overlap per pixel is the same everywhere.
     """
     cloud = make_inputs(max(sizes), *image, seed)  # the smaller ones share its memory
-    unit = {n: fitted(cloud, n, *image) for n in sizes}
-    by_size = _curve(sizes, [RasterPass(x) for x in unit.values()], repeats)
-    del cloud, unit
+    by_size = _curve({n: RasterPass(fitted(cloud, n, *image)) for n in sizes}, repeats)
     cloud = make_inputs(gaussians, *images[0], seed)
-    passes = [RasterPass(fitted(cloud, gaussians, *size)) for size in images]
-    by_pixels = _curve([width * height for width, height in images], passes, repeats)
+    passes = {w * h: RasterPass(fitted(cloud, gaussians, w, h)) for w, h in images}
     return {
         "gaussians": {"width": image[0], "height": image[1], **by_size},
-        "pixels": {"gaussians": gaussians, **by_pixels},
+        "pixels": {"gaussians": gaussians, **_curve(passes, repeats)},
         "target_exponent": TARGET,
     }
 
 
-def _curve(x: Sequence[int], passes: Sequence[RasterPass], repeats: int) -> dict[str, Any]:
-    measured = interleaved({str(v): warmed(p) for v, p in zip(x, passes, strict=True)}, repeats)
+def _curve(passes: dict[int, RasterPass], repeats: int) -> dict[str, Any]:
+    """Seconds of passes by what they grow with."""
+    measured = interleaved({str(x): warmed(case) for x, case in passes.items()}, repeats)
     rows = [whole(rounds) for rounds in measured.values()]
     curve = {name: [row[name] for row in rows] for name in ("seconds", "seconds_quartiles")}
-    ends = pairwise(zip(x, curve["seconds"], strict=True))
+    ends = pairwise(zip(passes, curve["seconds"], strict=True))
     steepest = max(exponent(*zip(*two, strict=True)) for two in ends)  # between two neighbours
-    return {"x": list(x), **curve, "exponent": exponent(x, curve["seconds"]), "steepest": steepest}
+    found = {"exponent": exponent(list(passes), curve["seconds"]), "steepest": steepest}
+    return {"x": list(passes), **curve, **found}
 
 
 def scaling_chart(scaling: dict[str, Any]) -> Figure:
     """Two panels: time against Gaussians and against megapixels, with the fitted power."""
-    figure, (left, right) = panels(9, 4, 1, 2, sharey=True)
-    curve = scaling["gaussians"]
-    _panel(left, curve, 1, "Gaussians", f"{curve['width']} x {curve['height']} pixels", BLUE)
-    left.set_ylabel("forward and backward (s)")
-    curve = scaling["pixels"]
-    _panel(right, curve, 1e6, "megapixels", f"{curve['gaussians']} Gaussians", ORANGE)
+    figure, grid = panels(9, 4, 1, 2, sharey=True)
+    grid[0].set_ylabel("forward and backward (s)")
+    first, second = (scaling[name] for name in AGAINST)
+    what = (
+        (first, 1, "Gaussians", f"{first['width']} x {first['height']} pixels"),
+        (second, 1e6, "megapixels", f"{second['gaussians']} Gaussians"),
+    )
+    for k, (axes, (curve, unit, label, text)) in enumerate(zip(grid, what, strict=True)):
+        x, seconds = np.array(curve["x"]) / unit, np.array(curve["seconds"])
+        errors = np.abs(np.array(curve["seconds_quartiles"]).T - seconds)
+        axes.errorbar(x, seconds, errors, color=color(k), marker="o", markersize=4, lw=1.6)
+        line = np.exp(np.log(seconds).mean()) * (x / np.exp(np.log(x).mean())) ** curve["exponent"]
+        axes.plot(x, line, color="#888888", linestyle="--", lw=1, label=f"power {curve['exponent']:.2f}")
+        axes.set(xscale="log", yscale="log", xlabel=label)
+        title(axes, text)
+        axes.legend(**LEGEND)
     return figure
-
-
-def _panel(axes: Axes, curve: dict[str, Any], unit: float, label: str, title: str, color: str) -> None:
-    x, seconds = np.array(curve["x"]) / unit, np.array(curve["seconds"])
-    low, high = np.array(curve["seconds_quartiles"]).T
-    axes.errorbar(x, seconds, [seconds - low, high - seconds], color=color, marker="o", markersize=4, lw=1.6)
-    center = np.exp(np.log(seconds).mean()) * (x / np.exp(np.log(x).mean())) ** curve["exponent"]
-    axes.plot(x, center, color="#888888", linestyle="--", linewidth=1, label=f"power {curve['exponent']:.2f}")
-    axes.set(xscale="log", yscale="log", xlabel=label)
-    charts.title(axes, title)
-    axes.legend(**LEGEND)

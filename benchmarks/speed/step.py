@@ -5,23 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from benchmarks.output import number
 from benchmarks.places import parts_of_step
 from benchmarks.speed.timing import Seconds, StageClock, interleaved, median_ratio, whole
+from hqgs.base.text import markdown_table
 from hqgs.training.trainer import Trainer
-
-# In the order of a step. Each is without the others that run inside it.
-PARTS = (
-    "activations",  # of the Gaussians, and the checks of hqgs.rasterization
-    "method",  # what it makes of the Gaussians before they are rasterized
-    "project",
-    "bin and composite",
-    "loss",
-    "autograd",  # the backward pass of the activations, and torch's own work
-    "composite backward",
-    "project backward",
-    "density statistics",
-    "Adam",
-)
 
 
 def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
@@ -31,11 +19,11 @@ def whole_step(trainer: Trainer) -> Callable[[], Seconds]:
 
 def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
     """A step with a clock around each part."""
-    clock = StageClock()
+    clock, parts = StageClock(), parts_of_step(trainer)
 
     def call() -> Seconds:
-        with clock.watching(parts_of_step(trainer)):
-            return clock.seconds(trainer.step, PARTS)
+        with clock.watching(parts):
+            return clock.seconds(trainer.step, parts.values())
 
     return call
 
@@ -56,7 +44,7 @@ def measure_steps(
         camera = trainer.scene.train[0].camera
         method, n = trainer.config.method, len(trainer.gaussians)
         rounds, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
-        stages = parts[[*PARTS, "rest"]].median()
+        stages = parts.drop(columns="total").median()
         rows.append(
             {"case": name, "method": method, "gaussians": n, "width": camera.width, "height": camera.height}
             | whole(rounds)
@@ -70,3 +58,18 @@ def measure_steps(
             }
         )
     return rows
+
+
+def steps_table(rows: list[dict[str, Any]]) -> str:
+    """One column for each case."""
+    first = rows[0]
+    body = [
+        ["whole step (ms)", *(number(r["seconds"], "ms") for r in rows)],
+        ["quartiles (ms)", *(number(r["seconds_quartiles"], "ms") for r in rows)],
+        [f"over {first['case']}", *(f"{r['over_first']:.2f}" for r in rows)],
+        ["target (ms)", *(str(r["target_ms"] or "") for r in rows)],
+        *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
+        ["with clocks / without", *(f"{r['clocked']:.2f}" for r in rows)],
+    ]
+    title = f"One training step, {first['width']} x {first['height']}"
+    return markdown_table(title, ["", *(r["case"] for r in rows)], body)

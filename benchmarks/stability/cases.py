@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.data import build, read_toml
+from benchmarks.data import read_toml
 from benchmarks.stability.oracle import GROUPS, Array, OracleScene, Pixel
+from hqgs.base.typed import build
 
 PIXELS: tuple[Pixel, ...] = ((4, 5), (4, 6), (3, 5), (6, 8), (0, 0), (8, 11))
 FILE = Path(__file__).with_suffix(".toml")

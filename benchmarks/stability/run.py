@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -59,12 +60,12 @@ def run(args: argparse.Namespace) -> Report:
 def tables(rows: Rows, conditions: dict[tuple[str, str], Outcome], rounding: float) -> list[str]:
     lines, missed = [], []
     for case, outcomes in rows:
-        words = {"name": case.name, "why": case.why, "targets": "met"}
+        words: dict[str, Any] = {"name": case.name, "why": case.why, "targets": "met"}
         for o in outcomes:
             if found := misses(case, o):
                 words["targets"] = "missed"
                 missed.append(vars(conditions[case.name, o.dtype]) | words | {"by": "; ".join(found)})
-            words |= {f"{o.dtype}_{name}": value for name, value in vars(o).items()}
+            words[o.dtype] = vars(o)
         if not case.poison:
             in_f32, in_f64 = (len(case.expected_culled(o.dtype)) for o in outcomes)
             culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import NoneType
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any
 
 from hqgs.base.files import PLAN
+from hqgs.base.typed import build
 from hqgs.training.config import TrainConfig, run_config
 
-T = TypeVar("T")
 SCHEDULE = ("sh_interval", "eval_every", "checkpoint_every")  # fields that follow from the length
 GROWTH = ("start", "stop", "every")  # those of `TrainConfig.densify`
 
@@ -58,7 +57,7 @@ def read_config(path: str | Path) -> TrainConfig:
 
 def config_of_values(values: Any, where: str) -> TrainConfig:
     """The configuration of JSON values, of `where`. ValueError that names the field."""
-    return _build(TrainConfig, values, where)
+    return build(TrainConfig, values, where)
 
 
 def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
@@ -99,34 +98,3 @@ def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
         return replace(with_iterations(config, int(iterations)), seconds=None, turn=turn)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         raise ValueError(f"{path} is no plan: {error!r}") from error
-
-
-def _build(kind: type[T], values: Any, where: str) -> T:
-    """A dataclass of JSON values. ValueError for a field that there is not, or one of another type."""
-    if not isinstance(values, dict):
-        raise ValueError(f"{where}: wanted an object with fields, got {values!r:.60}")
-    hints, found = get_type_hints(kind), dict[str, Any]()
-    for name, value in values.items():
-        if name not in {field.name for field in fields(kind)}:  # pyright: ignore[reportArgumentType]
-            known = ", ".join(field.name for field in fields(kind))  # pyright: ignore[reportArgumentType]
-            raise ValueError(f"{where}: there is no field {name!r}; there are: {known}")
-        found[name] = _value(hints[name], value, f"{where}: {name}")
-    try:
-        return kind(**found)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from error
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    options = [one for one in get_args(hint) if one is not NoneType]
-    if value is None and NoneType in get_args(hint):
-        return None
-    inner = options[0] if NoneType in get_args(hint) else hint
-    if is_dataclass(inner) and isinstance(inner, type):
-        return _build(inner, value, where)
-    if isinstance(value, list) and getattr(inner, "__origin__", None) is tuple:
-        return tuple(value)
-    simple = {int: int, float: (int, float), bool: bool, str: str}.get(inner, object)
-    if not isinstance(value, simple) or (isinstance(value, bool) and inner in (int, float)):
-        raise ValueError(f"{where} is {value!r}, wanted {getattr(inner, '__name__', inner)}")
-    return value

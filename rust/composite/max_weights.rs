@@ -11,6 +11,7 @@ use crate::{
     accuracy_knobs::EXP2_DEGREE,
     constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
+    memory,
     simd::{Lanes, Real},
 };
 use fearless_simd::{Select, Simd, SimdBase, dispatch};
@@ -24,7 +25,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// order, so that the bits depend on no number of threads.
 ///
 /// # Errors
-/// When the length of the mask does not fit.
+/// When the length of the mask does not fit, or there is no memory for the weights.
 pub fn max_weights<T: Real>(
     input: &CompositeInput<T>,
     mask: Option<&[u8]>,
@@ -35,7 +36,9 @@ pub fn max_weights<T: Real>(
     }
     let n = input.projection.splats.len();
     // The bits of a number that is not negative are ordered as the number is.
-    let most: Vec<AtomicU64> = (0..n).into_par_iter().map(|_| AtomicU64::new(0)).collect();
+    let mut most = memory::with_capacity(n, "weights")?;
+    let zeros = (0..n).into_par_iter().map(|_| AtomicU64::new(0));
+    zeros.collect_into_vec(&mut most);
     let grid = Grid::new();
     let level = input.projection.level.token;
     (0..input.tiles.lists.len())
@@ -43,10 +46,11 @@ pub fn max_weights<T: Real>(
         .for_each_init(Vec::new, |lanes, tile| {
             dispatch!(level, simd => weigh_tile(simd, input, &grid, mask, tile, lanes, &most));
         });
-    Ok(most
-        .into_par_iter()
+    let mut weights = memory::with_capacity(n, "weights")?;
+    most.into_par_iter()
         .map(|bits| T::from_f64(f64::from_bits(bits.into_inner())))
-        .collect())
+        .collect_into_vec(&mut weights);
+    Ok(weights)
 }
 
 /// Raise `most` to the weights of one tile. `lanes` is a buffer.

@@ -144,6 +144,16 @@ fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> {
     }
 }
 
+/// The elements of what `name` says.
+pub(crate) fn filled<T>(
+    elements: impl ExactSizeIterator<Item = T>,
+    name: &str,
+) -> Result<Vec<T>, Error> {
+    let mut vector = with_capacity(elements.len(), name)?;
+    vector.extend(elements);
+    Ok(vector)
+}
+
 /// A gradient to be filled, with no elements if it is not `wanted`.
 pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> Result<Vec<T>, Error> {
     let len = if wanted { len } else { 0 };

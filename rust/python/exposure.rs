@@ -1,7 +1,7 @@
 //! The binding of the exposure.
 
 use crate::{
-    arrays::{AnyType, Array, Scalar, by_dtype, of_type, optional_of_shape},
+    arrays::{AnyType, Array, Scalar, by_dtype, filled, of_type, optional_of_shape},
     error::BindingResult,
 };
 use hqgs::internals::{
@@ -65,7 +65,7 @@ fn forward_as<'py, T: Scalar + Light>(
         let got = format!("{:?}", warps.shape());
         return Err(Error::shape("warps", "[K, 3, 4]", got).into());
     };
-    let warps: Vec<Warp> = warps.slice()?.as_chunks().0.to_vec();
+    let warps: &[Warp] = warps.slice()?.as_chunks().0;
     let frame = Frame { size, margin };
     let (image, near) = (
         image.slice()?,
@@ -76,9 +76,10 @@ fn forward_as<'py, T: Scalar + Light>(
             .unwrap_or(&[]),
     );
     let taken = py.detach(|| {
-        threads::install(|| Photograph::<T>::take(frame, image, near, &warps, gains))
+        threads::install(|| Photograph::<T>::take(frame, image, near, warps, gains))
     })??;
-    let photo = taken.photo.clone().into_pyarray(py).into_any();
+    let photo = filled(taken.photo.iter().copied(), "photo")?;
+    let photo = photo.into_pyarray(py).into_any();
     Ok((
         Exposure {
             taken: Box::new(taken),

@@ -1,6 +1,7 @@
 //! The binding of the search for depths.
 
-use crate::{arrays::Array, error::BindingResult};
+use crate::arrays::{Array, filled};
+use crate::error::BindingResult;
 use hqgs::internals::{
     Error,
     stereo::{Other, Picture, Sweep},
@@ -51,7 +52,8 @@ fn agreed_depths<'py>(
     let sweep = Sweep { agreeing };
     let found =
         py.detach(|| threads::install(|| sweep.depths(first, &others, pixels, ranges)))??;
-    let (depths, scores): (Vec<_>, Vec<_>) = found.into_iter().unzip();
+    let depths = filled(found.iter().map(|(depth, _)| *depth), "depths")?;
+    let scores = filled(found.iter().map(|(_, score)| *score), "depths")?;
     Ok((
         depths.into_pyarray(py).into_any(),
         scores.into_pyarray(py).into_any(),

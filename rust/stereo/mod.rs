@@ -9,6 +9,7 @@ mod tests;
 
 use crate::{
     error::{Error, check_len},
+    memory,
     simd::{self, Level},
 };
 use fearless_simd::{Simd, dispatch};
@@ -75,7 +76,8 @@ impl Sweep {
     /// correlation of those `agreeing` that agree best; -1 where the patch is flat or too few photos show it.
     ///
     /// # Errors
-    /// Names an array of another size, a range that is not 0 < nearest <= farthest, or a value out of range.
+    /// Names an array of another size, a range that is not 0 < nearest <= farthest, a value out of range, or what
+    /// there is no memory for.
     pub fn depths(
         &self,
         first: Picture<'_>,
@@ -123,14 +125,14 @@ impl Sweep {
         {
             return Err(Error::new("pixels", format!("must be finite, got {bad:?}")));
         }
-        let mut found = vec![(0.0, NOTHING); pixels.len()];
+        let mut found = memory::filled((0.0, NOTHING), pixels.len(), "depths")?;
         let token = level.token;
         found
             .par_chunks_mut(CHUNK)
             .zip(pixels.par_chunks(CHUNK).zip(ranges.par_chunks(CHUNK)))
-            .for_each(|(found, (pixels, ranges))| {
-                dispatch!(token, simd => self.chunk(simd, first, others, pixels, ranges, found));
-            });
+            .try_for_each(|(found, (pixels, ranges))| {
+                dispatch!(token, simd => self.chunk(simd, first, others, pixels, ranges, found))
+            })?;
         Ok(found)
     }
 
@@ -143,8 +145,8 @@ impl Sweep {
         pixels: &[[f64; 2]],
         ranges: &[[f64; 2]],
         found: &mut [(f64, f32)],
-    ) {
-        let mut best = vec![NOTHING; self.agreeing];
+    ) -> Result<(), Error> {
+        let mut best = memory::filled(NOTHING, self.agreeing, "agreeing")?;
         for ((pixel, &[near, far]), found) in pixels.iter().zip(ranges).zip(found) {
             *found = ((near * far).sqrt(), NOTHING);
             let Some(patch) = Patch::of(first, *pixel) else {
@@ -175,6 +177,7 @@ impl Sweep {
                 }
             }
         }
+        Ok(())
     }
 }
 

@@ -130,11 +130,11 @@ impl<T: Light> Photograph<T> {
         let mut taken = Self {
             frame,
             photo: memory::filled(T::ZERO, frame.pixels() * 3, "photo")?,
-            image: image.to_vec(),
+            image: memory::copied(image, "image")?,
             light,
             mean: Vec::new(),
-            nearness: nearness.to_vec(),
-            warps: warps.to_vec(),
+            nearness: memory::copied(nearness, "nearness")?,
+            warps: memory::copied(warps, "warps")?,
             gains,
         };
         let mut mean = memory::filled([T::ZERO; WIDE], frame.pixels(), "mean")?;
@@ -190,7 +190,7 @@ impl<T: Light> Photograph<T> {
                     }
                 }
             });
-        let mut warps = vec![[0.0; 12]; self.warps.len()];
+        let mut warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
         let mut gains = [0.0; 3];
         for band in &bands {
             for (sum, part) in warps
@@ -253,8 +253,9 @@ impl<T: Light> Photograph<T> {
         let count = v_photo.len() / (across * 3);
         let rows = self.reached(first..first + count);
         let mut v_light = memory::filled([T::ZERO; WIDE], rows.len() * width, "gradient")?;
-        let (mut v_warps, mut v_gains) = (vec![[0.0; 12]; self.warps.len()], [0.0; 3]);
-        let mut v_mean = vec![[T::ZERO; WIDE]; across];
+        let mut v_warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
+        let mut v_gains = [0.0; 3];
+        let mut v_mean = memory::filled([T::ZERO; WIDE], across, "gradient")?;
         let mut places = Places::default();
         let gains = self.gains.map(T::from_f64);
         let share = T::from_f64(1.0 / self.warps.len().max(1) as f64);

@@ -22,26 +22,32 @@ struct Bands<T> {
 }
 
 impl<T: Real> Bands<T> {
-    /// From a dense row-major matrix [height, width].
-    fn new(dense: &[f64], height: usize, width: usize) -> Self {
+    /// From a dense matrix, or from its transpose where it is `turned`.
+    fn new(dense: &Dense, turned: bool, name: &str) -> Result<Self, Error> {
+        let (mut height, mut width) = (dense.height, dense.width);
+        let (mut down, mut across) = (dense.width, 1); // from one weight to the next
+        if turned {
+            (height, width, down, across) = (width, height, across, down);
+        }
         let mut bands = Self {
             width,
-            firsts: Vec::with_capacity(height),
-            begins: vec![0],
+            firsts: memory::with_capacity(height, name)?,
+            begins: memory::with_capacity(height + 1, name)?,
             weights: Vec::new(),
         };
-        for row in dense.chunks_exact(width) {
-            let first = row.iter().position(|w| *w != 0.0).unwrap_or(0);
-            let end = row
-                .iter()
-                .rposition(|w| *w != 0.0)
-                .map_or(0, |last| last + 1);
-            let weights = row[first..end].iter().map(|w| T::from_f64(*w));
+        bands.begins.push(0);
+        for row in 0..height {
+            let weight = |k: usize| dense.weights[row * down + k * across];
+            let first = (0..width).position(|k| weight(k) != 0.0).unwrap_or(0);
+            let last = (0..width).rposition(|k| weight(k) != 0.0);
+            let end = last.map_or(0, |last| last + 1);
+            memory::reserve(&mut bands.weights, end - first, name)?;
+            let weights = (first..end).map(|k| T::from_f64(weight(k)));
             bands.weights.extend(weights);
             bands.firsts.push(first);
             bands.begins.push(bands.weights.len());
         }
-        bands
+        Ok(bands)
     }
 
     fn height(&self) -> usize {
@@ -76,13 +82,6 @@ pub struct Dense<'a> {
 }
 
 impl Dense<'_> {
-    fn transposed(&self) -> Vec<f64> {
-        let columns = 0..self.width;
-        columns
-            .flat_map(|x| self.weights[x..].iter().step_by(self.width).copied())
-            .collect()
-    }
-
     fn check(&self, name: &'static str) -> Result<(), Error> {
         if self.height == 0 || self.width == 0 {
             let got = format!("[{}, {}]", self.height, self.width);
@@ -106,7 +105,7 @@ impl<T: Real> Separable<T> {
     /// `channels` any number of them stay apart.
     ///
     /// # Errors
-    /// Names a matrix without elements.
+    /// Names a matrix without elements, or one whose weights find no memory.
     pub fn pair(
         rows: Dense,
         columns: Dense,
@@ -115,14 +114,15 @@ impl<T: Real> Separable<T> {
         rows.check("rows")?;
         columns.check("columns")?;
         channels.map_or(Ok(()), |m| m.check("channels"))?;
-        let straight = |m: Dense| Bands::new(m.weights, m.height, m.width);
-        let turned = |m: Dense| Bands::new(&m.transposed(), m.width, m.height);
-        let of = |f: &dyn Fn(Dense) -> Bands<T>| Self {
-            rows: f(rows),
-            columns: f(columns),
-            channels: channels.map(f),
+        let of = |turned| -> Result<Self, Error> {
+            let channels = channels.map(|m| Bands::new(&m, turned, "channels"));
+            Ok(Self {
+                rows: Bands::new(&rows, turned, "rows")?,
+                columns: Bands::new(&columns, turned, "columns")?,
+                channels: channels.transpose()?,
+            })
         };
-        Ok((of(&straight), of(&turned)))
+        Ok((of(false)?, of(true)?))
     }
 
     /// Height and width of the picture that comes out.

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pandas import DataFrame
 
 from benchmarks.data import read_toml
-from benchmarks.features.switches import DEFAULT, PROTOCOLS, Feature
 from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, number, span, table
+from benchmarks.output import Benchmark, Report, number, table
+from benchmarks.protocol import Row, read_protocols
 from benchmarks.speed.timing import Seconds, interleaved, quartiles
 from benchmarks.speed.training import still_config, trainer_from
 from benchmarks.study import Cell, Study, begin
+from benchmarks.switches import SWITCHES
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
@@ -27,17 +28,42 @@ from hqgs.training.trainer import Trainer
 REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
 LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
 SURE = 2.0  # standard errors by which whole runs must be over the limit before they fail a feature
-ON = {True: "on", False: "off"}
-COLUMNS = read_toml(Path(__file__).with_name("features.toml"))["columns"]
 SHOWN = ("seed", "seconds", "gaussians", "history", "psnr", "refined_psnr")  # of a run, in the results
+
+
+@dataclass(frozen=True)
+class Feature(Row):
+    """One choice that is made for speed, and how to train with the other one."""
+
+    other: str = ""  # what is done instead in the run of this feature
+    by_default: bool = True  # whether the product has it on
+    switch: Literal["", "float64", "boxes", "every block", "torch's loss", "torch's Adam", "one thread"] = ""
+    refinable: bool = True  # whether Gaussians that were grown once and trained on can tell
+
+    @property
+    def more(self) -> dict[str, Any]:
+        return {"switch": self.switch}
+
+    @property
+    def about(self) -> dict[str, Any]:
+        return {"feature": self.label, "other": self.other, "by_default": self.by_default}
+
+    def switched(self) -> Any:
+        """A context manager: inside it the other choice is in place, as far as it is none of the config."""
+        return SWITCHES[self.switch]()
+
+
+FILE = Path(__file__).with_suffix(".toml")
+PROTOCOLS, COLUMNS = read_protocols(FILE, Feature), read_toml(FILE)["columns"]
+DEFAULT, *FEATURES = [row for row in PROTOCOLS["standard"].rows if isinstance(row, Feature)]
 
 
 class Features:
     """The runs of all features, and steps timed on what the default run grew."""
 
     def __init__(self, study: Study) -> None:
-        self.study = study
-        self.rows = [row for row in study.protocol.rows if isinstance(row, Feature)]
+        self.study, self.protocol = study, study.protocol
+        self.rows = [row for row in self.protocol.rows if isinstance(row, Feature)]
         self.cells = {(cell.scene.name, cell.row.label, cell.seed): cell for cell in study.cells}
 
     def measure(self, cell: Cell, photos: Scene) -> Run:
@@ -69,13 +95,12 @@ class Features:
 
     def final_steps(self, scene: Scene) -> dict[str, DataFrame]:
         """Seconds of steps on the final Gaussians of the default run, all features in turn."""
-        cell = self.cells[scene.name, DEFAULT.label, self.study.protocol.seeds[0]]
+        cell = self.cells[scene.name, DEFAULT.label, self.protocol.seeds[0]]
         final = Gaussians.load(self.grown(cell))
 
         def timed(feature: Feature) -> Callable[[], Seconds]:
-            config = self.study.protocol.train_config(feature, cell.seed)
             with feature.switched():
-                trainer = still_trainer(scene, config, final)
+                trainer = still_trainer(scene, self.protocol.train_config(feature, cell.seed), final)
 
             def call() -> Seconds:
                 with feature.switched():
@@ -86,21 +111,22 @@ class Features:
 
             return call
 
-        return interleaved({f.label: timed(f) for f in self.rows}, self.study.protocol.repeats)
+        return interleaved({f.label: timed(f) for f in self.rows}, self.protocol.repeats)
 
     def compare(self, scene: Scene) -> dict[str, Any] | None:
         """The results of a scene; None where a run of it is not finished."""
-        seeds, done = self.study.protocol.seeds, self.study.runs
-        cells = {f.label: [self.cells[scene.name, f.label, seed] for seed in seeds] for f in self.rows}
-        if any(cell not in done for same in cells.values() for cell in same):
-            return None
-        runs = {label: [{n: done[c][n] for n in SHOWN} for c in same] for label, same in cells.items()}
+        runs: dict[str, list[Run]] = {feature.label: [] for feature in self.rows}
+        for cell in self.study.cells:
+            if cell.scene is scene:
+                if cell not in self.study.runs:
+                    return None
+                runs[cell.row.label].append({name: self.study.runs[cell][name] for name in SHOWN})
         camera = scene.train[0].camera
         return {
             "scene": scene.name,
             "width": camera.width,
             "height": camera.height,
-            "iterations": self.study.protocol.iterations,
+            "iterations": self.protocol.iterations,
             "default": runs[DEFAULT.label],
             "features": compare(self.rows[1:], runs, self.final_steps(scene)),
         }
@@ -126,34 +152,19 @@ def compare(
     `refined_costs_db` the same of the Gaussians that were grown once and trained on, empty where they cannot
     tell; `cost_db` and `refined_cost_db` their means. `speedup`: of the fast choice, over the other one.
     """
-    rows = []
+    rows, fast = [], DataFrame(runs[DEFAULT.label])
     for feature in features:
-        other, sign = runs[feature.label], 1 if feature.by_default else -1
-        pairs = list(zip(runs[DEFAULT.label], other, strict=True))
-        costs, refined = (
-            [sign * (b[name] - a[name]) for a, b in pairs if b[name] is not None]
-            for name in ("psnr", "refined_psnr")
-        )
+        other, sign = DataFrame(runs[feature.label]), 1 if feature.by_default else -1
+        row = feature.about | {"psnr": float(other["psnr"].mean())}
+        for kind in ("", "refined_"):
+            costs = sign * (other[f"{kind}psnr"].astype(float) - fast[f"{kind}psnr"]).dropna()
+            row[f"{kind}costs_db"] = costs.tolist()
+            row[f"{kind}cost_db"] = float(costs.mean()) if len(costs) else None
         rounds = (steps[feature.label]["total"] / steps[DEFAULT.label]["total"]) ** sign
-        rows.append(
-            _about(feature)
-            | {
-                "psnr": float(np.mean([r["psnr"] for r in other])),
-                "costs_db": costs,
-                "cost_db": float(np.mean(costs)),
-                "refined_costs_db": refined,
-                "refined_cost_db": float(np.mean(refined)) if refined else None,
-                "speedup_run": float(np.mean([(b["seconds"] / a["seconds"]) ** sign for a, b in pairs])),
-                "speedup_step": rounds.median(),
-                "speedup_step_quartiles": quartiles(rounds),
-                "runs": other,
-            }
-        )
+        row["speedup_run"] = float(((other["seconds"] / fast["seconds"]) ** sign).mean())
+        row |= {"speedup_step": rounds.median(), "speedup_step_quartiles": quartiles(rounds)}
+        rows.append(row | {"runs": runs[feature.label]})
     return rows
-
-
-def _about(feature: Feature) -> dict[str, Any]:
-    return {"feature": feature.label, "other": feature.other, "by_default": feature.by_default}
 
 
 def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -165,12 +176,12 @@ def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> l
     """
     found = []
     for k, feature in enumerate(features):
-        entry = _about(feature) | {"limit_db": LIMIT_DB}
+        entry = feature.about | {"limit_db": LIMIT_DB}
         for kind in ("", "refined_"):
             costs = [cost for scene in scenes for cost in scene["features"][k][f"{kind}costs_db"]]
-            error = np.std(costs, ddof=1) / np.sqrt(len(costs)) if costs[1:] else None
+            error = float(np.std(costs, ddof=1) / np.sqrt(len(costs))) if costs[1:] else None
             entry[f"{kind}cost_db"] = float(np.mean(costs)) if costs else None
-            entry[f"{kind}standard_error_db"] = None if error is None else float(error)
+            entry[f"{kind}standard_error_db"] = error
         sure = entry["cost_db"] - SURE * (entry["standard_error_db"] or 0.0)
         worst = max(sure, -np.inf if entry["refined_cost_db"] is None else entry["refined_cost_db"])
         found.append(entry | {"passed": not feature.by_default or bool(worst <= LIMIT_DB)})
@@ -178,17 +189,13 @@ def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> l
 
 
 def scene_table(scene: dict[str, Any]) -> str:
-    default = scene["default"]
-    psnr, seconds = (float(np.mean([r[name] for r in default])) for name in ("psnr", "seconds"))
+    default = DataFrame(scene["default"])
     title = (
         f"{scene['scene']}, {scene['width']} x {scene['height']}, {scene['iterations']:,} iterations: "
-        f"default {psnr:.2f} dB, {seconds:.0f} s, {default[0]['gaussians']:,} Gaussians"
+        f"default {default['psnr'].mean():.2f} dB, {default['seconds'].mean():.0f} s, "
+        f"{default['gaussians'][0]:,} Gaussians"
     )
-    lines = [
-        row | {"on": ON[row["by_default"]], "quartiles": span(row["speedup_step_quartiles"], ".2f")}
-        for row in scene["features"]
-    ]
-    return table(title, lines, COLUMNS["of_scene"])
+    return table(title, scene["features"], COLUMNS["of_scene"])
 
 
 def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
@@ -196,12 +203,7 @@ def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
         error = row[f"{kind}standard_error_db"]
         return number(row[f"{kind}cost_db"], "+.3f") + ("" if error is None else f" ± {error:.3f}")
 
-    lines = [
-        row
-        | {"cost": with_error(row, ""), "refined": with_error(row, "refined_")}
-        | {"on": ON[row["by_default"]], "verdict": "pass" if row["passed"] else "FAIL"}
-        for row in rows
-    ]
+    lines = [row | {"cost": with_error(row, ""), "refined": with_error(row, "refined_")} for row in rows]
     title = f"Mean cost with its standard error; what is on by default may cost {LIMIT_DB} dB"
     return table(title, lines, COLUMNS["of_all"])
 
@@ -209,13 +211,12 @@ def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
 def run(args: argparse.Namespace) -> Report:
     """Train every scene with every feature switched, then time steps of all of them in turn."""
     rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
-    features = Features(begin(args, "features", PROTOCOLS["quick" if args.quick else "standard"], rows=rows))
+    features = Features(begin(args, PROTOCOLS, rows=rows))
     features.study.train(features.measure)
     report = features.study.report()
     results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
-    for result in results:
-        report.tables.append(scene_table(result))
     report.results = {"scenes": results, "verdicts": verdicts(features.rows[1:], results) if results else []}
+    report.tables += map(scene_table, results)
     if results:
         report.tables.append(verdict_table(report.results["verdicts"]))
     return report

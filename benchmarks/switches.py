@@ -1,13 +1,11 @@
-"""What makes training fast, each with a switch that puts the other choice in place."""
+"""What makes training fast, each with a switch that puts the other choice in place for a while."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from unittest.mock import patch
 
 import torch
@@ -16,8 +14,7 @@ from torch.nn.functional import conv2d
 
 import hqgs
 from benchmarks import places
-from benchmarks.accuracy.knobs import Knobs, tuned
-from benchmarks.protocol import Row, read_protocols
+from benchmarks.accuracy import Knobs, tuned
 from benchmarks.speed.timing import using_threads
 from hqgs.model.rasterization import RasterizationMeta
 
@@ -93,25 +90,3 @@ SWITCHES: dict[str, Callable[[], Any]] = {  # context managers: inside them the 
     "torch's Adam": partial(_in_torch, places.ADAM, TorchAdam),
     "one thread": partial(using_threads, 1),
 }
-
-
-@dataclass(frozen=True)
-class Feature(Row):
-    """One choice that is made for speed, and how to train with the other one."""
-
-    other: str = ""  # what is done instead in the run of this feature
-    by_default: bool = True  # whether the product has it on
-    switch: Literal["", "float64", "boxes", "every block", "torch's loss", "torch's Adam", "one thread"] = ""
-    refinable: bool = True  # whether Gaussians that were grown once and trained on can tell
-
-    @property
-    def more(self) -> dict[str, Any]:
-        return {"switch": self.switch}
-
-    def switched(self) -> Any:
-        """A context manager: inside it the other choice is in place, as far as it is none of the config."""
-        return SWITCHES[self.switch]()
-
-
-PROTOCOLS = read_protocols(Path(__file__).with_name("features.toml"), Feature)
-DEFAULT, *FEATURES = [row for row in PROTOCOLS["standard"].rows if isinstance(row, Feature)]

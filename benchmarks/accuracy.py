@@ -1,13 +1,20 @@
-"""The benchmark `accuracy`: the error against the run time of every knob of the rasterizer."""
+"""The benchmark `accuracy`: the error against the run time of every knob of the rasterizer.
+
+A knob trades accuracy for time. It is set for one pass, and what it is by default is the product's.
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
 import sys
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -15,48 +22,102 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.accuracy.knobs import CASES, FILE, ORACLES, Knobs, TunedPass
+from benchmarks import places
 from benchmarks.charts import LEGEND, color, panels, unbeaten
 from benchmarks.data import read_toml
 from benchmarks.measure import Training
-from benchmarks.output import Benchmark, Report, repeats_and_seed, span, table, with_repeats
+from benchmarks.output import Benchmark, Report, repeats_and_seed, table, with_repeats
 from benchmarks.protocol import Row
-from benchmarks.speed.inputs import RasterInputs, make_inputs
-from benchmarks.speed.rasterizer import measure_threads, thread_counts
+from benchmarks.speed.inputs import LEAVES, RasterInputs, make_inputs
+from benchmarks.speed.rasterizer import RasterPass, measure_threads, thread_counts
 from benchmarks.speed.timing import interleaved, quartiles, using_threads, whole
+from hqgs._rust import ALPHA_MIN, TRANSMITTANCE_MIN
 from hqgs.base.threads import one_torch_thread
+from hqgs.base.typed import build
 from hqgs.model.render import render_view
 from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.scene import Scene
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
 
+FILE = Path(__file__).with_suffix(".toml")
 DATA = read_toml(FILE)
 COLUMNS = DATA["columns"]
-IMAGE = "image"
 Errors = dict[str, Any]  # of a row against an oracle
 ERRORS: dict[str, Callable[[Errors], float]] = {  # what the panels show
-    "image": lambda errors: errors["image"]["rms"],
-    "gradients": lambda errors: errors["gradients"]["all"]["relative"],
+    "image RMS error": lambda errors: errors["image"]["rms"],
+    "relative error of the gradients": lambda errors: errors["gradients"]["all"]["relative"],
 }
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """The settings of `AccuracyKnobs` in rust/accuracy_knobs.rs, and the dtype."""
+
+    dtype: str = "float32"
+    alpha_min: float = ALPHA_MIN  # smallest alpha that is blended
+    transmittance_min: float = TRANSMITTANCE_MIN  # compositing stops there
+    spans: str = "ellipse"  # the tiles of a Gaussian: of its support, its "box", or a 3-sigma "square"
+    skip_blocks: bool = True  # leave out the 4 x 4 blocks that a Gaussian does not reach
+    exp2_degree: int = 6  # of the polynomial in float32
+
+
+# By knob and value; the first is what is measured against.
+CASES: dict[tuple[str, str], Knobs] = {
+    (knob, value): build(Knobs, settings, f"{FILE.name}, {knob} {value}")
+    for knob, values in DATA["cases"].items()
+    for value, settings in values.items()
+}
+ORACLES = {  # the definition of docs/conventions.md without float32's roundings, and without its cutoffs
+    "exact": CASES["cutoffs", "none, float64"],
+    "defined": CASES["dtype", "float64"],
+}
+
+
+@contextmanager
+def tuned(knobs: Knobs) -> Iterator[None]:
+    """Inside it the rasterizer has these knobs, the dtype aside."""
+    _, *values = asdict(knobs).values()
+    with patch.object(*places.PROJECT, partial(getattr(*places.PROJECT), knobs=tuple(values))):
+        yield
+
+
+class TunedPass(RasterPass):
+    """A pass with other settings than the default."""
+
+    def __init__(self, inputs: RasterInputs, knobs: Knobs) -> None:
+        super().__init__(inputs, dtype=getattr(torch, knobs.dtype))
+        self.knobs = knobs
+
+    def run(self) -> Tensor:
+        with tuned(self.knobs):
+            return super().run()
+
+    def outputs(self) -> dict[str, Tensor]:
+        """The image, and the gradient of each input by its name, all in float64."""
+        image = self.run()
+        grads = {n: leaf.grad for n, leaf in zip(LEAVES, self.leaves, strict=True) if leaf.grad is not None}
+        self.clear()
+        return {name: tensor.double() for name, tensor in ({"image": image} | grads).items()}
 
 
 def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
     """Errors and seconds of every case on the same numbers; the seconds of a round are taken in turn."""
-    passes = [TunedPass(inputs, knobs) for _, _, knobs in CASES]
+    passes = {f"{knob} {value}": TunedPass(inputs, knobs) for (knob, value), knobs in CASES.items()}
     oracles = {oracle: TunedPass(inputs, knobs).outputs() for oracle, knobs in ORACLES.items()}
-    found = []
-    for case in passes:
+    rows: list[dict[str, Any]] = []
+    for (knob, value), case in zip(CASES, passes.values(), strict=True):
         outputs = case.outputs()
-        found.append({oracle: errors_against(outputs, exact) for oracle, exact in oracles.items()})
-    measured = list(interleaved({str(k): p for k, p in enumerate(passes)}, repeats).values())
-    rows = []
-    for (knob, value, knobs), case, errors, rounds in zip(CASES, passes, found, measured, strict=True):
-        ratios = rounds["total"] / measured[0]["total"]  # to the default, in the same round
-        row = {"knob": knob, "value": value, "settings": asdict(knobs), **whole(rounds), "errors": errors}
-        row |= {"ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
-        rows.append(row | {"tile_pairs": case.work[0], "blocks": case.work[1]})
-    beaten = [f"{row['knob']} {row['value']}" for row in rows[1:] if beats(row, rows[0])]
+        errors = {oracle: errors_against(outputs, exact) for oracle, exact in oracles.items()}
+        work = {"tile_pairs": case.work[0], "blocks": case.work[1]}
+        work |= {"more_blocks": case.work[1] / max(rows[0]["blocks"], 1) if rows else 1.0}
+        rows.append({"knob": knob, "value": value, "settings": asdict(case.knobs), "errors": errors} | work)
+    measured = interleaved(passes, repeats)
+    default = next(iter(measured.values()))["total"]
+    for row, rounds in zip(rows, measured.values(), strict=True):
+        ratios = rounds["total"] / default  # in the same round
+        row |= {**whole(rounds), "ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
+    beaten = [name for name, row in zip(passes, rows, strict=True) if beats(row, rows[0])]
     size = {"inputs": name, "gaussians": len(inputs), "width": inputs.width, "height": inputs.height}
     return size | {"rows": rows, "beaten_by": beaten}
 
@@ -88,14 +149,9 @@ def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[dict[str, Any
 
 def errors_table(result: dict[str, Any]) -> str:
     """One row for each case; the errors against the exact result, then against the definition in float64."""
-    first, lines = result["rows"][0], []
-    for row in result["rows"]:
-        exact, defined = row["errors"]["exact"], row["errors"]["defined"]
-        every = exact["gradients"]["all"]
-        line = row | exact["image"] | {"quartiles": span(row["ratio_quartiles"], ".3f")}
-        line |= {"more_blocks": row["blocks"] / max(first["blocks"], 1), "gradients": every["relative"]}
-        line |= {"turn": None if every["cosine"] is None else 1 - every["cosine"]}
-        lines.append(line | {f"{name}_defined": error(defined) for name, error in ERRORS.items()})
+    cosines = [row["errors"]["exact"]["gradients"]["all"]["cosine"] for row in result["rows"]]
+    turns = [None if cosine is None else 1 - cosine for cosine in cosines]
+    lines = [row | {"turn": turn} for row, turn in zip(result["rows"], turns, strict=True)]
     size = f"{result['gaussians']:,} Gaussians, {result['width']} x {result['height']}"
     return table(f"{result['inputs']}: {size}, forward and backward", lines, COLUMNS["errors"])
 
@@ -103,18 +159,17 @@ def errors_table(result: dict[str, Any]) -> str:
 def chart(result: dict[str, Any]) -> Figure:
     """Error against time on log axes: rows are what is held against, columns are image and gradients."""
     figure, grid = panels(11, 8, len(ORACLES), len(ERRORS), sharex=True)
-    labels = {"image": "image RMS error", "gradients": "relative error of the gradients"}
     titles = {"exact": "against the exact result", "defined": "against the definition in float64"}
-    for axes, (oracle, what) in zip(grid, ((o, e) for o in ORACLES for e in ERRORS), strict=True):
+    shown = ((oracle, what) for oracle in ORACLES for what in ERRORS)
+    for axes, (oracle, what) in zip(grid, shown, strict=True):
         points = [
             (1000 * row["seconds"], ERRORS[what](row["errors"][oracle]), row["knob"], row["value"])
             for row in result["rows"]
         ]
         _panel(axes, [p for p in points if p[1] > 0])  # what has no error has no place on a log axis
-        axes.set_title(f"{labels[what]}, {titles[oracle]}", fontsize=9, loc="left")
+        axes.set_title(f"{what}, {titles[oracle]}", fontsize=9, loc="left")
         axes.set_xlabel("forward and backward (ms)")
-    handles, names = grid[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=5, **LEGEND)
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, **LEGEND)
     figure.suptitle(f"{result['inputs']}, {result['gaussians']:,} Gaussians", fontsize=10)
     return figure
 
@@ -123,34 +178,34 @@ def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
     times, errors = zip(*(points[k][:2] for k in unbeaten([p[:2] for p in points])), strict=True)
     label = "no other one is better in both"
     axes.plot(times, errors, color="#888888", lw=1.2, drawstyle="steps-post", label=label)
-    for k, knob in enumerate(dict.fromkeys(case[0] for case in CASES)):
+    for k, knob in enumerate(dict.fromkeys(knob for knob, _ in CASES)):
         own = [(x, y, value) for x, y, name, value in points if name == knob]
-        first = knob == "default"
-        axes.plot(
-            [p[0] for p in own], [p[1] for p in own], linestyle="", label=knob, color=color(k),
-            marker="*" if first else "o", markersize=13 if first else 5, zorder=4 if first else 3,
-        )  # fmt: skip
+        star: dict[str, Any] = {"marker": "*", "markersize": 13, "zorder": 4}
+        dot: dict[str, Any] = {"marker": "o", "markersize": 5, "zorder": 3}
+        look = star if knob == "default" else dot
+        axes.plot([p[0] for p in own], [p[1] for p in own], ls="", label=knob, color=color(k), **look)
         for x, y, value in own:
             axes.annotate(value, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6, rotation=40)
     axes.set(xscale="log", yscale="log")
 
 
-def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, Any]:
+def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> Errors:
     """Image and gradients against `exact`; both hold "image" and the gradients by name, float64.
 
     The image: largest and root-mean-square error, and PSNR in dB where white is 1 (None: no error). Each
     gradient, and "all" of them as one vector: |g - exact| / |exact|, and the cosine of the angle between the
     two (None: one of them is 0).
     """
-    difference = outputs[IMAGE] - exact[IMAGE]
+    (image, *found), (wanted, *truth) = (
+        [side[name].flatten() for name in exact] for side in (outputs, exact)
+    )
+    difference = image - wanted
     rms = float(difference.square().mean().sqrt())
-    names = [name for name in exact if name != IMAGE]
-    gradients = {name: _direction(outputs[name].flatten(), exact[name].flatten()) for name in names}
-    both = [torch.cat([side[name].flatten() for name in names]) for side in (outputs, exact)]
     psnr = -20 * math.log10(rms) if rms > 0 else None
+    pairs = zip([*found, torch.cat(found)], [*truth, torch.cat(truth)], strict=True)
     return {
-        IMAGE: {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
-        "gradients": gradients | {"all": _direction(*both)},
+        "image": {"max": float(difference.abs().max()), "rms": rms, "psnr": psnr},
+        "gradients": dict(zip([*list(exact)[1:], "all"], (_direction(*pair) for pair in pairs), strict=True)),
     }
 
 
@@ -171,15 +226,12 @@ def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInpu
     with one_torch_thread():
         image, _ = render_view(g, view.camera, 3, config.background)
         image.requires_grad_()
-        photo, mask = photo_tensors(view)
-        photometric_loss(image, photo, mask).backward()
+        photometric_loss(image, *photo_tensors(view)).backward()
     assert image.grad is not None
+    scales, opacities, sh = g.activated_scales(), g.activated_opacities(), torch.cat([g.sh0, g.shN], dim=1)
+    leaves = (tensor.numpy() for tensor in (g.means, g.quats, scales, opacities, sh))
     return RasterInputs(
-        means=g.means.numpy(),
-        quats=g.quats.numpy(),
-        scales=g.activated_scales().numpy(),
-        opacities=g.activated_opacities().numpy(),
-        sh=torch.cat([g.sh0, g.shN], dim=1).numpy(),
+        **dict(zip(LEAVES, leaves, strict=True)),
         v_image=image.grad.numpy(),
         viewmat=view.camera.viewmat,
         K=view.camera.K,
