@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from hqgs.scene.scene import Camera
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
+PARTS = [PROGRAM, *(PROGRAM.with_name(name) for name in ("database.py", "likely.py"))]  # files that it is of
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
@@ -123,6 +125,7 @@ def run_colmap(
     write: Callable[[Path], None],
     keep: Path | None = None,
     told: OnStage = untold,
+    coarse: bool = False,
 ) -> Model:
     """COLMAP's largest model of photos.
 
@@ -135,6 +138,8 @@ def run_colmap(
         keep: a folder for models: COLMAP does not run again for the same photos, masks, cameras and version,
             and goes on with the features and matches of a call that was interrupted.
         told: hears what is being done.
+        coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
+            placed.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
@@ -153,6 +158,8 @@ def run_colmap(
     else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
+    if coarse:
+        given["coarse"] = np.array(True)
     kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
         return _read(kept)
@@ -199,12 +206,23 @@ def _workplace(kept: Path | None) -> Iterator[Path]:
         shutil.rmtree(directory, ignore_errors=True)
 
 
+def surroundings() -> dict[str, str]:
+    """The environment in which PROGRAM finds the other files of PARTS, whatever hqgs was started from."""
+    paths = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
 def _run_program(directory: Path, told: OnStage) -> None:
     """Run `reconstruct` in `directory` to its end. Whatever ends this process ends it too."""
     program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
     with (directory / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+            program,
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=surroundings(),
         )
         try:
             while True:
@@ -243,7 +261,9 @@ def _passes(facts: Path) -> list[Pass]:
 
 def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArray[np.generic]]) -> str:
     """A name for everything that the model depends on; where the photos lie is not part of it."""
-    digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode() + PROGRAM.read_bytes())
+    digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode())
+    for part in PARTS:
+        digest.update(part.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
     for part in ("sizes", "Ks", "focals", "camera_of", "pairs"):
