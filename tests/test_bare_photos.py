@@ -231,8 +231,10 @@ def test_frames_of_a_film_are_matched_with_their_neighbours_and_a_few_others() -
 
 
 def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
-    def told(count: int, width: int, height: int, threads: int = 2, pairs: int | None = None) -> list[int]:
-        text = expected_time(np.tile([width, height], (count, 1)), pairs, threads)
+    def told(
+        count: int, width: int, height: int, threads: int = 2, pairs: int | None = None, coarse: bool = False
+    ) -> list[int]:
+        text = expected_time(np.tile([width, height], (count, 1)), pairs, threads, coarse)
         found = re.search(r"takes (\d+) to (\d+) minutes", text)
         return [] if found is None else [int(part) for part in found.groups()]
 
@@ -240,7 +242,9 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     few, many = told(25, 4032, 3024), told(200, 4032, 3024)
     assert few[0] < few[1] < many[1]
     assert told(200, 4032, 3024, threads=8)[1] < many[1] / 2
-    assert told(200, 4032, 3024, pairs=2000)[1] < many[1] / 3
+    assert told(200, 4032, 3024, pairs=1000)[1] < many[1] / 1.5
+    assert told(128, 1200, 900, coarse=True)[1] < 8
+    assert told(128, 1200, 900)[1] > 10
     text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
     assert text.startswith("200 photos of 12.0 megapixels, which COLMAP looks at at 1.9: ")
     assert text.endswith("; 100 photos are plenty for most scenes")

@@ -165,8 +165,7 @@ class _Pass:
         fine = extraction.sift.first_octave, extraction.sift.max_num_features
         extraction.sift.first_octave, extraction.sift.max_num_features = 0, COARSE
         some = self.names[:: -(-len(self.names) // PROBED)]
-        with self._watched("features", len(self.names)):
-            _extract(self.directory, photos, some, extraction, self.database)
+        _extract(self.directory, photos, some, extraction, self.database)
         with pycolmap.Database.open(self.database) as db:
             found = [db.num_keypoints_for_image(self.names.index(name) + 1) for name in some]
             if np.median(found) >= RICH:
@@ -183,6 +182,7 @@ class _Pass:
             return None
         if "pairs" in self.given:
             return self.given["pairs"]
+        self._tell("matches", 0)
         with pycolmap.Database.open(self.database) as db:
             return likely_pairs(db, len(self.names))
 

@@ -24,6 +24,7 @@ from hqgs.base.files import keep_folder, lock_folder
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
+from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
@@ -94,19 +95,23 @@ def film_pairs(count: int) -> NDArray[np.int64]:
     return np.stack([first[chosen], second[chosen]], axis=1)
 
 
-def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int) -> str:
+def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: bool = False) -> str:
     """A sentence on how long COLMAP takes, where that may be more than a minute; else nothing.
 
-    `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all. The range is that of photos with
-    little and with much detail, measured on two threads of an AMD EPYC.
+    `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all, or of many photos the likely ones.
+    The range is that of photos with little and with much detail, measured on two threads of an AMD EPYC.
     """
     count = len(sizes)
-    pairs = count * (count - 1) // 2 if pairs is None else pairs
+    if pairs is None:
+        pairs = count * (count - 1) // 2 if count <= likely.MANY else count * likely.BEST
     stored = sizes.prod(axis=1) / 1e6  # megapixels
     seen = stored * np.minimum(1, LARGEST / sizes.max(axis=1)) ** 2
     share = 2 / threads
     least = share * (0.8 * seen.sum() + 0.015 * pairs) + 0.02 * pairs
     most = share * (2.2 * seen.sum() + 0.4 * pairs * min(1, seen.mean()) ** 2) + 0.05 * pairs + 1.6 * count
+    if coarse:
+        least = share * (0.15 * seen.sum() + 0.01 * pairs)
+        most = share * (1.1 * seen.sum() + 0.03 * pairs) + 0.02 * pairs + 0.4 * count
     if most < LONG:
         return ""
     shrunk = f", which COLMAP looks at at {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
@@ -145,7 +150,7 @@ def run_colmap(
     """
     if len(names) < LEAST_PHOTOS:
         raise ValueError(
-            f"structure from motion needs at least {LEAST_PHOTOS} photos, got {len(names)}: 20 to 100 that "
+            f"finding cameras needs at least {LEAST_PHOTOS} photos, got {len(names)}: 20 to 100 that "
             "overlap make a good scene"
         )
     given: dict[str, NDArray[Any]] = {"names": np.array(names)}
@@ -164,7 +169,8 @@ def run_colmap(
     if kept is not None and kept.is_dir():
         return _read(kept)
     sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
-    if note := expected_time(sizes, len(given["pairs"]) if "pairs" in given else None, get_num_threads()):
+    pairs = len(given["pairs"]) if "pairs" in given else None
+    if note := expected_time(sizes, pairs, get_num_threads(), coarse):
         told(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:
         photos = directory / "photos"
