@@ -27,7 +27,7 @@ from benchmarks.quality.tables import courses, equal_time_gain, means, metrics, 
 from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
 from benchmarks.study import Cell, Store, Study, about, grid, key_of
 from hqgs.evaluation.metrics import psnr
-from hqgs.photos.formula import parse_degradation
+from hqgs.photos.formula import parse_formation
 from hqgs.scene.scene import Camera, Scene, SfmReport, View
 from hqgs.training.checkpoint import scene_fingerprint
 from hqgs.training.config import ESFGConfig, PaperConfig, SRGSConfig, TrainConfig
@@ -110,7 +110,7 @@ def test_each_cell_is_one_file_with_its_numbers(out: Path, runs: dict[Any, dict[
         assert sum(r["gaussians"] for r in regions.values()) <= 8 * run["gaussians"]
     for kind in KINDS:
         formation = runs[kind, 0, "hqgs"]["formation"]
-        assert str(parse_degradation(formation)) == runs[kind, 0, "hqgs"]["config"]["hqgs"]["formation"]
+        assert str(parse_formation(formation)) == runs[kind, 0, "hqgs"]["config"]["hqgs"]["formation"]
     assert "lowres:2" in runs["lowres:2", 0, "hqgs"]["formation"]  # the small photos are at hand
     assert runs["noise:25", 0, "3dgs"]["formation"] is None
 

@@ -24,7 +24,7 @@ import hqgs.diagnosis.scene as module
 from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.degrade import degrade_image
-from hqgs.photos.formula import parse_degradation
+from hqgs.photos.formula import parse_degradation, parse_formation
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.methods.formed import find_formation
@@ -67,7 +67,7 @@ def half_noisy_scene() -> Scene:
 
 def steps_of(diagnosis: Diagnosis) -> dict[str, float]:
     """The formation as {kind: value}; NaN for what each photo has its own of."""
-    steps = parse_degradation(diagnosis.formation).steps
+    steps = parse_formation(diagnosis.formation).steps
     return {step.kind: np.nan if step.value is None else step.value for step in steps}
 
 

@@ -142,6 +142,15 @@ def test_photos_with_noise_of_their_own_are_told_from_the_others() -> None:
             assert loss == pytest.approx(float(huber) / noise, rel=1e-5)
 
 
+def test_noise_of_a_photos_own_leaves_the_files_cells_in_the_loss() -> None:
+    scene = half_noisy_scene()
+    render, noisy = render_like(scene.train[1].image), scene.train[1]
+    losses = [
+        float(loss_of(HQGS(scene, fixed(kind)), render, noisy)) for kind in ("grain+jpeg:10", "jpeg:10")
+    ]
+    assert losses[0] == losses[1]
+
+
 def test_jpeg_forgives_what_the_file_leaves_open() -> None:
     clean = tiny_scene()
     scene = degrade_scene(clean, parse_degradation("jpeg:10"), 0)

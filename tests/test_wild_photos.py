@@ -396,6 +396,8 @@ def test_text_comes_back(text: str) -> None:
         ("some:noise", "noise needs a value"),
         ("some:noise:x", "'x' in the degradation 'some:noise:x' is no number"),
         ("some:jpeg:0", "jpeg is 0"),
+        ("focus", "the built-in scene true-defocus is photographed through a lens, and defocus:R blurs"),
+        ("blur+grain", "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos"),
     ],
 )
 def test_bad_text_is_refused(text: str, message: str) -> None:

@@ -13,7 +13,7 @@ from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread
 from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
-from hqgs.photos.formula import NONE, parse_degradation
+from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
@@ -30,7 +30,7 @@ class Part:
     needed: bool
     value: float | None  # median over photos: px, factor, levels or quality; None: not told
     spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
-    step: str | None  # in the grammar of `parse_degradation`, where needed
+    step: str | None  # in the grammar of `parse_formation`, where needed
     reason: str  # one sentence
 
 
@@ -39,7 +39,7 @@ class Diagnosis:
     """What degraded a scene's training photos. `asdict` makes it JSON."""
 
     scene: str
-    formation: str  # the degradation that best explains the photos, as `parse_degradation` reads it
+    formation: str  # the degradation that best explains the photos, as `parse_formation` reads it
     parts: tuple[Part, ...]  # in the order of the formation
     photos: tuple[PhotoDiagnosis, ...]  # those looked at
 
@@ -117,7 +117,7 @@ class Inspector:
             blur = replace(blur, needed=False, step=None, reason=reason)
         parts = (exposure, shake, focus, blur, _lowres(photos), _noise(photos), _jpeg(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
-        self.last = Diagnosis(scene.name, str(parse_degradation(text)), parts, photos)
+        self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos)
         return self.last
 
 

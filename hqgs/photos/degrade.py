@@ -234,17 +234,6 @@ def _exposure(image: Float32, stops: float, rng: np.random.Generator) -> _Own:
     return expose(image, gains), {"gains": gains.tolist()}
 
 
-def _focus(image: Float32, value: float, rng: np.random.Generator) -> _Own:
-    raise ValueError(
-        "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in scene "
-        "true-defocus is photographed through a lens, and defocus:R blurs the whole photo"
-    )
-
-
-def _grain(image: Float32, value: float, rng: np.random.Generator) -> _Own:
-    raise ValueError("grain says that each photo has noise of its own; some:noise:SIGMA makes such photos")
-
-
 def _chat(image: Float32, side: float, rng: np.random.Generator) -> _Own:
     quality = int(rng.integers(CHAT_QUALITIES[0], CHAT_QUALITIES[1] + 1))
     height, width = _chat_size(image.shape[0], image.shape[1], int(side))
@@ -257,8 +246,6 @@ _OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], _Own]] = {
     "defocus": _plain(lambda image, radius, rng: convolve(image, disc_kernel(radius))),
     "motion": _motion,
     "shake": _shake,
-    "focus": _focus,
-    "grain": _grain,
     "exposure": _exposure,
     "chat": _chat,
 }

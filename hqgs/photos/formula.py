@@ -28,8 +28,8 @@ KINDS = {
     "defocus": Kind(0.5, 50, "a radius in px", at_504=5.0),
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
     "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0),
-    "focus": Kind(0, 0, "no value", default=0, some=False),
-    "grain": Kind(0, 0, "no value", default=0, some=False),
+    "focus": Kind(0, math.inf, "no value", default=0, some=False),
+    "grain": Kind(0, math.inf, "no value", default=0, some=False),
     "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
     "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
@@ -41,6 +41,11 @@ LONGEST = ("chat",)  # their values are of the photo's longest side, not of its 
 VIDEOS = ("video", "video265")
 LEARNED = ("shake", "focus", "exposure")  # of each photo its own, which is learned with the scene
 OWN = (*LEARNED, "grain")  # of each photo its own; grain is noise, which is measured before
+NOT_MADE = {
+    "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
+    "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
+    "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
+}  # what a method can be told of only, and what to write for photos
 
 
 @dataclass(frozen=True)
@@ -61,8 +66,6 @@ class Step:
                 f"{SOME}:KIND, and steps joined by +"
             )
         kind = KINDS[self.kind]
-        if not kind.highest and self.value:
-            raise ValueError(f"{self}: each photo has its own of it, which is found; write {self.kind}")
         wanted = f"{kind.unit}, {'an integer in ' if kind.integer else ''}{kind.lowest:g}..{kind.highest:g}"
         if self.value is None:
             if kind.at_504 is None and kind.default is None:
@@ -140,19 +143,11 @@ def parse_degradation(text: str) -> Degradation:
     with the photo's width; chat takes half of the longest side, exposure 1, phone 4 and both videos 36.
     ValueError names what is wrong and the values there are.
     """
-    if text == NONE:
-        return Degradation(())
-    steps: list[Step] = []
-    for part in text.split("+"):
-        if part == MIXED:
-            steps.extend(MIXED_STEPS)
-        elif part == NONE:
-            raise ValueError(f"{NONE!r} stands alone, got the degradation {text!r}")
-        else:
-            some = part.partition(":")[0] == SOME
-            kind, colon, value = (part.partition(":")[2] if some else part).partition(":")
-            steps.append(Step(kind, _number(value, part) if colon else None, some))
-    return Degradation(tuple(steps))
+    degradation = _parsed(text)
+    for step in degradation.steps:
+        if step.kind in NOT_MADE:
+            raise ValueError(NOT_MADE[step.kind])
+    return degradation
 
 
 def parse_formation(text: str) -> Degradation:
@@ -161,7 +156,7 @@ def parse_formation(text: str) -> Degradation:
     `shake`, `focus`, `exposure` and `grain` (noise) stand without a value: each photo has its own, which is
     learned with the scene, or, as noise, measured before.
     """
-    return check_formation(parse_degradation(text))
+    return check_formation(_parsed(text))
 
 
 def check_formation(degradation: Degradation) -> Degradation:
@@ -176,6 +171,22 @@ def check_formation(degradation: Degradation) -> Degradation:
         if step.kind in OWN and step.value is not None:
             raise ValueError(f"{step}: each photo has its own of it, which is found; write {step.kind}")
     return degradation
+
+
+def _parsed(text: str) -> Degradation:
+    if text == NONE:
+        return Degradation(())
+    steps: list[Step] = []
+    for part in text.split("+"):
+        if part == MIXED:
+            steps.extend(MIXED_STEPS)
+        elif part == NONE:
+            raise ValueError(f"{NONE!r} stands alone, got the degradation {text!r}")
+        else:
+            some = part.partition(":")[0] == SOME
+            kind, colon, value = (part.partition(":")[2] if some else part).partition(":")
+            steps.append(Step(kind, _number(value, part) if colon else None, some))
+    return Degradation(tuple(steps))
 
 
 def small_side(side: int, factor: int) -> int:

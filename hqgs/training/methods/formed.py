@@ -15,7 +15,7 @@ from hqgs.base.text import some
 from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.formation import Operator, formation
-from hqgs.photos.formula import Degradation, parse_degradation, small_side
+from hqgs.photos.formula import Degradation, parse_formation, small_side
 from hqgs.photos.jpeg import tables_of_quality
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.scene import Scene, View
@@ -33,7 +33,7 @@ class FormedTarget(Target):
     cells: JpegCells | None  # that the photo's file leaves open
     centres: Coefficients | None  # of these cells
     held: HeldPixels | None = None  # which the mask leaves out too
-    noise: float = 0.0  # of this photo, where photos differ in it: standard deviation, where 1 is white
+    noise: float = 0.0  # of this photo: standard deviation, where 1 is white
 
     @property
     def kept(self) -> int:
@@ -90,7 +90,7 @@ class Formation:
             operator,
             cells,
             centres,
-            noise=self._noises.get(view.name, 0.0),
+            noise=self._noises.get(view.name, self.noise),
         )
 
 
@@ -106,7 +106,7 @@ def find_formation(scene: Scene, text: str, inspector: Inspector) -> tuple[Forma
             for part, needed, why in needs
             if not needed
         ]
-    degradation = parse_degradation(text)
+    degradation = parse_formation(text)
     directions: dict[str, float] = {}
     if any(step.kind == "motion" for step in degradation.steps):
         directions = _motion_directions(scene, inspector)

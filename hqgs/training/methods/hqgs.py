@@ -71,11 +71,9 @@ class HQGS(Plain):
         found = find_formation(scene, config.formation, inspector)
         self.formation: Formation = found[0]
         self._left_out: list[LeftOut] = found[1]
-        kinds, jpeg = self.formation.kinds, "jpeg" in self.formation.kinds
+        kinds = self.formation.kinds
         self.as_photographed: bool = not kinds
         self.noise: float = self.formation.noise
-        self._knee = 0.0 if jpeg else KNEE * self.noise
-        self._dssim = 0.0 if "noise" in kinds or jpeg else LAMBDA_DSSIM
         self._views = scene.train
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
         self._cameras: LearnedCameras | None = None
@@ -85,7 +83,7 @@ class HQGS(Plain):
                 gains = log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
-        self._plateau = Plateau(len(scene.train)) if self._knee else None
+        self._plateau = Plateau(len(scene.train)) if self.noise and "jpeg" not in kinds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
         self._since = 0  # the iteration after which they were computed
 
@@ -140,12 +138,11 @@ class HQGS(Plain):
         return render if target.operator is None else target.operator(render)
 
     def loss(self, image: Tensor, target: FormedTarget) -> Tensor:
-        if target.noise:
-            pixels = photometric_loss(image, target.photo, target.mask, 0.0, KNEE * target.noise)
-            return STEEPER * pixels
-        pixels = photometric_loss(image, target.photo, target.mask, self._dssim, self._knee)
+        plain = target.cells is None and not target.noise
+        dssim, knee = LAMBDA_DSSIM if plain else 0.0, KNEE * target.noise if target.cells is None else 0.0
+        pixels = photometric_loss(image, target.photo, target.mask, dssim, knee)
         if target.cells is None or target.centres is None:
-            return STEEPER * pixels if self._knee else pixels
+            return STEEPER * pixels if knee else pixels
         if target.mask is not None:
             image = torch.where(target.mask[..., None], image, floats(target.photo))
         return target.cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
