@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import subprocess
@@ -23,6 +24,7 @@ from hqgs.scene.sfm import program
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
+from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.program import _Pass
 from hqgs.scene.sfm.run import LARGEST, expected_time, film_pairs
 
@@ -229,8 +231,10 @@ def test_frames_of_a_film_are_matched_with_their_neighbours_and_a_few_others() -
 
 
 def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
-    def told(count: int, width: int, height: int, threads: int = 2, pairs: int | None = None) -> list[int]:
-        text = expected_time(np.tile([width, height], (count, 1)), pairs, threads)
+    def told(
+        count: int, width: int, height: int, threads: int = 2, pairs: int | None = None, coarse: bool = False
+    ) -> list[int]:
+        text = expected_time(np.tile([width, height], (count, 1)), pairs, threads, coarse)
         found = re.search(r"takes (\d+) to (\d+) minutes", text)
         return [] if found is None else [int(part) for part in found.groups()]
 
@@ -238,7 +242,9 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     few, many = told(25, 4032, 3024), told(200, 4032, 3024)
     assert few[0] < few[1] < many[1]
     assert told(200, 4032, 3024, threads=8)[1] < many[1] / 2
-    assert told(200, 4032, 3024, pairs=2000)[1] < many[1] / 3
+    assert told(200, 4032, 3024, pairs=1000)[1] < many[1] / 1.5
+    assert told(128, 1200, 900, coarse=True)[1] < 8
+    assert told(128, 1200, 900)[1] > 10
     text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
     assert text.startswith("200 photos of 12.0 megapixels, which COLMAP looks at at 1.9: ")
     assert text.endswith("; 100 photos are plenty for most scenes")
@@ -273,10 +279,98 @@ def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_p
     assert sorted(numbers) == [(1, 2), (1, 9), (2, 3)]
 
 
+def work_on(photos: list[np.ndarray], folder: Path) -> dict[str, np.ndarray]:
+    """The photos in `folder / "photos"`, and what the program of COLMAP is given of them."""
+    (folder / "photos").mkdir(parents=True)
+    names = [f"{k}.png" for k in range(len(photos))]
+    for name, image in zip(names, photos, strict=True):
+        Image.fromarray(image).save(folder / "photos" / name)
+    given = {"names": np.array(names), "photos": np.array(str(folder / "photos")), "coarse": np.array(True)}
+    given |= {"sizes": np.array([(WIDTH, HEIGHT)]), "focals": np.zeros(1)}
+    given["camera_of"] = np.zeros(len(names), np.intp)
+    np.savez(folder / "input.npz", **given)  # pyright: ignore[reportArgumentType]
+    return given
+
+
+def test_photos_rich_in_detail_are_looked_at_coarsely_and_others_finely(
+    photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import pycolmap
+
+    given = work_on(photos, tmp_path / "a")
+    fine = _Pass(tmp_path / "a", given, 1, tolerant=False)
+    fine.run()
+    poor = _Pass(tmp_path / "a", given, 1, tolerant=False, coarse=True)
+    poor.run()
+    assert not poor.coarse
+    assert poor.facts() == fine.facts()
+    again = _Pass(tmp_path / "a", given, 1, tolerant=False, coarse=True)
+    assert not again._probe(
+        tmp_path / "none", pycolmap.FeatureExtractionOptions()
+    )  # it was interrupted: what is there is fine already
+    monkeypatch.setattr(program, "RICH", 20)
+    given = work_on(photos, tmp_path / "b")
+    rich = _Pass(tmp_path / "b", given, 1, tolerant=False, coarse=True)
+    rich.run()
+    assert rich.coarse
+    counts = [sum(one.facts()["features"].values()) for one in (rich, fine)]
+    assert counts[0] < 0.6 * counts[1]
+
+
+def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
+    photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program, "RICH", 0)
+    monkeypatch.setattr(program, "COARSE", 3)  # features, which place nothing
+    work_on(photos, tmp_path)
+    program.reconstruct(tmp_path, 2)
+    (only,) = json.loads((tmp_path / "facts.json").read_text())["passes"]
+    assert only["registered"] == len(photos)
+    assert not only["tolerant"]
+    assert min(only["features"].values()) > 50
+
+
+def test_of_many_photos_those_that_are_alike_are_matched(tmp_path: Path) -> None:
+    """Three things in turn, 90 photos: each photo shows half of one thing, and something of its own."""
+    import pycolmap
+
+    rng = np.random.default_rng(0)
+
+    def descriptors(count: int) -> np.ndarray:
+        found = rng.exponential(size=(count, 128))
+        return np.rint(512 * found / np.linalg.norm(found, axis=1, keepdims=True)).clip(0, 255)
+
+    things, count = [descriptors(300) for _ in range(3)], 90
+    with pycolmap.Database.open(tmp_path / "a.db") as db:
+        db.write_camera(
+            pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=9, height=9, params=[9, 4, 4])
+        )
+        for k in range(count):
+            db.write_image(pycolmap.Image(name=str(k), camera_id=1, image_id=k + 1), use_image_id=True)
+            if k == 7:
+                continue  # a photo without features
+            seen = np.concatenate([rng.permutation(things[k % 3])[:150], descriptors(150)])
+            seen = (seen + rng.normal(0, 4, seen.shape)).clip(0, 255).round().astype(np.uint8)
+            points = np.column_stack([rng.random((300, 2)), np.tile([3.0, 0, 0, 3.0], (300, 1))])
+            points[:150, 2:] *= 2  # what it shares is larger
+            db.write_keypoints(k + 1, points.astype(np.float32))
+            db.write_descriptors(k + 1, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, seen))
+        pairs = likely_pairs(db, count)
+    assert pairs.tolist() == sorted(pairs.tolist())
+    chosen = {(i, j) for i, j in pairs.tolist()}
+    near = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + 5))}
+    assert near <= chosen
+    alike = [(i - j) % 3 == 0 for i, j in chosen - near]
+    assert len(alike) > 20 * count / 2 * 0.8
+    assert np.mean(alike) > 0.95
+    assert len(chosen) < count * (count - 1) / 2 / 2
+
+
 def test_the_second_pass_takes_more() -> None:
     """A few photos of the first pass lead to a second one, whose thresholds are all lower."""
     first, second = (_Pass.__new__(_Pass) for _ in range(2))
     first.tolerant, second.tolerant = False, True
+    first.coarse = second.coarse = False
     assert second._geometry().min_num_inliers < first._geometry().min_num_inliers
     mild, strict = second._mapping(False), first._mapping(False)
     assert mild.min_num_matches < strict.min_num_matches

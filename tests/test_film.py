@@ -65,7 +65,14 @@ def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.
         load(tmp_path / "no.mp4")
     with pytest.raises(ValueError, match="frames is 2, wanted at least 3"):
         film_frames(tmp_path / "no.mp4", tmp_path, 2)
-    assert sorted(os.listdir(tmp_path)) == ["no.mp4"]
+    with pytest.raises(ValueError, match=r"it is no film, or damaged$"):
+        load(tmp_path / "no.mp4", cache=tmp_path / "runs" / "new")
+    assert sorted(os.listdir(tmp_path)) == ["no.mp4"]  # nor the folder of a run, nor the one above it
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"it is no film, or damaged$"):
+        load(tmp_path / "no.mp4", cache=tmp_path / "empty")
+    assert list((tmp_path / "empty").iterdir()) == []  # the user's own folder stays
+    (tmp_path / "empty").rmdir()
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(
         ValueError, match=r"is a film, which needs the extra 'video': pip install 'hqgs\[video\]'"

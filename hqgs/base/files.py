@@ -120,7 +120,7 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
     The system frees the lock when its process ends, however it ends, so a lock never outlives its run.
     """
     folder = Path(folder)
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    made = missing_folders(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -140,11 +140,21 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-        for path in made:  # of a start that failed; what holds anything else stays
-            with suppress(OSError):
-                if {entry.name for entry in path.iterdir()} <= {LOCK}:
-                    (path / LOCK).unlink(missing_ok=True)
-                    path.rmdir()
+        remove_empty(made)
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """Those that making `folder` makes, itself first."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def remove_empty(made: list[Path]) -> None:
+    """Remove the folders of a failed start, the innermost first; what holds more than a lock stays."""
+    for path in made:
+        with suppress(OSError):
+            if {entry.name for entry in path.iterdir()} <= {LOCK}:
+                (path / LOCK).unlink(missing_ok=True)
+                path.rmdir()
 
 
 def remove_leftovers(path: str | Path) -> None:

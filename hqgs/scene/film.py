@@ -7,7 +7,6 @@ import hashlib
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import FRAMES, write_json
+from hqgs.base.files import FRAMES, missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, untold
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
@@ -41,6 +40,7 @@ def film_frames(
     if not target.is_dir():
         new = folder / f".{target.name}"
         shutil.rmtree(new, ignore_errors=True)
+        made = missing_folders(folder)
         new.mkdir(parents=True)
         try:
             for number, frame in _sharpest(av, path, count, told):
@@ -49,8 +49,7 @@ def film_frames(
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
-            with suppress(OSError):  # nothing is left of a film that cannot be read
-                folder.rmdir()
+            remove_empty(made)  # nothing is left of a film that cannot be read
     return (
         target,
         f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval",

@@ -28,6 +28,7 @@ COLMAP = "colmap"
 MOST_BYTES = (
     4e9  # of all photos in memory, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
 )
+COARSE = 640  # px: cameras for photos whose longer side is scaled down to no more need not be finer than that
 
 
 def load_scene(
@@ -59,7 +60,7 @@ def load_scene(
     a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
 
     `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
-    where all of them would take more than MOST_BYTES of memory.
+    where all of them would take more than MOST_BYTES of memory. Cameras for small photos are found coarsely.
 
     With `skip_unreadable` training photos that cannot be decoded (or whose mask or small photo cannot) are
     left out, as long as at least half of the training photos remain; `Scene.notes` names them. The other
@@ -73,7 +74,8 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    capture = _read(root, downscale, keep_sfm, told, sfm)
+    coarse = longest is not None and longest <= COARSE
+    capture = _read(root, downscale, keep_sfm, told, sfm, coarse)
     if longest is not None:
         capture = _bounded(capture, longest)
     degraded = read_degraded_folder(root)
@@ -143,7 +145,9 @@ def formats_of(root: Path, downscale: float) -> list[str]:
     return [COLMAP, *others] if has_model and (has_photos or not others) else others
 
 
-def _read(root: Path, downscale: float, keep_sfm: Path | None, told: OnStage, sfm: bool) -> Capture:
+def _read(
+    root: Path, downscale: float, keep_sfm: Path | None, told: OnStage, sfm: bool, coarse: bool
+) -> Capture:
     formats = formats_of(root, downscale)
     others = [name for name in formats if name != COLMAP]
     if COLMAP in formats:
@@ -161,7 +165,7 @@ def _read(root: Path, downscale: float, keep_sfm: Path | None, told: OnStage, sf
     if not sfm and (broken := _broken(root)) is not None:
         raise ValueError(f"{broken}; `--sfm` takes cameras and points from the photos alone")
     if (photos := bare_photos(root, downscale)) is not None:
-        return read_photos(root, photos, keep_sfm, told)
+        return read_photos(root, photos, keep_sfm, told, coarse)
     raise ValueError(_nothing(root))
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 from hqgs.scene.builtin.shading import render_depth
 from hqgs.scene.geometry import unproject
 from hqgs.scene.scene import View
-from hqgs.scene.sfm.run import PROGRAM
+from hqgs.scene.sfm.run import PROGRAM, surroundings
 
 MIN_POINTS = 200  # fewer are no basis for a reconstruction
 
@@ -56,7 +56,12 @@ def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -
         program = [sys.executable, str(PROGRAM), "triangulate", name]
         try:
             done = subprocess.run(
-                program, capture_output=True, stdin=subprocess.DEVNULL, timeout=time_limit, check=False
+                program,
+                capture_output=True,
+                stdin=subprocess.DEVNULL,
+                timeout=time_limit,
+                check=False,
+                env=surroundings(),
             )
         except subprocess.TimeoutExpired:
             trouble = f"it took more than {time_limit:g} s"

@@ -30,12 +30,14 @@ class Found:
     report: SfmReport
 
 
-def find_cameras(root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold) -> Found:
+def find_cameras(
+    root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold, coarse: bool = False
+) -> Found:
     """Cameras and points of photos alone, by COLMAP, as `read_photos` has them."""
     photos = readable(photos, told)
     names = photos.colmap_names
     try:
-        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, told)
+        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, told, coarse)
         poses = ran.poses()
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
@@ -64,16 +66,19 @@ def find_cameras(root: Path, photos: BarePhotos, keep: Path | None = None, told:
     return Found(photos, model, report)
 
 
-def read_photos(root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold) -> Capture:
+def read_photos(
+    root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold, coarse: bool = False
+) -> Capture:
     """Cameras and points of a folder of photos, from all of them, by COLMAP.
 
     Photos of one size share a camera (SIMPLE_RADIAL), unless EXIF tells cameras or zooms apart; it is found
     as well, from the focal length in EXIF where that has one. Held-out views are among the photos: without
     them they would have no pose. The report says so, and names the photos that have no place. The world is
     turned so that the photos' mean up is -y; up is what EXIF says of how each was held. `keep`: a folder for
-    the reconstruction, see `run_colmap`. ValueError where COLMAP cannot make a model of half of the photos.
+    the reconstruction; `coarse`: a first look, for small pictures; see `run_colmap`. ValueError where COLMAP
+    cannot make a model of half of the photos.
     """
-    cameras = find_cameras(root, photos, keep, told)
+    cameras = find_cameras(root, photos, keep, told, coarse)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     found = [

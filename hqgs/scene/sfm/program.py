@@ -1,9 +1,9 @@
 """COLMAP in a process of its own: the program `python program.py COMMAND DIRECTORY`.
 
-So a crash or a hang of COLMAP cannot take its caller along. It imports nothing of hqgs, so that it starts at
-once. DIRECTORY holds `input.npz`: photos (the folder), names [V], and of known cameras sizes [V, 2] as width
-and height and Ks [V, 3, 3], of known poses viewmats [V, 4, 4]. If DIRECTORY has a folder `masks`, each photo
-has a mask `NAME.png` there. The files of COLMAP and the answer go into DIRECTORY:
+So a crash or a hang of COLMAP cannot take its caller along. Of hqgs it imports two files that need nothing
+else, so that it starts at once. DIRECTORY holds `input.npz`: photos (the folder), names [V], and of known
+cameras sizes [V, 2] as width and height and Ks [V, 3, 3], of known poses viewmats [V, 4, 4]. If DIRECTORY
+has a folder `masks`, each photo has a mask `NAME.png` there. COLMAP's files and the answer go into DIRECTORY:
 
 `triangulate`: points for known cameras and poses, `points.npz` (points [P, 3] float32, colors [P, 3] uint8,
 and of each sighting the numbers of the photo and of the point: photos [O], rows [O]).
@@ -11,8 +11,10 @@ and of each sighting the numbers of the photo and of the point: photos [O], rows
 `reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is
 no model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes
 [C, 2], focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera,
-camera_of [V]. Where it has pairs [P, 2], numbers of photos, the first pass matches those alone. Where that
-registers few photos, a second, more tolerant one follows, with every pair; the better of the two counts.
+camera_of [V]. The first pass matches the pairs [P, 2], numbers of photos, where it has some; else all, or of
+many photos those that are alike. Where it has `coarse`, photos rich in detail are looked at coarsely, and
+again finely where too few find a place. Where the first pass registers few photos, a second, more tolerant
+one follows, with every pair; the better of the two counts.
 `facts.json` says what both came to, `stage.json` what is being done now, which is read from COLMAP's log: the
 caller sends the output to `log.txt`. A second call in the same DIRECTORY goes on with the features and
 matches that the first one left. The program ends when its standard input does.
@@ -33,11 +35,17 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from hqgs.scene.sfm.database import known_cameras, new_cameras
+from hqgs.scene.sfm.likely import MANY, likely_pairs
+
 MAX_FEATURES = 2048  # per photo, of known cameras
 MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many pixels on average
 LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
 ENOUGH = 0.7  # of the photos: with fewer, the second pass follows
-FOCAL = 1.2  # of the longer side, where nothing tells
+ALMOST = 0.95  # of the photos: with fewer, those that were looked at coarsely are looked at again
+PROBED, RICH = 8, 1000  # photos that tell whether coarse features are enough, and how many they need (median)
+SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
+COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
 BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
 LISTED = 64  # blocks of pairs that are listed
 EVERY = 0.5  # s between looks into the log
@@ -50,7 +58,7 @@ def triangulate(directory: Path) -> None:
     The check with known poses needs no RANSAC, so the same photos give the same points.
     """
     database, given = directory / "colmap.db", _given(directory)
-    known = _known_cameras(given, database)
+    known = known_cameras(given, database)
     photos, names = Path(str(given["photos"])), given["names"].tolist()
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = 1
@@ -75,12 +83,16 @@ def triangulate(directory: Path) -> None:
 def reconstruct(directory: Path, threads: int) -> None:
     """SIFT, matching, RANSAC, incremental mapping; the threads change no bit of the result.
 
-    Features and matches of one photo or pair depend on no other, and are read back in the order of their
-    numbers. What draws random numbers or adds up in the order of arrival has one thread and the seed 0.
+    What is found of one photo or pair depends on no other, not even its random numbers, and is read back in
+    the order of numbers. Mapping has one thread and the seed 0.
     """
     given = _given(directory)
-    passes = [_Pass(directory, given, threads, tolerant=False)]
+    passes = [_Pass(directory, given, threads, tolerant=False, coarse="coarse" in given)]
     passes[0].run()
+    if passes[0].coarse and passes[0].registered < ALMOST * len(given["names"]):
+        fine = _Pass(directory, given, threads, tolerant=False)
+        fine.run()
+        passes = [max(fine, passes[0], key=lambda one: one.registered)]
     if passes[0].registered < ENOUGH * len(given["names"]):
         passes.append(_Pass(directory, given, threads, tolerant=True))
         passes[1].run()
@@ -96,9 +108,12 @@ def reconstruct(directory: Path, threads: int) -> None:
 class _Pass:
     """One way from photos to a model; the tolerant one takes weaker features, and fewer matches as enough."""
 
-    def __init__(self, directory: Path, given: dict[str, Any], threads: int, tolerant: bool) -> None:
-        self.directory, self.given, self.threads, self.tolerant = directory, given, threads, tolerant
-        self.database = directory / ("tolerant.db" if tolerant else "colmap.db")
+    def __init__(
+        self, directory: Path, given: dict[str, Any], threads: int, tolerant: bool, coarse: bool = False
+    ) -> None:
+        self.directory, self.given, self.threads = directory, given, threads
+        self.tolerant, self.coarse = tolerant, coarse
+        self.database = directory / ("tolerant.db" if tolerant else "coarse.db" if coarse else "colmap.db")
         self.names: list[str] = given["names"].tolist()
         self.model: pycolmap.Reconstruction | None = None
         self._tell("features", 0)
@@ -112,19 +127,20 @@ class _Pass:
         if not self.database.exists():
             new = self.database.with_suffix(".new")
             new.unlink(missing_ok=True)
-            _known_cameras(self.given, new) if fixed else _new_cameras(self.given, new)
+            known_cameras(self.given, new) if fixed else new_cameras(self.given, new)
             new.rename(self.database)
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
         if self.tolerant:
             extraction.sift.peak_threshold /= 4
         photos = Path(str(self.given["photos"]))
-        pairs = None if self.tolerant else self.given.get("pairs")
+        if self.coarse:
+            self.coarse = self._probe(photos, extraction)
         todo = self.directory, photos, self.names, extraction, self.threads, self.database
-        _match(*todo, self._watched, pairs)
+        _match(*todo, self._watched, self._pairs)
         self._tell("verify", 0)
         verifier = pycolmap.GeometricVerifierOptions()
-        verifier.num_threads = 1
+        verifier.num_threads = self.threads
         pycolmap.geometric_verification(self.database, verifier, two_view_geometry_options=self._geometry())
         models = pycolmap.incremental_mapping(
             self.database,
@@ -137,6 +153,38 @@ class _Pass:
         if models:
             best = max(sorted(models), key=lambda k: (models[k].num_reg_images(), models[k].num_points3D()))
             self.model = models[best]
+
+    def _probe(self, photos: Path, extraction: pycolmap.FeatureExtractionOptions) -> bool:
+        """Whether a few photos show enough where they are not enlarged; if so, `extraction` is to do without.
+
+        SIFT looks at each photo at twice its size first, which takes three quarters of its time.
+        """
+        poor = self.directory / "poor"  # there: what was found coarsely is gone
+        if poor.exists():
+            return False
+        fine = extraction.sift.first_octave, extraction.sift.max_num_features
+        extraction.sift.first_octave, extraction.sift.max_num_features = 0, COARSE
+        some = self.names[:: -(-len(self.names) // PROBED)]
+        _extract(self.directory, photos, some, extraction, self.database)
+        with pycolmap.Database.open(self.database) as db:
+            found = [db.num_keypoints_for_image(self.names.index(name) + 1) for name in some]
+            if np.median(found) >= RICH:
+                return True
+            db.clear_keypoints()
+            db.clear_descriptors()
+        poor.touch()
+        extraction.sift.first_octave, extraction.sift.max_num_features = fine
+        return False
+
+    def _pairs(self) -> Any:
+        """Pairs [P, 2] of photos that are to be matched; None: all."""
+        if self.tolerant or (len(self.names) <= MANY and "pairs" not in self.given):
+            return None
+        if "pairs" in self.given:
+            return self.given["pairs"]
+        self._tell("matches", 0)
+        with pycolmap.Database.open(self.database) as db:
+            return likely_pairs(db, len(self.names))
 
     def facts(self) -> dict[str, Any]:
         """Features of each photo, matches and those that a geometry bears out of each pair, both sorted."""
@@ -164,6 +212,9 @@ class _Pass:
         options = _pipeline_options()
         options.min_model_size = 3
         mapper = options.mapper
+        if self.coarse:
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM
+            options.ba_global_max_refinements = 2
         if self.tolerant:
             options.min_num_matches = 10
             mapper.init_min_num_inliers, mapper.init_min_tri_angle = 50, 6.0
@@ -227,21 +278,12 @@ def _match(
     threads: int,
     database: Path,
     watched: Callable[[str, int], AbstractContextManager[None]] = _unwatched,
-    pairs: Any = None,
+    wanted: Callable[[], Any] = lambda: None,
 ) -> None:
-    """Features, and matches of these pairs [P, 2] or of every pair, not yet checked by geometry."""
-    reader = pycolmap.ImageReaderOptions()
-    if (directory / "masks").is_dir():
-        reader.mask_path = directory / "masks"
+    """Features, and matches of the pairs [P, 2] that are wanted then, or of all; geometry is not checked."""
     with watched("features", len(names)):
-        pycolmap.extract_features(
-            database,
-            photos,
-            image_names=names,
-            reader_options=reader,
-            extraction_options=extraction,
-            device=pycolmap.Device.cpu,
-        )
+        _extract(directory, photos, names, extraction, database)
+    pairs = wanted()
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = threads
     matching.skip_geometric_verification = True
@@ -262,6 +304,15 @@ def _match(
         )
 
 
+def _extract(directory: Path, photos: Path, names: list[str], extraction: Any, database: Path) -> None:
+    """Features of photos that have none yet."""
+    reader = pycolmap.ImageReaderOptions()
+    if (directory / "masks").is_dir():
+        reader.mask_path = directory / "masks"
+    found = {"reader_options": reader, "extraction_options": extraction, "device": pycolmap.Device.cpu}
+    pycolmap.extract_features(database, photos, image_names=names, **found)
+
+
 def _pipeline_options() -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1
@@ -272,56 +323,6 @@ def _pipeline_options() -> pycolmap.IncrementalPipelineOptions:
 def _given(directory: Path) -> dict[str, Any]:
     with np.load(directory / "input.npz", allow_pickle=False) as data:
         return dict(data)
-
-
-def _known_cameras(given: dict[str, Any], database: Path) -> pycolmap.Reconstruction:
-    """A reconstruction without points, and a database that gives its cameras and images the same numbers."""
-    known = pycolmap.Reconstruction()
-    names, sizes, Ks = (given[key] for key in ("names", "sizes", "Ks"))
-    viewmats = given.get("viewmats", np.broadcast_to(np.eye(4), (len(names), 4, 4)))
-    with pycolmap.Database.open(database) as db:
-        for k, (size, K, viewmat) in enumerate(zip(sizes.tolist(), Ks, viewmats, strict=True), 1):
-            pinhole = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-            camera = pycolmap.Camera(
-                camera_id=k, model="PINHOLE", width=size[0], height=size[1], params=pinhole
-            )
-            camera.has_prior_focal_length = True
-            image = pycolmap.Image(name=str(names[k - 1]), camera_id=k, image_id=k)
-            known.add_camera_with_trivial_rig(camera)
-            known.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3]))
-            db.write_camera(camera, use_camera_id=True)
-            db.write_rig(known.rigs[k], use_rig_id=True)
-            db.write_image(image, use_image_id=True)
-            db.write_frame(known.frames[k], use_frame_id=True)
-    return known
-
-
-def _new_cameras(given: dict[str, Any], database: Path) -> None:
-    """A database with the photos and their cameras, whose focal lengths and distortion COLMAP finds."""
-    with pycolmap.Database.open(database) as db:
-        for number, (focal, (width, height)) in enumerate(
-            zip(given["focals"].tolist(), given["sizes"].tolist(), strict=True), 1
-        ):
-            camera = pycolmap.Camera(
-                camera_id=number,
-                model="SIMPLE_RADIAL",
-                width=width,
-                height=height,
-                params=[focal or FOCAL * max(width, height), width / 2, height / 2, 0.0],
-            )
-            camera.has_prior_focal_length = focal > 0
-            db.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=number)
-            rig.add_ref_sensor(camera.sensor_id)
-            db.write_rig(rig, use_rig_id=True)
-        for k, (name, number) in enumerate(
-            zip(given["names"].tolist(), (given["camera_of"] + 1).tolist(), strict=True), 1
-        ):
-            image = pycolmap.Image(name=name, camera_id=number, image_id=k)
-            db.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=k, rig_id=number)
-            frame.add_data_id(image.data_id)
-            db.write_frame(frame, use_frame_id=True)
 
 
 def _end_with_caller() -> None:

@@ -22,7 +22,7 @@ from hqgs.scene.sfm.run import run_colmap
 def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
 
-    COLMAP (SIFT, exhaustive matching, incremental mapping) sees the training photos alone, clipped and
+    COLMAP (SIFT, matching, incremental mapping) sees the training photos alone, clipped and
     rounded to 8 bits, with the scene's intrinsics, which stay as they are: held-out views share them. The
     reconstruction is moved into the scene's frame by the training cameras (`align`, `refine`), so that the
     held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.

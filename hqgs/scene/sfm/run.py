@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -23,9 +24,11 @@ from hqgs.base.files import keep_folder, lock_folder
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
+from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
+PARTS = [PROGRAM, *(PROGRAM.with_name(name) for name in ("database.py", "likely.py"))]  # files that it is of
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
@@ -92,19 +95,23 @@ def film_pairs(count: int) -> NDArray[np.int64]:
     return np.stack([first[chosen], second[chosen]], axis=1)
 
 
-def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int) -> str:
+def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: bool = False) -> str:
     """A sentence on how long COLMAP takes, where that may be more than a minute; else nothing.
 
-    `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all. The range is that of photos with
-    little and with much detail, measured on two threads of an AMD EPYC.
+    `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all, or of many photos the likely ones.
+    The range is that of photos with little and with much detail, measured on two threads of an AMD EPYC.
     """
     count = len(sizes)
-    pairs = count * (count - 1) // 2 if pairs is None else pairs
+    if pairs is None:
+        pairs = count * (count - 1) // 2 if count <= likely.MANY else count * likely.BEST
     stored = sizes.prod(axis=1) / 1e6  # megapixels
     seen = stored * np.minimum(1, LARGEST / sizes.max(axis=1)) ** 2
     share = 2 / threads
     least = share * (0.8 * seen.sum() + 0.015 * pairs) + 0.02 * pairs
     most = share * (2.2 * seen.sum() + 0.4 * pairs * min(1, seen.mean()) ** 2) + 0.05 * pairs + 1.6 * count
+    if coarse:
+        least = share * (0.15 * seen.sum() + 0.01 * pairs)
+        most = share * (1.1 * seen.sum() + 0.03 * pairs) + 0.02 * pairs + 0.4 * count
     if most < LONG:
         return ""
     shrunk = f", which COLMAP looks at at {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
@@ -123,6 +130,7 @@ def run_colmap(
     write: Callable[[Path], None],
     keep: Path | None = None,
     told: OnStage = untold,
+    coarse: bool = False,
 ) -> Model:
     """COLMAP's largest model of photos.
 
@@ -135,12 +143,14 @@ def run_colmap(
         keep: a folder for models: COLMAP does not run again for the same photos, masks, cameras and version,
             and goes on with the features and matches of a call that was interrupted.
         told: hears what is being done.
+        coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
+            placed.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
     if len(names) < LEAST_PHOTOS:
         raise ValueError(
-            f"structure from motion needs at least {LEAST_PHOTOS} photos, got {len(names)}: 20 to 100 that "
+            f"finding cameras needs at least {LEAST_PHOTOS} photos, got {len(names)}: 20 to 100 that "
             "overlap make a good scene"
         )
     given: dict[str, NDArray[Any]] = {"names": np.array(names)}
@@ -153,11 +163,14 @@ def run_colmap(
     else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])
+    if coarse:
+        given["coarse"] = np.array(True)
     kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
         return _read(kept)
     sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
-    if note := expected_time(sizes, len(given["pairs"]) if "pairs" in given else None, get_num_threads()):
+    pairs = len(given["pairs"]) if "pairs" in given else None
+    if note := expected_time(sizes, pairs, get_num_threads(), coarse):
         told(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:
         photos = directory / "photos"
@@ -199,12 +212,23 @@ def _workplace(kept: Path | None) -> Iterator[Path]:
         shutil.rmtree(directory, ignore_errors=True)
 
 
+def surroundings() -> dict[str, str]:
+    """The environment in which PROGRAM finds the other files of PARTS, whatever hqgs was started from."""
+    paths = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+
+
 def _run_program(directory: Path, told: OnStage) -> None:
     """Run `reconstruct` in `directory` to its end. Whatever ends this process ends it too."""
     program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
     with (directory / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+            program,
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env=surroundings(),
         )
         try:
             while True:
@@ -243,7 +267,9 @@ def _passes(facts: Path) -> list[Pass]:
 
 def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArray[np.generic]]) -> str:
     """A name for everything that the model depends on; where the photos lie is not part of it."""
-    digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode() + PROGRAM.read_bytes())
+    digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode())
+    for part in PARTS:
+        digest.update(part.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
     for part in ("sizes", "Ks", "focals", "camera_of", "pairs"):

@@ -1,0 +1,66 @@
+"""Which of many photos may show the same things, so that not each has to be matched with each.
+
+It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+MANY = 60  # photos; of fewer each is matched with each
+LOOKED_AT = 256  # features of a photo, the largest, which are seen again from the farthest
+RATIO = 0.8  # of the distances to the nearest and the second feature of another photo, as COLMAP has it
+BEST, NEXT = 20, 4  # partners of a photo: those that are most like it, and those that follow it
+LENGTH = 512  # of COLMAP's descriptors, whole numbers
+BLOCK = 64  # photos that are compared with one at once
+
+
+def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
+    """Pairs [P, 2] of `count` photos, which have the numbers 1 to `count` in `db`, sorted, from 0.
+
+    The largest features of each photo are compared with those of each other. A photo is paired with the 20
+    that most of its features fit, and the 4 next ones in the order of names: people walk on between photos.
+    The numbers are whole and below 2^24, so that no order of sums and no number of threads changes a pair.
+    """
+    descriptors = [_largest(db, k + 1) for k in range(count)]
+    scores = np.zeros((count, count), np.int64)
+    for start in range(0, count, BLOCK):
+        block = descriptors[start : start + BLOCK]
+        together = np.concatenate(block).T
+        ends = np.cumsum([len(one) for one in block])
+        for k, one in enumerate(descriptors):
+            for other, alike in enumerate(np.split(one @ together, ends[:-1], axis=1), start):
+                scores[k, other] = 0 if k == other else _fitting(alike)
+    scores += scores.T
+    chosen = np.zeros((count, count), bool)
+    best = np.argsort(-scores, axis=1, kind="stable")[:, :BEST]
+    np.put_along_axis(chosen, best, np.take_along_axis(scores, best, axis=1) > 0, axis=1)
+    chosen |= chosen.T
+    first, second = np.triu_indices(count, 1)
+    wanted = chosen[first, second] | (second - first <= NEXT)
+    return np.stack([first[wanted], second[wanted]], axis=1)
+
+
+def _largest(db: pycolmap.Database, number: int) -> NDArray[np.float32]:
+    """Descriptors [N, 128] of a photo's largest features."""
+    if not db.exists_keypoints(number):
+        return np.zeros((0, 128), np.float32)
+    keypoints: NDArray[Any] = db.read_keypoints(number)
+    area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    rows = np.argsort(-area, kind="stable")[:LOOKED_AT]
+    return np.asarray(db.read_descriptors(number).data)[rows].astype(np.float32)
+
+
+def _fitting(alike: NDArray[np.float32]) -> int:
+    """How many of the features [N] have one of another photo's [M] that fits clearly better than the rest.
+
+    `alike` [N, M] holds products of descriptors: the squared distance is 2 (LENGTH^2 - product).
+    """
+    if alike.shape[0] == 0 or alike.shape[1] < 2:
+        return 0
+    second, first = np.partition(alike, -2, axis=1)[:, -2:].T
+    return int((LENGTH**2 - first < RATIO**2 * (LENGTH**2 - second)).sum())
