@@ -94,6 +94,35 @@ def test_learning_rates_by_hand() -> None:
     assert set(rates) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
 
 
+@pytest.mark.parametrize(
+    ("iterations", "faster", "last"),
+    [
+        (30_000, 1.0, 1.6e-6),
+        (15_000, 2**0.5, 1.6e-6 * 2**1.5),
+        (7_500, 2.0, 8 * 1.6e-6),
+        (100, 2.0, 1.6e-4 / 3),
+    ],
+)
+def test_short_runs_may_have_higher_rates(iterations: int, faster: float, last: float) -> None:
+    plain, brisk = TrainConfig(iterations=iterations), TrainConfig(iterations=iterations, brisk=True)
+    before, rates = (learning_rates(config, extent=2.0, part=1.0) for config in (plain, brisk))
+    assert before["means"] == pytest.approx(2 * 1.6e-6)
+    assert rates["means"] == pytest.approx(2 * last)
+    assert rates["opacities"] == before["opacities"]
+    for name in ("scales", "quats", "sh0", "shN"):
+        assert rates[name] == pytest.approx(faster * before[name])
+    assert learning_rates(brisk, 2.0, 0.0)["means"] == learning_rates(plain, 2.0, 0.0)["means"]
+
+
+def test_methods_of_our_own_have_them_unless_asked_not_to() -> None:
+    def brisk(method: str, asked: bool | None) -> bool | None:
+        return Trainer(tiny_scene(), tiny_config(method=method, brisk=asked)).config.brisk
+
+    assert [brisk(method, None) for method in ("auto", "hqgs", "3dgs", "srgs")] == [True, True, None, None]
+    assert not brisk("auto", False)
+    assert brisk("3dgs", True)
+
+
 # --- the example of a method ---
 
 

@@ -51,6 +51,7 @@ class HQGS(Plain):
     - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
       Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
+    - Short runs have higher rates than 3DGS (`learning_rates`).
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
@@ -105,6 +106,7 @@ class HQGS(Plain):
             what = f"1/{1 / SHARE:.0f} of each photo's pixels in the loss"
             left_out.append(LeftOut(what, "they tell when the scene would start to learn the noise"))
         config = replace(config, hqgs=replace(config.hqgs, formation=str(degradation)))
+        config = replace(config, brisk=config.brisk is not False)
         if self._cameras is not None:
             config, why = _without_held_photos(config)
             left_out += why
