@@ -187,14 +187,14 @@ def learning_rates(config: TrainConfig, extent: float, part: float) -> dict[str,
 
     Those of 3DGS suit its 30,000 iterations: in a tenth of them a Gaussian cannot become as large, as thin or
     as bright as it should, and stands still before it is where it should be. `brisk` lets sizes, rotations
-    and colours of a run of n iterations change sqrt(30,000 / n) times as fast, twice at most, and the means'
+    and colours of a run of n iterations change (30,000 / n)^0.3 times as fast, twice at most, and the means'
     rate end (30,000 / n)^1.5 times as high, at a third of the first at most.
     """
     names = ("scales", "quats", "sh0", "shN")
     faster, last = 1.0, config.lr_means_final
     if config.brisk:
         shorter = max(1.0, TrainConfig.iterations / config.iterations)
-        faster = min(math.sqrt(shorter), FASTER)
+        faster = min(shorter**0.3, FASTER)
         last = max(last, min(last * shorter**1.5, LAST_OF_FIRST * config.lr_means))
     means = extent * config.lr_means ** (1 - part) * last**part
     others = {name: faster * getattr(config, f"lr_{name}") for name in names}
