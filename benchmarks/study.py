@@ -164,8 +164,11 @@ def key_of(cell: Cell, fingerprint: dict[str, str]) -> str:
     config = {name: value for name, value in config.items() if name not in METHODS or name == row.method}
     if not config["leave_out"]:
         del config["leave_out"]  # runs from before there was such a choice are the same
-    if row.method == "hqgs" and cell.config.hqgs.guidance == PAPER:
-        del config["hqgs"]["first_points"]  # so are the paper's, which has no use for it
+    paper = row.method == "hqgs" and cell.config.hqgs.guidance == PAPER
+    if config["brisk"] is None and (paper or row.method in ("3dgs", "srgs")):
+        del config["brisk"]  # so are those of methods without higher rates
+    if paper:
+        del config["hqgs"]["first_points"]  # and the paper's, which has no use for it
     facts = {"format": FORMAT, "version": hqgs.__version__, "config": config, "degradation": cell.degradation}
     facts |= {"scene": fingerprint, **cell.more}
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
