@@ -178,10 +178,12 @@ class _Pass:
 
     def _pairs(self) -> Any:
         """Pairs [P, 2] of photos that are to be matched; None: all."""
-        if self.tolerant or (len(self.names) <= MANY and "pairs" not in self.given):
+        if self.tolerant:
             return None
         if "pairs" in self.given:
             return self.given["pairs"]
+        if len(self.names) <= MANY:
+            return None
         self._tell("matches", 0)
         with pycolmap.Database.open(self.database) as db:
             return likely_pairs(db, len(self.names))

@@ -105,8 +105,8 @@ class HQGS(Plain):
         if self._plateau is not None:
             what = f"1/{1 / SHARE:.0f} of each photo's pixels in the loss"
             left_out.append(LeftOut(what, "they tell when the scene would start to learn the noise"))
-        config = replace(config, hqgs=replace(config.hqgs, formation=str(degradation)))
-        config = replace(config, brisk=config.brisk is not False)
+        known = replace(config.hqgs, formation=str(degradation))
+        config = replace(config, hqgs=known, brisk=config.brisk is not False)
         if self._cameras is not None:
             config, why = _without_held_photos(config)
             left_out += why
@@ -140,13 +140,14 @@ class HQGS(Plain):
         return render if target.operator is None else target.operator(render)
 
     def loss(self, image: Tensor, target: FormedTarget) -> Tensor:
-        plain = target.cells is None and not target.noise
-        dssim, knee = LAMBDA_DSSIM if plain else 0.0, KNEE * target.noise if target.cells is None else 0.0
-        pixels = photometric_loss(image, target.photo, target.mask, dssim, knee)
+        photo, mask = target.photo, target.mask
         if target.cells is None or target.centres is None:
-            return STEEPER * pixels if knee else pixels
-        if target.mask is not None:
-            image = torch.where(target.mask[..., None], image, floats(target.photo))
+            if not target.noise:
+                return photometric_loss(image, photo, mask, LAMBDA_DSSIM)
+            return STEEPER * photometric_loss(image, photo, mask, 0.0, KNEE * target.noise)
+        pixels = photometric_loss(image, photo, mask, 0.0)
+        if mask is not None:
+            image = torch.where(mask[..., None], image, floats(photo))
         return target.cells.loss(image, target.centres) + self.config.jpeg_pixels * pixels
 
     def rows_changed(self, state: TrainState, parents: Tensor) -> None:
