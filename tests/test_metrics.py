@@ -25,6 +25,7 @@ from hqgs.evaluation.metrics import (
     lpips,
     mean_metrics,
     psnr,
+    psnr_aligned,
     ssim,
 )
 
@@ -146,9 +147,8 @@ def test_mask_leaves_pixels_out_of_psnr_and_copies_the_photo_elsewhere() -> None
 def test_mask_that_leaves_no_pixel_gives_no_value() -> None:
     photo = photo_of(20, 20)
     got = evaluate_view(noisy(photo, 0.1), photo, np.zeros((20, 20), bool))
-    assert got == ViewMetrics(
-        None, None, None, None, None, dict.fromkeys(METRICS, "the mask leaves no pixel")
-    )
+    reasons: dict[str, str] = dict.fromkeys(METRICS, "the mask leaves no pixel")
+    assert got == ViewMetrics(None, None, None, None, None, None, reasons)
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
@@ -177,12 +177,44 @@ def test_missing_values_have_a_reason() -> None:
         "haarpsi": "the view is shorter than 16 pixels on a side",
         "lpips": MISSING,
         "lpips_vgg": MISSING,
+        "psnr_aligned": "render and photo differ in brightness alone",
     }
 
 
+def test_brightness_and_tint_can_be_set_aside() -> None:
+    photo = photo_of(24, 20)
+    tinted = (np.array([1.1, 0.8, 0.9]) * np.minimum(noisy(photo, 0.02), 0.8)).astype(np.float32)
+    plain, aligned = psnr(tinted, photo), psnr_aligned(tinted, photo)
+    assert plain is not None
+    assert aligned is not None
+    assert aligned > plain + 3
+    # No other factor comes nearer.
+    for factor in (0.98, 1.02):
+        other = psnr(factor * _aligned(tinted, photo), photo)
+        assert other is not None
+        assert other < aligned
+    # What the mask leaves out does not count.
+    mask = np.ones((24, 20), dtype=bool)
+    mask[:, :4] = False
+    spoilt = np.where(mask[..., None], tinted, 0).astype(np.float32)
+    assert psnr_aligned(spoilt, photo, mask) == psnr_aligned(tinted, photo, mask)
+    # A black render has no factor.
+    black = np.zeros(photo.shape, np.float32)
+    assert psnr_aligned(black, photo) == psnr(black, photo)
+
+
+def _aligned(render: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """By least squares, a channel at a time."""
+    target = photo / 255
+    found = [np.linalg.lstsq(render[..., c].reshape(-1, 1), target[..., c].ravel())[0] for c in range(3)]
+    return np.clip(render * np.concatenate(found), 0, 1)
+
+
 def test_mean_is_over_views_and_none_where_a_view_has_no_value() -> None:
-    a = ViewMetrics(20.0, 0.5, 0.25, None, None, {"lpips": "why", "lpips_vgg": "why"})
-    b = ViewMetrics(30.0, 0.7, None, None, None, {"haarpsi": "small", "lpips": "why", "lpips_vgg": "why"})
+    a = ViewMetrics(20.0, 0.5, 0.25, None, None, 21.0, {"lpips": "why", "lpips_vgg": "why"})
+    b = ViewMetrics(
+        30.0, 0.7, None, None, None, 30.0, {"haarpsi": "small", "lpips": "why", "lpips_vgg": "why"}
+    )
     mean = mean_metrics([a, b])
     assert (mean.psnr, mean.ssim) == (25.0, pytest.approx(0.6))
     assert (mean.haarpsi, mean.lpips, mean.lpips_vgg) == (None, None, None)

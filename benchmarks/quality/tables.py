@@ -159,7 +159,7 @@ def frame_of(runs: Sequence[Run], baseline: str | None = None) -> DataFrame:
     """
     frame = DataFrame(runs)
     frame = frame.join(
-        DataFrame([[run["metrics"][name] for name in METRICS] for run in runs], columns=METRICS)
+        DataFrame([[run["metrics"].get(name) for name in METRICS] for run in runs], columns=METRICS)
     )
     frame["ms_per_step"] = 1_000 * frame["seconds"] / frame["iterations"]
     for name in ("edge", "flat"):

@@ -12,7 +12,7 @@ import tyro
 from hqgs.base.files import CONFIG, existing_folder
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
-from hqgs.evaluation.verdict import verdict
+from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import READERS, scene_file
 
 
@@ -61,7 +61,7 @@ def _file(path: Path) -> list[str]:
 def _run(path: Path) -> list[str]:
     report: dict[str, Any] = json.loads((path / "report.json").read_text(encoding="utf-8"))
     mean, steps = report["metrics"]["mean"], f"{report['iterations']:,} of {report['length']:,} iterations"
-    word, why = verdict(mean["psnr"])
+    word, why = verdict(judged_by(report)[0])
     numbers = ", ".join(f"{name} {value:.4g}" for name, value in mean.items() if value is not None)
     lines = [
         f"{path}: {report['scene']}, {report['method']}, {steps} in {duration(report['seconds'])}, "

@@ -1,4 +1,4 @@
-"""Image metrics of a render against a photo: PSNR, SSIM, HaarPSI and LPIPS.
+"""Image metrics of a render against a photo: PSNR, also with aligned colours, SSIM, HaarPSI and LPIPS.
 
 What every metric here shares:
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
 
-METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg")
+METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg", "psnr_aligned")
 
 # The files that torchvision keeps its ImageNet weights in; the name ends in the start of the file's SHA-256.
 LPIPS_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
@@ -46,6 +46,7 @@ class ViewMetrics:
     haarpsi: float | None  # up
     lpips: float | None  # AlexNet, down
     lpips_vgg: float | None  # VGG-16, down
+    psnr_aligned: float | None  # dB, up; brightness and tint set aside
     reasons: dict[str, str] = field(default_factory=dict)  # metric -> why it is None
 
 
@@ -58,6 +59,22 @@ def psnr(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | No
     error = (x - y) ** 2 if mask is None else (x - y)[mask] ** 2
     mse = float(error.mean()) if error.size else 0.0
     return -10 * math.log10(mse) if mse > 0 else None
+
+
+def psnr_aligned(
+    render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None
+) -> float | None:
+    """`psnr` of the render times a factor for each channel, the one that brings it nearest to the photo.
+
+    For photos that were each exposed in their own way, also those that a scene is judged by. A gain in linear
+    light is nearly a factor of the sRGB values. Never below `psnr`.
+    """
+    x, y = _pair(render, photo, mask)
+    told = (x, y) if mask is None else (x[mask], y[mask])
+    first, second = (image.reshape(-1, 3) for image in told)
+    squares, products = (first**2).sum(0), (first * second).sum(0)
+    factors = np.divide(products, squares, out=np.ones(3), where=squares > 0)
+    return psnr(factors * x, y, mask)
 
 
 def ssim(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
@@ -122,6 +139,7 @@ def evaluate_view(
         "haarpsi": haarpsi(render, photo, mask),
         "lpips": lpips(render, photo, mask, "alex"),
         "lpips_vgg": lpips(render, photo, mask, "vgg"),
+        "psnr_aligned": psnr_aligned(render, photo, mask),
     }
     too_small = "the view is shorter than {} pixels on a side"
     reasons = {
@@ -129,6 +147,7 @@ def evaluate_view(
         "haarpsi": too_small.format(HAARPSI_MIN_SIZE),
         "lpips": lpips_missing("alex") or too_small.format(LPIPS_MIN_SIZE),
         "lpips_vgg": lpips_missing("vgg") or too_small.format(LPIPS_MIN_SIZE),
+        "psnr_aligned": "render and photo differ in brightness alone",
     }
     return ViewMetrics(**values, reasons={m: reasons[m] for m, value in values.items() if value is None})
 
@@ -155,7 +174,7 @@ def mean_metrics(views: list[ViewMetrics]) -> ViewMetrics:
 
 
 def _without_values(reason: str) -> ViewMetrics:
-    return ViewMetrics(None, None, None, None, None, dict.fromkeys(METRICS, reason))
+    return ViewMetrics(None, None, None, None, None, None, dict.fromkeys(METRICS, reason))
 
 
 def _pair(

@@ -43,6 +43,7 @@ class MetricValues(TypedDict):
     haarpsi: float | None  # up
     lpips: float | None  # AlexNet, down
     lpips_vgg: float | None  # VGG-16, down
+    psnr_aligned: float | None  # dB, up; brightness and tint of each photo set aside
 
 
 class ViewMetricValues(MetricValues):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 _LEVELS = (
     (
         20.0,
@@ -19,3 +22,16 @@ def verdict(psnr: float | None) -> tuple[str, str]:
     if psnr is None:
         return "not measured", "no photo was held out: look at the scene"
     return next(((word, why) for limit, word, why in _LEVELS if psnr < limit), _BEST)
+
+
+def judged_by(report: Mapping[str, Any]) -> tuple[float | None, str]:
+    """The mean held-out PSNR (dB) that the verdict on a run goes by, None without one, and its name.
+
+    Where the photos were exposed each in its own way, the held-out ones were too, and the scene cannot know
+    how: brightness and tint are set aside then. Reports of older runs know the plain one alone.
+    """
+    mean = report["metrics"]["mean"]
+    exposed = any(gain != 1 for record in report.get("learned", []) for gain in record["gains"])
+    if exposed and mean.get("psnr_aligned") is not None:
+        return mean["psnr_aligned"], "PSNR with each photo's brightness and tint set aside"
+    return mean["psnr"], "PSNR"

@@ -20,7 +20,7 @@ from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
 from hqgs.evaluation.records import HistoryEntry, Report, ViewMetricValues, alike
-from hqgs.evaluation.verdict import verdict
+from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.paths import focus, world_up
@@ -57,13 +57,13 @@ class Page:
 
 def told_verdict(report: Report) -> str:
     """What came out, in words, with the number that it goes by."""
-    psnr = report["metrics"]["mean"]["psnr"]
+    psnr, name = judged_by(report)
     word, why = verdict(psnr)
     text = f"Quality: {word}. {why[0].upper()}{why[1:]}."
     if psnr is None:
         return text
     count = len(report["metrics"]["views"])
-    return f"{text} Measured on {count} held-out photo{'s' * (count > 1)}: {psnr:.1f} dB PSNR."
+    return f"{text} Measured on {count} held-out photo{'s' * (count > 1)}: {psnr:.1f} dB {name}."
 
 
 def summary_html(report: Report, views: Sequence[RenderedView]) -> str:
