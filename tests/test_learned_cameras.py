@@ -184,6 +184,21 @@ def test_gains_that_neighbours_share_are_the_scenes_own() -> None:
     assert np.abs(found).max() < UNLIKE_GAINS
 
 
+def test_gains_that_go_together_by_chance_are_the_photos_own() -> None:
+    """Brightness that is drawn anew for each photo, all channels alike, is not taken for the scene's."""
+    views = textured_scene(20).train
+    drawn = np.zeros((len(views), 3))
+    for seed in range(100):
+        drawn = np.random.default_rng(seed).uniform(-0.7, 0.7, (len(views), 1)) * np.ones(3)
+        drawn -= drawn.mean(0)
+        kept = gains._apart(views, drawn)  # pyright: ignore[reportPrivateUsage]
+        assert np.abs(kept - drawn).max() < 0.3
+    # With its tint the light itself gives away that it changes along the way.
+    slow = np.linspace(-1, 1, len(views))[:, None] * np.array([0.3, 0.45, 0.6])
+    found = gains._apart(views, drawn + slow)  # pyright: ignore[reportPrivateUsage]
+    assert np.sqrt(np.square(found - drawn).mean()) < np.sqrt(np.square(slow).mean()) / 2
+
+
 def test_gains_need_points_that_photos_share() -> None:
     scene = textured_scene()
     assert log_gains(replace(scene, seen=None)) is None

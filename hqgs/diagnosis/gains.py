@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
+from scipy.special import logsumexp
 
 from hqgs.photos.light import to_linear
 from hqgs.photos.pixels import as_floats
@@ -23,7 +25,8 @@ MOST_VALUES = 8_000_000  # photos times points that are looked at: 200 MB a tabl
 ROUNDS = 30
 LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
 SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
-CLEARLY = 3.0  # of the log-likelihood: less does not tell neighbours that go together from chance
+DOUBT = 3.0  # of the log-likelihood: less does not tell neighbours that go together from chance
+OPPONENTS = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # of red, green and blue
 
 
 def log_gains(scene: Scene) -> Floats | None:
@@ -31,9 +34,9 @@ def log_gains(scene: Scene) -> Floats | None:
 
     Only what a photo does not share with those taken beside it: where the light changes along the way, or a
     film's exposure follows the picture, neighbours go together, and colours that depend on the direction
-    hold that. It is told apart by the likelihood of a Gaussian process over places and directions with
-    independent gains on top. None where the scene does not tell which photos show which points, or a photo
-    shares fewer than 20 points with others (dark and saturated ones do not count).
+    hold that, and held-out photos have it too. It is told apart by the likelihood of a Gaussian process over
+    places and directions with independent gains on top. None where the scene does not tell which photos show
+    which points, or a photo shares fewer than 20 points with others (dark and saturated ones do not count).
     """
     if scene.seen is None or len(scene.train) < 3:
         return None
@@ -79,22 +82,32 @@ def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Flo
 
 
 def _apart(views: Sequence[View], gains: Floats) -> Floats:
-    """`gains` [N, 3] of mean 0 without what neighbours share."""
+    """`gains` [N, 3] of mean 0 without what neighbours share: its expectation over `LENGTHS` and `SHARES`.
+
+    Brightness and the two differences of colour are looked at apart, since a tint may drift where the
+    exposure does not; the length is one for all three.
+    """
     centers = np.stack([view.camera.center for view in views])
     ahead = np.stack([view.camera.viewmat[2, :3] for view in views])
     reach = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
     squares = np.square((centers[:, None] - centers) / reach).sum(-1)
     squares += np.square(ahead[:, None] - ahead).sum(-1)
-    apart = -0.5 * (len(views) * np.log(np.square(gains).mean(0) + 1e-12)).sum()
-    best, shared = apart + CLEARLY, np.zeros_like(gains)
+    parts = gains @ OPPONENTS.T
+    apart = -0.5 * len(views) * np.log(np.square(parts).mean(0) + 1e-12)
+    evidence, shared = [apart.sum() + DOUBT], [np.zeros_like(gains)]
     for length in LENGTHS:
         together = np.exp(-squares / (2 * length**2))
+        likely, means = [apart], [np.zeros_like(gains)]
         for share in SHARES:
             covariance = share * together + (1 - share + 1e-4) * np.eye(len(views))
             values, vectors = np.linalg.eigh(covariance)
-            energy = np.square(vectors.T @ gains) / values[:, None]
-            likelihood = -0.5 * (len(views) * np.log(energy.mean(0) + 1e-12) + np.log(values).sum()).sum()
-            if likelihood > best:
-                best, shared = likelihood, share * together @ np.linalg.solve(covariance, gains)
-    rest = gains - shared
+            seen = vectors.T @ parts
+            energy = np.square(seen) / values[:, None]
+            likely.append(-0.5 * (len(views) * np.log(energy.mean(0) + 1e-12) + np.log(values).sum()))
+            means.append(share * together @ (vectors @ (seen / values[:, None])))
+        total = np.asarray(logsumexp(likely, axis=0))
+        evidence.append(total.sum() - 3 * math.log(len(likely)) - math.log(len(LENGTHS)))
+        shared.append((np.exp(likely - total)[:, None] * means).sum(0))
+    weights = np.exp(np.array(evidence) - logsumexp(evidence))
+    rest = gains - np.tensordot(weights, shared, 1) @ OPPONENTS
     return rest - rest.mean(0)
