@@ -40,7 +40,8 @@ PLACES, DIRECTIONS = 10, 4  # octaves of the encodings
 RATE, LAST_RATE = 5e-3, 2e-4  # of Adam at the beginning and at the end of the run
 BEYOND = 0.005  # of the points' depths lie before the beginning of the rays, and as many behind the end
 DENSE = 10  # unit of densities, for each median distance: at 1 walls take longer to become solid
-CHUNK = 4_096  # rays that are rendered together
+CHUNK = 512  # rays that are rendered together
+EVALUATED = 2  # times as rarely as others, on the way by one view: a render takes as long as 30 steps
 
 
 def encoded(x: Tensor, octaves: int) -> Tensor:
@@ -176,12 +177,12 @@ class NerfTraining:
             self.iteration += 1
             self.seconds += time.perf_counter() - started
             self.cpu_seconds += time.process_time() - clock
-            if self.iteration % self.config.eval_every == 0 or self.iteration == length:
+            if self.iteration % (EVALUATED * self.config.eval_every) == 0 or self.iteration == length:
                 self._evaluate()
 
     def _evaluate(self) -> None:
         ended, every = self.iteration == self.config.iterations, self.config.eval_every
-        self._last = self._views(range(len(self.scene.test)) if ended else on_the_way(self.scene, every))
+        self._last = self._views(range(len(self.scene.test)) if ended else on_the_way(self.scene, every)[:1])
         entry: Run = {"iteration": self.iteration, "seconds": self.seconds, "gaussians": 0}
         entry |= {"views": len(self._last), "memory_mb": peak_rss_mb()}
         means = held_out_means([psnr, ssim], self._last)
