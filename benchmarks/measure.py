@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
+from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Step, Trainer
@@ -42,6 +43,9 @@ class Training:
         self._resets = reset_peak_rss()
         return peak
 
+    def held_out(self) -> HeldOutViews:
+        return self.trainer.held_out()
+
     def record(self) -> Run:
         """What every study keeps of a run."""
         return {
@@ -58,7 +62,7 @@ class Training:
 
     def judged(self) -> Run:
         """The record with the held-out means of where it is."""
-        self.trainer.evaluate(self.trainer.held_out())
+        self.trainer.evaluate(self.held_out())
         last = self.trainer.history[-1]
         return self.record() | {"psnr": last["psnr"], "ssim": last["ssim"]}
 

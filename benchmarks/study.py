@@ -172,7 +172,8 @@ def key_of(cell: Cell, fingerprint: dict[str, str]) -> str:
     facts = {"format": FORMAT, "version": hqgs.__version__, "config": config, "degradation": cell.degradation}
     facts |= {"scene": fingerprint, **cell.more}
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:12]
-    parts = [cell.scene.name, f"x{cell.downscale:g}", cell.degradation, row.method, f"s{cell.seed}"]
+    method = cell.more.get("rival", row.method)
+    parts = [cell.scene.name, f"x{cell.downscale:g}", cell.degradation, method, f"s{cell.seed}"]
     parts += [str(cell.config.iterations), *cell.tags, digest]
     return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from PIL import Image
 
-from benchmarks.measure import Run, train
+from benchmarks.measure import Run, Training, train
+from benchmarks.quality.rivals import RIVALS
 from benchmarks.scenes import degraded
 from benchmarks.study import Cell, Store, Study
 from hqgs._rust import NEAR_PLANE
@@ -45,34 +46,41 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
 
     `photos` is what is trained. Raises ValueError as `Trainer` does, and TrainingError.
     """
-    done = train(photos, cell.config)
-    trainer = done.trainer
-    views = list(trainer.held_out())
+    rival = cell.more.get("rival")
+    done = RIVALS[rival](photos, cell.config) if rival else train(photos, cell.config)
+    views = list(done.held_out())
     measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
     mean = asdict(mean_metrics(measured))
-    formation = trainer.config.hqgs.formation if cell.row.method == "hqgs" else AUTO
     for k, view in enumerate(views[:renders]):
         with atomic_path(render_path(study.store, study.keys[cell], k)) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
     return done.record() | {
         "downscale": cell.downscale,
         "degradation": cell.degradation,
-        "method": cell.row.method,
+        "method": rival or cell.row.method,
         "metrics": {name: mean[name] for name in METRICS},
         "reasons": mean["reasons"],
         "views": [
             {"name": view.name} | {name: getattr(m, name) for name in METRICS}
             for view, m in zip(views, measured, strict=True)
         ],
+        **(_facts(done.trainer, cell) if isinstance(done, Training) else {}),
+        "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
+        "notes": photos.notes,
+        "sfm": None if photos.sfm is None else asdict(photos.sfm),
+        "peak_rss_mb": done.peak_rss_mb(),  # of the whole cell
+    }
+
+
+def _facts(trainer: Trainer, cell: Cell) -> dict[str, Any]:
+    """What there is to know of Gaussians and of their method."""
+    formation = trainer.config.hqgs.formation if cell.row.method == "hqgs" else AUTO
+    return {
         "skipped_steps": trainer.guard.skipped,
         "render_ms": _render_ms(trainer),
         "regions": count_regions(trainer.shown().means.detach().numpy(), cell.scene.train),
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
         "left_out": [item.known() for item in trainer.method_left_out],
-        "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
-        "notes": photos.notes,
-        "sfm": None if photos.sfm is None else asdict(photos.sfm),
-        "peak_rss_mb": done.peak_rss_mb(),  # of the whole cell
     }
 
 

@@ -14,12 +14,13 @@ from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
 from benchmarks.quality.cell import edge_robustness, run_cell
 from benchmarks.quality.charts import gain_chart, time_chart, write_sheet
+from benchmarks.quality.rivals import RivalRow
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
 from hqgs.photos.formula import NONE
 from hqgs.scene.scene import Scene
 
-PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml")
+PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml", RivalRow)
 
 
 class Quality:
