@@ -20,6 +20,7 @@ import json
 import os
 import select
 import shutil
+import signal
 import statistics
 import struct
 import subprocess
@@ -37,6 +38,7 @@ from typing import Any
 import hqgs
 from hqgs.base.files import CHECKPOINT, PLY, write_json
 from hqgs.base.ranks import joined
+from hqgs.pipeline import open_run
 from hqgs.training.config import run_config
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -138,6 +140,12 @@ def machines(delay: float) -> Iterator[None]:
         yield
     finally:
         for space in SPACES:
+            inside = subprocess.run(
+                ["ip", "netns", "pids", space], capture_output=True, text=True, check=False
+            )
+            for process in inside.stdout.split():
+                with suppress(OSError):
+                    os.kill(int(process), signal.SIGKILL)
             subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
 
 
@@ -168,7 +176,7 @@ def digest(run: Path) -> str:
 
 
 def trained(args: argparse.Namespace, ranks: Any, out: Path) -> list[dict[str, Any]]:
-    """The run; a record of each step, if there is a network."""
+    """Train, and save the scene; a record of each step."""
     config = run_config(
         iterations=args.iterations,
         batch=args.batch,
@@ -177,39 +185,38 @@ def trained(args: argparse.Namespace, ranks: Any, out: Path) -> list[dict[str, A
         max_gaussians=args.gaussians,
         eval_every=10**9,
     )
-    records: list[dict[str, Any]] = []
-    before = {"seconds": 0.0, "worked": 0.0, "waited": 0.0, "sent": 0, "views": 0}
-
-    def note(now: hqgs.Progress) -> None:
-        nonlocal before
-        at = {
-            "seconds": time.perf_counter(),
-            "worked": ranks.worked,
-            "waited": ranks.waited,
-            "sent": ranks.sent,
-            "views": now.iteration,
-        }
-        number = len(records)
-        link = LINKS[number // args.hold % len(LINKS)]
-        steady = number % args.hold >= STEADY
-        step = {name: at[name] - before[name] for name in at}
-        records.append({"link": link.name, "steady": steady, "gaussians": now.gaussians} | step)
-        if (number + 1) % args.hold == 0 and ranks.count > 1:
-            set_link(ranks.rank, LINKS[(number + 1) // args.hold % len(LINKS)])
-        before = at | {"seconds": time.perf_counter()}
-
     hqgs.set_num_threads(1)
-    hqgs.train(hqgs.load(args.scene), out=out, config=config, overwrite=True, progress=note, ranks=ranks)
+    records: list[dict[str, Any]] = []
+    with open_run(hqgs.load(args.scene), config, ranks=ranks) as trainer:
+        while trainer.iteration < trainer.length:
+            number, views = len(records), trainer.iteration
+            if number % args.hold == 0 and ranks.count > 1:
+                set_link(ranks.rank, LINKS[number // args.hold % len(LINKS)])
+            ranks.count_anew()
+            began = time.perf_counter()
+            ranks.tell(False)  # as a run asks each of them for Ctrl-C
+            trainer.step()
+            step = {
+                "link": LINKS[number // args.hold % len(LINKS)].name,
+                "steady": number % args.hold >= STEADY,
+                "gaussians": len(trainer.gaussians),
+                "views": trainer.iteration - views,
+                "seconds": time.perf_counter() - began,
+                "worked": ranks.worked,
+                "waited": ranks.waited,
+                "sent": ranks.sent,
+            }
+            records.append(step)
+        if ranks.first:
+            out.mkdir(exist_ok=True)
+            trainer.shown().save(out / PLY)
     return records
 
 
 def work(args: argparse.Namespace) -> None:
     """What each of the processes does."""
     with joined() as ranks:
-        if ranks.count > 1:
-            set_link(ranks.rank, LINKS[0])
-        records = trained(args, ranks, args.out / "two")
-        write_json(args.out / f"steps{ranks.rank}.json", records)
+        write_json(args.out / f"steps{ranks.rank}.json", trained(args, ranks, args.out / "two"))
 
 
 def line(link: Link, steps: Sequence[dict[str, Any]], free: float) -> dict[str, Any]:
@@ -321,6 +328,7 @@ def main() -> int:
     if args.work:
         work(args)
         return 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what was made is removed
     try:
         results = cut(args) if args.cut else measure(args)
     except (RuntimeError, ValueError, OSError) as error:

@@ -20,7 +20,7 @@ SPEED = ROOT / "docs" / "results" / "speed.json"
 BYTES, FIRST = 60, 12  # of a visible Gaussian; of them in the first message
 RATES = 1e9, 10e9, 25e9  # bit/s
 SIZES = 100_000, 1_000_000, 10_000_000
-RANKS = 2, 4, 8, 16, 32, 64
+RANKS = 2, 4, 16, 64
 VIEWS = 2  # of a rank in a step
 UPDATE = 0.35  # of a view's b M: adding up and Adam, for each view of the step, by every rank
 
@@ -75,7 +75,7 @@ class Model:
 def table(cores: int) -> list[str]:
     """How many times as fast P machines are, for each network and size."""
     model = Model.of(cores)
-    head = ["Gaussians in a view", "MB a view", "s a view", "network", *map(str, RANKS), "most"]
+    head = ["Gaussians in a view", "s a view", "network", *map(str, RANKS), "most"]
     rows = ["| " + " | ".join(head) + " |", "|" + "--:|" * len(head)]
     for size in SIZES:
         for rate in RATES:

@@ -87,7 +87,7 @@ def work(out: str, what: str) -> None:
     monkeypatch = pytest.MonkeyPatch()
     install(monkeypatch, "tinted", lambda *given: Tinted())
     names, _, fault = what.partition(":")
-    module.PIECE = 5_000  # messages have several
+    module.PIECE = 20_000  # the longest messages have several
     if fault in ("silent", "bad"):
         module.HEARTBEAT = 0.5
     with joined() as ranks:
