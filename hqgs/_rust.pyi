@@ -103,8 +103,9 @@ def adam_step(
     visible: Array | None,
     used: int | None,
 ) -> None: ...
-def add_rows(
-    views: list[tuple[Array, Array, list[float], int]], means: Array, low: Array, high: Array, scale: float
+def add_rows(views: list[tuple[Array, Array]], sums: Array, scale: float) -> None: ...
+def add_harmonics(
+    views: list[tuple[Array, Array, list[float], int]], means: Array, high: Array, scale: float
 ) -> None: ...
 def set_num_threads(threads: int) -> None:
     """Use this many threads from now on, 1 to 1024; results do not depend on it. ValueError for others."""

@@ -26,7 +26,7 @@ from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.ranks import ALONE, RankError, joined
 from hqgs.cli.main import main
 from hqgs.training.adam import Adam
-from hqgs.training.batch import ROW_BYTES, Part, give_mean, part_of, to_rasterize
+from hqgs.training.batch import ROW_BYTES, Part, Rest, give_harmonics, give_others, part_of, to_rasterize
 from hqgs.training.config import TrainConfig
 from hqgs.training.guard import Fault
 from hqgs.training.looks import Looks
@@ -87,9 +87,10 @@ def work(out: str, what: str) -> None:
     monkeypatch = pytest.MonkeyPatch()
     install(monkeypatch, "tinted", lambda *given: Tinted())
     names, _, fault = what.partition(":")
+    module.PIECE = 20_000  # the longest messages have several
+    if fault in ("silent", "bad"):
+        module.HEARTBEAT = 0.5
     with joined() as ranks:
-        if fault in ("silent", "bad"):
-            module.HEARTBEAT = 0.5
         for case in names.split(","):
             for threads in (1, 2):
                 hqgs.set_num_threads(threads)
@@ -195,16 +196,22 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     plans = trainer.schedule.batch(26, trainer.state.decisions)
     assert len(plans) == 4
     assert plans[0].degree == 3
-    looks, parts = Looks(scene.train, ThreeDGS(), config.background), list[Part]()
+    looks = Looks(scene.train, ThreeDGS(), config.background)
+    parts, rests = list[Part](), list[Rest]()
     for plan in plans:
         look = looks.at(plan, to_rasterize(gaussians, gaussians))
         optimizer.zero_grad()
         assert look.backward(gaussians, optimizer) is None
         assert gaussians.shN.grad is None  # it is made of sh0's
-        part = part_of(look, None, gaussians, optimizer)
-        assert len(part.packed()) == pytest.approx(ROW_BYTES * len(part.rows), abs=1_000)
+        part, rest = part_of(look, None, gaussians, optimizer)
+        m, bits = len(part.rows), len(gaussians) / 8
+        assert len(part.packed()) == pytest.approx(ROW_BYTES[0] * m + bits, abs=500)
+        assert len(rest().packed()) == pytest.approx(ROW_BYTES[1] * m, abs=500)
         parts.append(Part.unpacked(part.packed()))
-    assert set(give_mean(parts, gaussians, gaussians, optimizer).values()) == {4}
+        rests.append(Rest.unpacked(rest().packed()))
+    optimizer.zero_grad()
+    give_harmonics(parts, [rest.higher for rest in rests], gaussians, gaussians)
+    assert set(give_others(parts, rests, gaussians, optimizer).values()) == {4}
     ours = {name: tensor.grad for name, tensor in gaussians.named().items()}
     optimizer.zero_grad()
     torch.stack([looks.at(plan, gaussians).loss for plan in plans]).mean().backward()
@@ -224,21 +231,24 @@ def test_a_part_comes_back_with_the_same_bits() -> None:
         measured=torch.tensor([math.pi], dtype=torch.float64),
         fault=Fault("gradient", ["means", "sh0"], rows, 3),
         center=torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64),
-        rows=torch.tensor([1, 5], dtype=torch.int32),
-        values=torch.tensor([[1e-40, -0.0], [3.0, 4.0]]),
-        higher=None,
-        own={"paths.3": torch.ones(2, 6, dtype=torch.float64)},
+        shown=torch.tensor([k in (1, 5) for k in range(11)]),
+        colors=torch.tensor([[1e-40, -0.0, 1.0], [3.0, 4.0, 5.0]]),
     )
-    back = Part.unpacked(part.packed())
-    assert (back.loss, back.degree, back.higher) == (part.loss, 2, None)
+    rest = Rest(torch.tensor([[1e-40, -0.0]]), None, {"paths.3": torch.ones(2, 6, dtype=torch.float64)})
+    back, rest_back = Part.unpacked(part.packed()), Rest.unpacked(rest.packed())
+    assert (back.loss, back.degree) == (part.loss, 2)
     assert back.fault is not None
     assert (back.fault.what, back.fault.tensors, back.fault.values) == ("gradient", ["means", "sh0"], 3)
     assert torch.equal(back.fault.rows, rows)
-    for name in ("measured", "center", "rows", "values"):
-        there, here = getattr(back, name), getattr(part, name)
+    assert back.rows.tolist() == [1, 5]
+    for there, here in [
+        *((getattr(back, name), getattr(part, name)) for name in ("measured", "center", "shown", "colors")),
+        (rest_back.values, rest.values),
+        (rest_back.own["paths.3"], rest.own["paths.3"]),
+    ]:
         assert there.dtype == here.dtype
         assert there.numpy().tobytes() == here.numpy().tobytes()
-    assert torch.equal(back.own["paths.3"], part.own["paths.3"])
+    assert rest_back.higher is None
 
 
 def test_steps_take_each_view_of_the_schedule_once() -> None:

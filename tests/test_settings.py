@@ -67,6 +67,7 @@ def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: 
     assert isinstance(chosen, Whole)
     wanted = run_config(iterations=600, seed=5)
     assert chosen.expert == replace(wanted, densify=replace(wanted.densify, grad_threshold=3e-4))
+    assert options("--config.densify.grad-threshold", "3e-4", "--overwrite").overwrite
     assert config_of(options()) == run_config()
     assert config_of(options("--preset", "quick")) == run_config(iterations=PRESETS["quick"].iterations)
     assert config_of(options("--preset", "quick", "--iterations", "50")) == run_config(iterations=50)

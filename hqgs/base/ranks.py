@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 HEARTBEAT = 5.0  # s: a rank that has nothing to say yet says so as often
-SILENCE = 40.0  # s without a word after which a rank counts as gone
+# s without a word after which a rank counts as gone: torchrun takes up to 30 more to end a process that was
+# stopped, and all is to be over within a minute.
+SILENCE = 25.0
+PIECE = 1 << 24  # bytes that are sent at once: on a slow network a long message is no silence
 NOTHING, DATA, FAILED, END = range(4)  # what a rank has to say in a round
 TORCHRUN = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # what it sets
 
@@ -203,9 +206,12 @@ class _Joined(Ranks):
             raise RankError("the ranks do not do the same: all need the same command and the same hqgs")
         failed = FAILED in kinds
         talks = {k for k, head in heads.items() if head[1] and (not failed or head[0] == FAILED)}
-        out = torch.frombuffer(bytearray(data), dtype=torch.uint8) if self.rank in talks else None
+        out = torch.frombuffer(bytearray(data), dtype=torch.uint8) if self.rank in talks else mine[:0]
         others = {k: torch.empty(heads[k][1], dtype=torch.uint8) for k in self._others if k in talks}
-        self._swap({} if out is None else {k: out for k in self._others}, others)
+        for at in range(0, max((heads[k][1] for k in talks), default=0), PIECE):
+            piece = slice(at, at + PIECE)
+            ins = {k: tensor[piece] for k, tensor in others.items() if at < len(tensor)}
+            self._swap({k: out[piece] for k in self._others if at < len(out)}, ins)
         said = {k: tensor.numpy().tobytes() for k, tensor in others.items()} | {self.rank: data}
         if failed:
             k = min(k for k, head in heads.items() if head[0] == FAILED)

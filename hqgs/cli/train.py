@@ -153,7 +153,7 @@ def read(options: type[Train], command: str, about: str, arguments: Sequence[str
         return parse(options, command, about, arguments)
     first = parse(Whole, command, about, arguments)
     try:
-        base = replace(first, expert=config_of(first))
+        base = Whole(scene=first.scene, out=first.out, expert=config_of(first))
     except BAD_INPUT as error:
         raise SystemExit(fail(2, error)) from None
     return parse(Whole, command, about, arguments, base)

@@ -1,7 +1,8 @@
 """Several views in one step: what each gives to it, as rows that can be sent, and their sum in their order.
 
 The bits depend on the views alone: each one's gradients are taken by themselves, by whichever rank, and every
-rank adds up the same rows.
+rank adds up the same rows. A view is sent in two messages: the colours' gradients first, since the harmonics,
+which are most of the work of a step's end, follow from them. The rest travels while that is done.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors.torch import load, save
 from torch import Tensor
@@ -25,33 +28,35 @@ from hqgs.training.densify import Densifier, gradient_norms
 from hqgs.training.guard import Fault
 from hqgs.training.looks import Look
 
-WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "sh0": 3}  # of a row, in its order
+Answer = Callable[[], list[bytes]]
+WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}  # of a row of the rest, in its order
 OBSERVED = sum(WIDTHS.values())  # the column after them: what growth goes by
 UNSEEN = -1.0  # there: the Gaussian has a gradient, but the view does not show it
-ROW_BYTES = 4 + 4 * (OBSERVED + 1)  # with the number of the Gaussian
+ROW_BYTES = 3 * 4, 4 * (OBSERVED + 1)  # of the two messages; the first has a bit for every Gaussian too
 
 
 @dataclass(frozen=True)
 class Part:
-    """What one view gives to its step."""
+    """What one view gives to its step, without the rest."""
 
     loss: float
     degree: int  # of the harmonics
     measured: Tensor  # what the method goes by after the step, float64 [K]
     fault: Fault | None  # with one there are no gradients
     center: Tensor  # of the camera, float64 [3]
-    rows: Tensor  # int32 [M]: the Gaussians that the view shows, or that have a gradient
-    values: Tensor  # float32 [M, OBSERVED + 1]: WIDTHS, and the norm of the 2D mean's gradient
-    higher: Tensor | None  # [M, L, 3]: the gradient of the higher harmonics; None: it follows from sh0's
-    own: dict[str, Tensor]  # gradients of the method's tensors, by `_own_names`
+    shown: Tensor  # bool [N]: the M Gaussians that the view shows, or that have a gradient
+    colors: Tensor  # float32 [M, 3]: sh0's gradient
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """int32 [M], ascending."""
+        return torch.nonzero(self.shown)[:, 0].int()
 
     def packed(self) -> bytes:
         """As bytes; `unpacked` gives the same bits back."""
-        tensors = {"measured": self.measured, "center": self.center, "rows": self.rows, "values": self.values}
-        tensors |= {f"own.{name}": gradient.contiguous() for name, gradient in self.own.items()}
-        if self.higher is not None:
-            tensors["higher"] = self.higher
-        meta: dict[str, Any] = {"loss": self.loss, "degree": self.degree, "fault": None}
+        bits = torch.from_numpy(np.packbits(self.shown.numpy()))
+        tensors = {"measured": self.measured, "center": self.center, "bits": bits, "colors": self.colors}
+        meta: dict[str, Any] = {"loss": self.loss, "degree": self.degree, "count": len(self.shown)}
         if (fault := self.fault) is not None:
             meta["fault"] = [fault.what, fault.tensors, fault.values]
             tensors["culled"] = fault.rows
@@ -61,18 +66,43 @@ class Part:
     def unpacked(data: bytes) -> Part:
         length = int.from_bytes(data[:8], "little")  # of the header, which the library keeps to itself
         meta = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["part"])
-        tensors, fault = load(data), meta["fault"]
+        tensors, fault = load(data), meta.get("fault")
+        bits = np.unpackbits(tensors["bits"].numpy(), count=meta["count"])
         return Part(
             loss=meta["loss"],
             degree=meta["degree"],
             measured=tensors["measured"],
             fault=None if fault is None else Fault(fault[0], fault[1], tensors["culled"], fault[2]),
             center=tensors["center"],
-            rows=tensors["rows"],
-            values=tensors["values"],
-            higher=tensors.get("higher"),
-            own=checkpoint.part("own.", tensors),
+            shown=torch.from_numpy(bits).bool(),
+            colors=tensors["colors"],
         )
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The rest of what one view gives."""
+
+    values: Tensor  # float32 [M, OBSERVED + 1]: WIDTHS, and the norm of the 2D mean's gradient
+    higher: Tensor | None  # [M, L, 3]: the gradient of the higher harmonics; None: it follows from sh0's
+    own: dict[str, Tensor]  # gradients of the method's tensors, by `_own_names`
+
+    @property
+    def seen(self) -> Tensor:
+        """Which of the rows the view shows, bool [M]."""
+        return self.values[:, OBSERVED] != UNSEEN
+
+    def packed(self) -> bytes:
+        """As bytes; `unpacked` gives the same bits back."""
+        tensors = {f"own.{name}": gradient.contiguous() for name, gradient in self.own.items()}
+        if self.higher is not None:
+            tensors["higher"] = self.higher
+        return save(tensors | {"values": self.values})
+
+    @staticmethod
+    def unpacked(data: bytes) -> Rest:
+        tensors = load(data)
+        return Rest(tensors["values"], tensors.get("higher"), checkpoint.part("own.", tensors))
 
 
 def to_rasterize(trained: Gaussians, modulated: Gaussians) -> Gaussians:
@@ -80,87 +110,152 @@ def to_rasterize(trained: Gaussians, modulated: Gaussians) -> Gaussians:
     return replace(modulated, shN=modulated.shN.detach()) if _follows(trained, modulated) else modulated
 
 
-def part_of(look: Look, fault: Fault | None, trained: Gaussians, optimizer: Adam) -> Part:
-    """What a look gives after its backward pass, which left its gradients in the trained tensors."""
-    empty = torch.zeros(0, dtype=torch.int32), torch.zeros(0, OBSERVED + 1)
+def part_of(
+    look: Look, fault: Fault | None, trained: Gaussians, optimizer: Adam
+) -> tuple[Part, Callable[[], Rest]]:
+    """What a look gives after its backward pass, which left its gradients in the trained tensors; the rest
+    is to be had as long as they are there."""
+    n = len(trained)
     center = torch.from_numpy(look.camera.center.copy()).double()
-    part = Part(float(look.loss.detach()), look.plan.degree, look.measured, fault, center, *empty, None, {})
+    part = Part(
+        loss=float(look.loss.detach()),
+        degree=look.plan.degree,
+        measured=look.measured,
+        fault=fault,
+        center=center,
+        shown=torch.zeros(n, dtype=torch.bool),
+        colors=torch.zeros(0, 3),
+    )
     if fault is not None:
-        return part
-    n, gradients = len(trained), {name: tensor.grad for name, tensor in trained.named().items()}
-    columns = [
-        torch.zeros(n, width) if (gradient := gradients[name]) is None else gradient.reshape(n, width)
-        for name, width in WIDTHS.items()
-    ]
-    means2d, camera = look.meta["means2d"].grad, look.view.camera
-    assert means2d is not None  # the backward pass was sound
-    visible = (look.meta["radii"][0] > 0).all(dim=1)
-    norms = torch.where(visible, gradient_norms(means2d[0], camera.width, camera.height), UNSEEN)
-    whole = torch.cat([*columns, norms[:, None]], dim=1)
-    rows = torch.nonzero(visible | (whole[:, :OBSERVED] != 0).any(dim=1))[:, 0]
-    higher = None if gradients["shN"] is None else gradients["shN"][rows]
-    own = {name: param.grad for name, param in _own(optimizer).items() if param.grad is not None}
-    return replace(part, rows=rows.int(), values=whole[rows], higher=higher, own=own)
+        return part, lambda: Rest(torch.zeros(0, OBSERVED + 1), None, {})
+    gradients = {
+        name: torch.zeros(tensor.shape) if tensor.grad is None else tensor.grad
+        for name, tensor in trained.named().items()
+        if name != "shN"
+    }
+    radii, camera = look.meta["radii"][0], look.view.camera
+    visible = (radii > 0).all(dim=1)
+    shown = visible.clone()
+    for gradient in gradients.values():
+        shown |= (gradient.reshape(n, -1) != 0).any(dim=1)
+    part = replace(part, shown=shown, colors=gradients["sh0"].reshape(n, 3)[shown])
+
+    def rest() -> Rest:
+        means2d, higher = look.meta["means2d"].grad, trained.shN.grad
+        assert means2d is not None  # the backward pass was sound
+        norms = torch.where(visible, gradient_norms(means2d[0], camera.width, camera.height), UNSEEN)
+        columns = [gradients[name].reshape(n, width) for name, width in WIDTHS.items()]
+        values = torch.cat([*columns, norms[:, None]], dim=1)[part.rows]
+        own = {name: param.grad for name, param in _own(optimizer).items() if param.grad is not None}
+        return Rest(values, None if higher is None else higher[part.rows], own)
+
+    return part, rest
 
 
-def exchanged(ranks: Ranks, count: int, make: Callable[[int], Part]) -> list[Part]:
-    """The parts of a step's views 0 to `count`, the same on every rank.
+def exchanged(
+    ranks: Ranks, count: int, make: Callable[[int], tuple[Part, Callable[[], Rest]]]
+) -> tuple[list[Part], Callable[[], list[Rest]]]:
+    """The parts of a step's views 0 to `count`, and what waits for the rest of each; the same on every rank.
 
     Rank r makes parts r, r + P, ... of P ranks; each is sent while the next one is made.
     """
     if ranks.count == 1:
-        return [make(k) for k in range(count)]
-    answers, started = [], time.perf_counter()
-    for first in range(ranks.rank, ranks.rank + count, ranks.count):
-        answers.append(ranks.begin(make(first).packed() if first < count else b""))
+        made = [(part, rest()) for part, rest in map(make, range(count))]
+        return [part for part, _ in made], lambda: [rest for _, rest in made]
+    started, firsts, seconds = time.perf_counter(), list[Answer](), list[Answer]()
+    for k in range(ranks.rank, ranks.rank + count, ranks.count):
+        part, rest = make(k) if k < count else (None, None)
+        firsts.append(ranks.begin(b"" if part is None else part.packed()))
+        seconds.append(ranks.begin(b"" if rest is None else rest().packed()))
     ranks.worked += time.perf_counter() - started
-    return [Part.unpacked(data) for answer in answers for data in answer() if data]
+    parts = [Part.unpacked(data) for answer in firsts for data in answer() if data]
+    return parts, lambda: [Rest.unpacked(data) for answer in seconds for data in answer() if data]
 
 
-def give_mean(
-    parts: Sequence[Part], trained: Gaussians, modulated: Gaussians, optimizer: Adam
+def descend(
+    parts: Sequence[Part],
+    others: Callable[[], list[Rest]],
+    trained: Gaussians,
+    modulated: Gaussians,
+    optimizer: Adam,
+    selective: bool,
+) -> list[Rest]:
+    """A step of Adam along the mean of the gradients of the parts without a fault, added in their order.
+
+    `others` waits for the rest of each part, which is returned; until then the harmonics are updated.
+    `selective`: only Gaussians that a view shows.
+    """
+    optimizer.zero_grad()
+    sound = [part for part in parts if part.fault is None]
+    early = _follows(trained, modulated) and not selective and any(part.degree for part in sound)
+    if early:
+        give_harmonics(sound, [None] * len(sound), trained, modulated)
+        optimizer.step(views={trained.shN: len(sound)})
+        trained.shN.grad = None
+    rests = others()
+    kept = [rest for part, rest in zip(parts, rests, strict=True) if part.fault is None]
+    if not early:
+        give_harmonics(sound, [rest.higher for rest in kept], trained, modulated)
+    views_of = give_others(sound, kept, trained, optimizer)
+    optimizer.step(visible=_visible(sound, kept, len(trained)) if selective else None, views=views_of)
+    return rests
+
+
+def give_harmonics(
+    parts: Sequence[Part], higher: Sequence[Tensor | None], trained: Gaussians, modulated: Gaussians
+) -> None:
+    """Put the mean of the gradients of the higher harmonics where Adam looks for it, if there is one."""
+    if not any(part.degree for part in parts):
+        return
+    sums = torch.empty_like(trained.shN)
+    views = [
+        (p.rows.numpy(), p.colors.numpy(), p.center.tolist(), 0 if sent is not None else p.degree)
+        for p, sent in zip(parts, higher, strict=True)
+    ]
+    _rust.add_harmonics(views, modulated.means.detach().numpy(), sums.numpy(), 1 / len(parts))
+    for part, sent in zip(parts, higher, strict=True):
+        if sent is not None:
+            sums[part.rows.long()] += 1 / len(parts) * sent
+    trained.shN.grad = sums
+
+
+def give_others(
+    parts: Sequence[Part], rests: Sequence[Rest], trained: Gaussians, optimizer: Adam
 ) -> dict[Tensor, int]:
-    """Put the mean of the parts' gradients, added in their order, where Adam looks for it.
+    """Put the means of all other gradients there.
 
     Returns of how many views each tensor's mean is: those that have a gradient of it.
     """
-    n = len(trained)
-    low, high = torch.empty(n, OBSERVED), torch.empty(n, *trained.shN.shape[1:])
-    views = [
-        (p.rows.numpy(), p.values.numpy(), p.center.tolist(), 0 if p.higher is not None else p.degree)
-        for p in parts
-    ]
-    scale = 1 / len(parts)
-    _rust.add_rows(views, modulated.means.detach().numpy(), low.numpy(), high.numpy(), scale)
-    for part in parts:
-        if part.higher is not None:
-            high[part.rows.long()] += scale * part.higher
-    gradients = dict(zip(WIDTHS, low.split(list(WIDTHS.values()), dim=1), strict=True))
-    if any(part.degree for part in parts):
-        gradients["shN"] = high
-    optimizer.zero_grad()
-    views_of = dict[Tensor, int]()
-    for name, gradient in gradients.items():
+    n, scale = len(trained), 1 / len(parts)
+    low, colors = torch.empty(n, OBSERVED + 1), torch.empty(n, 3)
+    rows = [part.rows.numpy() for part in parts]
+    values = [rest.values.numpy() for rest in rests]
+    _rust.add_rows(list(zip(rows, values, strict=True)), low.numpy(), scale)
+    values = [part.colors.numpy() for part in parts]
+    _rust.add_rows(list(zip(rows, values, strict=True)), colors.numpy(), scale)
+    columns = low[:, :OBSERVED].split(list(WIDTHS.values()), dim=1)
+    for name, gradient in [*zip(WIDTHS, columns, strict=True), ("sh0", colors)]:
         param = getattr(trained, name)
-        param.grad, views_of[param] = gradient.reshape(param.shape).contiguous(), len(parts)
+        param.grad = gradient.reshape(param.shape).contiguous()
+    views_of = dict.fromkeys(trained.named().values(), len(parts))
     for name, param in _own(optimizer).items():
-        if own := [part.own[name] for part in parts if name in part.own]:
+        if own := [rest.own[name] for rest in rests if name in rest.own]:
             param.grad, views_of[param] = torch.stack(own).sum(0) / len(own), len(own)
     return views_of
 
 
-def note_views(parts: Sequence[Part], densifier: Densifier) -> None:
+def note_views(parts: Sequence[Part], rests: Sequence[Rest], densifier: Densifier) -> None:
     """What growth goes by."""
-    for part in parts:
-        seen = part.values[:, OBSERVED] != UNSEEN
-        densifier.note(part.rows[seen].long(), part.values[seen, OBSERVED])
+    for part, rest in zip(parts, rests, strict=True):
+        if part.fault is None:
+            densifier.note(part.rows[rest.seen].long(), rest.values[rest.seen, OBSERVED])
 
 
-def visible_in(parts: Sequence[Part], count: int) -> Tensor:
+def _visible(parts: Sequence[Part], rests: Sequence[Rest], count: int) -> Tensor:
     """Which of `count` Gaussians any of the views shows, bool."""
     visible = torch.zeros(count, dtype=torch.bool)
-    for part in parts:
-        visible[part.rows[part.values[:, OBSERVED] != UNSEEN].long()] = True
+    for part, rest in zip(parts, rests, strict=True):
+        visible[part.rows[rest.seen].long()] = True
     return visible
 
 

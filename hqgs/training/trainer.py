@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, cut_harmonics, reset_opacities
-from hqgs.training.batch import Part, exchanged, give_mean, note_views, part_of, to_rasterize, visible_in
+from hqgs.training.batch import Part, Rest, descend, exchanged, note_views, part_of, to_rasterize
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
@@ -251,27 +251,24 @@ class Trainer:
         state, looks = self.state, self._looks
         step: Step | None = None
 
-        def make(k: int) -> Part:
+        def make(k: int) -> tuple[Part, Callable[[], Rest]]:
             nonlocal step
             modulated = self.method.modulate(state.gaussians)
             look = looks.at(plans[k], to_rasterize(state.gaussians, modulated))
             state.optimizer.zero_grad()
             fault = look.backward(state.gaussians, state.optimizer)
-            found = part_of(look, fault, state.gaussians, state.optimizer)
-            step = step or Step(found.loss, look.photo.detach(), look.view)
-            return found
+            step = step or Step(float(look.loss.detach()), look.photo.detach(), look.view)
+            return part_of(look, fault, state.gaussians, state.optimizer)
 
-        parts = exchanged(self.ranks, len(plans), make)
+        parts, others = exchanged(self.ranks, len(plans), make)
         views = [looks.views[plan.view] for plan in plans]
         if self._sound(views, [part.fault for part in parts], parts[-1].loss):
-            sound = [part for part in parts if part.fault is None]
-            if plans[0].observes:  # the end of growth ends a step: none of it grows any more
-                note_views(sound, state.densifier)
             with torch.no_grad():
                 modulated = self.method.modulate(state.gaussians)
-            views_of = give_mean(sound, state.gaussians, modulated, state.optimizer)
-            visible = visible_in(sound, len(state.gaussians)) if self.config.selective_adam else None
-            state.optimizer.step(visible=visible, views=views_of)
+            selective = self.config.selective_adam
+            rests = descend(parts, others, state.gaussians, modulated, state.optimizer, selective)
+            if plans[0].observes:  # the end of growth ends a step: none of it grows any more
+                note_views(parts, rests, state.densifier)
         step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
         return step, [part.measured for part in parts]
 

@@ -9,7 +9,7 @@ use hqgs::internals::{
     training::{
         adam::{self, AdamArrays, AdamOptions, Selection},
         loss::{self, LossScratch, Sample},
-        rows::{self, ADDED, ViewRows, WIDTH},
+        rows::{self, ViewColors, ViewRows},
     },
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn};
@@ -21,7 +21,8 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(photometric, m)?)?;
     m.add_function(wrap_pyfunction!(ssim, m)?)?;
     m.add_function(wrap_pyfunction!(adam_step, m)?)?;
-    m.add_function(wrap_pyfunction!(add_rows, m)?)
+    m.add_function(wrap_pyfunction!(add_rows, m)?)?;
+    m.add_function(wrap_pyfunction!(add_harmonics, m)?)
 }
 
 /// A scalar type with buffers that last as long as the calling thread, so that a step allocates none.
@@ -232,56 +233,90 @@ fn adam_step_as<T: Real + Element>(
     Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
 
-/// `(rows [M] i32, values [M, WIDTH] f32, centre, degree)`
-type RowsOfView<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, [f64; 3], usize);
-
-/// See [`rows::add`]. Everything but the rows' numbers is f32.
+/// See [`rows::add`]: `(rows [M] i32, values [M, W] f32)` of each view are added to `sums [N, W]`, f32.
 #[pyfunction]
 fn add_rows(
-    views: Vec<RowsOfView<'_>>,
+    views: Vec<(Bound<'_, PyAny>, Bound<'_, PyAny>)>,
+    sums: &Bound<'_, PyAny>,
+    scale: f32,
+) -> BindingResult<()> {
+    let shape = Array::<f32>::new("sums", sums)?.shape().to_vec();
+    let width = shape.get(1).copied().unwrap_or(0);
+    let mut held = writable::<f32>("sums", &[shape.first().copied().unwrap_or(0), width], sums)?;
+    let views = views
+        .iter()
+        .map(|(rows, values)| rows_of("values", rows, values, width))
+        .collect::<BindingResult<Vec<_>>>()?;
+    let views = views
+        .iter()
+        .map(|(rows, values)| {
+            Ok(ViewRows {
+                rows: rows.slice()?,
+                values: values.slice()?,
+            })
+        })
+        .collect::<BindingResult<Vec<_>>>()?;
+    let read: Vec<_> = views.iter().map(|v| place("values", v.values)).collect();
+    check_apart(&[place("sums", held.as_slice()?)], &read)?;
+    let target = held.as_slice_mut()?;
+    Ok(sums
+        .py()
+        .detach(|| threads::install(|| rows::add(&views, target, width, scale)))??)
+}
+
+/// `(rows [M] i32, colors [M, 3] f32, centre, degree)`
+type ColorsOfView<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, [f64; 3], usize);
+
+/// See [`rows::add_harmonics`]. Everything but the rows' numbers is f32.
+#[pyfunction]
+fn add_harmonics(
+    views: Vec<ColorsOfView<'_>>,
     means: &Bound<'_, PyAny>,
-    low: &Bound<'_, PyAny>,
     high: &Bound<'_, PyAny>,
     scale: f32,
 ) -> BindingResult<()> {
     let (means_of, n) = Array::<f32>::new("means", means)?.of_width(3)?;
     let shape = Array::<f32>::new("high", high)?.shape().to_vec();
     let coefficients = shape.get(1).copied().unwrap_or(0);
-    let mut low = writable::<f32>("low", &[n, ADDED], low)?;
     let mut high = writable::<f32>("high", &[n, coefficients, 3], high)?;
     let held = views
         .iter()
-        .map(|(rows, values, center, degree)| {
-            let (values, m) = Array::<f32>::new("values", values)?.of_width(WIDTH)?;
-            let rows = Array::<i32>::new("rows", rows)?.of_shape(&[m])?;
-            Ok((rows, values, *center, *degree))
+        .map(|(rows, colors, center, degree)| {
+            Ok((rows_of("colors", rows, colors, 3)?, *center, *degree))
         })
         .collect::<BindingResult<Vec<_>>>()?;
     let views = held
         .iter()
-        .map(|(rows, values, center, degree)| {
-            Ok(ViewRows {
+        .map(|((rows, colors), center, degree)| {
+            let colors = ViewRows {
                 rows: rows.slice()?,
-                values: values.slice()?,
+                values: colors.slice()?,
+            };
+            Ok(ViewColors {
+                colors,
                 center: *center,
                 degree: *degree,
             })
         })
         .collect::<BindingResult<Vec<_>>>()?;
     let mut read = vec![place("means", means_of.slice()?)];
-    read.extend(views.iter().map(|view| place("values", view.values)));
-    check_apart(
-        &[
-            place("low", low.as_slice()?),
-            place("high", high.as_slice()?),
-        ],
-        &read,
-    )?;
-    let (low, high) = (low.as_slice_mut()?, high.as_slice_mut()?);
-    let means_of = means_of.slice()?;
+    read.extend(views.iter().map(|view| place("colors", view.colors.values)));
+    check_apart(&[place("high", high.as_slice()?)], &read)?;
+    let (high, means_of) = (high.as_slice_mut()?, means_of.slice()?);
     Ok(means
         .py()
-        .detach(|| threads::install(|| rows::add(&views, means_of, low, high, scale)))??)
+        .detach(|| threads::install(|| rows::add_harmonics(&views, means_of, high, scale)))??)
+}
+
+/// The numbers `[M, width]` of a view's rows `[M]`.
+fn rows_of<'py>(
+    name: &'static str,
+    rows: &Bound<'py, PyAny>,
+    values: &Bound<'py, PyAny>,
+    width: usize,
+) -> BindingResult<(Array<'py, i32>, Array<'py, f32>)> {
+    let (values, m) = Array::<f32>::new(name, values)?.of_width(width)?;
+    Ok((Array::<i32>::new("rows", rows)?.of_shape(&[m])?, values))
 }
 
 /// Borrow a C-contiguous array of `shape` to write to it.
