@@ -74,6 +74,7 @@ def _parts_table(options: MergeParts, merged: Merged) -> str:
         ]
         for part in merged.parts
     ]
+    rows.append(["the dome", "", f"{merged.dome:,}", "", ""])
     rows.append(
         [str(options.out), "", f"{len(merged.model):,}", f"{sum(p.cropped for p in merged.parts):,}", ""]
     )

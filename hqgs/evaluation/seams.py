@@ -32,11 +32,13 @@ class SeamRow:
 def seams(gaussians: Gaussians, parts: NDArray[np.integer], camera: Camera) -> NDArray[np.bool_]:
     """Which pixels lie within NEAR px of where another part begins, [H, W].
 
-    `parts` [N] is the part of each Gaussian. A pixel is that part's which has most of its light, taken
-    digit by digit of the parts' binary numbers, so that 256 parts cost no more than 8 colours.
+    `parts` [N] is the part of each of the first N Gaussians; others do not count. A pixel is that part's
+    which has most of its light, taken digit by digit of the parts' binary numbers, so that 256 parts cost no
+    more than 8 colours.
     """
     digits = max(1, int(parts.max(initial=0)).bit_length())
     bits = parts[:, None] >> np.arange(digits) & 1
+    gaussians = Gaussians(**{name: rows[: len(parts)] for name, rows in gaussians.named().items()})
     with one_torch_thread(), torch.no_grad():
         shares, alphas, _ = rasterization(
             gaussians.means,

@@ -24,6 +24,7 @@ from hqgs.scene.camera_files import load_cameras
 from hqgs.scene.cells import cell_of
 from hqgs.scene.formats.part_json import Part, read_part
 from hqgs.scene.listing import some_views
+from hqgs.show.dome import Dome
 
 STEP = 1e-3  # of a colour, in which its change with the light is measured
 
@@ -44,9 +45,10 @@ class Merged:
     """A merged scene."""
 
     path: Path
-    model: Gaussians
-    part_of: NDArray[np.uint16]  # [N], the part that each Gaussian came from, from 0
+    model: Gaussians  # those of the parts, then those of the dome
+    part_of: NDArray[np.uint16]  # [N], the part that each of the parts' Gaussians came from, from 0
     parts: list[MergedPart]
+    dome: int  # Gaussians of the sky behind all
     left_out: int  # Gaussians that are not finite, and not in the file
 
 
@@ -55,7 +57,8 @@ def merge(runs: Sequence[str | Path], out: str | Path) -> Merged:
 
     Of each part the Gaussians in its cell are taken, with the harmonics of the part that has most. Parts that
     learned how bright their photos are have each another mean; the photos that they share bring them
-    together.
+    together. Sky that a part had hung outside its cell is gone then; a dome far behind everything has its
+    colours (`hqgs/show/dome.py`).
 
     Args:
         runs: folders of the runs, one of each part, in any order.
@@ -77,25 +80,42 @@ def merge(runs: Sequence[str | Path], out: str | Path) -> Merged:
     for (run, part), gain in zip(given, gains, strict=True):
         whole = Gaussians.load(run).arrays()
         own = cell_of(part.cells, whole["means"]) == part.part
-        kept: Arrays = {
-            "means": whole["means"][own],
-            "scales": whole["scales"][own],
-            "quats": whole["quats"][own],
-            "opacities": whole["opacities"][own],
-            "sh0": whole["sh0"][own],
-            "shN": whole["shN"][own],
-        }
-        arrays.append(brighter(kept, gain))
+        arrays.append(brighter(_rows(whole, own), gain))
         part_of.append(np.full(int(own.sum()), part.part, np.uint16))
         facts.append(MergedPart(run, part.part + 1, int(own.sum()), int((~own).sum()), np.exp(gain).tolist()))
+    model = _joined(arrays)
+    del arrays
+    cameras = [load_cameras(run).train for run, _ in given]
+    dome = Dome(model, np.stack([camera.center for some in cameras for camera in some]))
+    for (run, _), gain, some in zip(given, gains, cameras, strict=True):
+        dome.look(_joined([brighter(Gaussians.load(run).arrays(), gain)]), some)
+    sky = dome.gaussians(model.sh_degree)
+    both = {name: torch.cat([tensor, sky.named()[name]]) for name, tensor in model.named().items()}
+    model = Gaussians(**both)
+    return Merged(out, model, np.concatenate(part_of), facts, len(sky), model.save(out))
+
+
+def _rows(arrays: Arrays, rows: NDArray[np.bool_]) -> Arrays:
+    return {
+        "means": arrays["means"][rows],
+        "scales": arrays["scales"][rows],
+        "quats": arrays["quats"][rows],
+        "opacities": arrays["opacities"][rows],
+        "sh0": arrays["sh0"][rows],
+        "shN": arrays["shN"][rows],
+    }
+
+
+def _joined(arrays: list[Arrays]) -> Gaussians:
+    """All of them, with zeros where some have fewer harmonics."""
     most = max(one["shN"].shape[1] for one in arrays)
     for one in arrays:
         lacking = most - one["shN"].shape[1]
         one["shN"] = np.pad(one["shN"], ((0, 0), (0, lacking), (0, 0))).astype(np.float32)
-    names = list(arrays[0])
-    joined = {name: torch.from_numpy(np.concatenate([one[name] for one in arrays])) for name in names}
-    model = Gaussians(**joined)
-    return Merged(out, model, np.concatenate(part_of), facts, model.save(out))
+    tensors = {
+        name: torch.from_numpy(np.concatenate([one[name] for one in arrays])) for name in list(arrays[0])
+    }
+    return Gaussians(**tensors)
 
 
 def parts_of(runs: Sequence[str | Path]) -> list[tuple[Path, Part]]:
