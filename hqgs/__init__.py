@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from hqgs.scene.paths import camera_path, look_at
     from hqgs.scene.scene import Camera, Scene, View
     from hqgs.scene.source import degrade, load
+    from hqgs.scene.split import split
     from hqgs.show.frames import render_frames
+    from hqgs.show.merge import merge
     from hqgs.training.config import TrainConfig
     from hqgs.training.progress import Progress
     from hqgs.training.trainer import TrainingError
@@ -50,11 +52,13 @@ __all__ = [
     "load",
     "load_cameras",
     "look_at",
+    "merge",
     "orbit",
     "picture",
     "rasterization",
     "render_frames",
     "set_num_threads",
+    "split",
     "train",
 ]
 
@@ -78,11 +82,13 @@ _HOMES = {
     "load": "hqgs.scene.source",
     "load_cameras": "hqgs.scene.camera_files",
     "look_at": "hqgs.scene.paths",
+    "merge": "hqgs.show.merge",
     "orbit": "hqgs.model.orbit",
     "picture": "hqgs.photos.pixels",
     "rasterization": "hqgs.model.rasterization",
     "render_frames": "hqgs.show.frames",
     "set_num_threads": "hqgs._rust",
+    "split": "hqgs.scene.split",
     "train": "hqgs.pipeline",
 }
 

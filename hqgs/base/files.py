@@ -82,6 +82,18 @@ def check_new_folder(out: Path) -> None:
         raise FileExistsError(f"{out} exists and is not an empty folder")
 
 
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder that is moved to `out`, a resolved path, at the end; after an error it is gone."""
+    check_new_folder(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as name:
+        folder = Path(name) / out.name  # with the usual permissions; those around it are private
+        folder.mkdir()
+        yield folder.resolve()
+        folder.replace(out)
+
+
 def keep_folder(source: Path, target: Path) -> None:
     """Copy a folder of files, flushed to disk, under a name that it gets when it is complete.
 

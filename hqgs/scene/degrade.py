@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path, check_new_folder
+from hqgs.base.files import atomic_path, new_folder
 from hqgs.base.text import some
 from hqgs.photos.degrade import JPEG_FILES, Degraded, Record, degrade_image, degrade_sequence
 from hqgs.photos.files import PHOTO_SUFFIXES
@@ -70,7 +68,7 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
     names = {view.name: _with_suffix(view.name, ".png" if enlarged else suffix) for view in scene.train}
     names |= {view.name: _with_suffix(view.name, ".png") for view in scene.test}
     _check_names(names)
-    with _new_folder(Path(out).resolve()) as root:
+    with new_folder(Path(out).resolve()) as root:
         train: dict[str, str | None] = {}
         steps: dict[str, list[Record]] = {}
         for view, result in degraded_views(scene, degradation, seed):
@@ -212,15 +210,3 @@ def _store(folder: Path, name: str, content: bytes | NDArray[Any]) -> None:
             tmp.write_bytes(content)
         else:
             Image.fromarray(content if content.dtype == np.uint8 else to_uint8(content)).save(tmp, "PNG")
-
-
-@contextmanager
-def _new_folder(out: Path) -> Iterator[Path]:
-    """Yield a folder that is moved to `out`, a resolved path, at the end; after an error it is gone."""
-    check_new_folder(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as name:
-        folder = Path(name) / "scene"  # with the usual permissions; those around it are private
-        folder.mkdir()
-        yield folder.resolve()
-        folder.replace(out)

@@ -17,6 +17,7 @@ from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_fol
 from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
+from hqgs.scene.formats.part_json import read_part
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
@@ -52,8 +53,8 @@ def load_scene(
     none. A Blender pair of files names its own test views; a marker file `hold=N` stands for test_every = N,
     counted over the photos in the folder. `Scene.notes` says which rule and which files were used.
 
-    A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
-    at downscale 1, the only one at which they stand for `View.image`.
+    A folder that `hqgs degrade` or `hqgs split` wrote names its held-out photos itself. Small photos of the
+    first go into `View.low` at downscale 1, the only one at which they stand for `View.image`.
 
     A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is a
     folder for that reconstruction, which the next call takes from there. `told` hears what takes long. Half
@@ -77,13 +78,14 @@ def load_scene(
     coarse = longest is not None and longest <= COARSE
     capture = _read(root, downscale, keep_sfm, told, sfm, coarse)
     if longest is not None:
-        capture = _bounded(capture, longest)
-    degraded = read_degraded_folder(root)
+        capture = bounded(capture, longest)
+    degraded, part = read_degraded_folder(root), read_part(root)
     if degraded is not None:
-        notes = [*degraded.notes, *capture.notes]
-        capture = replace(capture, test_names=frozenset(degraded.held_out), notes=notes)
+        capture = replace(capture, notes=[*degraded.notes, *capture.notes])
     notes = list(capture.notes)
-    test_names = _test_names(root, capture, test_every, notes)
+    if part is not None:
+        notes.insert(0, f"{part}; the photos held out are those of the whole")
+    test_names = held_out_names(root, capture, test_every, notes)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
     views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
@@ -105,7 +107,17 @@ def load_scene(
         notes.append(note)
     tracks = _tracks(capture, views)
     return Scene(
-        root.name, train, test, points, colors, capture.source, notes, tracks, capture.seen, capture.sfm
+        root.name if part is None else f"{part.scene}, part {part.part + 1}",
+        train,
+        test,
+        points,
+        colors,
+        capture.source,
+        notes,
+        tracks,
+        capture.seen,
+        capture.sfm,
+        part=part,
     )
 
 
@@ -192,7 +204,7 @@ def _nothing(root: Path) -> str:
     )
 
 
-def _bounded(capture: Capture, longest: int) -> Capture:
+def bounded(capture: Capture, longest: int) -> Capture:
     """The capture with its photos scaled down until no side is longer, and all of them fit into memory."""
     sizes = [stored_size(photo.path) for photo in capture.photos if photo.path.is_file()]
     if not sizes:
@@ -251,8 +263,12 @@ def _tracks(capture: Capture, views: list[View]) -> Tracks | None:
     return replace(capture.tracks, error=capture.tracks.error * float(np.mean(scales)))
 
 
-def _test_names(root: Path, capture: Capture, test_every: int, notes: list[str]) -> frozenset[str]:
-    """Names of the test views; says in `notes` where the scene itself decides."""
+def held_out_names(root: Path, capture: Capture, test_every: int, notes: list[str]) -> frozenset[str]:
+    """Names of the photos to hold out; says in `notes` where the scene itself decides."""
+    if (part := read_part(root)) is not None:
+        return frozenset(part.held_out)
+    if (degraded := read_degraded_folder(root)) is not None:
+        return frozenset(degraded.held_out)
     if capture.test_names is not None:
         return capture.test_names
     hold = hold_marker(root)

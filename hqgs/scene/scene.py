@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from hqgs.scene.formats.part_json import Part
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class Scene:
     origin: dict[str, Any] | None = (
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
+    part: Part | None = None  # of a larger scene, which `hqgs split` made; None: it is whole
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""

@@ -74,7 +74,7 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     if twice:
         raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
 
-    files = _match_files(names, root, folder, notes)
+    files = match_files(names, root, folder, notes)
     photos = []
     for name, image_id in by_name:
         image = model.images[image_id]
@@ -150,7 +150,7 @@ def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
     return viewmat
 
 
-def _match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:
+def match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:
     """The file of each photo: by name; by name up to the suffix; in `images_N` also by sorted position.
 
     LLFF's scaled photos have names of their own (image000.png for IMG_4026.JPG) in the same order.
@@ -158,12 +158,12 @@ def _match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -
     present = list_photos(folder)
     by_stem: dict[str, list[str]] = {}
     for n in present:
-        by_stem.setdefault(_stem(n), []).append(n)
+        by_stem.setdefault(stem(n), []).append(n)
     files: dict[str, Path] = {}
     missing = []
     for name in names:
         exact = inside(folder, name, "the COLMAP model's photo")
-        similar = by_stem.get(_stem(name), [])
+        similar = by_stem.get(stem(name), [])
         if exact.is_file():
             files[name] = exact
         elif len(similar) == 1:
@@ -181,7 +181,8 @@ def _match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -
     raise FileNotFoundError(f"{len(missing)} cameras have no photo in {folder}: {some(missing)}")
 
 
-def _stem(name: str) -> str:
+def stem(name: str) -> str:
+    """The name without its suffix."""
     return name.rsplit(".", 1)[0]
 
 
