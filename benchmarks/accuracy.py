@@ -8,13 +8,10 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from functools import partial
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -22,16 +19,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks import places
 from benchmarks.charts import LEGEND, color, panels, unbeaten
 from benchmarks.data import read_toml
 from benchmarks.measure import Training
-from benchmarks.output import Benchmark, Report, repeats_and_seed, table, with_repeats
+from benchmarks.output import TIMED, Benchmark, Report, sizes_of, table
+from benchmarks.patches import Knobs, tuned
 from benchmarks.protocol import Row
 from benchmarks.speed.inputs import LEAVES, RasterInputs, make_inputs
-from benchmarks.speed.rasterizer import RasterPass, measure_threads, thread_counts
-from benchmarks.speed.timing import interleaved, quartiles, using_threads, whole
-from hqgs._rust import ALPHA_MIN, TRANSMITTANCE_MIN
+from benchmarks.speed.rasterizer import RasterPass
+from benchmarks.speed.timing import interleaved, quartiles, whole
 from hqgs.base.threads import one_torch_thread
 from hqgs.base.typed import build
 from hqgs.model.render import render_view
@@ -42,24 +38,11 @@ from hqgs.training.methods.photometric import photometric_loss
 
 FILE = Path(__file__).with_suffix(".toml")
 DATA = read_toml(FILE)
-COLUMNS = DATA["columns"]
 Errors = dict[str, Any]  # of a row against an oracle
 ERRORS: dict[str, Callable[[Errors], float]] = {  # what the panels show
     "image RMS error": lambda errors: errors["image"]["rms"],
     "relative error of the gradients": lambda errors: errors["gradients"]["all"]["relative"],
 }
-
-
-@dataclass(frozen=True)
-class Knobs:
-    """The settings of `AccuracyKnobs` in rust/accuracy_knobs.rs, and the dtype."""
-
-    dtype: str = "float32"
-    alpha_min: float = ALPHA_MIN  # smallest alpha that is blended
-    transmittance_min: float = TRANSMITTANCE_MIN  # compositing stops there
-    spans: str = "ellipse"  # the tiles of a Gaussian: of its support, its "box", or a 3-sigma "square"
-    skip_blocks: bool = True  # leave out the 4 x 4 blocks that a Gaussian does not reach
-    exp2_degree: int = 6  # of the polynomial in float32
 
 
 # By knob and value; the first is what is measured against.
@@ -72,14 +55,6 @@ ORACLES = {  # the definition of docs/conventions.md without float32's roundings
     "exact": CASES["cutoffs", "none, float64"],
     "defined": CASES["dtype", "float64"],
 }
-
-
-@contextmanager
-def tuned(knobs: Knobs) -> Iterator[None]:
-    """Inside it the rasterizer has these knobs, the dtype aside."""
-    _, *values = asdict(knobs).values()
-    with patch.object(*places.PROJECT, partial(getattr(*places.PROJECT), knobs=tuple(values))):
-        yield
 
 
 class TunedPass(RasterPass):
@@ -133,27 +108,13 @@ def beats(row: dict[str, Any], other: dict[str, Any]) -> bool:
     return no_worse and row["ratio_quartiles"][1] < 1
 
 
-def measure_by_threads(inputs: RasterInputs, repeats: int) -> list[dict[str, Any]]:
-    """Seconds with each number of threads, and the largest difference to one thread in any output."""
-    case = TunedPass(inputs, Knobs())
-    rows = measure_threads({"default": case}, repeats)
-    with using_threads(1):
-        one = case.outputs()
-    for row in rows:
-        with using_threads(row["threads"]):
-            several = case.outputs()
-        row["difference"] = max(float((several[name] - one[name]).abs().max()) for name in one)
-        row["same_bits"] = all(torch.equal(several[name], one[name]) for name in one)
-    return rows
-
-
 def errors_table(result: dict[str, Any]) -> str:
     """One row for each case; the errors against the exact result, then against the definition in float64."""
     cosines = [row["errors"]["exact"]["gradients"]["all"]["cosine"] for row in result["rows"]]
     turns = [None if cosine is None else 1 - cosine for cosine in cosines]
     lines = [row | {"turn": turn} for row, turn in zip(result["rows"], turns, strict=True)]
     size = f"{result['gaussians']:,} Gaussians, {result['width']} x {result['height']}"
-    return table(f"{result['inputs']}: {size}, forward and backward", lines, COLUMNS["errors"])
+    return table(f"{result['inputs']}: {size}, forward and backward", lines, DATA["columns"])
 
 
 def chart(result: dict[str, Any]) -> Figure:
@@ -241,7 +202,7 @@ def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInpu
 
 def run(args: argparse.Namespace) -> Report:
     """Measure every case on the clouds and on the trained Gaussians."""
-    sizes = with_repeats(DATA["quick" if args.quick else "full"], args)
+    sizes = sizes_of(DATA, args)
     report = Report(settings=sizes)
     inputs = {f"cloud of {n:,}": make_inputs(n, *sizes["size"], seed=args.seed) for n in sizes["gaussians"]}
     print("accuracy: training the built-in scene", file=sys.stderr)
@@ -254,12 +215,6 @@ def run(args: argparse.Namespace) -> Report:
         print(f"accuracy: {name}", file=sys.stderr)
         results.append(measure(name, x, sizes["repeats"]))
         report.tables.append(errors_table(results[-1]))
-    name, largest = max(inputs.items(), key=lambda item: len(item[1]))
-    if len(thread_counts()) > 1:
-        rows = report.results["threads"] = measure_by_threads(largest, sizes["repeats"])
-        report.tables.append(table(f"{name}: threads", rows, COLUMNS["threads"]))
-    else:
-        report.leave_out("threads", "there is one thread")
     why = "it only groups the work: blocks of 4 x 4 pixels inside exact spans decide what is computed"
     report.leave_out("tile size", why)
     for result in results:
@@ -270,4 +225,4 @@ def run(args: argparse.Namespace) -> Report:
 
 
 HELP = "error of the rasterizer against its run time, knob by knob"
-BENCHMARK = Benchmark(HELP, run, options=repeats_and_seed(DATA))
+BENCHMARK = Benchmark(HELP, run, options=TIMED)

@@ -14,11 +14,11 @@ from pandas import DataFrame
 from benchmarks.data import read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
+from benchmarks.patches import SWITCHES
 from benchmarks.protocol import Row, read_protocols
 from benchmarks.speed.timing import Seconds, interleaved, quartiles
 from benchmarks.speed.training import still_config, trainer_from
 from benchmarks.study import Cell, Study, begin
-from benchmarks.switches import SWITCHES
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene

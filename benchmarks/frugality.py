@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from benchmarks.charts import GREY, LEGEND, color, panels
-from benchmarks.data import read_toml
-from benchmarks.frames import paired
+from benchmarks.data import paired, read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
 from benchmarks.protocol import Protocol, read_protocols

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import base64
+import io
+import json
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import reduce
@@ -12,9 +15,10 @@ from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jinja2 import Environment, FileSystemLoader
+
 import hqgs
-from benchmarks.page import write_page
-from hqgs.base.files import atomic_path, write_json
+from hqgs.base.files import atomic_path, write_json, write_text
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.base.text import markdown_table
 
@@ -58,20 +62,19 @@ class Benchmark:
     options: Mapping[str, dict[str, Any]] = field(default_factory=dict)  # beyond those of all, for argparse
 
 
-def repeats_and_seed(sizes: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The options of what is timed: `sizes` has a table for `--quick` and one for `full`."""
-    default, quick = (sizes[name]["repeats"] for name in ("full", "quick"))
-    rounds = f"rounds of each measurement ({default}, with --quick {quick})"
-    seed = {"type": int, "default": 2026, "metavar": "S", "help": "of the Gaussians (%(default)s)"}
-    return {"--repeats": {"type": int, "metavar": "N", "help": rounds}, "--seed": seed}
+TIMED: dict[str, dict[str, Any]] = {  # the options of what is timed
+    "--repeats": {"type": int, "metavar": "N", "help": "rounds of each measurement"},
+    "--seed": {"type": int, "default": 2026, "metavar": "S", "help": "of the Gaussians (%(default)s)"},
+}
 
 
-def with_repeats(sizes: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
-    """The sizes with what the options of `repeats_and_seed` ask for."""
+def sizes_of(data: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """The table `quick` or `full` of what is timed, with what the options `TIMED` ask for."""
+    sizes = data["quick" if args.quick else "full"] | {"seed": args.seed}
     repeats = sizes["repeats"] if args.repeats is None else args.repeats
     if repeats < 1:
         raise ValueError(f"repeats is {repeats}, wanted at least 1")
-    return sizes | {"repeats": repeats, "seed": args.seed}
+    return sizes | {"repeats": repeats}
 
 
 def write_results(out: Path, name: str, command: str, report: Report, page: Path | None = None) -> list[Path]:
@@ -140,3 +143,38 @@ def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, S
     paths = [(key.split("/"), form) for key, (_, form) in columns.items()]
     body = [[number(reduce(getitem, path, row), form) for path, form in paths] for row in rows]
     return markdown_table(title, [head for head, _ in columns.values()], body)
+
+
+TEMPLATE = Path(__file__).with_name("page.html.j2")
+
+
+def write_page(path: Path, facts: dict[str, Any], report: Report) -> None:
+    """Write the page atomically. `facts`: what the JSON file holds. OSError where it cannot be written."""
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATE.parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    charts = {}
+    for what, figure in report.figures.items():
+        png = io.BytesIO()
+        figure.savefig(png, format="png")
+        charts[what.replace("_", " ")] = f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}"
+    page = environment.get_template(TEMPLATE.name).render(
+        title=f"hqgs benchmark {facts['benchmark']} {report.part}".rstrip(),
+        facts=facts,
+        blocks=[block for text in report.tables for block in _blocks(text)],
+        charts=charts,
+        settings=json.dumps({name: facts[name] for name in ("settings", "versions")}, indent=1),
+    )
+    write_text(path, page)
+
+
+def _blocks(text: str) -> Iterator[tuple[str, Any]]:
+    """Of Markdown as the benchmarks print it: titles, tables as rows of cells, and other text."""
+    for block in text.split("\n\n"):
+        if block.startswith("**") and block.endswith("**"):
+            yield "title", block.strip("*")
+        elif block.startswith("|"):
+            rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in block.splitlines()]
+            yield "table", [rows[0], *rows[2:]]
+        else:
+            yield "text", block

@@ -8,8 +8,7 @@ from typing import Any
 
 from pandas import DataFrame
 
-from benchmarks.data import read_toml
-from benchmarks.frames import means, paired, records
+from benchmarks.data import means, paired, read_toml, records
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
 from benchmarks.protocol import read_protocols

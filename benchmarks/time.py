@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from benchmarks.charts import GREY, LEGEND, draw, panels, title
-from benchmarks.data import read_toml
-from benchmarks.frames import means
+from benchmarks.data import means, read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, table
 from benchmarks.protocol import read_protocols

@@ -19,6 +19,19 @@ pub(crate) fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> 
     }
 }
 
+/// Make a vector `len` long; elements that it did not have are `value`.
+#[inline(always)]
+pub(crate) fn resize<T: Clone>(
+    vector: &mut Vec<T>,
+    len: usize,
+    value: T,
+    name: &str,
+) -> Result<(), Error> {
+    reserve(vector, len.saturating_sub(vector.len()), name)?;
+    vector.resize(len, value);
+    Ok(())
+}
+
 /// A vector of `len` times the same value.
 pub(crate) fn filled<T: Clone>(value: T, len: usize, name: &str) -> Result<Vec<T>, Error> {
     let mut vector = with_capacity(len, name)?;
@@ -59,7 +72,15 @@ mod tests {
             reserve(&mut vector, 1 << 58, "image").unwrap_err(),
             expected
         );
+        assert_eq!(
+            resize(&mut vector, 1 + (1 << 58), 0, "image").unwrap_err(),
+            expected
+        );
         assert_eq!(vector, [1]);
+        resize(&mut vector, 3, 5, "few").unwrap();
+        assert_eq!(vector, [1, 5, 5]);
+        resize(&mut vector, 2, 0, "few").unwrap();
+        assert_eq!(vector, [1, 5]);
         assert!(with_capacity::<u64>(usize::MAX, "all").is_err()); // more bytes than can be counted
     }
 }

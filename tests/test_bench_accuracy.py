@@ -123,13 +123,6 @@ def test_every_row_has_a_time_and_finite_errors(quick: dict[str, Any]) -> None:
                     assert -1 <= entry["cosine"] <= 1
 
 
-def test_threads_change_no_bit(quick: dict[str, Any]) -> None:
-    rows = quick["results"]["threads"]
-    assert [row["threads"] for row in rows] == [1, 2]
-    assert [row["difference"] for row in rows] == [0, 0]
-    assert all(row["same_bits"] for row in rows)
-
-
 @pytest.mark.parametrize(("floor", "stop"), [(1 / 64, 1e-2), (1 / 1024, 1e-5), (1e-12, 0.0)])
 def test_floor_and_stop_follow_the_definition(
     floor: float, stop: float, monkeypatch: pytest.MonkeyPatch

@@ -14,9 +14,9 @@ from pandas import DataFrame
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from benchmarks import cli, features, places
+from benchmarks import cli, features, patches
 from benchmarks.features import DEFAULT, FEATURES, PROTOCOLS, still_trainer
-from benchmarks.switches import TorchAdam, torch_loss
+from benchmarks.patches import TorchAdam, torch_loss
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 
@@ -169,7 +169,7 @@ def test_the_loss_in_torch_is_the_loss(masked: bool, shape: tuple[int, int, int]
 
 def test_switches_are_undone() -> None:
     before = hqgs.get_num_threads(), torch.get_num_threads()
-    watched = places.PROJECT, places.RASTERIZATION, places.ADAM, places.ONE_TORCH_THREAD, places.LOSS
+    watched = patches.PROJECT, patches.RASTERIZATION, patches.ADAM, patches.ONE_TORCH_THREAD, patches.LOSS
     found = [getattr(*place) for place in watched]
     default = PROTOCOLS["quick"].train_config(DEFAULT, 0)
     changed: set[str] = set()
@@ -188,7 +188,7 @@ def test_switches_are_undone() -> None:
 
 def test_a_trainer_with_adam_of_torch_learns_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     ours = Trainer(tiny_scene(), tiny_config())
-    monkeypatch.setattr(*places.ADAM, TorchAdam)
+    monkeypatch.setattr(*patches.ADAM, TorchAdam)
     theirs = Trainer(tiny_scene(), tiny_config())
     assert isinstance(theirs.state.optimizer, torch.optim.Adam)
     for _ in range(7):  # before the number of Gaussians can differ

@@ -277,6 +277,15 @@ CALLS = {
         "o.apply(np.ones((4, 4, 3)), False)",
         "image",
     ),
+    "bands": (
+        "a = np.zeros((11, 1 << 21, 3)); limit(1500); _rust.photometric(a, a, None, 0.2, 0.0, False)",
+        "loss",
+    ),
+    "columns": (
+        "o = _rust.Separable(np.eye(1, 4), np.eye(4, 1 << 24), None); limit(700); "
+        "o.apply(np.ones((4, 1 << 24, 1)), False)",
+        "image",
+    ),
     "operator": ("m = np.ones((8192, 8192)); limit(300); _rust.Separable(m, np.eye(4), None)", "rows"),
     "agreeing": (
         "g = np.zeros((32, 32), np.float32); "

@@ -14,9 +14,10 @@ import torch
 from reference import reference_rasterization
 
 from benchmarks import cli
-from benchmarks.stability import measure, run
+from benchmarks.stability import run
 from benchmarks.stability.cases import PIXELS, cases, scene
-from benchmarks.stability.measure import (
+from benchmarks.stability.oracle import GROUPS, Oracle
+from benchmarks.stability.run import (
     COSINE,
     GRADIENT_F64,
     VALUE_F64,
@@ -25,7 +26,6 @@ from benchmarks.stability.measure import (
     input_rounding,
     misses,
 )
-from benchmarks.stability.oracle import GROUPS, Oracle
 
 CASES = {case.name: case for case in cases()}
 
@@ -126,7 +126,7 @@ def test_oracle_agrees_with_autograd(antialiased: bool, degree: int | None) -> N
 
 def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The measure itself: a change of 1e-6 in one value, or of 1 % in one gradient, misses the targets."""
-    right = measure.render
+    right = run.render
 
     def wrong_image(*args):
         image, radii, gradients = right(*args)
@@ -140,7 +140,7 @@ def test_a_wrong_picture_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
     case = CASES["ordinary"]
     for wrong, word in ((wrong_image, "values"), (wrong_gradient, "gradient of quats")):
-        monkeypatch.setattr(measure, "render", wrong)
+        monkeypatch.setattr(run, "render", wrong)
         assert any(word in miss for miss in misses(case, evaluate(case, "f64")))
 
 

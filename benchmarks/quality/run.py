@@ -78,7 +78,6 @@ class Quality:
         baseline = self.protocol.baseline if self.protocol.baseline in labels and len(labels) > 1 else None
         runs = [self.study.runs[cell] | {"row": cell.row.label} for group in groups for cell in group]
         frame = tables.frame_of(runs, baseline)
-        report.results["summary"] = tables.summary(frame, baseline)
         what = self.what(frame)
         report.tables.append(tables.metrics(frame, what))
         if baseline is not None:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from pandas import DataFrame, Series, concat
 
-from benchmarks.data import read_toml
-from benchmarks.frames import means, paired, records
+from benchmarks.data import means, paired, read_toml, records
 from benchmarks.measure import Run
 from benchmarks.output import NOTHING, number, table
 from hqgs.base.text import markdown_table
@@ -59,10 +58,9 @@ def gains(frame: DataFrame, name: str, title: str, baseline: str) -> str:
     """Gains of the rows that have them: mean ± standard deviation over groups, and the worst group."""
 
     def text(part: DataFrame) -> str:
-        over = spread(part[name])
-        if over is None or over["std"] is None:
-            return number(None if over is None else over["mean"], "+.2f")
-        return f"{over['mean']:+.2f} ± {over['std']:.2f} ({over['min']:+.2f})"
+        over = part[name]
+        mean = number(over.mean(skipna=False), "+.2f")
+        return mean if len(over) == 1 or mean == NOTHING else f"{mean} ± {over.std():.2f} ({over.min():+.2f})"
 
     title = f"{title} (dB): mean ± std over scenes and seeds (worst)"
     return crossed(title, with_degraded(frame.loc[frame["row"] != baseline]), text)
@@ -181,14 +179,6 @@ def with_degraded(frame: DataFrame) -> DataFrame:
     return concat([frame, bad.assign(degradation=DEGRADED)], ignore_index=True)
 
 
-def spread(values: Series) -> dict[str, float | None] | None:
-    """Mean, sample standard deviation (None for one value), range and number; None where a value lacks."""
-    if values.isna().any():
-        return None
-    found = values.agg(["mean", "std", "min", "max"]).to_dict()
-    return found | {"std": found["std"] if len(values) > 1 else None, "count": len(values)}
-
-
 def psnr_at(history: Sequence[dict[str, Any]], seconds: float) -> float | None:
     """Held-out PSNR of a run when it had trained for so long, between two evaluations by a straight line.
 
@@ -211,15 +201,3 @@ def equal_time_gain(history: Sequence[dict[str, Any]], base: Sequence[dict[str, 
     moment = min(history[-1]["seconds"], base[-1]["seconds"])
     mine, other = psnr_at(history, moment), psnr_at(base, moment)
     return None if mine is None or other is None else mine - other
-
-
-def summary(frame: DataFrame, baseline: str | None) -> dict[str, Any]:
-    """All means and gains by row and degradation, as JSON values. `baseline` None: no gains."""
-    rows, frame = dict[str, Any](), with_degraded(frame)
-    parts = frame.groupby(["row", "degradation"], sort=False)
-    for line in records(means(frame, ["row", "degradation"], [*METRICS, *COSTS])):
-        label, kind = line.pop("row"), line.pop("degradation")
-        part = parts.get_group((label, kind))
-        over = {name: spread(Series(part[name])) for name in GAINS} if baseline not in (None, label) else {}
-        rows.setdefault(label, {})[kind] = {"runs": len(part), **line, **over}
-    return rows

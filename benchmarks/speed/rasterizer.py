@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import hqgs
 from benchmarks.charts import LEGEND, color, panels, title
-from benchmarks.places import COMPOSITE, CRATE
+from benchmarks.patches import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
 from benchmarks.speed.timing import (
     Seconds,

@@ -10,7 +10,7 @@ from typing import Any
 
 import hqgs
 from benchmarks.data import read_toml
-from benchmarks.output import Benchmark, Report, UnavailableError, repeats_and_seed, table, with_repeats
+from benchmarks.output import TIMED, Benchmark, Report, UnavailableError, sizes_of, table
 from benchmarks.speed.inputs import RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import (
     AGAINST,
@@ -20,8 +20,7 @@ from benchmarks.speed.rasterizer import (
     measure_threads,
     scaling_chart,
 )
-from benchmarks.speed.step import measure_steps, steps_table, whole_step
-from benchmarks.speed.training import make_trainer, measure_memory
+from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, steps_table, whole_step
 from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import Trainer
@@ -106,7 +105,7 @@ class Speed:
 def run(args: argparse.Namespace) -> Report:
     """Measure the parts that were asked for."""
     check_method(args.method)
-    config = with_repeats(DATA["quick" if args.quick else "full"], args)
+    config = sizes_of(DATA, args)
     same = {"method": args.method, "seed": args.seed}
     report = Report(settings=config | same | {"memory": config["memory"] | same})
     speed = Speed(report)
@@ -125,6 +124,6 @@ METHOD = f"of the training step: {', '.join(METHODS)} (%(default)s)"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--parts": {"nargs": "+", "choices": PARTS, "default": list(PARTS), "metavar": "PART", "help": LISTED},
     "--method": {"default": "3dgs", "help": METHOD},
-    **repeats_and_seed(DATA),
+    **TIMED,
 }
 BENCHMARK = Benchmark("time and memory of the rasterizer and of a training step", run, options=OPTIONS)

@@ -3,20 +3,200 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
+import hqgs
 from benchmarks.charts import BLUE, ORANGE, panels
 from benchmarks.data import read_toml
 from benchmarks.output import Benchmark, Report, table
-from benchmarks.stability import measure
 from benchmarks.stability.cases import Case, cases
-from benchmarks.stability.measure import VALUE_F32, Outcome, misses
-from benchmarks.stability.oracle import DIGITS, load_mpmath
+from benchmarks.stability.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, Pixel, load_mpmath
+
+DTYPES = {"f32": torch.float32, "f64": torch.float64}
+VALUE_F64, GRADIENT_F64 = 1e-12, 1e-9  # relative
+VALUE_F32, COSINE = 1e-5, 0.99999  # absolute, for ordinary cases; of each group of gradients
+# A group of gradients below this share of the largest, each times the size of its parameter, is rounding.
+NEGLIGIBLE = {"f32": 1e-4, "f64": 1e-6}
+NUDGES = 4  # scenes with inputs one ulp off, whose largest change is the condition
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was measured of a case in one dtype. Errors are 0 where nothing is there to compare."""
+
+    dtype: str
+    as_expected: bool = True  # exactly the expected Gaussians are culled
+    finite: bool = True  # image and gradients
+    others_equal: bool = True  # without the culled Gaussians: the same bits; culled ones have gradient 0
+    value_abs: float = 0.0
+    value_relative: float = 0.0  # over the largest value of the oracle
+    gradient: float = 0.0  # largest relative L2 of any group
+    cosine: float = 1.0  # smallest of any group
+    worst_group: str = ""
+
+
+def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
+    """Image with alpha [H, W, D + 1], radii [N, 2] and gradients by group, as float64 arrays."""
+    kind = DTYPES[dtype]
+
+    def tensor(values: Array) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(kind)
+
+    leaves: dict[str, Any] = {name: tensor(getattr(s, name)).requires_grad_() for name in GROUPS}
+    image, alphas, meta = hqgs.rasterization(
+        **leaves,
+        viewmats=tensor(s.viewmat)[None],
+        Ks=tensor(s.K)[None],
+        width=s.width,
+        height=s.height,
+        near_plane=s.near_plane,
+        far_plane=s.far_plane,
+        eps2d=s.eps2d,
+        sh_degree=s.sh_degree,
+        backgrounds=None if s.background is None else tensor(s.background)[None],
+        rasterize_mode="antialiased" if s.antialiased else "classic",
+    )
+    full = torch.cat([image, alphas], dim=-1)[0]
+    i, j = torch.tensor(list(cotangents)).T
+    (full[i, j] * tensor(np.stack(list(cotangents.values())))).sum().backward()
+    gradients = {name: _double(leaf.grad) for name, leaf in leaves.items()}
+    return _double(full), meta["radii"][0].numpy(), gradients
+
+
+def _double(values: torch.Tensor | None) -> Array:
+    assert values is not None
+    return values.detach().numpy().astype(np.float64)
+
+
+def weights(case: Case) -> dict[Pixel, Array]:
+    """The cotangents of the compared pixels, exact in float32."""
+    channels = (3 if case.scene.sh_degree is not None else case.scene.colors.shape[1]) + 1
+    values = np.cos(1.0 + np.arange(len(case.pixels) * channels)).astype(np.float32).astype(np.float64)
+    return dict(zip(case.pixels, values.reshape(-1, channels), strict=True))
+
+
+def evaluate(case: Case, dtype: str) -> Outcome:
+    """Measure one case."""
+    s = case.scene.rounded(dtype)
+    cotangents = weights(case)
+    image, radii, gradients = render(s, dtype, cotangents)
+    culled = case.expected_culled(dtype)
+    seen = (radii > 0).all(axis=1)
+    as_expected = set(np.flatnonzero(~seen)) == set(culled)
+    finite = all(np.isfinite(a).all() for a in (image, *gradients.values()))
+    equal = all((gradients[name][list(culled)] == 0).all() for name in GROUPS)
+    if culled:
+        image2, _, gradients2 = render(s.without(culled), dtype, cotangents)
+        equal = equal and np.array_equal(image, image2)
+        kept = [i for i in range(len(s.means)) if i not in culled]
+        equal = equal and all(np.array_equal(gradients[name][kept], gradients2[name]) for name in GROUPS)
+    if case.poison:
+        return Outcome(dtype, as_expected, finite, equal)
+    oracle = Oracle(s)
+    checked = range(len(s.means)) if len(s.means) <= 10 else case.gradients_of or ()
+    as_expected = as_expected and all(oracle.kept(i) == (i not in culled) for i in checked)
+    wanted = [oracle.pixel(pixel) for pixel in case.pixels]
+    error = largest_difference([image[pixel] for pixel in case.pixels], wanted)
+    size = max(float(abs(w)) for row in wanted for w in row)
+    ids = case.compared
+    worst, cosine, group = compare_gradients(
+        s, dtype, {name: gradients[name][ids] for name in GROUPS}, oracle.gradients(cotangents, ids), ids
+    )
+    return Outcome(
+        dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group
+    )
+
+
+def largest_difference(got: Sequence[Any], wanted: Sequence[Any]) -> float:
+    """Largest absolute difference of two lists of pixels."""
+    pairs = [pair for a, b in zip(got, wanted, strict=True) for pair in zip(a, b, strict=True)]
+    return max(float(abs(g - w)) for g, w in pairs)
+
+
+def condition(case: Case, dtype: str) -> Outcome:
+    """What one ulp of the inputs changes in the oracle's own results: no algorithm can be asked for more."""
+    s = case.scene.rounded(dtype)
+    cotangents, ids, rng = weights(case), case.compared, np.random.default_rng(0)
+    oracle = Oracle(s)
+    values, gradients = [oracle.pixel(p) for p in case.pixels], oracle.gradients(cotangents, ids)
+    size = max(float(abs(v)) for row in values for v in row)
+    found = []
+    for _ in range(NUDGES):
+        nudged = Oracle(s.nudged(dtype, rng))
+        change = largest_difference([nudged.pixel(p) for p in case.pixels], values) / size
+        other = {name: np.array(rows, float) for name, rows in nudged.gradients(cotangents, ids).items()}
+        found.append((change, *compare_gradients(s, dtype, other, gradients, ids)[:2]))
+    changes, worst, cosines = zip(*found, strict=True)
+    return Outcome(dtype, value_relative=max(changes), gradient=max(worst), cosine=min(cosines))
+
+
+def compare_gradients(
+    s: OracleScene, dtype: str, gradients: dict[str, Array], reference: dict[str, Any], ids: list[int]
+) -> tuple[float, float, str]:
+    """Largest relative L2 and smallest cosine over Gaussians `ids` and groups, and the group of the former.
+
+    Each Gaussian and group is compared by itself, so that a large one hides no small one. A gradient whose
+    product with its parameter is below NEGLIGIBLE of the largest such product is held against that share.
+    """
+    rows = []
+    for k, i in enumerate(ids):
+        for name in GROUPS:
+            truth = np.array([float(v) for v in reference[name][k]])
+            values = getattr(s, name)[i]
+            if name == "means":
+                values = s.viewmat[:3, :3] @ values + s.viewmat[:3, 3]
+            parameter = float(np.linalg.norm(values))
+            parameter = parameter if math.isfinite(parameter) else 0.0  # culled
+            rows.append((name, truth, gradients[name][k].ravel()[: len(truth)], parameter))
+    largest = max((np.linalg.norm(truth) * parameter for _, truth, _, parameter in rows), default=0.0)
+    worst, cosine, group = 0.0, 1.0, ""
+    for name, truth, found, parameter in rows:
+        length = float(np.linalg.norm(truth))
+        least = NEGLIGIBLE[dtype] * largest / parameter if parameter > 0 else 0.0
+        if max(length, least) == 0.0:
+            continue
+        unit = max(length, least)
+        error = float(np.linalg.norm((found - truth) / unit))
+        if error > worst:
+            worst, group = error, name
+        if length >= least:
+            f = found / unit
+            with np.errstate(invalid="ignore"):
+                cosine = min(cosine, float(f @ (truth / length) / max(np.linalg.norm(f), 1e-300)))
+    return worst, cosine, group
+
+
+def misses(case: Case, outcome: Outcome) -> list[str]:
+    """The targets that a case misses, in words."""
+    o, exact = outcome, outcome.dtype == "f64"
+    values = o.value_relative if exact else o.value_abs
+    limit = VALUE_F64 if exact else VALUE_F32 if case.ordinary else math.inf
+    missed = {
+        "not the expected Gaussians are culled": not o.as_expected,
+        "not finite": not o.finite,
+        "a culled Gaussian is noticed": not o.others_equal,
+        f"values {values:.1e} > {limit:g}": values > limit,
+        f"gradient of {o.worst_group} {o.gradient:.1e} > {GRADIENT_F64:g}": exact
+        and o.gradient > GRADIENT_F64,
+        f"cosine {o.cosine:.6f} < {COSINE}": o.cosine < COSINE,
+    }
+    return [words for words, is_so in missed.items() if is_so]
+
+
+def input_rounding(case: Case) -> float:
+    """Largest change of any compared value that rounding the inputs to float32 alone causes."""
+    exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
+    return largest_difference([exact.pixel(p) for p in case.pixels], [rounded.pixel(p) for p in case.pixels])
+
 
 COLUMNS = Path(__file__).with_name("columns.toml")
 Rows = list[tuple[Case, list[Outcome]]]  # in float32 and in float64
@@ -28,17 +208,17 @@ def run(args: argparse.Namespace) -> Report:
     if args.quick and args.long:
         raise ValueError("--quick and --long exclude each other")
     targets = {
-        "f64_values": measure.VALUE_F64, "f64_gradients": measure.GRADIENT_F64, "f32_ordinary": VALUE_F32,
-        "cosine": measure.COSINE, "negligible": measure.NEGLIGIBLE,
+        "f64_values": VALUE_F64, "f64_gradients": GRADIENT_F64, "f32_ordinary": VALUE_F32,
+        "cosine": COSINE, "negligible": NEGLIGIBLE,
     }  # fmt: skip
     report = Report(settings={"long": args.long, "digits": DIGITS} | targets)
     rows: Rows = []
     for case in cases(args.long):
         print(f"stability: {case.name}", file=sys.stderr)
-        rows.append((case, [measure.evaluate(case, dtype) for dtype in ("f32", "f64")]))
+        rows.append((case, [evaluate(case, dtype) for dtype in ("f32", "f64")]))
     missed = [(case, outcome) for case, outcomes in rows for outcome in outcomes if misses(case, outcome)]
-    conditions = {(case.name, o.dtype): measure.condition(case, o.dtype) for case, o in missed}
-    rounding = measure.input_rounding(next(case for case, _ in rows if case.name == "world offset 1e6"))
+    conditions = {(case.name, o.dtype): condition(case, o.dtype) for case, o in missed}
+    rounding = input_rounding(next(case for case, _ in rows if case.name == "world offset 1e6"))
     report.results = {
         "cases": [
             {
@@ -86,8 +266,8 @@ def chart(rows: Rows) -> Figure:
     figure, (left, right) = panels(10, 2 + 0.16 * len(shown), 1, 2, sharey=True)
     y = np.arange(len(shown))
     for axes, field, limit, what in (
-        (left, "value_relative", measure.VALUE_F64, "values, relative"),
-        (right, "gradient", measure.GRADIENT_F64, "gradients, relative L2"),
+        (left, "value_relative", VALUE_F64, "values, relative"),
+        (right, "gradient", GRADIENT_F64, "gradients, relative L2"),
     ):
         for k, (dtype, color) in enumerate((("f32", ORANGE), ("f64", BLUE))):
             errors = [max(getattr(outcomes[k], field), 1e-18) for _, outcomes in shown]

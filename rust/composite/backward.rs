@@ -79,7 +79,7 @@ pub fn backward<T: Real>(
         check_len("v_render_alphas", alphas, input.pixels())?;
     }
     let background = if wanted.background {
-        background_vjp(input, composited, v)
+        background_vjp(input, composited, v)?
     } else {
         Vec::new()
     };
@@ -104,10 +104,7 @@ pub fn backward<T: Real>(
         .zip(&mut counts)
         .enumerate()
         .try_for_each_init(
-            || Scratch {
-                adjoint: Adjoint::new(channels),
-                layers: Vec::new(),
-            },
+            Scratch::default,
             |scratch, (tile, (grads, counts))| -> Result<(), Error> {
                 (*grads, *counts) = dispatch!(level, simd => for_alpha!(
                     channels, degree, backward_tile, simd, T, (input, composited, v, &grid, tile, layout, scratch)
@@ -123,7 +120,8 @@ pub fn backward<T: Real>(
 }
 
 /// Buffers of one thread, reused from tile to tile.
-struct Scratch<T> {
+#[derive(Default)]
+struct Scratch<T: Real> {
     adjoint: Adjoint<T>,
     /// What `kernel::unblend` stores.
     layers: Vec<T>,
@@ -147,6 +145,7 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
         return Ok((Vec::new(), counts));
     }
     let Scratch { adjoint, layers } = scratch;
+    adjoint.make_room(layout.channels)?;
     let wanted = read_cotangents::<T, D>(input, v, tile, adjoint, &mut counts);
     // What the layers of a block without a cotangent contribute is 0.
     let mut depths = composited.depths[tile];
@@ -279,14 +278,15 @@ fn background_vjp<T: Real>(
     input: &CompositeInput<T>,
     composited: &Composited<T>,
     v: &CompositeCotangents<T>,
-) -> Vec<T> {
+) -> Result<Vec<T>, Error> {
     let channels = input.channels();
-    let parts: Vec<Vec<f64>> = composited
+    let mut parts = memory::filled(0.0, channels * input.tiles.lists.len(), NAME)?;
+    composited
         .transmittance
         .par_chunks(TILE_PIXELS)
+        .zip(parts.par_chunks_mut(channels.max(1)))
         .enumerate()
-        .map(|(tile, t)| {
-            let mut sums = vec![0.0; channels];
+        .for_each(|(tile, (t, sums))| {
             for (p, pixel, n) in input.runs(tile) {
                 for k in 0..n {
                     for (c, sum) in sums.iter_mut().enumerate() {
@@ -294,10 +294,7 @@ fn background_vjp<T: Real>(
                     }
                 }
             }
-            sums
-        })
-        .collect();
-    (0..channels)
-        .map(|c| T::from_f64(parts.iter().map(|p| p[c]).sum()))
-        .collect()
+        });
+    let sum = |c: usize| parts.iter().skip(c).step_by(channels).sum();
+    Ok((0..channels).map(|c| T::from_f64(sum(c))).collect())
 }

@@ -6,6 +6,7 @@ use super::{
 };
 use crate::{
     error::Error,
+    memory,
     project::Splat,
     simd::Real,
     tiles::{Chunk, UNIT},
@@ -14,6 +15,9 @@ use crate::{
 use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 use std::hint::black_box;
+
+/// What an error calls the buffers of this file.
+const NAME: &str = "gradients";
 
 /// Call a function for the number of channels: the common ones are compiled for it.
 macro_rules! for_channels {
@@ -58,7 +62,7 @@ pub(super) fn gather<T: Real>(
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
     let n = input.projection.splats.len();
-    let mut arrays = UninitVec::several(rows.map(|row| row * n), "gradients")?;
+    let mut arrays = UninitVec::several(rows.map(|row| row * n), NAME)?;
     let cut = |array, row| UninitVec::cut(array, chunks.iter().map(|c| (c.end - c.begin) * row));
     let [means2d, whitened, opacities, absolute, colors] = &mut arrays;
     let jobs: Vec<_> = chunks
@@ -70,7 +74,7 @@ pub(super) fn gather<T: Real>(
         .zip(cut(colors, rows[4]))
         .collect();
     let level = input.projection.level.token;
-    jobs.into_par_iter().for_each(
+    jobs.into_par_iter().try_for_each(
         |(((((chunk, means2d), whitened), opacities), absolute), colors)| {
             let out = Gather {
                 chunk,
@@ -82,9 +86,9 @@ pub(super) fn gather<T: Real>(
             };
             dispatch!(level, simd => for_channels!(
                 channels, gather_chunk, simd, T, (input, pair_grads, layout, out)
-            ));
+            ))
         },
-    );
+    )?;
     let [means2d, whitened, opacities, absolute, colors] = arrays.map(UninitVec::finish);
     Ok(CompositeGrads {
         means2d,
@@ -155,14 +159,14 @@ fn gather_chunk<S: Simd, T: Real, const D: usize>(
     pair_grads: &[Vec<T>],
     layout: PairLayout,
     mut out: Gather<T>,
-) {
+) -> Result<(), Error> {
     let channels = if D > 0 { D } else { layout.channels };
     let row = PairLayout { channels, ..layout }.row();
-    let mut next = out.chunk.starts.clone();
-    let zeros = vec![T::ZERO; row];
+    let mut next = memory::copied(&out.chunk.starts, NAME)?;
+    let zeros = memory::filled(T::ZERO, row, NAME)?;
     let mut moments = [0.0; MOMENTS];
     let mut absolute = [0.0; ABSOLUTE];
-    let mut colors = vec![0.0; channels];
+    let mut colors = memory::filled(0.0, channels, NAME)?;
     let mut current = None;
     let mut rows: Vec<&[T]> = Vec::new();
     for spans in out.chunk.spans.chunks(FETCH) {
@@ -204,6 +208,7 @@ fn gather_chunk<S: Simd, T: Real, const D: usize>(
         let splat = &input.projection.splats[last];
         out.write(last, splat, &moments, &colors, &absolute);
     }
+    Ok(())
 }
 
 #[inline(always)]

@@ -43,9 +43,9 @@ pub fn max_weights<T: Real>(
     let level = input.projection.level.token;
     (0..input.tiles.lists.len())
         .into_par_iter()
-        .for_each_init(Vec::new, |lanes, tile| {
-            dispatch!(level, simd => weigh_tile(simd, input, &grid, mask, tile, lanes, &most));
-        });
+        .try_for_each_init(Vec::new, |lanes, tile| {
+            dispatch!(level, simd => weigh_tile(simd, input, &grid, mask, tile, lanes, &most))
+        })?;
     let mut weights = memory::with_capacity(n, "weights")?;
     most.into_par_iter()
         .map(|bits| T::from_f64(f64::from_bits(bits.into_inner())))
@@ -63,10 +63,10 @@ fn weigh_tile<S: Simd, T: Real>(
     tile: usize,
     lanes: &mut Vec<T>,
     most: &[AtomicU64],
-) {
+) -> Result<(), Error> {
     let list = &input.tiles.lists[tile];
     if list.records.is_empty() {
-        return;
+        return Ok(());
     }
     // A pixel that does not count is finished before it begins, as one outside the image.
     let mut open = [T::ZERO; TILE_PIXELS];
@@ -78,7 +78,8 @@ fn weigh_tile<S: Simd, T: Real>(
         }
     }
     lanes.clear();
-    lanes.resize(list.records.len() * width::<S, T>(), T::ZERO);
+    let len = list.records.len() * width::<S, T>();
+    memory::resize(lanes, len, T::ZERO, "weights")?;
     for block in 0..TILE_BLOCKS {
         let open = &open[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
         if open.iter().all(|x| *x == T::ZERO) {
@@ -97,6 +98,7 @@ fn weigh_tile<S: Simd, T: Real>(
             most.fetch_max(weight.to_bits(), Ordering::Relaxed);
         }
     }
+    Ok(())
 }
 
 /// Raise `largest` to the weights of the layers in one block (V vectors): for each record of the tile as many

@@ -3,6 +3,8 @@
 use super::{Decision, Grid, Layers, Pixels, RecordLanes, load, store, width};
 use crate::{
     constants::{ALPHA_MAX, BLOCK_PIXELS, TILE_PIXELS},
+    error::Error,
+    memory,
     simd::{Lanes, Real, sums::fold},
     tiles::Record,
 };
@@ -28,13 +30,25 @@ pub struct Adjoint<T> {
     pub v_colors: Vec<Pixels<T>>,
 }
 
-impl<T: Real> Adjoint<T> {
-    pub fn new(channels: usize) -> Self {
+impl<T: Real> Default for Adjoint<T> {
+    fn default() -> Self {
         Self {
             transmittance: [T::ZERO; TILE_PIXELS],
             behind: [T::ZERO; TILE_PIXELS],
-            v_colors: vec![[T::ZERO; TILE_PIXELS]; channels],
+            v_colors: Vec::new(),
         }
+    }
+}
+
+impl<T: Real> Adjoint<T> {
+    /// Make room for so many channels.
+    pub fn make_room(&mut self, channels: usize) -> Result<(), Error> {
+        memory::resize(
+            &mut self.v_colors,
+            channels,
+            [T::ZERO; TILE_PIXELS],
+            "gradients",
+        )
     }
 
     /// Set everything to 0.

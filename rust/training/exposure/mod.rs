@@ -143,9 +143,9 @@ impl<T: Light> Photograph<T> {
         mean.par_chunks_mut(across)
             .zip(photo.par_chunks_mut(across * 3))
             .enumerate()
-            .for_each_init(Places::default, |places, (row, (mean, photo))| {
-                dispatch!(token, simd => taken.take_row(simd, row, places, tables, mean, photo));
-            });
+            .try_for_each_init(Places::default, |places, (row, (mean, photo))| {
+                dispatch!(token, simd => taken.take_row(simd, row, places, tables, mean, photo))
+            })?;
         (taken.mean, taken.photo) = (mean, photo);
         Ok(taken)
     }
@@ -220,7 +220,7 @@ impl<T: Light> Photograph<T> {
         tables: &Tables,
         mean: &mut [[T; WIDE]],
         photo: &mut [T],
-    ) {
+    ) -> Result<(), Error> {
         let width = self.frame.render_size()[1];
         if self.warps.is_empty() {
             let at = (row + self.frame.margin) * width + self.frame.margin;
@@ -228,7 +228,7 @@ impl<T: Light> Photograph<T> {
         }
         let share = T::from_f64(1.0 / self.warps.len().max(1) as f64);
         for warp in &self.warps {
-            self.find(row, warp, places);
+            self.find(row, warp, places)?;
             for (place, mean) in places.of_row.iter().zip(mean.iter_mut()) {
                 let [a, b, c, d] = self.corners(place);
                 let (x, y) = (place.fx, place.fy);
@@ -245,6 +245,7 @@ impl<T: Light> Photograph<T> {
                 photo[c] = (gains[c] * mean[c]).to_value(tables);
             }
         }
+        Ok(())
     }
 
     #[inline(always)]
@@ -284,7 +285,7 @@ impl<T: Light> Photograph<T> {
                 v_light[at..at + across].copy_from_slice(&v_mean);
             }
             for (warp, v_warp) in self.warps.iter().zip(&mut v_warps) {
-                self.find(row, warp, &mut places);
+                self.find(row, warp, &mut places)?;
                 let mut sums = [T::ZERO; 12];
                 let y = T::from_f64(row as f64 + 0.5);
                 for (x, (place, v)) in places.of_row.iter().zip(&v_mean).enumerate() {
@@ -358,10 +359,10 @@ impl<T: Light> Photograph<T> {
 
     /// Where a warp takes the pixels of a row.
     #[inline(always)]
-    fn find(&self, row: usize, warp: &Warp, places: &mut Places<T>) {
+    fn find(&self, row: usize, warp: &Warp, places: &mut Places<T>) -> Result<(), Error> {
         let [height, width] = self.frame.render_size();
         let across = self.frame.size[1];
-        places.of_row.resize(across, Place::default());
+        memory::resize(&mut places.of_row, across, Place::default(), "photo")?;
         let m = warp.map(T::from_f64);
         let y = T::from_f64(row as f64 + 0.5);
         let shift = T::from_f64(self.frame.margin as f64 - 0.5);
@@ -392,6 +393,7 @@ impl<T: Light> Photograph<T> {
                 y: line - shift,
             };
         }
+        Ok(())
     }
 
     /// The rows of the render that the warps of these rows of the photo reach.

@@ -6,8 +6,12 @@
 //!
 //! No closure holds SIMD code here: one that the compiler does not inline loses the instruction set.
 
-use super::{Images, Plan, Sample, Sums};
-use crate::simd::{Lanes, Real};
+use super::{Images, NAME, Plan, Sample, Sums};
+use crate::{
+    error::Error,
+    memory,
+    simd::{Lanes, Real},
+};
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
 /// Half the window: 11 taps.
@@ -100,12 +104,17 @@ pub(super) struct Band<'a, T, Y> {
 
 impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
     /// The band of `images` from row `first` on; `memory` grows to what it needs.
-    pub fn new(images: Images<'a, T, Y>, plan: Plan, first: usize, memory: &'a mut Vec<T>) -> Self {
+    pub fn new(
+        images: Images<'a, T, Y>,
+        plan: Plan,
+        first: usize,
+        memory: &'a mut Vec<T>,
+    ) -> Result<Self, Error> {
         let (n, pad) = (images.width * images.channels, REACH * images.channels);
         let row = n.next_multiple_of(LINE) + (2 * pad).next_multiple_of(LINE);
         let size = BUFFER_ROWS * row;
         if memory.len() < size + LINE {
-            memory.resize(size + LINE, T::ZERO);
+            memory::resize(memory, size + LINE, T::ZERO, NAME)?;
         }
         let start = memory
             .as_ptr()
@@ -117,14 +126,14 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         for map in buffers.maps.as_flattened_mut() {
             map.fill(T::ZERO);
         }
-        Self {
+        Ok(Self {
             images,
             plan,
             first,
             n,
             pad,
             buffers,
-        }
+        })
     }
 
     /// Fill in the sums of each row and, if wanted, the gradient of all rows.

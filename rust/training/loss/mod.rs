@@ -18,11 +18,15 @@ mod band;
 
 use crate::{
     error::{Error, check_len},
+    memory,
     simd::{self, Level, Real},
 };
 use band::Band;
 use fearless_simd::dispatch;
 use rayon::prelude::*;
+
+/// What an error calls the buffers of this folder.
+const NAME: &str = "loss";
 
 /// A band is at least this high: below it the rows shared with its neighbours cost more than they gain.
 const MIN_BAND: usize = 32;
@@ -178,7 +182,7 @@ fn photometric_at<T: Real, Y: Sample<T>>(
         l1_scale: (1.0 - lambda) / counted.max(1) as f64,
         ssim_scale: lambda / render.len() as f64,
     };
-    let sums = run(level, images, plan, grad, scratch);
+    let sums = run(level, images, plan, grad, scratch)?;
     let l1 = sums.l1 / counted.max(1) as f64;
     if !plan.ssim {
         return Ok(Photometric {
@@ -237,7 +241,7 @@ fn ssim_at<T: Real, Y: Sample<T>>(
         l1_scale: 0.0,
         ssim_scale: 0.0,
     };
-    let sums = run(level, images, plan, None, scratch);
+    let sums = run(level, images, plan, None, scratch)?;
     Ok(1.0 - sums.dissimilarity / a.len() as f64)
 }
 
@@ -278,14 +282,14 @@ fn run<T: Real, Y: Sample<T>>(
     plan: Plan,
     mut grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
-) -> Sums {
+) -> Result<Sums, Error> {
     let (height, n) = (images.height, images.width * images.channels);
     let threads = rayon::current_num_threads();
     let wanted = if threads == 1 { 1 } else { 2 * threads }; // two each, so that a late thread can be helped
     let rows = height.div_ceil(wanted).max(MIN_BAND);
     let count = height.div_ceil(rows);
     scratch.sums.clear();
-    scratch.sums.resize(height, Sums::default());
+    memory::resize(&mut scratch.sums, height, Sums::default(), NAME)?;
     if scratch.bands.len() < count {
         scratch.bands.resize_with(count, Vec::new);
     }
@@ -297,14 +301,15 @@ fn run<T: Real, Y: Sample<T>>(
         jobs.push((i * rows, sums, buffer, grad));
     }
     jobs.into_par_iter()
-        .for_each(|(first, sums, buffer, grad)| {
-            let band = Band::new(images, plan, first, buffer);
+        .try_for_each(|(first, sums, buffer, grad)| {
+            let band = Band::new(images, plan, first, buffer)?;
             dispatch!(level.token, simd => band.run(simd, grad, sums));
-        });
-    scratch.sums.iter().fold(Sums::default(), |a, b| Sums {
+            Ok(())
+        })?;
+    Ok(scratch.sums.iter().fold(Sums::default(), |a, b| Sums {
         l1: a.l1 + b.l1,
         dissimilarity: a.dissimilarity + b.dissimilarity,
-    })
+    }))
 }
 
 #[cfg(test)]

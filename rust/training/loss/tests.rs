@@ -369,7 +369,7 @@ fn each_level_agrees_with_the_best() {
             Some(&mut grad),
             &mut LossScratch::default(),
         );
-        (sums, grad)
+        (sums.unwrap(), grad)
     };
     let best = at(levels()[0]);
     at_each_level(|level| {

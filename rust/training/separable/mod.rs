@@ -192,12 +192,12 @@ impl<T: Real> Separable<T> {
         };
         let mut out = memory::filled(T::ZERO, h * w * d, "image")?;
         let level = level.token;
-        out.par_chunks_mut(GROUP * w * d).enumerate().for_each_init(
+        out.par_chunks_mut(GROUP * w * d).enumerate().try_for_each_init(
             Buffers::default,
             |buffers, (group, out)| {
-                dispatch!(level, simd => self.group(simd, &picture, group * GROUP, d, buffers, out));
+                dispatch!(level, simd => self.group(simd, &picture, group * GROUP, d, buffers, out))
             },
-        );
+        )?;
         Ok(out)
     }
 
@@ -211,15 +211,16 @@ impl<T: Real> Separable<T> {
         channels: usize,
         buffers: &mut Buffers<T>,
         out: &mut [T],
-    ) {
+    ) -> Result<(), Error> {
         let n = Lanes::<T, S>::LEN;
         let row = self.columns.height() * channels;
         let Buffers { tall, mixed, small } = buffers;
         for out in out.chunks_mut(n * row) {
-            self.over_rows(simd, image, first, out.len() / row, tall);
+            self.over_rows(simd, image, first, out.len() / row, tall)?;
             first += n;
             let turned = if let Some(matrix) = &self.channels {
-                mixed.resize(self.columns.width * channels * n, T::ZERO);
+                let len = self.columns.width * channels * n;
+                memory::resize(mixed, len, T::ZERO, "image")?;
                 let pixels = tall.chunks_exact(image.channels * n);
                 for (pixel, mixed) in pixels.zip(mixed.chunks_exact_mut(channels * n)) {
                     for (c, mixed) in mixed.chunks_exact_mut(n).enumerate() {
@@ -231,7 +232,7 @@ impl<T: Real> Separable<T> {
             } else {
                 &*tall
             };
-            small.resize(row.max(n) * n, T::ZERO);
+            memory::resize(small, row.max(n) * n, T::ZERO, "image")?;
             let pixels = small.chunks_exact_mut(channels * n);
             for (x, pixel) in pixels.take(self.columns.height()).enumerate() {
                 let (first, weights) = self.columns.row(x);
@@ -242,6 +243,7 @@ impl<T: Real> Separable<T> {
             }
             turn_into_rows(simd, small, row, out);
         }
+        Ok(())
     }
 
     /// The products with `rows` in `tall`: the output row `first + lane` in each lane, `lanes` of them.
@@ -253,9 +255,9 @@ impl<T: Real> Separable<T> {
         first: usize,
         lanes: usize,
         tall: &mut Vec<T>,
-    ) {
+    ) -> Result<(), Error> {
         let n = Lanes::<T, S>::LEN;
-        tall.resize(image.pitch * n, T::ZERO);
+        memory::resize(tall, image.pitch * n, T::ZERO, "image")?;
         let mut block = [T::ZERO; GROUP * GROUP];
         for at in (0..image.pitch).step_by(n) {
             // The last block overlaps the one before it.
@@ -270,6 +272,7 @@ impl<T: Real> Separable<T> {
                 m.store_slice(tall);
             }
         }
+        Ok(())
     }
 }
 
