@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.measure import Training, train
-from benchmarks.places import RENDER_VIEW
+from benchmarks.patches import RENDER_VIEW
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.scene.scene import Camera, Scene, View
