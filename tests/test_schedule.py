@@ -15,7 +15,7 @@ from tiny_scene import tiny_config, tiny_scene
 import hqgs
 import hqgs.training.schedule as module
 from hqgs.scene.scene import View
-from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
 from hqgs.training.schedule import FINEST, Decisions, Plan, Schedule, learning_rates
 from hqgs.training.trainer import Trainer
 
@@ -121,6 +121,8 @@ def test_methods_of_our_own_have_them_unless_asked_not_to() -> None:
     assert [brisk(method, None) for method in ("auto", "hqgs", "3dgs", "srgs")] == [True, True, None, None]
     assert not brisk("auto", False)
     assert brisk("3dgs", True)
+    told = [tiny_config(method="hqgs", hqgs=HQGSConfig(formation=f)) for f in ("jpeg:10", "noise:9+jpeg:10")]
+    assert [Trainer(tiny_scene(), config).config.brisk for config in told] == [False, True]
 
 
 # --- the example of a method ---

@@ -106,7 +106,9 @@ class HQGS(Plain):
             what = f"1/{1 / SHARE:.0f} of each photo's pixels in the loss"
             left_out.append(LeftOut(what, "they tell when the scene would start to learn the noise"))
         known = replace(config.hqgs, formation=str(degradation))
-        config = replace(config, hqgs=known, brisk=config.brisk is not False)
+        # What a codec leaves open is learned sooner at higher rates, and nothing holds it back.
+        brisk = self.formation.kinds != {"jpeg"} if config.brisk is None else config.brisk
+        config = replace(config, hqgs=known, brisk=brisk)
         if self._cameras is not None:
             config, why = _without_held_photos(config)
             left_out += why
