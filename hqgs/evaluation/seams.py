@@ -10,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.rasterization import rasterization
+from hqgs.model.render import composited
 from hqgs.scene.scene import Camera, View
 
 NEAR = 8  # px on either side of a seam
@@ -39,19 +38,8 @@ def seams(gaussians: Gaussians, parts: NDArray[np.integer], camera: Camera) -> N
     digits = max(1, int(parts.max(initial=0)).bit_length())
     bits = parts[:, None] >> np.arange(digits) & 1
     gaussians = Gaussians(**{name: rows[: len(parts)] for name, rows in gaussians.named().items()})
-    with one_torch_thread(), torch.no_grad():
-        shares, alphas, _ = rasterization(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.activated_scales(),
-            gaussians.activated_opacities(),
-            torch.from_numpy(bits.astype(np.float32)),
-            torch.tensor(camera.viewmat[None]),
-            torch.tensor(camera.K[None]),
-            camera.width,
-            camera.height,
-        )
-    label = ((shares[0] > alphas[0] / 2).numpy() << np.arange(digits)).sum(2)
+    shares, alphas = composited(gaussians, camera, torch.from_numpy(bits.astype(np.float32)))
+    label = ((shares > alphas / 2).numpy() << np.arange(digits)).sum(2)
     size = 2 * NEAR + 1
     return maximum_filter(label, size) != minimum_filter(label, size)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs import _rust
+from hqgs.base.threads import one_torch_thread
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.scene.scene import Camera, View
 
@@ -41,6 +42,29 @@ def render_view(
         backgrounds=torch.tensor([[*background]], dtype=gaussians.means.dtype),
     )
     return images[0], meta
+
+
+def composited(
+    gaussians: Gaussians, camera: Camera, colors: Tensor, sh_degree: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """What the Gaussians look like with these colours, black behind them: [H, W, C], and alphas [H, W, 1].
+
+    `colors` [N, C], or with `sh_degree` harmonics, as `hqgs.rasterization` takes them. Without a gradient.
+    """
+    with one_torch_thread(), torch.no_grad():
+        image, alpha, _ = rasterization(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.activated_scales(),
+            gaussians.activated_opacities(),
+            colors,
+            torch.tensor(camera.viewmat[None]),
+            torch.tensor(camera.K[None]),
+            camera.width,
+            camera.height,
+            sh_degree=sh_degree,
+        )
+    return image[0], alpha[0]
 
 
 @torch.no_grad()

@@ -87,9 +87,13 @@ def in_picture(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     return z, seen
 
 
+def resized_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with pixels of another size: the same picture in width x height px."""
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    return Camera(width, height, K, camera.viewmat)
+
+
 def resized(view: View, width: int, height: int) -> View:
     """The view with photo, mask and camera at a smaller size, px."""
-    camera = view.camera
     image, mask = area_downscale(view.image, view.mask, width, height)
-    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
-    return View(view.name, Camera(width, height, K, camera.viewmat), image, mask)
+    return View(view.name, resized_camera(view.camera, width, height), image, mask)

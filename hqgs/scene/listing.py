@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from hqgs.base.files import existing_folder
 from hqgs.base.text import some
-from hqgs.scene.capture import Capture, Photo, find_mask, no_points, photo_folder, viewmat_from_pose
-from hqgs.scene.formats.colmap import find_models, match_files
-from hqgs.scene.formats.colmap_stream import StoredImage, read_cameras, read_images, stored_count
+from hqgs.scene.capture import Capture, Photo, find_mask, no_points, photo_folder
+from hqgs.scene.formats.colmap import find_models, match_files, pose_viewmat
+from hqgs.scene.formats.colmap_stream import read_cameras, read_images, stored_count
 from hqgs.scene.load import bounded
 from hqgs.scene.scene import View
 from hqgs.scene.views import load_views
@@ -80,7 +80,9 @@ def listed(root: Path, model: Path, downscale: float = 1.0) -> Listed:
                 f"{model}: photo {image.name!r} has the camera {image.camera_id}, which it lacks"
             )
         camera = cameras[image.camera_id]
-        photos.append(Photo(image.name, folder, camera, _viewmat(image)))
+        rotation = pycolmap.Rotation3d(np.roll(image.quat, -1))  # which wants w last
+        viewmat = pose_viewmat(pycolmap.Rigid3d(rotation, image.shift), image.name)
+        photos.append(Photo(image.name, folder, camera, viewmat))
         shown = image.pixels["point"][image.pixels["point"] >= 0]
         samples.append(shown[np.linspace(0, len(shown) - 1, min(SAMPLE, len(shown))).astype(int)])
         rows.append((image.image_id, image.camera_id))
@@ -124,20 +126,3 @@ def some_views(
     photos = [photo for photo in capture.photos if photo.name in set(names)]
     for first in range(0, len(photos), AT_ONCE):
         yield from load_views(photos[first : first + AT_ONCE], capture.downscale)[0]
-
-
-def _viewmat(image: StoredImage) -> NDArray[np.float64]:
-    norm = float(np.linalg.norm(image.quat))
-    if not abs(norm - 1) <= 1e-2:
-        raise ValueError(
-            f"photo {image.name!r}: its quaternion (w, x, y, z) is not of length 1: {image.quat.tolist()}"
-        )
-    w, x, y, z = image.quat / norm
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return viewmat_from_pose(np.c_[R, image.shift], image.name, camera_to_world=False)

@@ -17,7 +17,7 @@ from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_fol
 from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
-from hqgs.scene.formats.part_json import read_part
+from hqgs.scene.formats.part_json import Part, read_part
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
@@ -85,7 +85,7 @@ def load_scene(
     notes = list(capture.notes)
     if part is not None:
         notes.insert(0, f"{part}; the photos held out are those of the whole")
-    test_names = held_out_names(root, capture, test_every, notes)
+    test_names = held_out_names(root, capture, test_every, notes, part or degraded)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
     views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
@@ -263,12 +263,12 @@ def _tracks(capture: Capture, views: list[View]) -> Tracks | None:
     return replace(capture.tracks, error=capture.tracks.error * float(np.mean(scales)))
 
 
-def held_out_names(root: Path, capture: Capture, test_every: int, notes: list[str]) -> frozenset[str]:
-    """Names of the photos to hold out; says in `notes` where the scene itself decides."""
-    if (part := read_part(root)) is not None:
-        return frozenset(part.held_out)
-    if (degraded := read_degraded_folder(root)) is not None:
-        return frozenset(degraded.held_out)
+def held_out_names(
+    root: Path, capture: Capture, test_every: int, notes: list[str], named: Part | DegradedFolder | None
+) -> frozenset[str]:
+    """Names of the photos to hold out, those of `named` if given; `notes` hears where the scene decides."""
+    if named is not None:
+        return frozenset(named.held_out)
     if capture.test_names is not None:
         return capture.test_names
     hold = hold_marker(root)

@@ -14,6 +14,7 @@ from hqgs.base.files import check_new_folder, existing_folder, new_folder, write
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.scene.capture import Photo
 from hqgs.scene.cells import Cells, cell_of, cut_space, sight_shares
+from hqgs.scene.formats.degradation_json import read_degraded_folder
 from hqgs.scene.formats.part_json import VERSION, Part, keep_part, read_part
 from hqgs.scene.geometry import project
 from hqgs.scene.listing import Listed, binary_model, listed
@@ -93,7 +94,7 @@ def split(
     with binary_model(root) as model:
         told(Stage("photos listed", 0, 0))
         scene = listed(root, model)
-        held_out = held_out_names(root, scene.capture, test_every, [])
+        held_out = held_out_names(root, scene.capture, test_every, [], read_degraded_folder(root))
         names = [photo.name for photo in scene.capture.photos]
         train = np.array([name not in held_out for name in names])
         if parts > train.sum():

@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import SH_C0
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.rasterization import rasterization
+from hqgs.model.render import composited
+from hqgs.scene.geometry import resized_camera, unproject
 from hqgs.scene.scene import Camera
 
 DIRECTIONS = 1 << 15  # about a degree apart
@@ -70,32 +70,19 @@ class Dome:
 def _small(camera: Camera) -> Camera:
     factor = min(1.0, SIDE / max(camera.width, camera.height))
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
-    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
-    return Camera(width, height, K, camera.viewmat)
+    return resized_camera(camera, width, height)
 
 
 def _rays(camera: Camera) -> NDArray[np.float64]:
     """The direction of each pixel, [H W, 3], unit, world."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    K, R = camera.K, camera.viewmat[:3, :3]
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
-    rays = rays.reshape(-1, 3) @ R
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    rays = unproject(camera, pixels, np.ones(len(pixels))) - camera.center
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def _render(gaussians: Gaussians, camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Colours [H W, 3] in front of black, and alphas [H W]."""
-    with one_torch_thread(), torch.no_grad():
-        image, alpha, _ = rasterization(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.activated_scales(),
-            gaussians.activated_opacities(),
-            torch.cat([gaussians.sh0, gaussians.shN], dim=1),
-            torch.tensor(camera.viewmat[None]),
-            torch.tensor(camera.K[None]),
-            camera.width,
-            camera.height,
-            sh_degree=gaussians.sh_degree,
-        )
-    return image[0].double().numpy().reshape(-1, 3), alpha[0].double().numpy().reshape(-1)
+    harmonics = torch.cat([gaussians.sh0, gaussians.shN], dim=1)
+    image, alpha = composited(gaussians, camera, harmonics, gaussians.sh_degree)
+    return image.double().numpy().reshape(-1, 3), alpha.double().numpy().reshape(-1)

@@ -18,6 +18,7 @@ from hqgs.evaluation.seams import SeamRow, measure_seams
 from hqgs.model.constants import SH_C0
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.files import format_of, scene_file
+from hqgs.model.formats.rows import pick
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.scene.camera_files import load_cameras
@@ -80,7 +81,7 @@ def merge(runs: Sequence[str | Path], out: str | Path) -> Merged:
     for (run, part), gain in zip(given, gains, strict=True):
         whole = Gaussians.load(run).arrays()
         own = cell_of(part.cells, whole["means"]) == part.part
-        arrays.append(brighter(_rows(whole, own), gain))
+        arrays.append(brighter(pick(whole, own), gain))
         part_of.append(np.full(int(own.sum()), part.part, np.uint16))
         facts.append(MergedPart(run, part.part + 1, int(own.sum()), int((~own).sum()), np.exp(gain).tolist()))
     model = _joined(arrays)
@@ -93,17 +94,6 @@ def merge(runs: Sequence[str | Path], out: str | Path) -> Merged:
     both = {name: torch.cat([tensor, sky.named()[name]]) for name, tensor in model.named().items()}
     model = Gaussians(**both)
     return Merged(out, model, np.concatenate(part_of), facts, len(sky), model.save(out))
-
-
-def _rows(arrays: Arrays, rows: NDArray[np.bool_]) -> Arrays:
-    return {
-        "means": arrays["means"][rows],
-        "scales": arrays["scales"][rows],
-        "quats": arrays["quats"][rows],
-        "opacities": arrays["opacities"][rows],
-        "sh0": arrays["sh0"][rows],
-        "shN": arrays["shN"][rows],
-    }
 
 
 def _joined(arrays: list[Arrays]) -> Gaussians:

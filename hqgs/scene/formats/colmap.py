@@ -79,7 +79,8 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     for name, image_id in by_name:
         image = model.images[image_id]
         camera = model.cameras[image.camera_id]
-        photos.append(Photo(name, files[name], camera, _viewmat(image), find_mask(root, name)))
+        viewmat = pose_viewmat(image.cam_from_world(), name)
+        photos.append(Photo(name, files[name], camera, viewmat, find_mask(root, name)))
     used = set(files.values())
     if len(used) < len(files):
         shared = [n for n, p in files.items() if list(files.values()).count(p) > 1]
@@ -139,14 +140,12 @@ def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [image for image in model.images.values() if image.has_pose]
 
 
-def _viewmat(image: pycolmap.Image) -> NDArray[np.float64]:
-    pose = image.cam_from_world()
-    viewmat = viewmat_from_pose(pose.matrix(), image.name, camera_to_world=False)
+def pose_viewmat(pose: pycolmap.Rigid3d, name: str) -> NDArray[np.float64]:
+    """World to camera, [4, 4], of the photo of that name. ValueError for what is no pose."""
+    viewmat = viewmat_from_pose(pose.matrix(), name, camera_to_world=False)
     quat = pose.rotation.quat
     if abs(np.linalg.norm(quat) - 1) > 1e-2:  # the matrix does not show it: that of a zero quaternion is I
-        raise ValueError(
-            f"photo {image.name!r}: its quaternion (x, y, z, w) is not of length 1: {quat.tolist()}"
-        )
+        raise ValueError(f"photo {name!r}: its quaternion (x, y, z, w) is not of length 1: {quat.tolist()}")
     return viewmat
 
 
