@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hqgs import get_num_threads
 from hqgs.base import machine
 from hqgs.evaluation import report
-from hqgs.evaluation.held_out import RenderedView
-from hqgs.evaluation.metrics import METRICS
+from hqgs.evaluation.held_out import RenderedView, measured
+from hqgs.evaluation.metrics import METRICS, evaluate_view
 from hqgs.evaluation.report import RunResult, read_report, write_report
 
 HEIGHT, WIDTH = 40, 60
@@ -265,6 +266,29 @@ def test_a_field_that_is_no_json_is_named_before_work_starts(
     with pytest.raises(ValueError, match=message):
         write_report(tmp_path / "out", result_of(view_of("a"), **changes))
     assert not (tmp_path / "out").exists()
+
+
+def test_each_view_is_rendered_once_and_few_are_held() -> None:
+    views = [view_of(f"{k}", 0.01 * k + 0.01) for k in range(12)]
+    asked: list[int] = []
+    drawn: list[int] = []
+
+    class Rendered(list[RenderedView]):
+        def __getitem__(self, number: Any) -> Any:
+            assert len(asked) - len(drawn) <= get_num_threads() + 1
+            asked.append(number)
+            return super().__getitem__(number)
+
+    found = measured(Rendered(views), lambda number, view, _: drawn.append(int(view.name) * (number + 1)))
+    assert asked == list(range(12))
+    assert sorted(drawn) == [k * (k + 1) for k in range(12)]
+    assert found == [evaluate_view(view.render, view.photo) for view in views]
+
+    def fails(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        measured(views, fails)
 
 
 def test_a_bad_view_is_named(tmp_path: Path) -> None:

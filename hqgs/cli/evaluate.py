@@ -42,8 +42,8 @@ def run(options: Evaluate) -> int:
             raise ValueError(f"{options.source} is a file: --scene names the photos to measure it with")
         if options.scene is not None:
             ready(options.scene)
-        from hqgs.evaluation.held_out import held_out_renders  # here: they load torch
-        from hqgs.evaluation.metrics import METRICS, evaluate_view, mean_metrics
+        from hqgs.evaluation.held_out import held_out_renders, measured  # here: they load torch
+        from hqgs.evaluation.metrics import METRICS, mean_metrics
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.source import load, load_again
 
@@ -59,11 +59,11 @@ def run(options: Evaluate) -> int:
         if not scene.test:
             raise ValueError(f"{scene.name} has no held-out photo to measure with")
         views = held_out_renders(scene, Gaussians.load(source))
-        measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
-        mean = mean_metrics(measured)
+        each = measured(views)
+        mean = mean_metrics(each)
         if options.out is not None:
-            each = {name: asdict(one) for name, one in zip(views.names, measured, strict=True)}
-            write_json(options.out, {"mean": asdict(mean), "views": each})
+            named = {name: asdict(one) for name, one in zip(views.names, each, strict=True)}
+            write_json(options.out, {"mean": asdict(mean), "views": named})
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
@@ -74,7 +74,7 @@ def run(options: Evaluate) -> int:
             name,
             *(f"{getattr(one, metric):.4g}" if getattr(one, metric) is not None else "-" for metric in shown),
         ]
-        for name, one in [*zip(views.names, measured, strict=True), ("mean", mean)]
+        for name, one in [*zip(views.names, each, strict=True), ("mean", mean)]
     ]
     print(markdown_table(f"{source} on the held-out photos of {scene.name}", ["photo", *shown], rows))
     word, why = verdict(mean.psnr)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, overload
 
@@ -10,10 +12,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hqgs._rust import get_num_threads
 from hqgs.base.machine import peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.metrics import psnr, ssim
+from hqgs.evaluation.metrics import ViewMetrics, evaluate_view, psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
@@ -115,6 +118,37 @@ def history_entry(
     if len(views) < of:
         entry["views"] = len(views)
     return entry
+
+
+def measured(
+    views: Sequence[RenderedView], then: Callable[[int, RenderedView, ViewMetrics], None] | None = None
+) -> list[ViewMetrics]:
+    """All metrics of each view. `then` gets each view's number, the view and its metrics.
+
+    One view after the other is rendered, once; what is done with it runs beside that, on as many threads as
+    the rasterizer has, for as many views. Raises ValueError, which names the view, where its render, photo
+    and mask do not fit; and what `then` raises.
+    """
+
+    def one(number: int, view: RenderedView) -> ViewMetrics:
+        try:
+            metrics = evaluate_view(view.render, view.photo, view.mask)
+        except ValueError as error:
+            raise ValueError(f"view {view.name!r}: {error}") from error
+        if then is not None:
+            then(number, view, metrics)
+        return metrics
+
+    threads = get_num_threads()
+    waiting: deque[Future[ViewMetrics]] = deque()
+    done: list[ViewMetrics] = []
+    with one_torch_thread(), ThreadPoolExecutor(threads) as pool:
+        for number in range(len(views)):
+            view = views[number]
+            if len(waiting) == threads:  # no more renders than that are held
+                done.append(waiting.popleft().result())
+            waiting.append(pool.submit(one, number, view))
+        return done + [future.result() for future in waiting]
 
 
 def names_of(views: Sequence[RenderedView]) -> list[str]:
