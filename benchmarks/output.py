@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import base64
-import io
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import reduce
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader
+from markdown_it import MarkdownIt
 
 import hqgs
 from hqgs.base.files import atomic_path, write_json, write_text
@@ -102,7 +102,7 @@ def write_results(out: Path, name: str, command: str, report: Report, page: Path
             figure.savefig(tmp)
     write_json(out / f"{stem}.json", facts)
     if page is not None:
-        write_page(page, facts, report)
+        write_page(page, facts, report, pictures)
     return [out / f"{stem}.json", *pictures, *([] if page is None else [page])]
 
 
@@ -148,33 +148,20 @@ def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, S
 TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
-def write_page(path: Path, facts: dict[str, Any], report: Report) -> None:
+def write_page(path: Path, facts: dict[str, Any], report: Report, pictures: Iterable[Path]) -> None:
     """Write the page atomically. `facts`: what the JSON file holds. OSError where it cannot be written."""
     environment = Environment(
         loader=FileSystemLoader(TEMPLATE.parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    charts = {}
-    for what, figure in report.figures.items():
-        png = io.BytesIO()
-        figure.savefig(png, format="png")
-        charts[what.replace("_", " ")] = f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}"
+    charts = {
+        what.replace("_", " "): base64.b64encode(picture.read_bytes()).decode()
+        for what, picture in zip(report.figures, pictures, strict=True)
+    }
     page = environment.get_template(TEMPLATE.name).render(
         title=f"hqgs benchmark {facts['benchmark']} {report.part}".rstrip(),
         facts=facts,
-        blocks=[block for text in report.tables for block in _blocks(text)],
+        tables=MarkdownIt("commonmark", {"html": False}).enable("table").render("\n\n".join(report.tables)),
         charts=charts,
         settings=json.dumps({name: facts[name] for name in ("settings", "versions")}, indent=1),
     )
     write_text(path, page)
-
-
-def _blocks(text: str) -> Iterator[tuple[str, Any]]:
-    """Of Markdown as the benchmarks print it: titles, tables as rows of cells, and other text."""
-    for block in text.split("\n\n"):
-        if block.startswith("**") and block.endswith("**"):
-            yield "title", block.strip("*")
-        elif block.startswith("|"):
-            rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in block.splitlines()]
-            yield "table", [rows[0], *rows[2:]]
-        else:
-            yield "text", block

@@ -1,9 +1,8 @@
-"""Charts of the quality benchmark: error against time, gains; and picture sheets."""
+"""Pictures of the quality benchmark: a chart of the gains, and sheets of renders."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from pandas import DataFrame
 from PIL import Image
 
-from benchmarks.charts import LEGEND, draw, panels, title
+from benchmarks.charts import panels, title
 from benchmarks.quality.cell import render_path
 from benchmarks.scenes import degraded_view
 from benchmarks.study import Store
@@ -24,32 +23,7 @@ from hqgs.photos.pixels import to_uint8
 from hqgs.photos.sheet import printable, sheet
 from hqgs.scene.scene import Scene
 
-ACROSS = 3  # panels in a row
 Uint8 = NDArray[np.uint8]
-
-
-def time_chart(frame: DataFrame, what: str) -> Figure:
-    """Held-out PSNR against training seconds, a panel for each degradation, a curve for each method.
-
-    A point is the mean over scenes and seeds of PSNR and of time, after the same number of iterations.
-    """
-    parts = frame.groupby("degradation", sort=False)
-    across = min(ACROSS, len(parts))
-    down = -(-len(parts) // across)
-    figure, grid = panels(1.2 + 3.6 * across, 0.9 + 2.8 * down, down, across)
-    for axes in grid[len(parts) :]:
-        axes.set_visible(False)
-    for axes, (kind, part) in zip(grid, parts, strict=False):
-        for k, (label, histories) in enumerate(part.groupby("row", sort=False)["history"]):
-            points = [DataFrame(history)[["seconds", "psnr"]].astype(float) for history in histories]
-            draw(axes, reduce(DataFrame.add, points) / len(points), k, str(label))
-        title(axes, str(kind))
-        axes.set_xlim(left=0)
-    grid[0].legend(**LEGEND)
-    figure.suptitle(what, fontsize=11, x=0.01, ha="left", parse_math=False)
-    figure.supxlabel("training time (s)", fontsize=10)
-    figure.supylabel("held-out PSNR (dB)", fontsize=10)
-    return figure
 
 
 def gain_chart(frame: DataFrame, baseline: str) -> Figure:

@@ -13,7 +13,7 @@ from benchmarks.output import Benchmark, Report
 from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
 from benchmarks.quality.cell import edge_robustness, run_cell
-from benchmarks.quality.charts import gain_chart, time_chart, write_sheet
+from benchmarks.quality.charts import gain_chart, write_sheet
 from benchmarks.quality.rivals import RivalRow
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
@@ -94,7 +94,6 @@ class Quality:
         report.tables += [tables.formations(frame, label) for label in labels if label in guessing]
         if self.args.sfm:
             report.tables.append(tables.reconstructions(frame))
-        report.figures["psnr_vs_time"] = time_chart(frame, what)
         for metric, why in sorted({item for reasons in frame["reasons"] for item in reasons.items()}):
             report.leave_out(metric, why)
 
