@@ -449,6 +449,7 @@ def test_protocols() -> None:
     sizes = [cell.config.hqgs.paper.esfg for cell in grid(PROTOCOLS["downsampling"], [scene])[1:]]
     assert sizes == [ESFGConfig(downscale=k) for k in (1, 2, 4)]
     assert [cell.config.hqgs.first_points for cell in grid(PROTOCOLS["points"], [scene])[:2]] == [0.0, 1.0]
+    assert [cell.config.batch for cell in grid(PROTOCOLS["ranks"], [scene])] == [1, 2, 4, 8]
     assert grid(PROTOCOLS["long"], [scene])[0].config.densify.stop == 15_000
     for cell in standard:
         config = TrainConfig(3_000, cell.row.label, cell.seed, leave_out=()).scaled()
