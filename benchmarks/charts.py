@@ -18,12 +18,6 @@ def color(k: int) -> str:
     return COLORS[k % len(COLORS)]
 
 
-def draw(axes: Axes, points: Any, k: int, label: str) -> None:
-    """The k-th curve: points are a frame of two columns, without those that lack a number."""
-    x, y = points.dropna().to_numpy().T
-    axes.plot(x, y, color=color(k), label=label, marker="o", markersize=3, lw=1.5)
-
-
 def panels(
     width: float, height: float, down: int = 1, across: int = 1, **shared: Any
 ) -> tuple[Figure, list[Axes]]:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from benchmarks.charts import LEGEND, draw, panels
+from benchmarks.charts import LEGEND, color, panels
 from benchmarks.data import read_toml
 from benchmarks.measure import Run, Training
 from benchmarks.output import Benchmark, Report, table
@@ -173,7 +173,8 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
     what = {"psnr": "held-out PSNR (dB)", "gaussians": "Gaussians", "peak_rss_mb": "peak memory (MB)"}
     for axes, (name, label) in zip(grid, what.items(), strict=True):
         for k, result in enumerate(results):
-            draw(axes, DataFrame(result["records"], columns=["iteration", name]), k, result["case"])
+            points = DataFrame(result["records"], columns=["iteration", name]).dropna()
+            axes.plot(*points.to_numpy().T, "o-", color=color(k), label=result["case"], ms=3, lw=1.5)
         axes.set_ylabel(label)
     if results:
         grid[0].legend(**LEGEND)

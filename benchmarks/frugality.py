@@ -48,31 +48,31 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
 
 
 def compared(runs: DataFrame) -> DataFrame:
-    """Each run beside that of the same scene and seed which left nothing out, with its shares and gains."""
-    pairs = paired(runs, NONE)
+    """The other runs beside those of the same scene and seed which left nothing out: shares and gains."""
+    pairs = paired(runs, NONE).loc[lambda pairs: pairs["row"] != NONE]
     shares = {f"{name}_share": pairs[name] / pairs[f"{name}_base"] for name in SHARES}
     gains = {f"{name}_gain": pairs[name] - pairs[f"{name}_base"] for name in ("psnr", "ssim")}
     return pairs.assign(**shares, **gains)
 
 
-def against_none(runs: DataFrame, row: str) -> dict[str, Any] | None:
-    """Means over scenes and seeds of a row's ratios and differences to "none"; None where no run has both.
+def against_none(runs: DataFrame) -> dict[str, dict[str, Any]]:
+    """By row the means over scenes and seeds of its ratios and differences to "none", where runs have both.
 
     The worst scene is the one whose mean over the seeds is lowest.
     """
-    pairs = compared(runs).loc[lambda pairs: pairs["row"] == row]
-    if not len(pairs):
-        return None
-    gains = pairs.groupby("scene")["psnr_gain"].mean()
-    return {
-        "scenes": len(gains),
-        "runs": len(pairs),
-        **{name: float(pairs[f"{name}_share"].mean()) for name in SHARES},
-        "psnr": float(gains.mean()),
-        "worst_psnr": float(gains.min()),
-        "ssim": float(pairs["ssim_gain"].mean()),
-        "decision_share": float((pairs["decision_seconds"] / pairs["seconds"]).mean()),
-    }
+    found = {}
+    for row, pairs in compared(runs).groupby("row", sort=False):
+        gains: Any = pairs.groupby("scene")["psnr_gain"].mean()
+        found[str(row)] = {
+            "scenes": len(gains),
+            "runs": len(pairs),
+            **{name: float(pairs[f"{name}_share"].mean()) for name in SHARES},
+            "psnr": float(gains.mean()),
+            "worst_psnr": float(gains.min()),
+            "ssim": float(pairs["ssim_gain"].mean()),
+            "decision_share": float((pairs["decision_seconds"] / pairs["seconds"]).mean()),
+        }
+    return found
 
 
 def verdict(summary: dict[str, Any]) -> dict[str, bool]:
@@ -105,7 +105,7 @@ def runs_table(runs: DataFrame, protocol: Protocol) -> str:
 def chart(runs: DataFrame) -> Figure:
     """PSNR gained against the share of the CPU time, and against the share of the bytes; a mark a run."""
     figure, grid = panels(9, 4.2, 1, 2, sharey=True)
-    parts = compared(runs).loc[lambda pairs: pairs["row"] != NONE].groupby("row", sort=False)
+    parts = compared(runs).groupby("row", sort=False)
     for axes, (name, label) in zip(grid, (("cpu_seconds", "CPU time"), ("bytes", "bytes")), strict=True):
         for k, (row, pairs) in enumerate(parts):
             size = 60 if row == AUTO else 30
@@ -125,9 +125,7 @@ def run(args: argparse.Namespace) -> Report:
     study, report, runs = finished(args, PROTOCOLS, run_cell)
     if not len(runs):
         return report
-    labels = [label for label in study.protocol.labels if label != NONE]
-    summaries = {row: s for row in labels if (s := against_none(runs, row)) is not None}
-    report.results["against_none"] = summaries
+    summaries = report.results["against_none"] = against_none(runs)
     report.tables.append(runs_table(runs, study.protocol))
     if summaries:
         title = "Against none: mean differences and ratios over the scenes"

@@ -13,7 +13,6 @@ import numpy as np
 from pandas import DataFrame, Series, concat
 
 from benchmarks.data import means, paired, read_toml, records
-from benchmarks.measure import Run
 from benchmarks.output import NOTHING, number, table
 from hqgs.base.text import markdown_table
 from hqgs.evaluation.metrics import METRICS
@@ -150,18 +149,16 @@ def reconstructions(frame: DataFrame) -> str:
     return table(title, lines, LABEL | COLUMNS["sfm"])
 
 
-def frame_of(runs: Sequence[Run], baseline: str | None = None) -> DataFrame:
+def frame_of(runs: DataFrame, baseline: str | None = None) -> DataFrame:
     """The runs with the numbers of the tables beside what they hold, NaN where there is none.
 
     Gains are over the run of the `baseline` in the same group; without one there are none.
     """
-    frame = DataFrame(runs)
-    frame = frame.join(
-        DataFrame([[run["metrics"].get(name) for name in METRICS] for run in runs], columns=METRICS)
-    )
+    frame = runs.reset_index(drop=True)
+    frame = frame.join(DataFrame(frame["metrics"].tolist(), columns=METRICS))
     frame["ms_per_step"] = 1_000 * frame["seconds"] / frame["iterations"]
     for name in ("edge", "flat"):
-        frame[f"{name}_density"] = [run["regions"][name]["density"] for run in runs]
+        frame[f"{name}_density"] = [regions[name]["density"] for regions in frame["regions"]]
     frame = frame.astype(dict.fromkeys([*METRICS, *COSTS], float))
     if baseline is not None:
         pairs = paired(frame, baseline, GROUP)

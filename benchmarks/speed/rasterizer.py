@@ -119,7 +119,7 @@ def count_work(case: RasterPass, pixels: int) -> dict[str, Any]:
 def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
     """Time and work of each of the inputs."""
     passes = [RasterPass(x) for x in inputs]
-    measured = interleaved({str(k): warmed(case) for k, case in enumerate(passes)}, repeats)
+    measured = interleaved({k: warmed(case) for k, case in enumerate(passes)}, repeats)
     rows = []
     for x, case, rounds in zip(inputs, passes, measured.values(), strict=True):
         work = count_work(case, x.width * x.height)
@@ -141,15 +141,10 @@ def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]
     return rows
 
 
-def thread_counts() -> list[int]:
-    """1, 2, 4, ... up to the number of threads in use, which is the last."""
-    most = hqgs.get_num_threads()
-    return [*(1 << k for k in range(most.bit_length()) if 1 << k < most), most]
-
-
 def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> list[dict[str, Any]]:
-    """Each case with each number of threads; the speed-up is that of the same round."""
-    threads = thread_counts()
+    """Each case with 1, 2, 4, ... threads and with all; the speed-up is that of the same round."""
+    most = hqgs.get_num_threads()
+    counts = sorted({most, *(1 << k for k in range(most.bit_length()))})
 
     def with_threads(case: Callable[[], Seconds], count: int) -> Callable[[], Seconds]:
         def call() -> Seconds:
@@ -158,13 +153,12 @@ def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> li
 
         return call
 
-    jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
+    jobs = {(name, count): with_threads(case, count) for name, case in cases.items() for count in counts}
     measured, rows = interleaved(jobs, repeats), []
-    for key, rounds in measured.items():
-        name, count = key.rsplit("/", 1)
-        line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}
-        speedup = median_ratio(measured[f"{name}/1"], rounds)
-        rows.append(line | {"speedup": speedup, "share": speedup / int(count)})
+    for (name, count), rounds in measured.items():
+        line = {"case": name, "threads": count, "seconds": rounds["total"].median()}
+        speedup = median_ratio(measured[name, 1], rounds)
+        rows.append(line | {"speedup": speedup, "share": speedup / count})
     return rows
 
 
@@ -188,7 +182,7 @@ def measure_scaling(
 
 def _curve(passes: dict[int, RasterPass], repeats: int) -> dict[str, Any]:
     """Seconds of passes by what they grow with."""
-    measured = interleaved({str(x): warmed(case) for x, case in passes.items()}, repeats)
+    measured = interleaved({x: warmed(case) for x, case in passes.items()}, repeats)
     rows = [whole(rounds) for rounds in measured.values()]
     curve = {name: [row[name] for row in rows] for name in ("seconds", "seconds_quartiles")}
     ends = pairwise(zip(passes, curve["seconds"], strict=True))

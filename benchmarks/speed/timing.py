@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -15,15 +15,16 @@ from pandas import DataFrame
 
 import hqgs
 
+Case = TypeVar("Case", bound=Hashable)
 Seconds = dict[str, float]  # by stage; "total" is the whole, and what no stage holds is "rest"
 
 
-def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dict[str, DataFrame]:
+def interleaved(cases: Mapping[Case, Callable[[], Seconds]], repeats: int) -> dict[Case, DataFrame]:
     """Call each case once to warm up, then all of them in each of `repeats` rounds, which are the rows.
 
     What disturbs the machine for a while then disturbs all cases alike. Every other round goes backwards.
     """
-    measured: dict[str, list[Seconds]] = {name: [] for name in cases}
+    measured: dict[Case, list[Seconds]] = {name: [] for name in cases}
     for case in cases.values():
         case()
     collecting = gc.isenabled()

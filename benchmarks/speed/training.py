@@ -147,15 +147,14 @@ def measure_steps(
 
     `targets`: milliseconds by method and number of Gaussians.
     """
-    cases: dict[str, Callable[[], Seconds]] = {}
-    for name, trainer in trainers.items():
-        cases |= {f"{name}/whole": whole_step(trainer), f"{name}/parts": step_by_parts(trainer)}
+    ways = {"whole": whole_step, "parts": step_by_parts}
+    cases = {(name, way): time(t) for name, t in trainers.items() for way, time in ways.items()}
     measured = interleaved(cases, repeats)
     first, rows = next(iter(measured.values())), []
     for name, trainer in trainers.items():
         camera = trainer.scene.train[0].camera
         method, n = trainer.config.method, len(trainer.gaussians)
-        rounds, parts = measured[f"{name}/whole"], measured[f"{name}/parts"]
+        rounds, parts = measured[name, "whole"], measured[name, "parts"]
         stages = parts.drop(columns="total").median()
         rows.append(
             {"case": name, "method": method, "gaussians": n, "width": camera.width, "height": camera.height}

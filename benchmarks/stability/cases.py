@@ -18,6 +18,7 @@ from hqgs.base.typed import build
 
 PIXELS: tuple[Pixel, ...] = ((4, 5), (4, 6), (3, 5), (6, 8), (0, 0), (8, 11))
 FILE = Path(__file__).with_suffix(".toml")
+BASE = read_toml(FILE)["base"]
 
 
 @dataclass(frozen=True)
@@ -45,17 +46,15 @@ class Case:
         return self.culled_f32 if dtype == "f32" and self.culled_f32 is not None else self.culled
 
 
-BASE = OracleScene(
-    **{
-        name: np.array(value) if isinstance(value, list) else value
-        for name, value in read_toml(FILE)["base"].items()
-    }
-)
+def arrays(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a scene as cases.toml has them: its lists become arrays, `K` from focal length, cx, cy."""
+    made = {name: np.array(value) if isinstance(value, list) else value for name, value in values.items()}
+    return made | ({"K": _intrinsics(*values["K"])} if "K" in values else {})
 
 
 def scene(**changes: Any) -> OracleScene:
     """Two ordinary Gaussians at depths 5 and 6 before a 12 x 9 camera of focal length 20 at the origin."""
-    return replace(BASE, **changes)
+    return OracleScene(**arrays(BASE) | changes)
 
 
 def changed(
@@ -70,9 +69,7 @@ def changed(
     """The ordinary scene with the changes of cases.toml, in the order of the parameters."""
     s = scene() if stack is None else stacked(**stack)
     s = replace(s, **{name: getattr(s, name)[:keep] for name in GROUPS})
-    for name, value in (all or {}).items():
-        value = _intrinsics(*value) if name == "K" else np.array(value) if isinstance(value, list) else value
-        s = replace(s, **{name: value})
+    s = replace(s, **arrays(all or {}))
     if sh is not None:
         s = replace(s, colors=harmonics()[sh])
     for name, value in (first or {}).items():
