@@ -1,9 +1,9 @@
-"""One training run of the quality benchmark: what is measured of it, and which renders are kept."""
+"""One training run of the quality benchmark: what is measured of it, which renders are kept and shown."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,17 @@ from PIL import Image
 
 from benchmarks.measure import Run, Training, train
 from benchmarks.quality.rivals import RIVALS
-from benchmarks.scenes import degraded
+from benchmarks.scenes import degraded, degraded_view
 from benchmarks.study import Cell, Store, Study
 from hqgs._rust import NEAR_PLANE
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import METRICS, evaluate_view, mean_metrics, psnr
+from hqgs.evaluation.report import AMPLIFICATION, MASKED
 from hqgs.model.render import render_view
 from hqgs.photos.edges import edge_magnitude
 from hqgs.photos.pixels import to_uint8
+from hqgs.photos.sheet import printable, sheet
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import AUTO
@@ -70,6 +72,45 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
         "sfm": None if photos.sfm is None else asdict(photos.sfm),
         "peak_rss_mb": done.peak_rss_mb(),  # of the whole cell
     }
+
+
+def write_sheet(
+    path: Path, store: Store, clean: Scene, runs: Mapping[str, dict[str, Any]], number: int
+) -> bool:
+    """Write the sheet of one held-out view; False where a render was not kept.
+
+    Above: photo, degraded photo, the render of each run. Below each of those after the first: its difference
+    from the photo. No run has seen the degraded photo; it shows what happened to the training photos.
+    """
+    files = {label: render_path(store, run["key"], number) for label, run in runs.items()}
+    if not all(file.is_file() for file in files.values()):
+        return False
+    first = next(iter(runs.values()))
+    view = clean.test[number]
+    bad = degraded_view(clean, view, first["degradation"], first["seed"]).image
+    photo = _uint8(view.image)
+    above = [(printable(f"photo {view.name}"), photo)]
+    above.append((_caption(first["degradation"], psnr(bad, photo, view.mask)), _uint8(bad)))
+    for label, run in runs.items():
+        with Image.open(files[label]) as image:
+            above.append((_caption(label, run["views"][number]["psnr"]), np.asarray(image.convert("RGB"))))
+    below = [("", np.full_like(photo, 255))]
+    for _, panel in above[1:]:
+        error = np.minimum(AMPLIFICATION * np.abs(panel.astype(np.int64) - photo), 255).astype(np.uint8)
+        if view.mask is not None:
+            error[~view.mask] = MASKED
+        below.append((f"difference x{AMPLIFICATION}", error))
+    with atomic_path(path) as tmp:
+        sheet([above, below]).save(tmp)
+    return True
+
+
+def _caption(label: str, value: float | None) -> str:
+    return printable(label if value is None else f"{label}  {value:.2f} dB")
+
+
+def _uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
+    return image if image.dtype == np.uint8 else to_uint8(image)
 
 
 def _facts(trainer: Trainer, cell: Cell) -> dict[str, Any]:

@@ -12,8 +12,7 @@ from pandas import DataFrame
 from benchmarks.output import Benchmark, Report
 from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
-from benchmarks.quality.cell import edge_robustness, run_cell
-from benchmarks.quality.charts import gain_chart, write_sheet
+from benchmarks.quality.cell import edge_robustness, run_cell, write_sheet
 from benchmarks.quality.rivals import RivalRow
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
@@ -81,7 +80,7 @@ class Quality:
             over = f"PSNR gain over {baseline}"
             for name, when in zip(tables.GAINS, ("", " when the faster of the two ends"), strict=True):
                 report.tables.append(tables.gains(frame, name, f"{over}{when}", baseline))
-            report.figures["gains"] = gain_chart(frame, baseline)
+            report.figures["gains"] = tables.gain_chart(frame, baseline)
         parts = frame.groupby("scene", sort=False)
         for _, part in parts if len(parts) > 1 else ():
             report.tables.append(tables.metrics(part, self.what(part), ("psnr", "ssim")))
