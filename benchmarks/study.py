@@ -41,8 +41,6 @@ from hqgs.training.config import METHODS, PAPER, TrainConfig
 from hqgs.training.trainer import TrainingError
 
 FORMAT = 1  # raised when a run records something else
-KEY = r"[A-Za-z0-9_][A-Za-z0-9._-]*"  # what a run's name looks like: no path
-KNOWN = "known"  # the folder of runs from elsewhere
 NO_RESULT = "cli"  # of the package: what no result depends on
 
 
@@ -94,48 +92,35 @@ def grid(protocol: Protocol, scenes: Sequence[Scene], labelled: bool = False, *t
 class Store:
     """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside.
 
-    A run that failed holds `error`, and is to be tried again.
+    A run that failed holds `error`, and is to be tried again. `known`: result files of this benchmark, whose
+    runs count where there is none here, without what lies beside. ValueError where one is no such file.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = root / "runs"
-        self.here = self.root / f"{hqgs.__version__}-{sources()}"
+    def __init__(self, root: Path, known: Sequence[Path] = ()) -> None:
+        self.here = root / "runs" / f"{hqgs.__version__}-{sources()}"
+        self.known: dict[str, Run] = {}
+        for path in known:
+            try:
+                runs = json.loads(path.read_text(encoding="utf-8"))["results"]["runs"]
+                self.known |= {run["key"]: run for run in runs}
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"known: {path} holds no runs of this benchmark: {error!r}") from error
 
     def read(self, key: str) -> Run | None:
         """The finished run, else the failed one, else None; ValueError for a damaged file."""
-        failed = None
-        for path in (self.here / f"{key}.json", self.root / KNOWN / f"{key}.json"):
-            if path.is_file():
-                try:
-                    run = json.loads(path.read_text(encoding="utf-8"))
-                    if run["key"] != key:
-                        raise ValueError(f"it holds the run {run['key']}")
-                except (ValueError, KeyError, TypeError) as error:
-                    why = f"{path} is damaged: {error!r}"
-                    raise ValueError(f"{why}; remove it, and the run is repeated") from error
-                if "error" not in run:
-                    return run
-                failed = run
-        return failed
+        path = self.here / f"{key}.json"
+        if not path.is_file():
+            return self.known.get(key)
+        try:
+            run = json.loads(path.read_text(encoding="utf-8"))
+            if run["key"] != key:
+                raise ValueError(f"it holds the run {run['key']}")
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is damaged: {error!r}; remove it, and the run is repeated") from error
+        return self.known.get(key, run) if "error" in run else run
 
     def write(self, run: Run) -> None:
         write_json(self.here / f"{run['key']}.json", run)
-
-    def take(self, path: Path) -> None:
-        """Keep the runs of a result file of this benchmark that are not there yet, without what lies beside.
-
-        ValueError where it is no such file.
-        """
-        try:
-            runs = json.loads(path.read_text(encoding="utf-8"))["results"]["runs"]
-            keys = [run["key"] for run in runs]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"known: {path} holds no runs of this benchmark: {error!r}") from error
-        for key, run in zip(keys, runs, strict=True):
-            if not re.fullmatch(KEY, key):
-                raise ValueError(f"known: {path} has a run of the name {key!r}")
-            if not (self.root / KNOWN / f"{key}.json").exists():
-                write_json(self.root / KNOWN / f"{key}.json", run)
 
     def beside(self, key: str, name: str) -> Path:
         """Where a run keeps a file: to be written before the run is, which vouches for it."""
@@ -188,9 +173,7 @@ class Study:
         self.args, self.name, self.protocol, self.scenes = args, name, protocol, scenes
         self.tags = [tag for tag, on in (("validation", args.validate), ("sfm", args.sfm)) if on]
         self.cells = grid(protocol, scenes, labelled, *self.tags)
-        self.store = Store(args.out)
-        for path in args.known or ():
-            self.store.take(path)
+        self.store = Store(args.out, args.known or ())
         self._last: tuple[tuple[str, str, int], Scene] | None = None
         prints = {scene.name: scene_fingerprint(scene) for scene in scenes}
         self.keys = {cell: key_of(cell, prints[cell.scene.name]) for cell in self.cells}
