@@ -19,10 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.charts import LEGEND, color, panels, unbeaten
 from benchmarks.data import read_toml
 from benchmarks.measure import Training
-from benchmarks.output import TIMED, Benchmark, Report, sizes_of, table
+from benchmarks.output import LEGEND, TIMED, Benchmark, Report, color, panels, sizes_of, table, unbeaten
 from benchmarks.patches import Knobs, tuned
 from benchmarks.protocol import Row
 from benchmarks.speed.inputs import LEAVES, RasterInputs, make_inputs

@@ -20,7 +20,7 @@ from scenes import random_scene
 import hqgs
 from benchmarks import cli
 from benchmarks.accuracy import CASES, ORACLES, Knobs, TunedPass, beats, errors_against
-from benchmarks.charts import unbeaten
+from benchmarks.output import unbeaten
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust

@@ -15,7 +15,7 @@ from tiny_scene import tiny_scene
 
 from benchmarks import cli, scenes
 from benchmarks import export as bench
-from benchmarks.charts import unbeaten
+from benchmarks.output import unbeaten
 from benchmarks.study import Store
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.model.gaussians import Gaussians

@@ -13,9 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat
 
-from benchmarks.charts import panels, title
 from benchmarks.data import means, paired, read_toml, records
-from benchmarks.output import NOTHING, number, table
+from benchmarks.output import NOTHING, number, panels, table, title
 from hqgs.base.text import markdown_table
 from hqgs.evaluation.metrics import METRICS
 from hqgs.photos.formula import NONE

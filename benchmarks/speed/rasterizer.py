@@ -17,7 +17,7 @@ import torch
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.charts import LEGEND, color, panels, title
+from benchmarks.output import LEGEND, color, panels, title
 from benchmarks.patches import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
 from benchmarks.speed.timing import (

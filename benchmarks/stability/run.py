@@ -15,9 +15,8 @@ import torch
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.charts import BLUE, ORANGE, panels
 from benchmarks.data import read_toml
-from benchmarks.output import Benchmark, Report, table
+from benchmarks.output import BLUE, ORANGE, Benchmark, Report, panels, table
 from benchmarks.stability.cases import Case, cases
 from benchmarks.stability.oracle import DIGITS, GROUPS, KINDS, Array, Oracle, OracleScene, Pixel, load_mpmath
 
