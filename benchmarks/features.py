@@ -17,13 +17,11 @@ from benchmarks.output import Benchmark, Report, number, table
 from benchmarks.patches import SWITCHES
 from benchmarks.protocol import Row, read_protocols
 from benchmarks.speed.timing import Seconds, interleaved, quartiles
-from benchmarks.speed.training import still_config, trainer_from
+from benchmarks.speed.training import still_trainer, trainer_from
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
-from hqgs.training.config import TrainConfig
-from hqgs.training.trainer import Trainer
 
 REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
 LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
@@ -130,17 +128,6 @@ class Features:
             "default": runs[DEFAULT.label],
             "features": compare(self.rows[1:], runs, self.final_steps(scene)),
         }
-
-
-def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
-    """A trainer at the given Gaussians whose steps do all the work of a step, but change next to nothing.
-
-    The SH degree is what it is at the end of a run, and statistics for the density are gathered.
-    """
-    trainer = trainer_from(scene, still_config(config, max(len(gaussians), 1)), gaussians)
-    for _ in range(config.sh_degree):
-        trainer.step()
-    return trainer
 
 
 def compare(

@@ -15,8 +15,9 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from benchmarks import cli, features, patches
-from benchmarks.features import DEFAULT, FEATURES, PROTOCOLS, still_trainer
+from benchmarks.features import DEFAULT, FEATURES, PROTOCOLS
 from benchmarks.patches import TorchAdam, torch_loss
+from benchmarks.speed.training import still_trainer
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 

@@ -73,7 +73,8 @@ def exponent(x: Sequence[float], seconds: Sequence[float]) -> float:
 class StageClock:
     """Seconds by stage of what runs inside `watching`; a stage does not count the stages within it."""
 
-    def __init__(self) -> None:
+    def __init__(self, keep: str = "") -> None:
+        self.keep, self.kept = keep, list[Any]()  # a stage, and what its functions returned
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._inner: list[float] = []  # of each open stage, the seconds of the stages within it
 
@@ -84,7 +85,10 @@ class StageClock:
             self._inner.append(0.0)
             started = time.perf_counter()
             try:
-                return function(*args, **kwargs)
+                returned = function(*args, **kwargs)
+                if stage == self.keep:
+                    self.kept.append(returned)
+                return returned
             finally:
                 spent = time.perf_counter() - started
                 self._seconds[stage] += spent - self._inner.pop()

@@ -26,21 +26,7 @@ from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
 from hqgs.training.trainer import Trainer
 
 TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
-WARM_UP = 3  # steps
 TARGET_MB = 3000.0
-
-
-def still_config(config: TrainConfig, n: int) -> TrainConfig:
-    """Steps that do all the work of a step on `n` Gaussians, the statistics for their number included, but
-    change next to nothing. The SH degree rises by one in each of the first."""
-    iterations = 1_000_000
-    return replace(
-        config,
-        iterations=iterations,
-        sh_interval=1,
-        **{name: TINY for name in vars(config) if name.startswith("lr_")},
-        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
-    )
 
 
 def make_trainer(
@@ -53,11 +39,9 @@ def make_trainer(
     options: HQGSConfig | None = None,
     warm: bool = False,
 ) -> Trainer:
-    """A trainer that holds the Gaussians of `make_inputs`. `options`: of method hqgs. `warm`: it has made the
-    steps until harmonics of degree 3 are trained.
+    """A `still_trainer` that holds the Gaussians of `make_inputs`. `options`: of method hqgs.
 
-    It never changes their number, but gathers the statistics for it in each step. Raises ValueError as
-    `make_inputs` and `Trainer` do.
+    Raises ValueError as `make_inputs` and `Trainer` do.
     """
     inputs = make_inputs(gaussians, width, height, seed)
     rng = np.random.default_rng(seed)
@@ -69,8 +53,22 @@ def make_trainer(
     config = TrainConfig(method=method, seed=seed, hqgs=options or HQGSConfig(), leave_out=())
     means, quats, scales, opacities, sh = (torch.from_numpy(getattr(inputs, name)) for name in LEAVES)
     start = Gaussians(means, scales.log(), quats, opacities.logit(), sh[:, :1], sh[:, 1:])
-    trainer = trainer_from(scene, still_config(config, gaussians), start)
-    for _ in range(WARM_UP if warm else 0):
+    return still_trainer(scene, config, start, warm)
+
+
+def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians, warm: bool = True) -> Trainer:
+    """A trainer at these Gaussians whose steps do all the work of a step, the statistics for their number
+    included, but change next to nothing. `warm`: it has made the steps until all harmonics are trained."""
+    iterations, n = 1_000_000, max(len(gaussians), 1)
+    still = replace(
+        config,
+        iterations=iterations,
+        sh_interval=1,
+        **{name: TINY for name in vars(config) if name.startswith("lr_")},
+        densify=DensifyConfig(start=iterations, stop=iterations, reset_every=iterations, max_gaussians=n),
+    )
+    trainer = trainer_from(scene, still, gaussians)
+    for _ in range(config.sh_degree if warm else 0):
         trainer.step()
     return trainer
 
