@@ -19,11 +19,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.data import read_toml
 from benchmarks.measure import Training
 from benchmarks.output import LEGEND, TIMED, Benchmark, Report, color, panels, sizes_of, table, unbeaten
 from benchmarks.patches import Knobs, tuned
-from benchmarks.protocol import Row
+from benchmarks.protocol import Row, read_toml
 from benchmarks.speed.inputs import LEAVES, RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from benchmarks.speed.timing import interleaved, quartiles, whole

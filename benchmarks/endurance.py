@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from benchmarks.data import read_toml
 from benchmarks.measure import Run, Training
 from benchmarks.output import LEGEND, Benchmark, Report, color, panels, table
-from benchmarks.protocol import Protocol, Row, read_protocols
+from benchmarks.protocol import Protocol, Row, read_protocols, read_toml
 from benchmarks.study import Cell, begin
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.data import read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import GREY, LEGEND, Benchmark, Report, color, panels, table, title, unbeaten
-from benchmarks.protocol import read_protocols
+from benchmarks.protocol import read_protocols, read_toml
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import PLY
 from hqgs.base.typed import build

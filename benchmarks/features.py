@@ -11,11 +11,10 @@ from typing import Any, Literal
 import numpy as np
 from pandas import DataFrame
 
-from benchmarks.data import read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
 from benchmarks.patches import SWITCHES
-from benchmarks.protocol import Row, read_protocols
+from benchmarks.protocol import Row, read_protocols, read_toml
 from benchmarks.speed.timing import Seconds, interleaved, quartiles
 from benchmarks.speed.training import still_trainer, trainer_from
 from benchmarks.study import Cell, Study, begin

@@ -10,10 +10,9 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.data import paired, read_toml
 from benchmarks.measure import Run, train
-from benchmarks.output import GREY, LEGEND, Benchmark, Report, color, number, panels, table
-from benchmarks.protocol import Protocol, read_protocols
+from benchmarks.output import GREY, LEGEND, Benchmark, Report, color, number, paired, panels, table
+from benchmarks.protocol import Protocol, read_protocols, read_toml
 from benchmarks.study import Cell, finished
 from hqgs.base.files import PLY
 from hqgs.scene.scene import Scene

@@ -18,6 +18,7 @@ from jinja2 import Environment, FileSystemLoader
 from markdown_it import MarkdownIt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from pandas import DataFrame
 
 import hqgs
 from hqgs.base.files import atomic_path, write_json, write_text
@@ -146,6 +147,24 @@ def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, S
     paths = [(key.split("/"), form) for key, (_, form) in columns.items()]
     body = [[number(reduce(getitem, path, row), form) for path, form in paths] for row in rows]
     return markdown_table(title, [head for head, _ in columns.values()], body)
+
+
+def paired(runs: DataFrame, label: str, by: Sequence[str] = ("scene", "seed")) -> DataFrame:
+    """Each run beside that of row `label` with the same values of `by` (`_base`), where there is one."""
+    base = runs.loc[runs["row"] == label].set_index(list(by)).add_suffix("_base")
+    return runs.join(base, on=list(by), how="inner")
+
+
+def means(frame: DataFrame, by: Sequence[str], values: Sequence[str]) -> DataFrame:
+    """Means over the runs that share `by`, in their order; NaN where one of them lacks the number."""
+    parts = frame.groupby(list(by), sort=False)[list(values)]
+    return DataFrame(parts.agg(lambda v: v.astype(float).mean(skipna=False)))
+
+
+def records(frame: DataFrame) -> list[dict[str, Any]]:
+    """The lines as JSON values, with the index; None for NaN."""
+    lines = frame.reset_index().to_dict("records")
+    return [{str(name): None if value != value else value for name, value in line.items()} for line in lines]
 
 
 def color(k: int) -> str:

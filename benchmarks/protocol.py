@@ -1,14 +1,14 @@
-"""What a study runs: rows, degradations and seeds, from the TOML file beside the benchmark."""
+"""What a benchmark runs, from the TOML file beside it; of a study the rows, degradations and seeds."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from benchmarks.data import read_toml
 from benchmarks.scenes import BUILT_IN, EMBEDDED
 from hqgs.base.typed import build
 from hqgs.photos.formula import parse_degradation
@@ -16,7 +16,20 @@ from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_lea
 from hqgs.training.frugality import RULES
 from hqgs.training.methods.paper import VARIANTS
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
 T = TypeVar("T")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file; ValueError with its name where it is none."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path.name}: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ from typing import Any
 
 from pandas import DataFrame
 
-from benchmarks.data import means, read_toml
 from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import read_protocols
+from benchmarks.output import Benchmark, Report, means, table
+from benchmarks.protocol import read_protocols, read_toml
 from benchmarks.study import Cell, finished
 from hqgs.pipeline import fitted
 from hqgs.scene.scene import Scene

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 import hqgs
 from benchmarks import cli, study
-from benchmarks.data import means
+from benchmarks.output import means
 from benchmarks.protocol import Protocol, narrowed
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality

@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat
 
-from benchmarks.data import means, paired, read_toml, records
-from benchmarks.output import NOTHING, number, panels, table, title
+from benchmarks.output import NOTHING, means, number, paired, panels, records, table, title
+from benchmarks.protocol import read_toml
 from hqgs.base.text import markdown_table
 from hqgs.evaluation.metrics import METRICS
 from hqgs.photos.formula import NONE

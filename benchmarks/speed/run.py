@@ -14,7 +14,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.data import read_toml
 from benchmarks.output import (
     LEGEND,
     TIMED,
@@ -27,6 +26,7 @@ from benchmarks.output import (
     table,
     title,
 )
+from benchmarks.protocol import read_toml
 from benchmarks.speed.inputs import RasterInputs, fitted, make_inputs
 from benchmarks.speed.rasterizer import RasterPass, measure, warmed
 from benchmarks.speed.timing import Seconds, exponent, interleaved, median_ratio, using_threads, whole

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.data import read_toml
+from benchmarks.protocol import read_toml
 from benchmarks.stability.oracle import GROUPS, Array, OracleScene, Pixel
 from hqgs.base.typed import build
 

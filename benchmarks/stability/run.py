@@ -15,8 +15,8 @@ import torch
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.data import read_toml
 from benchmarks.output import BLUE, ORANGE, Benchmark, Report, panels, table
+from benchmarks.protocol import read_toml
 from benchmarks.stability.cases import Case, cases
 from benchmarks.stability.oracle import DIGITS, GROUPS, KINDS, Array, Oracle, OracleScene, Pixel, load_mpmath
 
