@@ -17,7 +17,7 @@ from pandas import DataFrame
 from benchmarks.measure import Run, Training
 from benchmarks.output import LEGEND, Benchmark, Report, color, panels, table
 from benchmarks.protocol import Protocol, Row, read_protocols, read_toml
-from benchmarks.study import Cell, begin
+from benchmarks.study import Cell, finished
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Step, TrainingError
@@ -182,13 +182,11 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
 
 def run(args: argparse.Namespace) -> Report:
     """Run the cases that are not finished, in their order; each is written as soon as it is done."""
-    study = begin(args, PROTOCOLS)
-    study.train(measure)
+    study, report, _ = finished(args, PROTOCOLS, measure)
     alone = len(study.scenes) == len(study.protocol.seeds) == 1
     names = {cell: cell.row.label if alone else str(cell) for cell in study.cells}
     results = [{"case": name, **study.runs[c]} for c, name in names.items() if c in study.runs]
     passed = len(results) == len(study.cells) and all(result["passed"] for result in results)
-    report = study.report()
     report.settings["limit_mb"] = LIMIT_MB
     report.results = {"passed": passed, "cases": results}
     report.tables = [cases_table(results, study.protocol), "All passed." if passed else "NOT all passed."]

@@ -38,7 +38,6 @@ from hqgs.training.trainer import Trainer
 DATA = read_toml(Path(__file__).with_name("speed.toml"))
 COLUMNS = DATA["columns"]
 PARTS = ("rasterizer", "step", "formations", "threads", "scaling", "memory")
-TARGET = 1.05  # the largest exponent that is good
 AGAINST = {"gaussians": "Gaussians", "pixels": "pixels"}  # what the time grows with
 Outcome = tuple[Any, list[str]]  # what the JSON file holds of a part, and its tables
 
@@ -72,8 +71,7 @@ class Speed:
         return rows, [table(title, rows, COLUMNS["rasterizer"]), work]
 
     def step(self, trainers: dict[str, Trainer] | None = None) -> Outcome:
-        targets = DATA["targets"] if self.size == DATA["full"]["size"] else {}
-        rows = measure_steps(trainers or self.trainers, self.repeats, targets)
+        rows = measure_steps(trainers or self.trainers, self.repeats)
         return rows, [steps_table(rows)]
 
     def formations(self) -> Outcome:
@@ -127,10 +125,9 @@ class Speed:
         scaling = {
             "gaussians": {"width": image[0], "height": image[1], **by_size},
             "pixels": {"gaussians": n, **by_pixels},
-            "target_exponent": TARGET,
         }
         self.report.figures["scaling"] = scaling_chart(scaling)
-        rows = [scaling[name] | {"against": what, "target": TARGET} for name, what in AGAINST.items()]
+        rows = [scaling[name] | {"against": what} for name, what in AGAINST.items()]
         title = "Power with which the time of forward and backward grows"
         return scaling, [table(title, rows, COLUMNS["powers"])]
 

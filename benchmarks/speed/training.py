@@ -26,7 +26,6 @@ from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
 from hqgs.training.trainer import Trainer
 
 TINY = 1e-6  # learning rates: the same arithmetic, and the scene stays what it is while it is timed
-TARGET_MB = 3000.0
 
 
 def make_trainer(
@@ -109,7 +108,7 @@ def measure_memory(settings: dict[str, Any]) -> dict[str, Any]:
             raise UnavailableError(f"the process that measures the memory ended: {error}") from error
     if None in peaks.values():
         raise UnavailableError("this system does not tell the peak memory of a process")
-    return {**settings, **peaks, "target_mb": TARGET_MB}
+    return settings | peaks
 
 
 def _measure(threads: int, steps: int, **settings: Any) -> dict[str, float | None]:
@@ -138,13 +137,8 @@ def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
     return call
 
 
-def measure_steps(
-    trainers: Mapping[str, Trainer], repeats: int, targets: Mapping[str, int]
-) -> list[dict[str, Any]]:
-    """Seconds of a step, and the share of each part of it, for each trainer; `case` is its key.
-
-    `targets`: milliseconds by method and number of Gaussians.
-    """
+def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[str, Any]]:
+    """Seconds of a step, and the share of each part of it, for each trainer; `case` is its key."""
     ways = {"whole": whole_step, "parts": step_by_parts}
     cases = {(name, way): time(t) for name, t in trainers.items() for way, time in ways.items()}
     measured = interleaved(cases, repeats)
@@ -159,7 +153,6 @@ def measure_steps(
             | whole(rounds)
             | {
                 "over_first": median_ratio(rounds, first),
-                "target_ms": targets.get(f"{method}, {n}"),
                 "clocked": median_ratio(parts, rounds),  # how much the clocks slow the step down
                 "stages": stages.to_dict(),
                 "percent": (100 * stages / stages.sum()).to_dict(),
@@ -176,7 +169,6 @@ def steps_table(rows: list[dict[str, Any]]) -> str:
         ["whole step (ms)", *(number(r["seconds"], "ms") for r in rows)],
         ["quartiles (ms)", *(number(r["seconds_quartiles"], "ms") for r in rows)],
         [f"over {first['case']}", *(f"{r['over_first']:.2f}" for r in rows)],
-        ["target (ms)", *(str(r["target_ms"] or "") for r in rows)],
         *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
         ["with clocks / without", *(f"{r['clocked']:.2f}" for r in rows)],
     ]
