@@ -115,15 +115,12 @@ def _so_far(done: Training, losses: NDArray[np.float64]) -> dict[str, Any]:
     trainer.evaluate()
     finite = losses[np.isfinite(losses)]
     return {
-        "iteration": trainer.iteration,
-        "seconds": trainer.seconds,
+        **trainer.history[-1],
         "loss": float(finite.mean()) if len(finite) else None,
         "losses_not_finite": len(losses) - len(finite),
         "values_not_finite": sum(int((~torch.isfinite(t)).sum()) for t in trainer.gaussians.named().values()),
         "events": trainer.guard.num_events,
-        "gaussians": len(trainer.gaussians),
         "peak_rss_mb": peak,  # since the last record
-        "psnr": trainer.history[-1]["psnr"],
     }
 
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.measure import Run, train
+import hqgs
 from benchmarks.output import GREY, LEGEND, Benchmark, Report, color, panels, table, title, unbeaten
 from benchmarks.protocol import read_protocols, read_toml
-from benchmarks.study import Cell, Study, begin
+from benchmarks.study import begin
 from hqgs.base.files import PLY
 from hqgs.base.typed import build
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
@@ -87,28 +87,18 @@ def chart(result: dict[str, Any]) -> Figure:
     return figure
 
 
-def trained(study: Study) -> Path:
-    """The folder that keeps the Gaussians of the study's only run."""
-    (cell,) = study.cells
-
-    def run_cell(cell: Cell, photos: Scene) -> Run:
-        done = train(photos, cell.config)
-        done.trainer.shown().save(study.beside(cell, PLY))
-        return done.record()
-
-    study.train(run_cell)
-    for failure in study.failures.values():
-        raise ValueError(f"{cell}: {failure}")
-    return study.beside(cell, PLY).parent
-
-
 def run(args: argparse.Namespace) -> Report:
     """Train, or read a run, and write its Gaussians in every way."""
     if len(args.scenes) > 1 or len(args.seeds or ()) > 1:
         raise ValueError("one scene and one seed are written")
     study = begin(args, PROTOCOLS, labelled=False)
-    (scene,) = study.scenes
-    gaussians = Gaussians.load(trained(study) if args.run_folder is None else args.run_folder)
+    (cell,) = study.cells
+    scene, folder = cell.scene, args.run_folder
+    if folder is None:
+        folder = study.beside(cell, PLY).parent
+        if not (args.finished or hqgs.train(scene, out=folder, config=cell.config, resume=True).finished):
+            raise KeyboardInterrupt  # the next call goes on with it
+    gaussians = Gaussians.load(folder)
     with tempfile.TemporaryDirectory(dir=args.out) as name:
         files = measure(scene, gaussians, Path(name))
     result = {
@@ -121,8 +111,9 @@ def run(args: argparse.Namespace) -> Report:
         "ply_of_3dgs_bytes": files[0]["bytes"] + NORMALS * len(gaussians),
         "files": files,
     }
-    own = args.run_folder is None
-    settings = study.report().settings if own else {"downscale": study.protocol.downscale}
+    settings = {"downscale": study.protocol.downscale}
+    if args.run_folder is None:
+        settings = study.report().settings
     return Report(settings, results=result, tables=[files_table(result)], figures={"size": chart(result)})
 
 

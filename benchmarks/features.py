@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,8 +15,8 @@ from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
 from benchmarks.patches import SWITCHES
 from benchmarks.protocol import Row, read_protocols, read_toml
-from benchmarks.speed.timing import Seconds, interleaved, quartiles
-from benchmarks.speed.training import still_trainer, trainer_from
+from benchmarks.speed.timing import interleaved, quartiles, warmed
+from benchmarks.speed.training import still_trainer, trainer_from, whole_step
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
@@ -93,22 +93,12 @@ class Features:
     def final_steps(self, scene: Scene) -> dict[str, DataFrame]:
         """Seconds of steps on the final Gaussians of the default run, all features in turn."""
         cell = self.cells[scene.name, DEFAULT.label, self.protocol.seeds[0]]
-        final = Gaussians.load(self.grown(cell))
-
-        def timed(feature: Feature) -> Callable[[], Seconds]:
+        final, cases = Gaussians.load(self.grown(cell)), {}
+        for feature in self.rows:
             with feature.switched():
                 trainer = still_trainer(scene, self.protocol.train_config(feature, cell.seed), final)
-
-            def call() -> Seconds:
-                with feature.switched():
-                    trainer.step()  # a switch may have made new threads, without memory of their own
-                    before = trainer.seconds
-                    trainer.step()
-                return {"total": trainer.seconds - before}
-
-            return call
-
-        return interleaved({f.label: timed(f) for f in self.rows}, self.protocol.repeats)
+            cases[feature.label] = warmed(whole_step(trainer), feature.switched)
+        return interleaved(cases, self.protocol.repeats)
 
     def compare(self, scene: Scene) -> dict[str, Any] | None:
         """The results of a scene; None where a run of it is not finished."""

@@ -14,7 +14,7 @@ from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Template
 from markdown_it import MarkdownIt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -206,14 +206,12 @@ TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 def write_page(path: Path, facts: dict[str, Any], report: Report, pictures: Iterable[Path]) -> None:
     """Write the page atomically. `facts`: what the JSON file holds. OSError where it cannot be written."""
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATE.parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
+    template = Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True, trim_blocks=True)
     charts = {
         what.replace("_", " "): base64.b64encode(picture.read_bytes()).decode()
         for what, picture in zip(report.figures, pictures, strict=True)
     }
-    page = environment.get_template(TEMPLATE.name).render(
+    page = template.render(
         title=f"hqgs benchmark {facts['benchmark']} {report.part}".rstrip(),
         facts=facts,
         tables=MarkdownIt("commonmark", {"html": False}).enable("table").render("\n\n".join(report.tables)),

@@ -61,11 +61,6 @@ class Cell:
         return self.config.seed
 
     @property
-    def kind(self) -> tuple[str, str]:
-        """What its speed depends on most: scene, row."""
-        return self.scene.name, self.row.label
-
-    @property
     def group(self) -> tuple[str, str, int]:
         """What it shares with the other rows: scene, degradation, seed."""
         return self.scene.name, self.degradation, self.seed
@@ -190,7 +185,8 @@ class Study:
         if self.args.finished:
             return
         pending = [cell for cell in self.cells if cell not in self.runs]
-        self.say(f"{len(self.cells)} runs, {len(pending)} left{about(pending, self.runs)}")
+        self.say(f"{len(self.cells)} runs, {len(pending)} left")
+        walls: list[float] = []  # seconds of the runs so far
         facts = {"sources": sources(), "machine": machine_facts(), "versions": version_facts()}
         for k, cell in enumerate(pending, 1):
             key, started = self.keys[cell], time.perf_counter()
@@ -201,16 +197,17 @@ class Study:
                 self.store.write({"key": key, "error": str(error), **facts})
                 self.say(f"[{k}/{len(pending)}] {cell} failed: {error}")
                 continue
-            wall = time.perf_counter() - started
+            walls.append(time.perf_counter() - started)
             run = {"key": key, "scene": cell.scene.name, **run, "threads": hqgs.get_num_threads()}
-            self.runs[cell] = run | {"wall_seconds": wall, **facts}
+            self.runs[cell] = run | {"wall_seconds": walls[-1], **facts}
             self.store.write(self.runs[cell])
             self.failures.pop(cell, None)
             value = run["history"][-1]["psnr"] if run["history"] else None
-            left = about(pending[k:], self.runs)
+            left = len(pending) - k
             self.say(
                 f"[{k}/{len(pending)}] {cell}: {'no PSNR' if value is None else f'{value:.2f} dB'}, "
-                f"{run['gaussians']:,} Gaussians, {duration(wall)}; {len(pending) - k} left{left}"
+                f"{run['gaussians']:,} Gaussians, {duration(walls[-1])}; {left} left"
+                + (f", about {duration(left * mean(walls))}" if left else "")
             )
 
     def photos(self, cell: Cell) -> Scene:
@@ -278,12 +275,3 @@ def finished(
     report = study.report()
     report.results["runs"] = study.results()
     return study, report, DataFrame(study.results())
-
-
-def about(cells: Sequence[Cell], runs: Mapping[Cell, Run]) -> str:
-    """How long these cells will take by the runs of the same scene and row, in words; "" if none is known."""
-    known: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
-    for cell, run in runs.items():
-        known[cell.kind].append(run["wall_seconds"] / max(run["iterations"], 1))
-    seconds = sum(cell.config.iterations * mean(known[cell.kind]) for cell in cells if cell.kind in known)
-    return f", about {duration(seconds)}" if seconds else ""

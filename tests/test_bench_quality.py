@@ -26,7 +26,7 @@ from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
 from benchmarks.quality.tables import courses, equal_time_gain, metrics, psnr_at, with_degraded
 from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
-from benchmarks.study import Cell, Store, Study, about, grid, key_of
+from benchmarks.study import Cell, Store, Study, grid, key_of
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.scene import Camera, Scene, SfmReport, View
@@ -582,15 +582,3 @@ def test_the_way_of_the_runs_is_that_of_their_common_evaluations() -> None:
     }
     second[0]["psnr"] = None
     assert courses(frame.loc[frame["row"] == "x"]).count("–, 8 s") == 1
-
-
-def test_the_time_left_follows_from_finished_runs() -> None:
-    scene = replace(tiny_scene(), name="a")
-    first, second, third = grid(replace(PROTOCOLS["quick"], iterations=100), [scene])[:3]
-    assert about([first, second], {}) == ""  # nothing is known
-    runs = {first: {"iterations": 100, "wall_seconds": 15.0}}
-    assert about([first, third], runs) == ", about 15 s"
-    again = replace(first, degradation="blur:2")
-    runs[again] = {"iterations": 100, "wall_seconds": 60.0}
-    assert about([first, second, again], runs) == ", about 75 s"
-    assert about([], runs) == ""

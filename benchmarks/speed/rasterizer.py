@@ -6,7 +6,7 @@ cache (measured with a probe of the arithmetic).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ import torch
 import hqgs
 from benchmarks.patches import COMPOSITE, CRATE
 from benchmarks.speed.inputs import LEAVES, RasterInputs
-from benchmarks.speed.timing import Seconds, StageClock, interleaved, whole
+from benchmarks.speed.timing import Seconds, StageClock, interleaved, warmed, whole
 from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
@@ -58,16 +58,6 @@ class RasterPass:
         """Free the gradients, so that the many cases of a benchmark fit into memory together."""
         for leaf in self.leaves:
             leaf.grad = None
-
-
-def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
-    """The second of two passes in a row: as in training, its memory is what the one before gave back."""
-
-    def call() -> Seconds:
-        case()
-        return case()
-
-    return call
 
 
 def count_work(case: RasterPass, pixels: int) -> dict[str, Any]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,8 @@ from benchmarks.output import (
 )
 from benchmarks.protocol import read_toml
 from benchmarks.speed.inputs import RasterInputs, fitted, make_inputs
-from benchmarks.speed.rasterizer import RasterPass, measure, warmed
-from benchmarks.speed.timing import Seconds, exponent, interleaved, median_ratio, using_threads, whole
+from benchmarks.speed.rasterizer import RasterPass, measure
+from benchmarks.speed.timing import exponent, interleaved, median_ratio, using_threads, warmed, whole
 from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, steps_table, whole_step
 from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.methods.paper import VARIANTS
@@ -94,15 +93,11 @@ class Speed:
         }
         most = hqgs.get_num_threads()
         counts = sorted({most, *(1 << k for k in range(most.bit_length()))})
-
-        def with_threads(case: Callable[[], Seconds], count: int) -> Callable[[], Seconds]:
-            def call() -> Seconds:
-                with using_threads(count):
-                    return warmed(case)()  # new threads start with no memory of their own
-
-            return call
-
-        jobs = {(name, count): with_threads(case, count) for name, case in cases.items() for count in counts}
+        jobs = {
+            (name, count): warmed(case, partial(using_threads, count))
+            for name, case in cases.items()
+            for count in counts
+        }
         measured, rows = interleaved(jobs, self.repeats), []
         for (name, count), rounds in measured.items():
             speedup = median_ratio(measured[name, 1], rounds)  # in the same round

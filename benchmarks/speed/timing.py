@@ -6,7 +6,7 @@ import gc
 import time
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Any, TypeVar
 from unittest.mock import patch
 
@@ -37,6 +37,18 @@ def interleaved(cases: Mapping[Case, Callable[[], Seconds]], repeats: int) -> di
         if collecting:
             gc.enable()
     return {name: DataFrame(rounds) for name, rounds in measured.items()}
+
+
+def warmed(case: Callable[[], Seconds], context: Callable[[], Any] = nullcontext) -> Callable[[], Seconds]:
+    """The second of two calls in a row, inside the context: as in training, its memory is what the one before
+    gave back, and threads that the context makes start with none of their own."""
+
+    def call() -> Seconds:
+        with context():
+            case()
+            return case()
+
+    return call
 
 
 @contextmanager
