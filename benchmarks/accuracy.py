@@ -76,21 +76,20 @@ class TunedPass(RasterPass):
 
 def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
     """Errors and seconds of every case on the same numbers; the seconds of a round are taken in turn."""
-    passes = {f"{knob} {value}": TunedPass(inputs, knobs) for (knob, value), knobs in CASES.items()}
+    passes = {case: TunedPass(inputs, knobs) for case, knobs in CASES.items()}
     oracles = {oracle: TunedPass(inputs, knobs).outputs() for oracle, knobs in ORACLES.items()}
     rows: list[dict[str, Any]] = []
-    for (knob, value), case in zip(CASES, passes.values(), strict=True):
+    for (knob, value), case in passes.items():
         outputs = case.outputs()
         errors = {oracle: errors_against(outputs, exact) for oracle, exact in oracles.items()}
         work = {"tile_pairs": case.work[0], "blocks": case.work[1]}
         work |= {"more_blocks": case.work[1] / max(rows[0]["blocks"], 1) if rows else 1.0}
         rows.append({"knob": knob, "value": value, "settings": asdict(case.knobs), "errors": errors} | work)
-    measured = interleaved(passes, repeats)
-    default = next(iter(measured.values()))["total"]
-    for row, rounds in zip(rows, measured.values(), strict=True):
-        ratios = rounds["total"] / default  # in the same round
+    first, *others = interleaved(passes, repeats).values()
+    for row, rounds in zip(rows, (first, *others), strict=True):
+        ratios = rounds["total"] / first["total"]  # in the same round
         row |= {**whole(rounds), "ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
-    beaten = [name for name, row in zip(passes, rows, strict=True) if beats(row, rows[0])]
+    beaten = [f"{row['knob']} {row['value']}" for row in rows if beats(row, rows[0])]
     size = {"inputs": name, "gaussians": len(inputs), "width": inputs.width, "height": inputs.height}
     return size | {"rows": rows, "beaten_by": beaten}
 

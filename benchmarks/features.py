@@ -41,10 +41,6 @@ class Feature(Row):
     def more(self) -> dict[str, Any]:
         return {"switch": self.switch}
 
-    @property
-    def about(self) -> dict[str, Any]:
-        return {"feature": self.label, "other": self.other, "by_default": self.by_default}
-
     def switched(self) -> Any:
         """A context manager: inside it the other choice is in place, as far as it is none of the config."""
         return SWITCHES[self.switch]()
@@ -131,7 +127,8 @@ def compare(
     rows, fast = [], DataFrame(runs[DEFAULT.label])
     for feature in features:
         other, sign = DataFrame(runs[feature.label]), 1 if feature.by_default else -1
-        row = feature.about | {"psnr": float(other["psnr"].mean())}
+        row: dict[str, Any] = {"feature": feature.label, "other": feature.other}
+        row |= {"by_default": feature.by_default, "psnr": float(other["psnr"].mean())}
         for kind in ("", "refined_"):
             costs = sign * (other[f"{kind}psnr"].astype(float) - fast[f"{kind}psnr"]).dropna()
             row[f"{kind}costs_db"] = costs.tolist()
@@ -143,7 +140,7 @@ def compare(
     return rows
 
 
-def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def verdicts(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mean costs over the scenes, and whether the feature may be on.
 
     Growth decides by thresholds, so that a change of one bit makes other Gaussians: whole runs scatter by
@@ -151,16 +148,16 @@ def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> l
     grown once and trained on with either choice scatter little, and are held against the limit itself.
     """
     found = []
-    for k, feature in enumerate(features):
-        entry = feature.about | {"limit_db": LIMIT_DB}
+    for rows in zip(*(scene["features"] for scene in scenes), strict=True):  # of one feature
+        entry = {name: rows[0][name] for name in ("feature", "other", "by_default")} | {"limit_db": LIMIT_DB}
         for kind in ("", "refined_"):
-            costs = [cost for scene in scenes for cost in scene["features"][k][f"{kind}costs_db"]]
+            costs = [cost for row in rows for cost in row[f"{kind}costs_db"]]
             error = float(np.std(costs, ddof=1) / np.sqrt(len(costs))) if costs[1:] else None
             entry[f"{kind}cost_db"] = float(np.mean(costs)) if costs else None
             entry[f"{kind}standard_error_db"] = error
         sure = entry["cost_db"] - SURE * (entry["standard_error_db"] or 0.0)
         worst = max(sure, -np.inf if entry["refined_cost_db"] is None else entry["refined_cost_db"])
-        found.append(entry | {"passed": not feature.by_default or bool(worst <= LIMIT_DB)})
+        found.append(entry | {"passed": not entry["by_default"] or bool(worst <= LIMIT_DB)})
     return found
 
 
@@ -191,7 +188,7 @@ def run(args: argparse.Namespace) -> Report:
     features.study.train(features.measure)
     report = features.study.report()
     results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
-    report.results = {"scenes": results, "verdicts": verdicts(features.rows[1:], results) if results else []}
+    report.results = {"scenes": results, "verdicts": verdicts(results)}
     report.tables += map(scene_table, results)
     if results:
         report.tables.append(verdict_table(report.results["verdicts"]))

@@ -25,7 +25,7 @@ from hqgs.evaluation.metrics import METRICS, evaluate_view, mean_metrics, psnr
 from hqgs.evaluation.report import AMPLIFICATION, MASKED
 from hqgs.model.render import render_view
 from hqgs.photos.edges import edge_magnitude
-from hqgs.photos.pixels import to_uint8
+from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.photos.sheet import printable, sheet
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Scene, View
@@ -88,9 +88,9 @@ def write_sheet(
     first = next(iter(runs.values()))
     view = clean.test[number]
     bad = degraded_view(clean, view, first["degradation"], first["seed"]).image
-    photo = _uint8(view.image)
+    photo, degraded_photo = (to_uint8(as_floats(image)) for image in (view.image, bad))
     above = [(printable(f"photo {view.name}"), photo)]
-    above.append((_caption(first["degradation"], psnr(bad, photo, view.mask)), _uint8(bad)))
+    above.append((_caption(first["degradation"], psnr(bad, photo, view.mask)), degraded_photo))
     for label, run in runs.items():
         with Image.open(files[label]) as image:
             above.append((_caption(label, run["views"][number]["psnr"]), np.asarray(image.convert("RGB"))))
@@ -107,10 +107,6 @@ def write_sheet(
 
 def _caption(label: str, value: float | None) -> str:
     return printable(label if value is None else f"{label}  {value:.2f} dB")
-
-
-def _uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
-    return image if image.dtype == np.uint8 else to_uint8(image)
 
 
 def _facts(trainer: Trainer, cell: Cell) -> dict[str, Any]:
