@@ -85,9 +85,9 @@ def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
         work = {"tile_pairs": case.work[0], "blocks": case.work[1]}
         work |= {"more_blocks": case.work[1] / max(rows[0]["blocks"], 1) if rows else 1.0}
         rows.append({"knob": knob, "value": value, "settings": asdict(case.knobs), "errors": errors} | work)
-    first, *others = interleaved(passes, repeats).values()
-    for row, rounds in zip(rows, (first, *others), strict=True):
-        ratios = rounds["total"] / first["total"]  # in the same round
+    measured = interleaved(passes, repeats)
+    for row, rounds in zip(rows, measured.values(), strict=True):
+        ratios = rounds["total"] / measured["default", ""]["total"]  # in the same round
         row |= {**whole(rounds), "ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
     beaten = [f"{row['knob']} {row['value']}" for row in rows if beats(row, rows[0])]
     size = {"inputs": name, "gaussians": len(inputs), "width": inputs.width, "height": inputs.height}

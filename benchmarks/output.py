@@ -197,8 +197,8 @@ def unbeaten(points: Sequence[tuple[float, float]]) -> list[int]:
     def beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
         return a != b and a[0] <= b[0] and a[1] <= b[1]
 
-    front = [k for k, point in enumerate(points) if not any(beats(other, point) for other in points)]
-    return sorted(front, key=lambda k: points[k])
+    order = sorted(range(len(points)), key=lambda k: points[k])
+    return [k for k in order if not any(beats(other, points[k]) for other in points)]
 
 
 TEMPLATE = Path(__file__).with_name("page.html.j2")

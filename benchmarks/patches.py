@@ -6,7 +6,7 @@ And what is put there: other knobs of the rasterizer, and the other choice of wh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -97,9 +97,7 @@ def _in_torch(place: Place, function: Any) -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(hqgs.get_num_threads())
     try:
-        with ExitStack() as stack:
-            stack.enter_context(patch.object(*ONE_TORCH_THREAD, nullcontext))
-            stack.enter_context(patch.object(*place, function))
+        with patch.object(*ONE_TORCH_THREAD, nullcontext), patch.object(*place, function):
             yield
     finally:
         torch.set_num_threads(before)

@@ -28,8 +28,7 @@ from pandas import DataFrame
 import hqgs
 from benchmarks.measure import Run
 from benchmarks.output import Report
-from benchmarks.protocol import Protocol, Row, narrowed
-from benchmarks.scenes import degraded, load_scenes
+from benchmarks.protocol import Protocol, Row, degraded, load_scenes, narrowed
 from hqgs.base.files import KEPT, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.cli.progress import duration
@@ -224,15 +223,12 @@ class Study:
         return path
 
     def report(self, part: str = "") -> Report:
-        """A report that holds nothing yet but what was run."""
+        """A report that holds nothing yet but what was run, and why the other runs are not there."""
         settings = asdict(self.protocol) | {"scenes": [scene.name for scene in self.scenes]}
         settings |= {"validation": self.args.validate, "sfm": self.args.sfm, **self.circumstances()}
-        return Report(settings, part, left_out=self.left_out())
-
-    def left_out(self) -> list[dict[str, str]]:
-        """The runs that are not there, with the reasons."""
         missing = [cell for cell in self.cells if cell not in self.runs]
-        return [{"what": f"run {c}", "why": self.failures.get(c, "not finished")} for c in missing]
+        why = [{"what": f"run {cell}", "why": self.failures.get(cell, "not finished")} for cell in missing]
+        return Report(settings, part, left_out=why)
 
     def results(self) -> list[Run]:
         """The finished runs with the labels of their rows, in the order of the cells."""

@@ -19,13 +19,12 @@ from scipy import ndimage
 import hqgs
 from benchmarks import cli, study
 from benchmarks.output import means
-from benchmarks.protocol import Protocol, narrowed
+from benchmarks.protocol import Protocol, degraded, degraded_view, load_scenes, narrowed, validation_split
 from benchmarks.quality import cell as quality_cell
 from benchmarks.quality import run as quality
 from benchmarks.quality.cell import count_regions, edge_robustness
 from benchmarks.quality.run import PROTOCOLS
 from benchmarks.quality.tables import courses, equal_time_gain, metrics, psnr_at, with_degraded
-from benchmarks.scenes import degraded, degraded_view, load_scenes, validation_split
 from benchmarks.study import Cell, Store, Study, grid, key_of
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import parse_formation

@@ -15,8 +15,8 @@ from pandas import DataFrame
 from PIL import Image
 
 from benchmarks.measure import Run, Training, train
+from benchmarks.protocol import degraded, degraded_view
 from benchmarks.quality.rivals import RIVALS
-from benchmarks.scenes import degraded, degraded_view
 from benchmarks.study import Cell, Store, Study
 from hqgs._rust import NEAR_PLANE
 from hqgs.base.files import atomic_path
@@ -38,11 +38,6 @@ MAX_PHOTOS = 8  # of a scene, whose edge maps are compared
 RENDERS = 3  # times that each held-out view is rendered
 
 
-def render_path(store: Store, key: str, view: int) -> Path:
-    """The render of the held-out view of that number."""
-    return store.beside(key, f"{view}.png")
-
-
 def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
     """Train, measure and describe one cell; so many of its held-out views are kept in the store.
 
@@ -54,7 +49,7 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
     measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
     mean = asdict(mean_metrics(measured))
     for k, view in enumerate(views[:renders]):
-        with atomic_path(render_path(study.store, study.keys[cell], k)) as tmp:
+        with atomic_path(study.beside(cell, f"{k}.png")) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
     return done.record() | {
         "downscale": cell.downscale,
@@ -82,7 +77,7 @@ def write_sheet(
     Above: photo, degraded photo, the render of each run. Below each of those after the first: its difference
     from the photo. No run has seen the degraded photo; it shows what happened to the training photos.
     """
-    files = {label: render_path(store, run["key"], number) for label, run in runs.items()}
+    files = {label: store.beside(run["key"], f"{number}.png") for label, run in runs.items()}
     if not all(file.is_file() for file in files.values()):
         return False
     first = next(iter(runs.values()))

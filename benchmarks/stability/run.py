@@ -105,21 +105,19 @@ def evaluate(case: Case, dtype: str) -> Outcome:
     checked = range(len(s.means)) if len(s.means) <= 10 else case.gradients_of or ()
     as_expected = as_expected and all((oracle.splat(i) is None) == (i in culled) for i in checked)
     wanted = [oracle.pixel(pixel) for pixel in case.pixels]
-    error = largest_difference([image[pixel] for pixel in case.pixels], wanted)
-    size = max(float(abs(w)) for row in wanted for w in row)
+    errors = value_errors([image[pixel] for pixel in case.pixels], wanted)
     ids = case.compared
     worst, cosine, group = compare_gradients(
         s, dtype, {name: gradients[name][ids] for name in GROUPS}, oracle.gradients(cotangents, ids), ids
     )
-    return Outcome(
-        dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group
-    )
+    return Outcome(dtype, as_expected, finite, equal, *errors, worst, cosine, group)
 
 
-def largest_difference(got: Sequence[Any], wanted: Sequence[Any]) -> float:
-    """Largest absolute difference of two lists of pixels."""
-    pairs = [pair for a, b in zip(got, wanted, strict=True) for pair in zip(a, b, strict=True)]
-    return max(float(abs(g - w)) for g, w in pairs)
+def value_errors(got: Sequence[Any], wanted: Sequence[Any]) -> tuple[float, float]:
+    """Largest absolute difference of two lists of pixels, and the same over the largest value wanted."""
+    truth = np.array(wanted, object)
+    error, size = (float(np.abs(values).max()) for values in (np.array(got, object) - truth, truth))
+    return error, error / size if size else error
 
 
 def condition(case: Case, dtype: str) -> Outcome:
@@ -128,11 +126,10 @@ def condition(case: Case, dtype: str) -> Outcome:
     cotangents, ids, rng = weights(case), case.compared, np.random.default_rng(0)
     oracle = Oracle(s)
     values, gradients = [oracle.pixel(p) for p in case.pixels], oracle.gradients(cotangents, ids)
-    size = max(float(abs(v)) for row in values for v in row)
     found = []
     for _ in range(NUDGES):
         nudged = Oracle(s.nudged(dtype, rng))
-        change = largest_difference([nudged.pixel(p) for p in case.pixels], values) / size
+        _, change = value_errors([nudged.pixel(p) for p in case.pixels], values)
         other = {name: np.array(rows, float) for name, rows in nudged.gradients(cotangents, ids).items()}
         found.append((change, *compare_gradients(s, dtype, other, gradients, ids)[:2]))
     changes, worst, cosines = zip(*found, strict=True)
@@ -195,7 +192,7 @@ def misses(case: Case, outcome: Outcome) -> list[str]:
 def input_rounding(case: Case) -> float:
     """Largest change of any compared value that rounding the inputs to float32 alone causes."""
     exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
-    return largest_difference([exact.pixel(p) for p in case.pixels], [rounded.pixel(p) for p in case.pixels])
+    return value_errors(*([oracle.pixel(p) for p in case.pixels] for oracle in (exact, rounded)))[0]
 
 
 COLUMNS = read_toml(Path(__file__).with_name("columns.toml"))
