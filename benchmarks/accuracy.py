@@ -212,8 +212,6 @@ def run(args: argparse.Namespace) -> Report:
         print(f"accuracy: {name}", file=sys.stderr)
         results.append(measure(name, x, sizes["repeats"]))
         report.tables.append(errors_table(results[-1]))
-    why = "it only groups the work: blocks of 4 x 4 pixels inside exact spans decide what is computed"
-    report.leave_out("tile size", why)
     for result in results:
         beaten = ", ".join(result["beaten_by"]) or "nothing"
         report.tables.append(f"{result['inputs']}: better than the default in error and time: {beaten}.")

@@ -93,9 +93,9 @@ def run(args: argparse.Namespace) -> Report:
         raise ValueError("one scene and one seed are written")
     study = begin(args, PROTOCOLS, labelled=False)
     (cell,) = study.cells
-    scene, folder = cell.scene, args.run_folder
+    scene, folder, settings = cell.scene, args.run_folder, {"downscale": study.protocol.downscale}
     if folder is None:
-        folder = study.beside(cell, PLY).parent
+        folder, settings = study.beside(cell, PLY).parent, study.report().settings
         if not (args.finished or hqgs.train(scene, out=folder, config=cell.config, resume=True).finished):
             raise KeyboardInterrupt  # the next call goes on with it
     gaussians = Gaussians.load(folder)
@@ -111,9 +111,6 @@ def run(args: argparse.Namespace) -> Report:
         "ply_of_3dgs_bytes": files[0]["bytes"] + NORMALS * len(gaussians),
         "files": files,
     }
-    settings = {"downscale": study.protocol.downscale}
-    if args.run_folder is None:
-        settings = study.report().settings
     return Report(settings, results=result, tables=[files_table(result)], figures={"size": chart(result)})
 
 

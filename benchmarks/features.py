@@ -77,8 +77,7 @@ class Features:
     def refined(self, cell: Cell, feature: Feature) -> float | None:
         """Held-out PSNR of the default run's final Gaussians when they are trained on, their number fixed."""
         iterations = -(-cell.config.iterations // REFINED_SHARE)
-        densify = replace(cell.config.densify, stop=0)
-        config = replace(cell.config, iterations=iterations, densify=densify)
+        config = replace(cell.config, iterations=iterations, densify=replace(cell.config.densify, stop=0))
         with feature.switched():
             trainer = trainer_from(cell.scene, config, Gaussians.load(self.grown(cell)))
             for _ in range(iterations):

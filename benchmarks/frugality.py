@@ -32,10 +32,8 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
         path = Path(folder) / PLY
         trainer.shown().save(path)
         size = path.stat().st_size
-    camera = photos.test[0].camera
     left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
     return done.judged() | {
-        "photo": [camera.width, camera.height],
         "cpu_seconds": done.setup_cpu_seconds + done.cpu_seconds,  # with the choice of photos
         "decision_seconds": trainer.frugality.memory.seconds,
         "peak_rss_mb": peak,

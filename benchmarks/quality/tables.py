@@ -149,10 +149,9 @@ def edge_maps(rows: Sequence[dict[str, Any]]) -> str:
 
 def formations(frame: DataFrame, label: str) -> str:
     """What a method took for the photos' degradation, by scene; several where the seeds differ."""
-    mine = frame.loc[frame["row"] == label]
     return crossed(
         f"What {label} took for the degradation",
-        mine.assign(formation=[formation or NOTHING for formation in mine["formation"]]),
+        frame.loc[frame["row"] == label].fillna({"formation": NOTHING}),
         lambda part: ", ".join(dict.fromkeys(part["formation"])),
         down="scene",
     )

@@ -68,13 +68,8 @@ def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
     full = torch.cat([image, alphas], dim=-1)[0]
     i, j = torch.tensor(list(cotangents)).T
     (full[i, j] * tensor(np.stack(list(cotangents.values())))).sum().backward()
-    gradients = {name: _double(leaf.grad) for name, leaf in leaves.items()}
-    return _double(full), meta["radii"][0].numpy(), gradients
-
-
-def _double(values: torch.Tensor | None) -> Array:
-    assert values is not None
-    return values.detach().numpy().astype(np.float64)
+    gradients = {name: leaf.grad.numpy().astype(np.float64) for name, leaf in leaves.items()}
+    return full.detach().numpy().astype(np.float64), meta["radii"][0].numpy(), gradients
 
 
 def weights(case: Case) -> dict[Pixel, Array]:
@@ -203,10 +198,6 @@ def run(args: argparse.Namespace) -> Report:
     load_mpmath()
     if args.quick and args.long:
         raise ValueError("--quick and --long exclude each other")
-    targets = {
-        "f64_values": VALUE_F64, "f64_gradients": GRADIENT_F64, "f32_ordinary": VALUE_F32,
-        "cosine": COSINE, "negligible": NEGLIGIBLE,
-    }  # fmt: skip
     catalogue = cases(args.long)
     found, conditions = [], []
     for case in catalogue:
@@ -223,7 +214,10 @@ def run(args: argparse.Namespace) -> Report:
         found.append(facts | {"outcomes": outcomes})
     rounding = input_rounding(next(case for case in catalogue if case.name == "world offset 1e6"))
     results = {"cases": found, "conditions": conditions, "world_offset_f32_input_rounding": rounding}
-    settings = {"long": args.long, "digits": DIGITS} | targets
+    settings = {
+        "long": args.long, "digits": DIGITS, "f64_values": VALUE_F64, "f64_gradients": GRADIENT_F64,
+        "f32_ordinary": VALUE_F32, "cosine": COSINE, "negligible": NEGLIGIBLE,
+    }  # fmt: skip
     return Report(settings, results=results, tables=tables(results), figures={"errors": chart(found)})
 
 
