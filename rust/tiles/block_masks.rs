@@ -33,7 +33,8 @@ impl Shapes {
     }
 }
 
-/// Make room for what the functions below write for `count` Gaussians: whole vectors, in the lists one more.
+/// Make room for what the functions below write for `count` Gaussians: whole vectors, in the lists one more. What
+/// lists held stays: to set them to zero for each tile would cost more than to fill them.
 pub(super) fn make_room(
     count: usize,
     masks: &mut Vec<u16>,
@@ -41,14 +42,17 @@ pub(super) fn make_room(
 ) -> Result<(), Error> {
     *masks = memory::with_capacity(count.next_multiple_of(GROUP), NAME)?;
     for list in lists {
-        let more = (count.next_multiple_of(GROUP) + GROUP).saturating_sub(list.len());
-        memory::reserve(list, more, NAME)?;
+        let room = count.next_multiple_of(GROUP) + GROUP;
+        if list.len() < room {
+            memory::resize(list, room, 0, NAME)?;
+        }
     }
     Ok(())
 }
 
 /// For each of `count` Gaussians the blocks of which a pixel centre can lie in the support (bit b for block
-/// b), and for each block the Gaussians, in order.
+/// b), and for each block the Gaussians, in order. Returns how many each block has; what its list holds after them
+/// means nothing.
 ///
 /// Row of blocks by row, the extent of the ellipse in the band of the row's pixel centres. The right border
 /// is concave in y and the left one convex, so in a band each is extreme at the y nearest to its top.
@@ -60,18 +64,14 @@ pub(super) fn reached_blocks<S: Simd>(
     count: usize,
     masks: &mut Vec<u16>,
     lists: &mut [Vec<u32>; TILE_BLOCKS],
-) {
+) -> [usize; TILE_BLOCKS] {
     let lanes = S::f32s::LEN;
     let splat = |x: f32| S::f32s::splat(simd, x);
     let (zero, one) = (splat(0.0), splat(1.0));
-    for list in lists.iter_mut() {
-        list.resize(count.next_multiple_of(lanes) + lanes, 0);
-    }
     let mut lengths = [0; TILE_BLOCKS];
     let ramp = S::u32s::from_fn(simd, |lane| lane as u32);
     let end = S::u32s::splat(simd, count as u32);
     let half = (TILE / 2) as f32;
-    masks.resize(count.next_multiple_of(lanes), 0);
     for first in (0..count).step_by(lanes) {
         let group = &shapes.0[first / GROUP];
         let at = first % GROUP..first % GROUP + lanes;
@@ -112,21 +112,23 @@ pub(super) fn reached_blocks<S: Simd>(
                 *length += inside.to_bitmask().count_ones() as usize;
             }
         }
-        for (mask, bits) in masks[first..].iter_mut().zip(bits.as_slice()) {
-            *mask = *bits as u16;
-        }
+        masks.extend(bits.as_slice().iter().map(|bits| *bits as u16));
     }
     masks.truncate(count);
-    for (list, length) in lists.iter_mut().zip(lengths) {
-        list.truncate(length);
-    }
+    lengths
 }
 
 /// The result of `reached_blocks` if every Gaussian reached every block.
-pub(super) fn all_blocks(count: usize, masks: &mut Vec<u16>, lists: &mut [Vec<u32>; TILE_BLOCKS]) {
+pub(super) fn all_blocks(
+    count: usize,
+    masks: &mut Vec<u16>,
+    lists: &mut [Vec<u32>; TILE_BLOCKS],
+) -> [usize; TILE_BLOCKS] {
     masks.resize(count, u16::MAX);
     for list in lists.iter_mut() {
-        list.clear();
-        list.extend(0..count as u32);
+        for (k, record) in list[..count].iter_mut().enumerate() {
+            *record = k as u32;
+        }
     }
+    [count; TILE_BLOCKS]
 }

@@ -130,15 +130,15 @@ pub(super) fn list<S: Simd, T: Real>(
         list.records.push(records[place]);
     }
     make_room(n, &mut list.masks, reached)?;
-    if projection.knobs.skip_blocks {
-        reached_blocks(simd, shapes, n, &mut list.masks, reached);
+    let lengths = if projection.knobs.skip_blocks {
+        reached_blocks(simd, shapes, n, &mut list.masks, reached)
     } else {
-        all_blocks(n, &mut list.masks, reached);
-    }
-    list.blocks = memory::with_capacity(reached.iter().map(Vec::len).sum(), NAME)?;
-    for (begin, records) in list.begins[1..].iter_mut().zip(reached) {
-        list.blocks.extend_from_slice(records);
-        *begin = list.blocks.len() as u32;
+        all_blocks(n, &mut list.masks, reached)
+    };
+    list.blocks = memory::with_capacity(lengths.iter().sum(), NAME)?;
+    for (block, length) in lengths.into_iter().enumerate() {
+        list.blocks.extend_from_slice(&reached[block][..length]);
+        list.begins[block + 1] = list.blocks.len() as u32;
     }
     Ok(list)
 }

@@ -131,9 +131,6 @@ impl<T: Real> Source<'_, T> {
             let [_, _, first, last] = splat.tiles.map(usize::from);
             memory::reserve(&mut spans, last - first, NAME)?;
             tile_spans(splat, exact, |row, x0, x1| {
-                if too_many {
-                    return;
-                }
                 let span = Span {
                     gaussian: i as u32,
                     row: row as u16,
@@ -145,10 +142,10 @@ impl<T: Real> Source<'_, T> {
                 }
                 spans.push(span);
                 fresh += (x1 - x0) as u64;
-                if fresh >= REPORT {
-                    too_many = self.add(std::mem::take(&mut fresh));
-                }
             });
+            if fresh >= REPORT {
+                too_many = self.add(std::mem::take(&mut fresh));
+            }
         }
         too_many = self.add(fresh);
         let chunk = Chunk {
