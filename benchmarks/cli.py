@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hqgs
-from benchmarks import accuracy, endurance, export, features, frugality, parts, ranks, time
+from benchmarks import accuracy, endurance, export, features, frugality, parts, time
 from benchmarks.output import Benchmark, command_line, write_results
 from benchmarks.protocol import add_options
 from benchmarks.quality import run as quality
@@ -18,7 +18,7 @@ from benchmarks.stability import run as stability
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.training.trainer import TrainingError
 
-MODULES = (accuracy, endurance, export, features, frugality, parts, quality, ranks, speed, stability, time)
+MODULES = (accuracy, endurance, export, features, frugality, parts, quality, speed, stability, time)
 BENCHMARKS: dict[str, Benchmark] = {m.__name__.split(".")[1]: m.BENCHMARK for m in MODULES}
 
 
@@ -49,21 +49,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM counts as Ctrl-C
     try:
-        return _run(args)
-    except KeyboardInterrupt:
-        return 130
-
-
-def _run(args: argparse.Namespace) -> int:
-    name = args.benchmark
-    try:
         args.out.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
         if args.page is not None and args.page.is_dir():
             raise ValueError(f"--page {args.page} is a folder: name a file")
         if args.threads is not None:
             hqgs.set_num_threads(args.threads)
-        report = BENCHMARKS[name].run(args)
-        files = write_results(args.out, name, command_line(args), report, args.page)
+        report = BENCHMARKS[args.benchmark].run(args)
+        files = write_results(args.out, args.benchmark, command_line(args), report, args.page)
+    except KeyboardInterrupt:
+        return 130
     except BAD_INPUT as error:
         return fail(2, error)
     except TrainingError as error:

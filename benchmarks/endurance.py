@@ -14,12 +14,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
-from benchmarks.charts import LEGEND, draw, panels
-from benchmarks.data import read_toml
 from benchmarks.measure import Run, Training
-from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import Protocol, Row, read_protocols
-from benchmarks.study import Cell, begin
+from benchmarks.output import LEGEND, Benchmark, Report, color, panels, table
+from benchmarks.protocol import Protocol, Row, read_protocols, read_toml
+from benchmarks.study import Cell, finished
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.trainer import Step, TrainingError
@@ -117,15 +115,12 @@ def _so_far(done: Training, losses: NDArray[np.float64]) -> dict[str, Any]:
     trainer.evaluate()
     finite = losses[np.isfinite(losses)]
     return {
-        "iteration": trainer.iteration,
-        "seconds": trainer.seconds,
+        **trainer.history[-1],
         "loss": float(finite.mean()) if len(finite) else None,
         "losses_not_finite": len(losses) - len(finite),
         "values_not_finite": sum(int((~torch.isfinite(t)).sum()) for t in trainer.gaussians.named().values()),
         "events": trainer.guard.num_events,
-        "gaussians": len(trainer.gaussians),
         "peak_rss_mb": peak,  # since the last record
-        "psnr": trainer.history[-1]["psnr"],
     }
 
 
@@ -173,7 +168,8 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
     what = {"psnr": "held-out PSNR (dB)", "gaussians": "Gaussians", "peak_rss_mb": "peak memory (MB)"}
     for axes, (name, label) in zip(grid, what.items(), strict=True):
         for k, result in enumerate(results):
-            draw(axes, DataFrame(result["records"], columns=["iteration", name]), k, result["case"])
+            points = DataFrame(result["records"], columns=["iteration", name]).dropna()
+            axes.plot(*points.to_numpy().T, "o-", color=color(k), label=result["case"], ms=3, lw=1.5)
         axes.set_ylabel(label)
     if results:
         grid[0].legend(**LEGEND)
@@ -183,13 +179,11 @@ def chart(results: Sequence[dict[str, Any]]) -> Figure:
 
 def run(args: argparse.Namespace) -> Report:
     """Run the cases that are not finished, in their order; each is written as soon as it is done."""
-    study = begin(args, PROTOCOLS)
-    study.train(measure)
+    study, report, _ = finished(args, PROTOCOLS, measure)
     alone = len(study.scenes) == len(study.protocol.seeds) == 1
     names = {cell: cell.row.label if alone else str(cell) for cell in study.cells}
     results = [{"case": name, **study.runs[c]} for c, name in names.items() if c in study.runs]
     passed = len(results) == len(study.cells) and all(result["passed"] for result in results)
-    report = study.report()
     report.settings["limit_mb"] = LIMIT_MB
     report.results = {"passed": passed, "cases": results}
     report.tables = [cases_table(results, study.protocol), "All passed." if passed else "NOT all passed."]

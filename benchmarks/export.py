@@ -12,18 +12,15 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.charts import GREY, LEGEND, color, panels, title, unbeaten
-from benchmarks.data import read_toml
-from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import read_protocols
-from benchmarks.study import Cell, begin
+import hqgs
+from benchmarks.output import GREY, LEGEND, Benchmark, Report, color, panels, table, title, unbeaten
+from benchmarks.protocol import read_protocols, read_toml
+from benchmarks.study import begin
 from hqgs.base.files import PLY
 from hqgs.base.typed import build
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
-from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.show.export import export
 from hqgs.show.export_options import ExportOptions
@@ -90,38 +87,24 @@ def chart(result: dict[str, Any]) -> Figure:
     return figure
 
 
-def trained(args: argparse.Namespace) -> tuple[Scene, Path, dict[str, Any]]:
-    """The scene, the folder that keeps its Gaussians, and the settings: trained, or of a given run."""
-    if len(args.scenes) > 1 or len(args.seeds or ()) > 1:
-        raise ValueError("one scene and one seed are written")
-    if args.run_folder is not None:
-        downscale = args.downscale or PROTOCOLS["quick" if args.quick else "standard"].downscale
-        return load_scene(args.scenes[0], downscale), args.run_folder, {"downscale": downscale}
-    study = begin(args, PROTOCOLS, labelled=False)
-    (cell,) = study.cells
-
-    def run_cell(cell: Cell, photos: Scene) -> Run:
-        done = train(photos, cell.config)
-        done.trainer.shown().save(study.beside(cell, PLY))
-        return done.record()
-
-    study.train(run_cell)
-    for failure in study.failures.values():
-        raise ValueError(f"{cell}: {failure}")
-    return cell.scene, study.beside(cell, PLY).parent, study.report().settings
-
-
 def run(args: argparse.Namespace) -> Report:
     """Train, or read a run, and write its Gaussians in every way."""
-    scene, folder, settings = trained(args)
+    if len(args.scenes) > 1 or len(args.seeds or ()) > 1:
+        raise ValueError("one scene and one seed are written")
+    study = begin(args, PROTOCOLS, labelled=False)
+    (cell,) = study.cells
+    scene, folder, settings = cell.scene, args.run_folder, {"downscale": study.protocol.downscale}
+    if folder is None:
+        folder, settings = study.beside(cell, PLY).parent, study.report().settings
+        if not (args.finished or hqgs.train(scene, out=folder, config=cell.config, resume=True).finished):
+            raise KeyboardInterrupt  # the next call goes on with it
     gaussians = Gaussians.load(folder)
-    camera = (scene.test or scene.train)[0].camera
     with tempfile.TemporaryDirectory(dir=args.out) as name:
         files = measure(scene, gaussians, Path(name))
     result = {
         "scene": scene.name,
-        "width": camera.width,
-        "height": camera.height,
+        "width": scene.test[0].camera.width,
+        "height": scene.test[0].camera.height,
         "gaussians": len(gaussians),
         "sh_degree": gaussians.sh_degree,
         "psnr": files[0]["psnr"] + files[0]["cost_db"],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,19 +11,16 @@ from typing import Any, Literal
 import numpy as np
 from pandas import DataFrame
 
-from benchmarks.data import read_toml
 from benchmarks.measure import Run, train
 from benchmarks.output import Benchmark, Report, number, table
 from benchmarks.patches import SWITCHES
-from benchmarks.protocol import Row, read_protocols
-from benchmarks.speed.timing import Seconds, interleaved, quartiles
-from benchmarks.speed.training import still_config, trainer_from
+from benchmarks.protocol import Row, read_protocols, read_toml
+from benchmarks.speed.timing import interleaved, quartiles, warmed
+from benchmarks.speed.training import still_trainer, trainer_from, whole_step
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import PLY
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
-from hqgs.training.config import TrainConfig
-from hqgs.training.trainer import Trainer
 
 REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
 LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
@@ -43,10 +40,6 @@ class Feature(Row):
     @property
     def more(self) -> dict[str, Any]:
         return {"switch": self.switch}
-
-    @property
-    def about(self) -> dict[str, Any]:
-        return {"feature": self.label, "other": self.other, "by_default": self.by_default}
 
     def switched(self) -> Any:
         """A context manager: inside it the other choice is in place, as far as it is none of the config."""
@@ -84,8 +77,7 @@ class Features:
     def refined(self, cell: Cell, feature: Feature) -> float | None:
         """Held-out PSNR of the default run's final Gaussians when they are trained on, their number fixed."""
         iterations = -(-cell.config.iterations // REFINED_SHARE)
-        densify = replace(cell.config.densify, stop=0)
-        config = replace(cell.config, iterations=iterations, densify=densify)
+        config = replace(cell.config, iterations=iterations, densify=replace(cell.config.densify, stop=0))
         with feature.switched():
             trainer = trainer_from(cell.scene, config, Gaussians.load(self.grown(cell)))
             for _ in range(iterations):
@@ -96,22 +88,12 @@ class Features:
     def final_steps(self, scene: Scene) -> dict[str, DataFrame]:
         """Seconds of steps on the final Gaussians of the default run, all features in turn."""
         cell = self.cells[scene.name, DEFAULT.label, self.protocol.seeds[0]]
-        final = Gaussians.load(self.grown(cell))
-
-        def timed(feature: Feature) -> Callable[[], Seconds]:
+        final, cases = Gaussians.load(self.grown(cell)), {}
+        for feature in self.rows:
             with feature.switched():
                 trainer = still_trainer(scene, self.protocol.train_config(feature, cell.seed), final)
-
-            def call() -> Seconds:
-                with feature.switched():
-                    trainer.step()  # a switch may have made new threads, without memory of their own
-                    before = trainer.seconds
-                    trainer.step()
-                return {"total": trainer.seconds - before}
-
-            return call
-
-        return interleaved({f.label: timed(f) for f in self.rows}, self.protocol.repeats)
+            cases[feature.label] = warmed(whole_step(trainer), feature.switched)
+        return interleaved(cases, self.protocol.repeats)
 
     def compare(self, scene: Scene) -> dict[str, Any] | None:
         """The results of a scene; None where a run of it is not finished."""
@@ -132,17 +114,6 @@ class Features:
         }
 
 
-def still_trainer(scene: Scene, config: TrainConfig, gaussians: Gaussians) -> Trainer:
-    """A trainer at the given Gaussians whose steps do all the work of a step, but change next to nothing.
-
-    The SH degree is what it is at the end of a run, and statistics for the density are gathered.
-    """
-    trainer = trainer_from(scene, still_config(config, max(len(gaussians), 1)), gaussians)
-    for _ in range(config.sh_degree):
-        trainer.step()
-    return trainer
-
-
 def compare(
     features: Sequence[Feature], runs: dict[str, list[dict[str, Any]]], steps: dict[str, DataFrame]
 ) -> list[dict[str, Any]]:
@@ -155,7 +126,8 @@ def compare(
     rows, fast = [], DataFrame(runs[DEFAULT.label])
     for feature in features:
         other, sign = DataFrame(runs[feature.label]), 1 if feature.by_default else -1
-        row = feature.about | {"psnr": float(other["psnr"].mean())}
+        row: dict[str, Any] = {"feature": feature.label, "other": feature.other}
+        row |= {"by_default": feature.by_default, "psnr": float(other["psnr"].mean())}
         for kind in ("", "refined_"):
             costs = sign * (other[f"{kind}psnr"].astype(float) - fast[f"{kind}psnr"]).dropna()
             row[f"{kind}costs_db"] = costs.tolist()
@@ -167,7 +139,7 @@ def compare(
     return rows
 
 
-def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def verdicts(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mean costs over the scenes, and whether the feature may be on.
 
     Growth decides by thresholds, so that a change of one bit makes other Gaussians: whole runs scatter by
@@ -175,16 +147,16 @@ def verdicts(features: Sequence[Feature], scenes: Sequence[dict[str, Any]]) -> l
     grown once and trained on with either choice scatter little, and are held against the limit itself.
     """
     found = []
-    for k, feature in enumerate(features):
-        entry = feature.about | {"limit_db": LIMIT_DB}
+    for rows in zip(*(scene["features"] for scene in scenes), strict=True):  # of one feature
+        entry = {name: rows[0][name] for name in ("feature", "other", "by_default")} | {"limit_db": LIMIT_DB}
         for kind in ("", "refined_"):
-            costs = [cost for scene in scenes for cost in scene["features"][k][f"{kind}costs_db"]]
+            costs = [cost for row in rows for cost in row[f"{kind}costs_db"]]
             error = float(np.std(costs, ddof=1) / np.sqrt(len(costs))) if costs[1:] else None
             entry[f"{kind}cost_db"] = float(np.mean(costs)) if costs else None
             entry[f"{kind}standard_error_db"] = error
         sure = entry["cost_db"] - SURE * (entry["standard_error_db"] or 0.0)
         worst = max(sure, -np.inf if entry["refined_cost_db"] is None else entry["refined_cost_db"])
-        found.append(entry | {"passed": not feature.by_default or bool(worst <= LIMIT_DB)})
+        found.append(entry | {"passed": not entry["by_default"] or bool(worst <= LIMIT_DB)})
     return found
 
 
@@ -215,7 +187,7 @@ def run(args: argparse.Namespace) -> Report:
     features.study.train(features.measure)
     report = features.study.report()
     results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
-    report.results = {"scenes": results, "verdicts": verdicts(features.rows[1:], results) if results else []}
+    report.results = {"scenes": results, "verdicts": verdicts(results)}
     report.tables += map(scene_table, results)
     if results:
         report.tables.append(verdict_table(report.results["verdicts"]))

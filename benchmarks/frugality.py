@@ -10,11 +10,9 @@ from typing import Any
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.charts import GREY, LEGEND, color, panels
-from benchmarks.data import paired, read_toml
 from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, number, table
-from benchmarks.protocol import Protocol, read_protocols
+from benchmarks.output import GREY, LEGEND, Benchmark, Report, color, number, paired, panels, table
+from benchmarks.protocol import Protocol, read_protocols, read_toml
 from benchmarks.study import Cell, finished
 from hqgs.base.files import PLY
 from hqgs.scene.scene import Scene
@@ -34,10 +32,8 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
         path = Path(folder) / PLY
         trainer.shown().save(path)
         size = path.stat().st_size
-    camera = photos.test[0].camera
     left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
     return done.judged() | {
-        "photo": [camera.width, camera.height],
         "cpu_seconds": done.setup_cpu_seconds + done.cpu_seconds,  # with the choice of photos
         "decision_seconds": trainer.frugality.memory.seconds,
         "peak_rss_mb": peak,
@@ -48,31 +44,31 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
 
 
 def compared(runs: DataFrame) -> DataFrame:
-    """Each run beside that of the same scene and seed which left nothing out, with its shares and gains."""
-    pairs = paired(runs, NONE)
+    """The other runs beside those of the same scene and seed which left nothing out: shares and gains."""
+    pairs = paired(runs, NONE).loc[lambda pairs: pairs["row"] != NONE]
     shares = {f"{name}_share": pairs[name] / pairs[f"{name}_base"] for name in SHARES}
     gains = {f"{name}_gain": pairs[name] - pairs[f"{name}_base"] for name in ("psnr", "ssim")}
     return pairs.assign(**shares, **gains)
 
 
-def against_none(runs: DataFrame, row: str) -> dict[str, Any] | None:
-    """Means over scenes and seeds of a row's ratios and differences to "none"; None where no run has both.
+def against_none(runs: DataFrame) -> dict[str, dict[str, Any]]:
+    """By row the means over scenes and seeds of its ratios and differences to "none", where runs have both.
 
     The worst scene is the one whose mean over the seeds is lowest.
     """
-    pairs = compared(runs).loc[lambda pairs: pairs["row"] == row]
-    if not len(pairs):
-        return None
-    gains = pairs.groupby("scene")["psnr_gain"].mean()
-    return {
-        "scenes": len(gains),
-        "runs": len(pairs),
-        **{name: float(pairs[f"{name}_share"].mean()) for name in SHARES},
-        "psnr": float(gains.mean()),
-        "worst_psnr": float(gains.min()),
-        "ssim": float(pairs["ssim_gain"].mean()),
-        "decision_share": float((pairs["decision_seconds"] / pairs["seconds"]).mean()),
-    }
+    found = {}
+    for row, pairs in compared(runs).groupby("row", sort=False):
+        gains: Any = pairs.groupby("scene")["psnr_gain"].mean()
+        found[str(row)] = {
+            "scenes": len(gains),
+            "runs": len(pairs),
+            **{name: float(pairs[f"{name}_share"].mean()) for name in SHARES},
+            "psnr": float(gains.mean()),
+            "worst_psnr": float(gains.min()),
+            "ssim": float(pairs["ssim_gain"].mean()),
+            "decision_share": float((pairs["decision_seconds"] / pairs["seconds"]).mean()),
+        }
+    return found
 
 
 def verdict(summary: dict[str, Any]) -> dict[str, bool]:
@@ -105,7 +101,7 @@ def runs_table(runs: DataFrame, protocol: Protocol) -> str:
 def chart(runs: DataFrame) -> Figure:
     """PSNR gained against the share of the CPU time, and against the share of the bytes; a mark a run."""
     figure, grid = panels(9, 4.2, 1, 2, sharey=True)
-    parts = compared(runs).loc[lambda pairs: pairs["row"] != NONE].groupby("row", sort=False)
+    parts = compared(runs).groupby("row", sort=False)
     for axes, (name, label) in zip(grid, (("cpu_seconds", "CPU time"), ("bytes", "bytes")), strict=True):
         for k, (row, pairs) in enumerate(parts):
             size = 60 if row == AUTO else 30
@@ -125,9 +121,7 @@ def run(args: argparse.Namespace) -> Report:
     study, report, runs = finished(args, PROTOCOLS, run_cell)
     if not len(runs):
         return report
-    labels = [label for label in study.protocol.labels if label != NONE]
-    summaries = {row: s for row in labels if (s := against_none(runs, row)) is not None}
-    report.results["against_none"] = summaries
+    summaries = report.results["against_none"] = against_none(runs)
     report.tables.append(runs_table(runs, study.protocol))
     if summaries:
         title = "Against none: mean differences and ratios over the scenes"

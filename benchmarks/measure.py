@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -28,8 +29,8 @@ class Training:
         self.initial_points = len(self.trainer.gaussians)
         self.cpu_seconds = 0.0  # of all threads in the steps; tells a busy machine from a slow method
 
-    def steps(self, count: int, after: Callable[[Step], None] = lambda step: None) -> None:
-        """So many steps, or to the end; raises TrainingError."""
+    def steps(self, count: float = math.inf, after: Callable[[Step], None] = lambda step: None) -> None:
+        """So many steps, or to the end, which the clock may change on the way; raises TrainingError."""
         end = self.trainer.iteration + count
         while self.trainer.iteration < min(end, self.trainer.length):
             clock = time.process_time()
@@ -79,8 +80,7 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
         if evaluate and trainer.iteration % trainer.config.eval_every == 0:
             trainer.evaluate()
 
-    while trainer.iteration < trainer.length:  # which the clock may change on the way
-        done.steps(trainer.length - trainer.iteration, after)
+    done.steps(after=after)
     if evaluate:
         trainer.evaluate()
     return done

@@ -1,13 +1,12 @@
-"""What every benchmark gives back, and how it is written and printed."""
+"""What every benchmark gives back, and how it is written, printed and drawn."""
 
 from __future__ import annotations
 
 import argparse
 import base64
-import io
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import reduce
@@ -15,7 +14,11 @@ from operator import getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Template
+from markdown_it import MarkdownIt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from pandas import DataFrame
 
 import hqgs
 from hqgs.base.files import atomic_path, write_json, write_text
@@ -23,10 +26,11 @@ from hqgs.base.machine import machine_facts, version_facts
 from hqgs.base.text import markdown_table
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from benchmarks.protocol import Protocol
 
+BLUE, ORANGE, GREEN, GREY = "#1f6fb2", "#c2571a", "#3a8f3a", "#6b6b6b"
+COLORS = (BLUE, ORANGE, GREEN, "#7b4fa3", "#b23a48", GREY, "#9a8a00", "#2a9d9d", "#d98cb3", "#000000")
+LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8}
 NOTHING = "–"  # in the place of a number that there is not
 UNTOLD = ("benchmark", "command", "out", "page")  # what of the arguments is no option, or changes no result
 
@@ -102,7 +106,7 @@ def write_results(out: Path, name: str, command: str, report: Report, page: Path
             figure.savefig(tmp)
     write_json(out / f"{stem}.json", facts)
     if page is not None:
-        write_page(page, facts, report)
+        write_page(page, facts, report, pictures)
     return [out / f"{stem}.json", *pictures, *([] if page is None else [page])]
 
 
@@ -145,36 +149,73 @@ def table(title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, S
     return markdown_table(title, [head for head, _ in columns.values()], body)
 
 
+def paired(runs: DataFrame, label: str, by: Sequence[str] = ("scene", "seed")) -> DataFrame:
+    """Each run beside that of row `label` with the same values of `by` (`_base`), where there is one."""
+    base = runs.loc[runs["row"] == label].set_index(list(by)).add_suffix("_base")
+    return runs.join(base, on=list(by), how="inner")
+
+
+def means(frame: DataFrame, by: Sequence[str], values: Sequence[str]) -> DataFrame:
+    """Means over the runs that share `by`, in their order; NaN where one of them lacks the number."""
+    parts = frame.groupby(list(by), sort=False)[list(values)]
+    return DataFrame(parts.agg(lambda v: v.astype(float).mean(skipna=False)))
+
+
+def records(frame: DataFrame) -> list[dict[str, Any]]:
+    """The lines as JSON values, with the index; None for NaN."""
+    lines = frame.reset_index().to_dict("records")
+    return [{str(name): None if value != value else value for name, value in line.items()} for line in lines]
+
+
+def color(k: int) -> str:
+    """The colour of the k-th curve; beyond the last they start again."""
+    return COLORS[k % len(COLORS)]
+
+
+def panels(
+    width: float, height: float, down: int = 1, across: int = 1, **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure of inches with its panels row by row, each with a grid behind the data and two spines."""
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    found = list(figure.subplots(down, across, squeeze=False, **shared).ravel())
+    for axes in found:
+        axes.grid(color="#dddddd", linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure, found
+
+
+def title(axes: Axes, text: str) -> None:
+    """Above the panel, to the left; a $ in a name of a scene is no formula."""
+    axes.set_title(text, fontsize=10, loc="left", parse_math=False)
+
+
+def unbeaten(points: Sequence[tuple[float, float]]) -> list[int]:
+    """The indices of the points that no other one beats, with less of one and no more of the other: a Pareto
+    front by rising first coordinate."""
+
+    def beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
+        return a != b and a[0] <= b[0] and a[1] <= b[1]
+
+    order = sorted(range(len(points)), key=lambda k: points[k])
+    return [k for k in order if not any(beats(other, points[k]) for other in points)]
+
+
 TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
-def write_page(path: Path, facts: dict[str, Any], report: Report) -> None:
+def write_page(path: Path, facts: dict[str, Any], report: Report, pictures: Iterable[Path]) -> None:
     """Write the page atomically. `facts`: what the JSON file holds. OSError where it cannot be written."""
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATE.parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    charts = {}
-    for what, figure in report.figures.items():
-        png = io.BytesIO()
-        figure.savefig(png, format="png")
-        charts[what.replace("_", " ")] = f"data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}"
-    page = environment.get_template(TEMPLATE.name).render(
+    template = Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True, trim_blocks=True)
+    charts = {
+        what.replace("_", " "): base64.b64encode(picture.read_bytes()).decode()
+        for what, picture in zip(report.figures, pictures, strict=True)
+    }
+    page = template.render(
         title=f"hqgs benchmark {facts['benchmark']} {report.part}".rstrip(),
         facts=facts,
-        blocks=[block for text in report.tables for block in _blocks(text)],
+        tables=MarkdownIt("commonmark", {"html": False}).enable("table").render("\n\n".join(report.tables)),
         charts=charts,
         settings=json.dumps({name: facts[name] for name in ("settings", "versions")}, indent=1),
     )
     write_text(path, page)
-
-
-def _blocks(text: str) -> Iterator[tuple[str, Any]]:
-    """Of Markdown as the benchmarks print it: titles, tables as rows of cells, and other text."""
-    for block in text.split("\n\n"):
-        if block.startswith("**") and block.endswith("**"):
-            yield "title", block.strip("*")
-        elif block.startswith("|"):
-            rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in block.splitlines()]
-            yield "table", [rows[0], *rows[2:]]
-        else:
-            yield "text", block

@@ -6,7 +6,7 @@ And what is put there: other knobs of the rasterizer, and the other choice of wh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -97,9 +97,7 @@ def _in_torch(place: Place, function: Any) -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(hqgs.get_num_threads())
     try:
-        with ExitStack() as stack:
-            stack.enter_context(patch.object(*ONE_TORCH_THREAD, nullcontext))
-            stack.enter_context(patch.object(*place, function))
+        with patch.object(*ONE_TORCH_THREAD, nullcontext), patch.object(*place, function):
             yield
     finally:
         torch.set_num_threads(before)
@@ -121,19 +119,18 @@ def in_float64(*args: Any, **options: Any) -> tuple[Tensor, Tensor, Rasterizatio
 def torch_loss(
     render: Tensor, target: Tensor, mask: Tensor | None = None, lambda_dssim: float = 0.2
 ) -> Tensor:
-    """`hqgs.losses.photometric_loss` from torch's operations and autograd, as the field writes it."""
+    """`photometric_loss` from torch's operations and autograd, as the field writes it."""
+    from kornia.filters import get_gaussian_kernel2d  # here: it takes seconds
+
     photo = target.to(render.dtype) / 255 if target.dtype == torch.uint8 else target
     counted = slice(None) if mask is None else mask
     l1 = (render - photo)[counted].abs().mean()
     if mask is not None:
         render = torch.where(mask[..., None], render, photo)
     x, y = (image.permute(2, 0, 1)[None] for image in (render, photo))
-    steps = torch.arange(SSIM_WINDOW, dtype=render.dtype) - SSIM_WINDOW // 2
-    row = torch.exp(-(steps**2) / (2 * SSIM_SIGMA**2))
-    row = row / row.sum()
-    channels = x.shape[1]
-    window = (row[:, None] * row).expand(channels, 1, -1, -1).contiguous()
-    blur = partial(conv2d, weight=window, padding=SSIM_WINDOW // 2, groups=channels)
+    window = get_gaussian_kernel2d(SSIM_WINDOW, (SSIM_SIGMA, SSIM_SIGMA), dtype=render.dtype)
+    window = window.expand(x.shape[1], 1, -1, -1).contiguous()
+    blur = partial(conv2d, weight=window, padding=SSIM_WINDOW // 2, groups=x.shape[1])
     mean_x, mean_y = blur(x), blur(y)
     var_x, var_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
     covariance = blur(x * y) - mean_x * mean_y

@@ -28,8 +28,7 @@ from pandas import DataFrame
 import hqgs
 from benchmarks.measure import Run
 from benchmarks.output import Report
-from benchmarks.protocol import Protocol, Row, narrowed
-from benchmarks.scenes import degraded, load_scenes
+from benchmarks.protocol import Protocol, Row, degraded, load_scenes, narrowed
 from hqgs.base.files import KEPT, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.cli.progress import duration
@@ -41,8 +40,6 @@ from hqgs.training.config import METHODS, PAPER, TrainConfig
 from hqgs.training.trainer import TrainingError
 
 FORMAT = 1  # raised when a run records something else
-KEY = r"[A-Za-z0-9_][A-Za-z0-9._-]*"  # what a run's name looks like: no path
-KNOWN = "known"  # the folder of runs from elsewhere
 NO_RESULT = "cli"  # of the package: what no result depends on
 
 
@@ -61,11 +58,6 @@ class Cell:
     @property
     def seed(self) -> int:
         return self.config.seed
-
-    @property
-    def kind(self) -> tuple[str, str]:
-        """What its speed depends on most: scene, row."""
-        return self.scene.name, self.row.label
 
     @property
     def group(self) -> tuple[str, str, int]:
@@ -94,48 +86,35 @@ def grid(protocol: Protocol, scenes: Sequence[Scene], labelled: bool = False, *t
 class Store:
     """`runs/VERSION-SOURCES/KEY.json` for each finished run, and a folder `KEY` for what it keeps beside.
 
-    A run that failed holds `error`, and is to be tried again.
+    A run that failed holds `error`, and is to be tried again. `known`: result files of this benchmark, whose
+    runs count where there is none here, without what lies beside. ValueError where one is no such file.
     """
 
-    def __init__(self, root: Path) -> None:
-        self.root = root / "runs"
-        self.here = self.root / f"{hqgs.__version__}-{sources()}"
+    def __init__(self, root: Path, known: Sequence[Path] = ()) -> None:
+        self.here = root / "runs" / f"{hqgs.__version__}-{sources()}"
+        self.known: dict[str, Run] = {}
+        for path in known:
+            try:
+                runs = json.loads(path.read_text(encoding="utf-8"))["results"]["runs"]
+                self.known |= {run["key"]: run for run in runs}
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"known: {path} holds no runs of this benchmark: {error!r}") from error
 
     def read(self, key: str) -> Run | None:
         """The finished run, else the failed one, else None; ValueError for a damaged file."""
-        failed = None
-        for path in (self.here / f"{key}.json", self.root / KNOWN / f"{key}.json"):
-            if path.is_file():
-                try:
-                    run = json.loads(path.read_text(encoding="utf-8"))
-                    if run["key"] != key:
-                        raise ValueError(f"it holds the run {run['key']}")
-                except (ValueError, KeyError, TypeError) as error:
-                    why = f"{path} is damaged: {error!r}"
-                    raise ValueError(f"{why}; remove it, and the run is repeated") from error
-                if "error" not in run:
-                    return run
-                failed = run
-        return failed
+        path = self.here / f"{key}.json"
+        if not path.is_file():
+            return self.known.get(key)
+        try:
+            run = json.loads(path.read_text(encoding="utf-8"))
+            if run["key"] != key:
+                raise ValueError(f"it holds the run {run['key']}")
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is damaged: {error!r}; remove it, and the run is repeated") from error
+        return self.known.get(key, run) if "error" in run else run
 
     def write(self, run: Run) -> None:
         write_json(self.here / f"{run['key']}.json", run)
-
-    def take(self, path: Path) -> None:
-        """Keep the runs of a result file of this benchmark that are not there yet, without what lies beside.
-
-        ValueError where it is no such file.
-        """
-        try:
-            runs = json.loads(path.read_text(encoding="utf-8"))["results"]["runs"]
-            keys = [run["key"] for run in runs]
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"known: {path} holds no runs of this benchmark: {error!r}") from error
-        for key, run in zip(keys, runs, strict=True):
-            if not re.fullmatch(KEY, key):
-                raise ValueError(f"known: {path} has a run of the name {key!r}")
-            if not (self.root / KNOWN / f"{key}.json").exists():
-                write_json(self.root / KNOWN / f"{key}.json", run)
 
     def beside(self, key: str, name: str) -> Path:
         """Where a run keeps a file: to be written before the run is, which vouches for it."""
@@ -188,9 +167,7 @@ class Study:
         self.args, self.name, self.protocol, self.scenes = args, name, protocol, scenes
         self.tags = [tag for tag, on in (("validation", args.validate), ("sfm", args.sfm)) if on]
         self.cells = grid(protocol, scenes, labelled, *self.tags)
-        self.store = Store(args.out)
-        for path in args.known or ():
-            self.store.take(path)
+        self.store = Store(args.out, args.known or ())
         self._last: tuple[tuple[str, str, int], Scene] | None = None
         prints = {scene.name: scene_fingerprint(scene) for scene in scenes}
         self.keys = {cell: key_of(cell, prints[cell.scene.name]) for cell in self.cells}
@@ -207,7 +184,8 @@ class Study:
         if self.args.finished:
             return
         pending = [cell for cell in self.cells if cell not in self.runs]
-        self.say(f"{len(self.cells)} runs, {len(pending)} left{about(pending, self.runs)}")
+        self.say(f"{len(self.cells)} runs, {len(pending)} left")
+        walls: list[float] = []  # seconds of the runs so far
         facts = {"sources": sources(), "machine": machine_facts(), "versions": version_facts()}
         for k, cell in enumerate(pending, 1):
             key, started = self.keys[cell], time.perf_counter()
@@ -218,16 +196,17 @@ class Study:
                 self.store.write({"key": key, "error": str(error), **facts})
                 self.say(f"[{k}/{len(pending)}] {cell} failed: {error}")
                 continue
-            wall = time.perf_counter() - started
+            walls.append(time.perf_counter() - started)
             run = {"key": key, "scene": cell.scene.name, **run, "threads": hqgs.get_num_threads()}
-            self.runs[cell] = run | {"wall_seconds": wall, **facts}
+            self.runs[cell] = run | {"wall_seconds": walls[-1], **facts}
             self.store.write(self.runs[cell])
             self.failures.pop(cell, None)
             value = run["history"][-1]["psnr"] if run["history"] else None
-            left = about(pending[k:], self.runs)
+            left = len(pending) - k
             self.say(
                 f"[{k}/{len(pending)}] {cell}: {'no PSNR' if value is None else f'{value:.2f} dB'}, "
-                f"{run['gaussians']:,} Gaussians, {duration(wall)}; {len(pending) - k} left{left}"
+                f"{run['gaussians']:,} Gaussians, {duration(walls[-1])}; {left} left"
+                + (f", about {duration(left * mean(walls))}" if left else "")
             )
 
     def photos(self, cell: Cell) -> Scene:
@@ -244,15 +223,12 @@ class Study:
         return path
 
     def report(self, part: str = "") -> Report:
-        """A report that holds nothing yet but what was run."""
+        """A report that holds nothing yet but what was run, and why the other runs are not there."""
         settings = asdict(self.protocol) | {"scenes": [scene.name for scene in self.scenes]}
         settings |= {"validation": self.args.validate, "sfm": self.args.sfm, **self.circumstances()}
-        return Report(settings, part, left_out=self.left_out())
-
-    def left_out(self) -> list[dict[str, str]]:
-        """The runs that are not there, with the reasons."""
         missing = [cell for cell in self.cells if cell not in self.runs]
-        return [{"what": f"run {c}", "why": self.failures.get(c, "not finished")} for c in missing]
+        why = [{"what": f"run {cell}", "why": self.failures.get(cell, "not finished")} for cell in missing]
+        return Report(settings, part, left_out=why)
 
     def results(self) -> list[Run]:
         """The finished runs with the labels of their rows, in the order of the cells."""
@@ -295,12 +271,3 @@ def finished(
     report = study.report()
     report.results["runs"] = study.results()
     return study, report, DataFrame(study.results())
-
-
-def about(cells: Sequence[Cell], runs: Mapping[Cell, Run]) -> str:
-    """How long these cells will take by the runs of the same scene and row, in words; "" if none is known."""
-    known: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
-    for cell, run in runs.items():
-        known[cell.kind].append(run["wall_seconds"] / max(run["iterations"], 1))
-    seconds = sum(cell.config.iterations * mean(known[cell.kind]) for cell in cells if cell.kind in known)
-    return f", about {duration(seconds)}" if seconds else ""

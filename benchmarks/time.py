@@ -6,14 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.charts import GREY, LEGEND, draw, panels, title
-from benchmarks.data import means, read_toml
 from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, table
-from benchmarks.protocol import read_protocols
+from benchmarks.output import Benchmark, Report, means, table
+from benchmarks.protocol import read_protocols, read_toml
 from benchmarks.study import Cell, finished
 from hqgs.pipeline import fitted
 from hqgs.scene.scene import Scene
@@ -22,7 +19,6 @@ FILE = Path(__file__).with_suffix(".toml")
 PROTOCOLS, COLUMNS = read_protocols(FILE), read_toml(FILE)["columns"]
 BASE, OWN = "3dgs", ", own points"
 MEANS = ("seconds", "iterations", "gaussians", "psnr", "ssim")  # over the seeds
-TICKS = (3, 10, 30, 60, 180, 600)  # s
 SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
 
 
@@ -65,34 +61,12 @@ def levels(runs: DataFrame) -> list[str]:
     return words
 
 
-def chart(runs: DataFrame) -> Figure:
-    """Held-out PSNR against seconds of training, a panel for each scene."""
-    scenes = list(runs["scene"].unique())
-    figure, grid = panels(5 * len(scenes), 4, 1, len(scenes))
-    for axes, scene in zip(grid, scenes, strict=True):
-        for history in runs.loc[(runs["scene"] == scene) & (runs["row"] == BASE), "history"]:
-            points = DataFrame(history)
-            axes.plot(points["seconds"], points["psnr"], color=GREY, label=BASE)
-        mine = DataFrame([line for line in lines(runs) if line["name"] == scene])
-        for k, (key, label) in enumerate((("psnr", "hqgs --seconds"), ("own", "from its own points"))):
-            draw(axes, mine[["seconds", key]], k, label)
-        axes.set(xscale="log", xlabel="training (s)", ylabel="held-out PSNR (dB)")
-        axes.set_xticks(TICKS, list(map(str, TICKS)))
-        axes.set_xticks([], minor=True)
-        axes.set_xlim(TICKS[0], TICKS[-1])
-        title(axes, str(scene))
-    handles = dict(zip(*reversed(grid[0].get_legend_handles_labels()), strict=True))
-    grid[0].legend(handles.values(), handles.keys(), **LEGEND)
-    return figure
-
-
 def run(args: argparse.Namespace) -> Report:
     """Train what is not finished; each run is kept as soon as it is done."""
     _, report, runs = finished(args, PROTOCOLS, run_cell)
     if len(runs) and (found := lines(runs)):
         report.results["lines"] = found
         report.tables += [table("Held-out error against seconds of training", found, COLUMNS), *levels(runs)]
-        report.figures["error"] = chart(runs)
     return report
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from benchmarks import cli, endurance, scenes
+from benchmarks import cli, endurance, protocol
 from benchmarks.endurance import PHOTOS, PROTOCOLS, Case, run_case, verdict
 from benchmarks.study import Store
 from hqgs.scene.scene import Scene
@@ -136,7 +136,7 @@ def test_the_command_keeps_finished_cases(
         sizes.append((width, height))
         return tiny_scene()
 
-    monkeypatch.setattr(scenes, "embedded_scene", embedded)
+    monkeypatch.setattr(protocol, "embedded_scene", embedded)
     options = ["--quick", "--out", tmp_path, "--rows", "as it is", "one photo"]
     assert call(*options) == 0
     out, err = capsys.readouterr()

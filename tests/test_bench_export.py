@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 from tiny_scene import tiny_scene
 
-from benchmarks import cli, scenes
+from benchmarks import cli, protocol
 from benchmarks import export as bench
-from benchmarks.charts import unbeaten
+from benchmarks.output import unbeaten
 from benchmarks.study import Store
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.model.gaussians import Gaussians
@@ -27,7 +27,7 @@ def call(*arguments: str | Path) -> int:
 
 def test_quick(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    monkeypatch.setattr(scenes, "embedded_scene", lambda *args, **_: asked.append(args) or tiny_scene())
+    monkeypatch.setattr(protocol, "embedded_scene", lambda *args, **_: asked.append(args) or tiny_scene())
     assert call("--quick", "--out", tmp_path, "--page", tmp_path) == 2
     assert "is a folder: name a file" in capsys.readouterr().err
     page = tmp_path / "page.html"
@@ -92,7 +92,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: list[str],
     message: str,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(scenes, "embedded_scene", lambda *_, **__: tiny_scene())
+    monkeypatch.setattr(protocol, "embedded_scene", lambda *_, **__: tiny_scene())
     assert call(*arguments, "--out", tmp_path) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line

@@ -15,8 +15,9 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from benchmarks import cli, features, patches
-from benchmarks.features import DEFAULT, FEATURES, PROTOCOLS, still_trainer
+from benchmarks.features import DEFAULT, FEATURES, PROTOCOLS
 from benchmarks.patches import TorchAdam, torch_loss
+from benchmarks.speed.training import still_trainer
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 
@@ -224,10 +225,6 @@ def compare(*arguments: Any) -> list[dict[str, Any]]:
     return features.compare(FEATURES, *arguments)
 
 
-def verdicts(scenes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return features.verdicts(FEATURES, scenes)
-
-
 def runs_of(*psnrs: float) -> dict[str, list[dict[str, Any]]]:
     runs = {f.label: [run_of(psnr, 20.0) for psnr in psnrs] for f in (DEFAULT, *FEATURES)}
     for run in runs["rising SH degree"]:
@@ -249,7 +246,7 @@ def test_costs_and_verdicts_of_a_hand_made_case() -> None:
     assert rows["rising SH degree"]["refined_costs_db"] == []
     runs["fused Adam"] = [run_of(30.2, 20.0), run_of(30.2, 20.0)]
     runs["selective Adam"] = [run_of(29.0, 5.0), run_of(29.0, 5.0)]
-    found = {row["feature"]: row for row in verdicts([{"features": compare(runs, steps)}] * 2)}
+    found = {row["feature"]: row for row in features.verdicts([{"features": compare(runs, steps)}] * 2)}
     assert found["fused Adam"]["cost_db"] == pytest.approx(0.19)
     assert not found["fused Adam"]["passed"]
     assert found["selective Adam"]["cost_db"] == pytest.approx(1.01)
@@ -263,7 +260,7 @@ def test_whole_runs_must_be_sure_to_cost_too_much_and_the_refined_ones_only_do()
         runs = runs_of(30.0, 30.0)
         runs["fused loss"] = other
         steps = {name: rounds(1.0) for name in runs}
-        found = {row["feature"]: row for row in verdicts([{"features": compare(runs, steps)}])}
+        found = {row["feature"]: row for row in features.verdicts([{"features": compare(runs, steps)}])}
         return found["fused loss"]["passed"]
 
     assert passes([run_of(30.5, 10.0), run_of(29.9, 10.0)])  # 0.2 dB with an error of 0.3

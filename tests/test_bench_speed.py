@@ -90,7 +90,6 @@ def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: dict[str, Any]) -> None
     assert rows[0]["over_first"] == 1
     assert all(0.5 < r["over_first"] / (r["seconds"] / rows[0]["seconds"]) < 2 for r in rows)
     assert {r["gaussians"] for r in rows} == {500}
-    assert {r["target_ms"] for r in rows} == {None}  # they hold at another size
     assert rows[0]["stages"]["method"] < rows[1]["stages"]["method"]  # no Gaussian is too small
 
 

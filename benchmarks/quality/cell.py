@@ -1,9 +1,9 @@
-"""One training run of the quality benchmark: what is measured of it, and which renders are kept."""
+"""One training run of the quality benchmark: what is measured of it, which renders are kept and shown."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,18 @@ from pandas import DataFrame
 from PIL import Image
 
 from benchmarks.measure import Run, Training, train
+from benchmarks.protocol import degraded, degraded_view
 from benchmarks.quality.rivals import RIVALS
-from benchmarks.scenes import degraded
 from benchmarks.study import Cell, Store, Study
 from hqgs._rust import NEAR_PLANE
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import METRICS, evaluate_view, mean_metrics, psnr
+from hqgs.evaluation.report import AMPLIFICATION, MASKED
 from hqgs.model.render import render_view
 from hqgs.photos.edges import edge_magnitude
-from hqgs.photos.pixels import to_uint8
+from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.photos.sheet import printable, sheet
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import AUTO
@@ -34,11 +36,6 @@ from hqgs.training.trainer import Trainer
 EDGE_SHARE = 0.2  # of the pixels of a photo, those with the largest gradient, are its edges
 MAX_PHOTOS = 8  # of a scene, whose edge maps are compared
 RENDERS = 3  # times that each held-out view is rendered
-
-
-def render_path(store: Store, key: str, view: int) -> Path:
-    """The render of the held-out view of that number."""
-    return store.beside(key, f"{view}.png")
 
 
 def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
@@ -52,7 +49,7 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
     measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
     mean = asdict(mean_metrics(measured))
     for k, view in enumerate(views[:renders]):
-        with atomic_path(render_path(study.store, study.keys[cell], k)) as tmp:
+        with atomic_path(study.beside(cell, f"{k}.png")) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
     return done.record() | {
         "downscale": cell.downscale,
@@ -70,6 +67,41 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
         "sfm": None if photos.sfm is None else asdict(photos.sfm),
         "peak_rss_mb": done.peak_rss_mb(),  # of the whole cell
     }
+
+
+def write_sheet(
+    path: Path, store: Store, clean: Scene, runs: Mapping[str, dict[str, Any]], number: int
+) -> bool:
+    """Write the sheet of one held-out view; False where a render was not kept.
+
+    Above: photo, degraded photo, the render of each run. Below each of those after the first: its difference
+    from the photo. No run has seen the degraded photo; it shows what happened to the training photos.
+    """
+    files = {label: store.beside(run["key"], f"{number}.png") for label, run in runs.items()}
+    if not all(file.is_file() for file in files.values()):
+        return False
+    first = next(iter(runs.values()))
+    view = clean.test[number]
+    bad = degraded_view(clean, view, first["degradation"], first["seed"]).image
+    photo, degraded_photo = (to_uint8(as_floats(image)) for image in (view.image, bad))
+    above = [(printable(f"photo {view.name}"), photo)]
+    above.append((_caption(first["degradation"], psnr(bad, photo, view.mask)), degraded_photo))
+    for label, run in runs.items():
+        with Image.open(files[label]) as image:
+            above.append((_caption(label, run["views"][number]["psnr"]), np.asarray(image.convert("RGB"))))
+    below = [("", np.full_like(photo, 255))]
+    for _, panel in above[1:]:
+        error = np.minimum(AMPLIFICATION * np.abs(panel.astype(np.int64) - photo), 255).astype(np.uint8)
+        if view.mask is not None:
+            error[~view.mask] = MASKED
+        below.append((f"difference x{AMPLIFICATION}", error))
+    with atomic_path(path) as tmp:
+        sheet([above, below]).save(tmp)
+    return True
+
+
+def _caption(label: str, value: float | None) -> str:
+    return printable(label if value is None else f"{label}  {value:.2f} dB")
 
 
 def _facts(trainer: Trainer, cell: Cell) -> dict[str, Any]:

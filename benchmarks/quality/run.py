@@ -12,8 +12,7 @@ from pandas import DataFrame
 from benchmarks.output import Benchmark, Report
 from benchmarks.protocol import read_protocols
 from benchmarks.quality import tables
-from benchmarks.quality.cell import edge_robustness, run_cell
-from benchmarks.quality.charts import gain_chart, time_chart, write_sheet
+from benchmarks.quality.cell import edge_robustness, run_cell, write_sheet
 from benchmarks.quality.rivals import RivalRow
 from benchmarks.study import Cell, Study, begin
 from hqgs.base.files import write_text
@@ -35,22 +34,21 @@ class Quality:
         renders = self.args.pictures if cell.seed == self.protocol.seeds[0] else 0
         return run_cell(cell, photos, self.study, renders)
 
-    def groups(self) -> list[list[Cell]]:
-        """The cells that see the same photos, where every row is finished: only they are compared."""
-        found: dict[tuple[str, str, int], list[Cell]] = {}
-        for cell in self.study.cells:
-            found.setdefault(cell.group, []).append(cell)
-        return [group for group in found.values() if all(cell in self.study.runs for cell in group)]
+    def compared(self) -> DataFrame:
+        """The runs that see the same photos where every row is finished: only they are compared."""
+        runs = DataFrame(self.study.results(), columns=None if self.study.runs else tables.GROUP)
+        whole = runs.groupby(tables.GROUP)["seed"].transform("size") == len(self.protocol.rows)
+        return runs.loc[whole]
 
-    def sheets(self, group: list[Cell]) -> None:
+    def sheets(self, group: DataFrame) -> None:
         """The picture sheets of a group, if they are not there yet."""
-        cell, runs = group[0], {cell.row.label: self.study.runs[cell] for cell in group}
-        digest = hashlib.sha256(" ".join(run["key"] for run in runs.values()).encode()).hexdigest()[:8]
-        for number in range(min(self.args.pictures, len(cell.scene.test))):
-            kind = cell.degradation.replace(":", "_")
-            name = f"{cell.scene.name}-{kind}-s{cell.seed}-{number}-{digest}.png"
+        (name, kind, seed), runs = group[tables.GROUP].iloc[0], group.set_index("row").to_dict("index")
+        scene = next(scene for scene in self.study.scenes if scene.name == name)
+        digest = hashlib.sha256(" ".join(group["key"]).encode()).hexdigest()[:8]
+        for number in range(min(self.args.pictures, len(scene.test))):
+            name = f"{scene.name}-{kind.replace(':', '_')}-s{seed}-{number}-{digest}.png"
             path = self.args.out / "pictures" / name
-            if not (path.is_file() or write_sheet(path, self.study.store, cell.scene, runs, number)):
+            if not (path.is_file() or write_sheet(path, self.study.store, scene, runs, number)):
                 self.report.leave_out(f"picture {name}", "the runs did not keep its renders")
 
     def tables(self) -> None:
@@ -64,19 +62,17 @@ class Quality:
             except ValueError as error:  # a blur too wide for the photos, which fails the runs as well
                 report.leave_out(f"edge maps of {scene.name}", str(error))
         report.results |= {"edge_maps": maps, "runs": self.study.results()}
-        if groups := self.groups():
-            self.compare(groups)
+        if len(runs := self.compared()):
+            self.compare(runs)
         if kinds and maps:
             report.tables.append(tables.edge_maps(maps))
 
-    def compare(self, groups: list[list[Cell]]) -> None:
+    def compare(self, runs: DataFrame) -> None:
         """Tables and charts of the groups in which every row is finished."""
         report, labels = self.report, self.protocol.labels
-        for group in groups:
-            if group[0].seed == self.protocol.seeds[0]:
-                self.sheets(group)
+        for _, group in runs.loc[runs["seed"] == self.protocol.seeds[0]].groupby(tables.GROUP, sort=False):
+            self.sheets(group)
         baseline = self.protocol.baseline if self.protocol.baseline in labels and len(labels) > 1 else None
-        runs = [self.study.runs[cell] | {"row": cell.row.label} for group in groups for cell in group]
         frame = tables.frame_of(runs, baseline)
         what = self.what(frame)
         report.tables.append(tables.metrics(frame, what))
@@ -84,7 +80,7 @@ class Quality:
             over = f"PSNR gain over {baseline}"
             for name, when in zip(tables.GAINS, ("", " when the faster of the two ends"), strict=True):
                 report.tables.append(tables.gains(frame, name, f"{over}{when}", baseline))
-            report.figures["gains"] = gain_chart(frame, baseline)
+            report.figures["gains"] = tables.gain_chart(frame, baseline)
         parts = frame.groupby("scene", sort=False)
         for _, part in parts if len(parts) > 1 else ():
             report.tables.append(tables.metrics(part, self.what(part), ("psnr", "ssim")))
@@ -94,7 +90,6 @@ class Quality:
         report.tables += [tables.formations(frame, label) for label in labels if label in guessing]
         if self.args.sfm:
             report.tables.append(tables.reconstructions(frame))
-        report.figures["psnr_vs_time"] = time_chart(frame, what)
         for metric, why in sorted({item for reasons in frame["reasons"] for item in reasons.items()}):
             report.leave_out(metric, why)
 

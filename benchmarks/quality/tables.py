@@ -1,4 +1,4 @@
-"""The quality benchmark's numbers, and Markdown tables of them in the layout of the paper's.
+"""The quality benchmark's numbers, Markdown tables of them in the layout of the paper's, and their chart.
 
 A mean is that of all runs of its group: where one of them lacks the number, there is none.
 """
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from pandas import DataFrame, Series, concat
 
-from benchmarks.data import means, paired, read_toml, records
-from benchmarks.measure import Run
-from benchmarks.output import NOTHING, number, table
+from benchmarks.output import NOTHING, means, number, paired, panels, records, table, title
+from benchmarks.protocol import read_toml
 from hqgs.base.text import markdown_table
 from hqgs.evaluation.metrics import METRICS
 from hqgs.photos.formula import NONE
@@ -64,6 +64,35 @@ def gains(frame: DataFrame, name: str, title: str, baseline: str) -> str:
 
     title = f"{title} (dB): mean ± std over scenes and seeds (worst)"
     return crossed(title, with_degraded(frame.loc[frame["row"] != baseline]), text)
+
+
+def gain_chart(frame: DataFrame, baseline: str) -> Figure:
+    """A heat map for each method but the baseline: its PSNR over the baseline's in each group."""
+    others = frame.loc[frame["row"] != baseline]
+    kinds = list(frame["degradation"].unique())
+    lines = frame[["scene", "seed"]].drop_duplicates()
+    limit = others["gain"].abs().max()
+    limit = limit if limit > 0 else 1.0  # NaN, where there is no gain, is not
+    parts = others.groupby("row", sort=False)
+    size = 2.2 + 0.85 * len(kinds), (1.1 + 0.34 * len(lines)) * len(parts) + 0.3
+    figure, grid = panels(*size, len(parts))
+    image = None
+    for axes, (label, part) in zip(grid, parts, strict=True):
+        values = part.set_index(["scene", "seed", "degradation"])["gain"].unstack()
+        values = values.reindex(index=list(lines.itertuples(index=False, name=None)), columns=kinds)
+        image = axes.imshow(values.to_numpy(), cmap="RdBu", vmin=-limit, vmax=limit, aspect="auto")
+        axes.grid(visible=False)
+        title(axes, f"{label} over {baseline}")
+        names = [f"{scene}, seed {seed}" for scene, seed in values.index]
+        axes.set_xticks(range(len(kinds)), kinds, fontsize=8, parse_math=False)
+        axes.set_yticks(range(len(names)), names, fontsize=8, parse_math=False)
+        for (i, j), value in np.ndenumerate(values.to_numpy()):
+            if np.isfinite(value):
+                shade = "white" if abs(value) > 0.6 * limit else "black"
+                axes.text(j, i, f"{value:+.2f}", ha="center", va="center", fontsize=8, color=shade)
+    if image is not None:
+        figure.colorbar(image, ax=grid, label="PSNR gain (dB)")
+    return figure
 
 
 def costs(frame: DataFrame, facts: str) -> str:
@@ -120,10 +149,9 @@ def edge_maps(rows: Sequence[dict[str, Any]]) -> str:
 
 def formations(frame: DataFrame, label: str) -> str:
     """What a method took for the photos' degradation, by scene; several where the seeds differ."""
-    mine = frame.loc[frame["row"] == label]
     return crossed(
         f"What {label} took for the degradation",
-        mine.assign(formation=[formation or NOTHING for formation in mine["formation"]]),
+        frame.loc[frame["row"] == label].fillna({"formation": NOTHING}),
         lambda part: ", ".join(dict.fromkeys(part["formation"])),
         down="scene",
     )
@@ -150,18 +178,16 @@ def reconstructions(frame: DataFrame) -> str:
     return table(title, lines, LABEL | COLUMNS["sfm"])
 
 
-def frame_of(runs: Sequence[Run], baseline: str | None = None) -> DataFrame:
+def frame_of(runs: DataFrame, baseline: str | None = None) -> DataFrame:
     """The runs with the numbers of the tables beside what they hold, NaN where there is none.
 
     Gains are over the run of the `baseline` in the same group; without one there are none.
     """
-    frame = DataFrame(runs)
-    frame = frame.join(
-        DataFrame([[run["metrics"].get(name) for name in METRICS] for run in runs], columns=METRICS)
-    )
+    frame = runs.reset_index(drop=True)
+    frame = frame.join(DataFrame(frame["metrics"].tolist(), columns=METRICS))
     frame["ms_per_step"] = 1_000 * frame["seconds"] / frame["iterations"]
     for name in ("edge", "flat"):
-        frame[f"{name}_density"] = [run["regions"][name]["density"] for run in runs]
+        frame[f"{name}_density"] = [regions[name]["density"] for regions in frame["regions"]]
     frame = frame.astype(dict.fromkeys([*METRICS, *COSTS], float))
     if baseline is not None:
         pairs = paired(frame, baseline, GROUP)

@@ -6,35 +6,18 @@ cache (measured with a probe of the arithmetic).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import Any
-from unittest.mock import patch
 
-import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.charts import LEGEND, color, panels, title
 from benchmarks.patches import COMPOSITE, CRATE
-from benchmarks.speed.inputs import LEAVES, RasterInputs, fitted, make_inputs
-from benchmarks.speed.timing import (
-    Seconds,
-    StageClock,
-    exponent,
-    interleaved,
-    median_ratio,
-    using_threads,
-    whole,
-)
+from benchmarks.speed.inputs import LEAVES, RasterInputs
+from benchmarks.speed.timing import Seconds, StageClock, interleaved, warmed, whole
 from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
-Size = tuple[int, int]  # width, height
-TARGET = 1.05  # the largest exponent that is good
-AGAINST = {"gaussians": "Gaussians", "pixels": "pixels"}  # what the time grows with
 BIN = "bin"  # the part of "bin and composite" before the first pixel
 BLOCK_PIXELS = 16  # lanes of a block of 4 x 4 pixels
 LIMIT_NS = 0.65 + 1.05  # of one core, for a pair that blends: forward, backward
@@ -63,10 +46,11 @@ class RasterPass:
         return image.detach()
 
     def __call__(self) -> Seconds:
-        clock, composites = StageClock(), list[Any]()
-        with one_torch_thread(), clock.watching(CRATE), _keeping(composites):
+        clock = StageClock(keep=CRATE[COMPOSITE])
+        with one_torch_thread(), clock.watching(CRATE):
             seconds = clock.seconds(self.run, STAGES)
         self.clear()
+        composites = [composite for composite, *_ in clock.kept]  # which the crate counts and times itself
         self.blended = sum(composite.blended for composite in composites)
         return seconds | {BIN: sum(composite.bin_seconds for composite in composites)}
 
@@ -74,30 +58,6 @@ class RasterPass:
         """Free the gradients, so that the many cases of a benchmark fit into memory together."""
         for leaf in self.leaves:
             leaf.grad = None
-
-
-@contextmanager
-def _keeping(composites: list[Any]) -> Iterator[None]:
-    """Add to the list what the crate counts and times itself in each composite."""
-    forward = getattr(*COMPOSITE)
-
-    def call(*args: Any) -> Any:
-        out = forward(*args)
-        composites.append(out[0])
-        return out
-
-    with patch.object(*COMPOSITE, call):
-        yield
-
-
-def warmed(case: Callable[[], Seconds]) -> Callable[[], Seconds]:
-    """The second of two passes in a row: as in training, its memory is what the one before gave back."""
-
-    def call() -> Seconds:
-        case()
-        return case()
-
-    return call
 
 
 def count_work(case: RasterPass, pixels: int) -> dict[str, Any]:
@@ -119,7 +79,7 @@ def count_work(case: RasterPass, pixels: int) -> dict[str, Any]:
 def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]]:
     """Time and work of each of the inputs."""
     passes = [RasterPass(x) for x in inputs]
-    measured = interleaved({str(k): warmed(case) for k, case in enumerate(passes)}, repeats)
+    measured = interleaved({k: warmed(case) for k, case in enumerate(passes)}, repeats)
     rows = []
     for x, case, rounds in zip(inputs, passes, measured.values(), strict=True):
         work = count_work(case, x.width * x.height)
@@ -139,80 +99,3 @@ def measure(inputs: Sequence[RasterInputs], repeats: int) -> list[dict[str, Any]
             }
         )
     return rows
-
-
-def thread_counts() -> list[int]:
-    """1, 2, 4, ... up to the number of threads in use, which is the last."""
-    most = hqgs.get_num_threads()
-    return [*(1 << k for k in range(most.bit_length()) if 1 << k < most), most]
-
-
-def measure_threads(cases: dict[str, Callable[[], Seconds]], repeats: int) -> list[dict[str, Any]]:
-    """Each case with each number of threads; the speed-up is that of the same round."""
-    threads = thread_counts()
-
-    def with_threads(case: Callable[[], Seconds], count: int) -> Callable[[], Seconds]:
-        def call() -> Seconds:
-            with using_threads(count):
-                return warmed(case)()  # new threads start with no memory of their own
-
-        return call
-
-    jobs = {f"{name}/{t}": with_threads(case, t) for name, case in cases.items() for t in threads}
-    measured, rows = interleaved(jobs, repeats), []
-    for key, rounds in measured.items():
-        name, count = key.rsplit("/", 1)
-        line = {"case": name, "threads": int(count), "seconds": rounds["total"].median()}
-        speedup = median_ratio(measured[f"{name}/1"], rounds)
-        rows.append(line | {"speedup": speedup, "share": speedup / int(count)})
-    return rows
-
-
-def measure_scaling(
-    sizes: Sequence[int], image: Size, images: Sequence[Size], gaussians: int, repeats: int, seed: int
-) -> dict[str, Any]:
-    """Time against the number of Gaussians in one image, and of `gaussians` against the size of the image.
-
-    The overlap per pixel is the same everywhere.
-    """
-    cloud = make_inputs(max(sizes), *image, seed)  # the smaller ones share its memory
-    by_size = _curve({n: RasterPass(fitted(cloud, n, *image)) for n in sizes}, repeats)
-    cloud = make_inputs(gaussians, *images[0], seed)
-    passes = {w * h: RasterPass(fitted(cloud, gaussians, w, h)) for w, h in images}
-    return {
-        "gaussians": {"width": image[0], "height": image[1], **by_size},
-        "pixels": {"gaussians": gaussians, **_curve(passes, repeats)},
-        "target_exponent": TARGET,
-    }
-
-
-def _curve(passes: dict[int, RasterPass], repeats: int) -> dict[str, Any]:
-    """Seconds of passes by what they grow with."""
-    measured = interleaved({str(x): warmed(case) for x, case in passes.items()}, repeats)
-    rows = [whole(rounds) for rounds in measured.values()]
-    curve = {name: [row[name] for row in rows] for name in ("seconds", "seconds_quartiles")}
-    ends = pairwise(zip(passes, curve["seconds"], strict=True))
-    steepest = max(exponent(*zip(*two, strict=True)) for two in ends)  # between two neighbours
-    found = {"exponent": exponent(list(passes), curve["seconds"]), "steepest": steepest}
-    return {"x": list(passes), **curve, **found}
-
-
-def scaling_chart(scaling: dict[str, Any]) -> Figure:
-    """Two panels: time against Gaussians and against megapixels, with the fitted power."""
-    figure, grid = panels(9, 4, 1, 2, sharey=True)
-    grid[0].set_ylabel("forward and backward (s)")
-    first, second = (scaling[name] for name in AGAINST)
-    what = (
-        (first, 1, "Gaussians", f"{first['width']} x {first['height']} pixels"),
-        (second, 1e6, "megapixels", f"{second['gaussians']} Gaussians"),
-    )
-    for k, (axes, (curve, unit, label, text)) in enumerate(zip(grid, what, strict=True)):
-        x, seconds = np.array(curve["x"]) / unit, np.array(curve["seconds"])
-        errors = np.abs(np.array(curve["seconds_quartiles"]).T - seconds)
-        axes.errorbar(x, seconds, errors, color=color(k), marker="o", markersize=4, lw=1.6)
-        line = np.exp(np.log(seconds).mean()) * (x / np.exp(np.log(x).mean())) ** curve["exponent"]
-        axes.plot(x, line, color="#888888", linestyle="--", lw=1, label=f"power {curve['exponent']:.2f}")
-        axes.set(xscale="log", yscale="log", xlabel=label)
-        title(axes, text)
-        axes.legend(**LEGEND)
-    return figure

@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -15,15 +15,16 @@ from pandas import DataFrame
 
 import hqgs
 
+Case = TypeVar("Case", bound=Hashable)
 Seconds = dict[str, float]  # by stage; "total" is the whole, and what no stage holds is "rest"
 
 
-def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dict[str, DataFrame]:
+def interleaved(cases: Mapping[Case, Callable[[], Seconds]], repeats: int) -> dict[Case, DataFrame]:
     """Call each case once to warm up, then all of them in each of `repeats` rounds, which are the rows.
 
     What disturbs the machine for a while then disturbs all cases alike. Every other round goes backwards.
     """
-    measured: dict[str, list[Seconds]] = {name: [] for name in cases}
+    measured: dict[Case, list[Seconds]] = {name: [] for name in cases}
     for case in cases.values():
         case()
     collecting = gc.isenabled()
@@ -36,6 +37,18 @@ def interleaved(cases: Mapping[str, Callable[[], Seconds]], repeats: int) -> dic
         if collecting:
             gc.enable()
     return {name: DataFrame(rounds) for name, rounds in measured.items()}
+
+
+def warmed(case: Callable[[], Seconds], context: Callable[[], Any] = nullcontext) -> Callable[[], Seconds]:
+    """The second of two calls in a row, inside the context: as in training, its memory is what the one before
+    gave back, and threads that the context makes start with none of their own."""
+
+    def call() -> Seconds:
+        with context():
+            case()
+            return case()
+
+    return call
 
 
 @contextmanager
@@ -72,7 +85,8 @@ def exponent(x: Sequence[float], seconds: Sequence[float]) -> float:
 class StageClock:
     """Seconds by stage of what runs inside `watching`; a stage does not count the stages within it."""
 
-    def __init__(self) -> None:
+    def __init__(self, keep: str = "") -> None:
+        self.keep, self.kept = keep, list[Any]()  # a stage, and what its functions returned
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._inner: list[float] = []  # of each open stage, the seconds of the stages within it
 
@@ -83,7 +97,10 @@ class StageClock:
             self._inner.append(0.0)
             started = time.perf_counter()
             try:
-                return function(*args, **kwargs)
+                returned = function(*args, **kwargs)
+                if stage == self.keep:
+                    self.kept.append(returned)
+                return returned
             finally:
                 spent = time.perf_counter() - started
                 self._seconds[stage] += spent - self._inner.pop()

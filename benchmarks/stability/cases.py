@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.data import read_toml
+from benchmarks.protocol import read_toml
 from benchmarks.stability.oracle import GROUPS, Array, OracleScene, Pixel
 from hqgs.base.typed import build
 
 PIXELS: tuple[Pixel, ...] = ((4, 5), (4, 6), (3, 5), (6, 8), (0, 0), (8, 11))
 FILE = Path(__file__).with_suffix(".toml")
+BASE = read_toml(FILE)["base"]
 
 
 @dataclass(frozen=True)
@@ -45,21 +46,15 @@ class Case:
         return self.culled_f32 if dtype == "f32" and self.culled_f32 is not None else self.culled
 
 
+def arrays(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a scene as cases.toml has them: its lists become arrays, `K` from focal length, cx, cy."""
+    made = {name: np.array(value) if isinstance(value, list) else value for name, value in values.items()}
+    return made | ({"K": _intrinsics(*values["K"])} if "K" in values else {})
+
+
 def scene(**changes: Any) -> OracleScene:
     """Two ordinary Gaussians at depths 5 and 6 before a 12 x 9 camera of focal length 20 at the origin."""
-    base = OracleScene(
-        means=np.array([[-0.11, 0.07, 5.0], [0.31, -0.17, 6.0]]),
-        quats=np.array([[0.83, -0.21, 0.42, 0.31], [0.47, 0.61, -0.33, 0.52]]),
-        scales=np.array([[0.41, 0.23, 0.32], [0.52, 0.61, 0.27]]),
-        opacities=np.array([0.73, 0.64]),
-        colors=np.array([[0.81, 0.37, 0.22], [0.13, 0.58, 0.94]]),
-        viewmat=np.eye(4),
-        K=_intrinsics(20.0, 6.0, 4.5),
-        width=12,
-        height=9,
-        background=np.array([0.31, 0.62, 0.17]),
-    )
-    return replace(base, **changes)
+    return OracleScene(**arrays(BASE) | changes)
 
 
 def changed(
@@ -74,9 +69,7 @@ def changed(
     """The ordinary scene with the changes of cases.toml, in the order of the parameters."""
     s = scene() if stack is None else stacked(**stack)
     s = replace(s, **{name: getattr(s, name)[:keep] for name in GROUPS})
-    for name, value in (all or {}).items():
-        value = _intrinsics(*value) if name == "K" else np.array(value) if isinstance(value, list) else value
-        s = replace(s, **{name: value})
+    s = replace(s, **arrays(all or {}))
     if sh is not None:
         s = replace(s, colors=harmonics()[sh])
     for name, value in (first or {}).items():
@@ -158,6 +151,8 @@ def cases(long: bool = False) -> list[Case]:
     """The catalogue; `long` adds what takes minutes or gigabytes. ValueError names a mistake in the file."""
     found, changes = [], inspect.signature(changed).parameters
     for group, tables in read_toml(FILE).items():
+        if group == "base":
+            continue
         for table in tables if long or group != "long" else ():
             expected = {name: value for name, value in table.items() if name not in changes}
             made = changed(**{name: value for name, value in table.items() if name in changes})

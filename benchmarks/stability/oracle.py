@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ class Oracle:
         self.mp = load_mpmath().mp.clone()
         self.mp.dps = DIGITS
         self.scene = scene
-        self.splats: dict[int, Splat | None] = {}
+        self.splat = cache(self._splat)
         self.R, self.t = (self.mp.matrix(part.tolist()) for part in np.split(scene.viewmat[:3], [3], axis=1))
 
     @cached_property
@@ -108,10 +108,6 @@ class Oracle:
         finite = [i for i in range(len(self.scene.means)) if self._finite(i)]
         return sorted(finite, key=lambda i: (self._camera_point(self._numbers("means", i))[2], i))
 
-    def kept(self, i: int) -> bool:
-        """Whether Gaussian `i` is not culled."""
-        return self._finite(i) and self._splat(i) is not None
-
     def pixel(self, pixel: Pixel) -> list[Any]:
         """Colour channels and alpha of a pixel (row, column)."""
         return self._blend(self._layers(pixel))
@@ -124,7 +120,7 @@ class Oracle:
     def _differences(self, i: int, name: str, plans: list[Any]) -> list[Any]:
         mp, values = self.mp, self._numbers(name, i)
         touched = [plan for plan in plans if any(layer[0] == i for layer in plan[2])]
-        if self._splat(i) is None or not touched:
+        if self.splat(i) is None or not touched:
             return [mp.mpf(0)] * len(values)
         largest = max(abs(v) for v in values)
         if name == "means":
@@ -153,7 +149,7 @@ class Oracle:
         transmittance, layers = mp.mpf(1), []
         cap, stop = mp.mpf("0.99"), mp.mpf("0.999e-4")
         for i in self.order:
-            splat = self._splat(i)
+            splat = self.splat(i)
             if splat is None or (alpha := self._alpha(splat, pixel)) < ALPHA_FLOOR:
                 continue
             capped = alpha >= cap
@@ -183,26 +179,21 @@ class Oracle:
         return splat.opacity * self.mp.exp(-sigma)
 
     def _finite(self, i: int) -> bool:
-        return all(np.isfinite(self._used(name, i)).all() for name in GROUPS)
-
-    def _used(self, name: str, i: int) -> Array:
-        values = getattr(self.scene, name)[i]
-        if name == "colors" and self.scene.sh_degree is not None:
-            values = values[: (self.scene.sh_degree + 1) ** 2]
-        return np.ravel(values)
+        return all(self.mp.isfinite(v) for name in GROUPS for v in self._numbers(name, i))
 
     def _numbers(self, name: str, i: int) -> list[Any]:
-        return [self.mp.mpf(v) for v in self._used(name, i).tolist()]
+        values, degree = getattr(self.scene, name)[i], self.scene.sh_degree
+        if name == "colors" and degree is not None:
+            values = values[: (degree + 1) ** 2]
+        return [self.mp.mpf(v) for v in np.ravel(values).tolist()]
 
     def _camera_point(self, mean: list[Any]) -> Any:
         return self.R * self.mp.matrix(mean) + self.t
 
     def _splat(self, i: int) -> Splat | None:
-        if i not in self.splats:
-            self.splats[i] = self._cull(i)
-        return self.splats[i]
-
-    def _cull(self, i: int) -> Splat | None:
+        """Gaussian `i` as it is projected; None where it is culled."""
+        if not self._finite(i):
+            return None
         mp, s = self.mp, self.scene
         depth = self._camera_point(self._numbers("means", i))[2]
         norm2 = sum(v * v for v in self._numbers("quats", i))

@@ -15,13 +15,19 @@ import torch
 from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.charts import BLUE, ORANGE, panels
-from benchmarks.data import read_toml
-from benchmarks.output import Benchmark, Report, table
+from benchmarks.output import BLUE, ORANGE, Benchmark, Report, panels, table
+from benchmarks.protocol import read_toml
 from benchmarks.stability.cases import Case, cases
-from benchmarks.stability.oracle import DIGITS, GROUPS, Array, Oracle, OracleScene, Pixel, load_mpmath
+from benchmarks.stability.oracle import DIGITS, GROUPS, KINDS, Array, Oracle, OracleScene, Pixel, load_mpmath
 
-DTYPES = {"f32": torch.float32, "f64": torch.float64}
+CAMERA = (
+    "width",
+    "height",
+    "near_plane",
+    "far_plane",
+    "eps2d",
+    "sh_degree",
+)  # as `hqgs.rasterization` has it
 VALUE_F64, GRADIENT_F64 = 1e-12, 1e-9  # relative
 VALUE_F32, COSINE = 1e-5, 0.99999  # absolute, for ordinary cases; of each group of gradients
 # A group of gradients below this share of the largest, each times the size of its parameter, is rounding.
@@ -46,35 +52,24 @@ class Outcome:
 
 def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
     """Image with alpha [H, W, D + 1], radii [N, 2] and gradients by group, as float64 arrays."""
-    kind = DTYPES[dtype]
 
     def tensor(values: Array) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(kind)
+        return torch.from_numpy(np.ascontiguousarray(values, KINDS[dtype]))
 
     leaves: dict[str, Any] = {name: tensor(getattr(s, name)).requires_grad_() for name in GROUPS}
     image, alphas, meta = hqgs.rasterization(
         **leaves,
+        **{name: getattr(s, name) for name in CAMERA},
         viewmats=tensor(s.viewmat)[None],
         Ks=tensor(s.K)[None],
-        width=s.width,
-        height=s.height,
-        near_plane=s.near_plane,
-        far_plane=s.far_plane,
-        eps2d=s.eps2d,
-        sh_degree=s.sh_degree,
         backgrounds=None if s.background is None else tensor(s.background)[None],
         rasterize_mode="antialiased" if s.antialiased else "classic",
     )
     full = torch.cat([image, alphas], dim=-1)[0]
     i, j = torch.tensor(list(cotangents)).T
     (full[i, j] * tensor(np.stack(list(cotangents.values())))).sum().backward()
-    gradients = {name: _double(leaf.grad) for name, leaf in leaves.items()}
-    return _double(full), meta["radii"][0].numpy(), gradients
-
-
-def _double(values: torch.Tensor | None) -> Array:
-    assert values is not None
-    return values.detach().numpy().astype(np.float64)
+    gradients = {name: leaf.grad.numpy().astype(np.float64) for name, leaf in leaves.items()}
+    return full.detach().numpy().astype(np.float64), meta["radii"][0].numpy(), gradients
 
 
 def weights(case: Case) -> dict[Pixel, Array]:
@@ -103,23 +98,21 @@ def evaluate(case: Case, dtype: str) -> Outcome:
         return Outcome(dtype, as_expected, finite, equal)
     oracle = Oracle(s)
     checked = range(len(s.means)) if len(s.means) <= 10 else case.gradients_of or ()
-    as_expected = as_expected and all(oracle.kept(i) == (i not in culled) for i in checked)
+    as_expected = as_expected and all((oracle.splat(i) is None) == (i in culled) for i in checked)
     wanted = [oracle.pixel(pixel) for pixel in case.pixels]
-    error = largest_difference([image[pixel] for pixel in case.pixels], wanted)
-    size = max(float(abs(w)) for row in wanted for w in row)
+    errors = value_errors([image[pixel] for pixel in case.pixels], wanted)
     ids = case.compared
     worst, cosine, group = compare_gradients(
         s, dtype, {name: gradients[name][ids] for name in GROUPS}, oracle.gradients(cotangents, ids), ids
     )
-    return Outcome(
-        dtype, as_expected, finite, equal, error, error / size if size else error, worst, cosine, group
-    )
+    return Outcome(dtype, as_expected, finite, equal, *errors, worst, cosine, group)
 
 
-def largest_difference(got: Sequence[Any], wanted: Sequence[Any]) -> float:
-    """Largest absolute difference of two lists of pixels."""
-    pairs = [pair for a, b in zip(got, wanted, strict=True) for pair in zip(a, b, strict=True)]
-    return max(float(abs(g - w)) for g, w in pairs)
+def value_errors(got: Sequence[Any], wanted: Sequence[Any]) -> tuple[float, float]:
+    """Largest absolute difference of two lists of pixels, and the same over the largest value wanted."""
+    truth = np.array(wanted, object)
+    error, size = (float(np.abs(values).max()) for values in (np.array(got, object) - truth, truth))
+    return error, error / size if size else error
 
 
 def condition(case: Case, dtype: str) -> Outcome:
@@ -128,11 +121,10 @@ def condition(case: Case, dtype: str) -> Outcome:
     cotangents, ids, rng = weights(case), case.compared, np.random.default_rng(0)
     oracle = Oracle(s)
     values, gradients = [oracle.pixel(p) for p in case.pixels], oracle.gradients(cotangents, ids)
-    size = max(float(abs(v)) for row in values for v in row)
     found = []
     for _ in range(NUDGES):
         nudged = Oracle(s.nudged(dtype, rng))
-        change = largest_difference([nudged.pixel(p) for p in case.pixels], values) / size
+        _, change = value_errors([nudged.pixel(p) for p in case.pixels], values)
         other = {name: np.array(rows, float) for name, rows in nudged.gradients(cotangents, ids).items()}
         found.append((change, *compare_gradients(s, dtype, other, gradients, ids)[:2]))
     changes, worst, cosines = zip(*found, strict=True)
@@ -195,11 +187,10 @@ def misses(case: Case, outcome: Outcome) -> list[str]:
 def input_rounding(case: Case) -> float:
     """Largest change of any compared value that rounding the inputs to float32 alone causes."""
     exact, rounded = Oracle(case.scene), Oracle(case.scene.rounded("f32"))
-    return largest_difference([exact.pixel(p) for p in case.pixels], [rounded.pixel(p) for p in case.pixels])
+    return value_errors(*([oracle.pixel(p) for p in case.pixels] for oracle in (exact, rounded)))[0]
 
 
-COLUMNS = Path(__file__).with_name("columns.toml")
-Rows = list[tuple[Case, list[Outcome]]]  # in float32 and in float64
+COLUMNS = read_toml(Path(__file__).with_name("columns.toml"))
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -207,62 +198,54 @@ def run(args: argparse.Namespace) -> Report:
     load_mpmath()
     if args.quick and args.long:
         raise ValueError("--quick and --long exclude each other")
-    targets = {
-        "f64_values": VALUE_F64, "f64_gradients": GRADIENT_F64, "f32_ordinary": VALUE_F32,
-        "cosine": COSINE, "negligible": NEGLIGIBLE,
-    }  # fmt: skip
-    report = Report(settings={"long": args.long, "digits": DIGITS} | targets)
-    rows: Rows = []
-    for case in cases(args.long):
+    catalogue = cases(args.long)
+    found, conditions = [], []
+    for case in catalogue:
         print(f"stability: {case.name}", file=sys.stderr)
-        rows.append((case, [evaluate(case, dtype) for dtype in ("f32", "f64")]))
-    missed = [(case, outcome) for case, outcomes in rows for outcome in outcomes if misses(case, outcome)]
-    conditions = {(case.name, o.dtype): condition(case, o.dtype) for case, o in missed}
-    rounding = input_rounding(next(case for case, _ in rows if case.name == "world offset 1e6"))
-    report.results = {
-        "cases": [
-            {
-                "name": case.name,
-                "reason": case.why,
-                "culled": {o.dtype: list(case.expected_culled(o.dtype)) for o in outcomes},
-                "outcomes": [{**vars(o), "misses": misses(case, o)} for o in outcomes],
-            }
-            for case, outcomes in rows
-        ],
-        "conditions": [{"name": name, **vars(found)} for (name, _), found in conditions.items()],
-        "world_offset_f32_input_rounding": rounding,
-    }
-    report.tables = tables(rows, conditions, rounding)
-    report.figures["errors"] = chart(rows)
-    return report
+        outcomes = []
+        for outcome in (evaluate(case, dtype) for dtype in KINDS):
+            missed = misses(case, outcome)
+            outcomes.append(vars(outcome) | {"misses": missed})
+            if missed:
+                limits = vars(condition(case, outcome.dtype))
+                conditions.append({"name": case.name, "by": "; ".join(missed), **limits})
+        culled = {dtype: list(case.expected_culled(dtype)) for dtype in KINDS}
+        facts = {"name": case.name, "reason": case.why, "poison": case.poison, "culled": culled}
+        found.append(facts | {"outcomes": outcomes})
+    rounding = input_rounding(next(case for case in catalogue if case.name == "world offset 1e6"))
+    results = {"cases": found, "conditions": conditions, "world_offset_f32_input_rounding": rounding}
+    settings = {
+        "long": args.long, "digits": DIGITS, "f64_values": VALUE_F64, "f64_gradients": GRADIENT_F64,
+        "f32_ordinary": VALUE_F32, "cosine": COSINE, "negligible": NEGLIGIBLE,
+    }  # fmt: skip
+    return Report(settings, results=results, tables=tables(results), figures={"errors": chart(found)})
 
 
-def tables(rows: Rows, conditions: dict[tuple[str, str], Outcome], rounding: float) -> list[str]:
-    lines, missed = [], []
-    for case, outcomes in rows:
-        words: dict[str, Any] = {"name": case.name, "why": case.why, "targets": "met"}
-        for o in outcomes:
-            if found := misses(case, o):
-                words["targets"] = "missed"
-                missed.append(vars(conditions[case.name, o.dtype]) | words | {"by": "; ".join(found)})
-            words[o.dtype] = vars(o)
-        if not case.poison:
-            in_f32, in_f64 = (len(case.expected_culled(o.dtype)) for o in outcomes)
-            culled = f"{in_f32 or ''}" if in_f32 == in_f64 else f"f32 {in_f32}, f64 {in_f64}"
-            lines.append(words | {"culled": culled, "turn": max(0.0, 1 - outcomes[0].cosine)})
-    poison = [misses(case, o) for case, outcomes in rows if case.poison for o in outcomes]
-    good, columns = f"{poison.count([])} of {len(poison)}", read_toml(COLUMNS)
+def tables(results: dict[str, Any]) -> list[str]:
+    """Of what the JSON file holds."""
+    lines, poisoned = [], []
+    for case in results["cases"]:
+        f32, f64 = case["outcomes"]
+        if case["poison"]:
+            poisoned += [f32["misses"], f64["misses"]]
+            continue
+        counts = [len(gone) for gone in case["culled"].values()]
+        words = "f32 {}, f64 {}".format(*counts) if len(set(counts)) > 1 else str(counts[0] or "")
+        line = case | {"f32": f32, "f64": f64, "culled": words, "turn": max(0.0, 1 - f32["cosine"])}
+        lines.append(line | {"targets": "missed" if f32["misses"] or f64["misses"] else "met"})
+    missed, rounding = results["conditions"], results["world_offset_f32_input_rounding"]
     return [
-        table("Error against the oracle, on the same rounded inputs", lines, columns["errors"]),
-        table("Targets that are missed, and what one ulp of the inputs changes", missed, columns["missed"]),
-        f"Inputs that are not finite: {good} culled, with every other bit unchanged.",
+        table("Error against the oracle, on the same rounded inputs", lines, COLUMNS["errors"]),
+        table("Targets that are missed, and what one ulp of the inputs changes", missed, COLUMNS["missed"]),
+        f"Inputs that are not finite: {poisoned.count([])} of {len(poisoned)} culled, with every other bit "
+        "unchanged.",
         f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
     ]
 
 
-def chart(rows: Rows) -> Figure:
+def chart(found: list[dict[str, Any]]) -> Figure:
     """Two panels, values and gradients: one row per case, f32 and f64, the targets as lines."""
-    shown = [(case, outcomes) for case, outcomes in rows if not case.poison]
+    shown = [case for case in found if not case["poison"]]
     figure, (left, right) = panels(10, 2 + 0.16 * len(shown), 1, 2, sharey=True)
     y = np.arange(len(shown))
     for axes, field, limit, what in (
@@ -270,13 +253,13 @@ def chart(rows: Rows) -> Figure:
         (right, "gradient", GRADIENT_F64, "gradients, relative L2"),
     ):
         for k, (dtype, color) in enumerate((("f32", ORANGE), ("f64", BLUE))):
-            errors = [max(getattr(outcomes[k], field), 1e-18) for _, outcomes in shown]
+            errors = [max(case["outcomes"][k][field], 1e-18) for case in shown]
             axes.plot(errors, y, "o", color=color, markersize=4, label=dtype)
         axes.axvline(limit, color=BLUE, linestyle="--", linewidth=1, label=f"target f64, {limit:g}")
         axes.set(xscale="log", xlabel=what)
         axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=3, frameon=False)
     left.axvline(VALUE_F32, color=ORANGE, linestyle="--", linewidth=1)  # absolute, but the values are near 1
-    left.set_yticks(y, [case.name for case, _ in shown], fontsize=7)
+    left.set_yticks(y, [case["name"] for case in shown], fontsize=7)
     left.set_ylim(len(shown), -1)
     return figure
 
