@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, means, table
+from benchmarks.output import BLUE, GREY, Benchmark, Report, means, panels, table, title
 from benchmarks.protocol import read_protocols, read_toml
 from benchmarks.study import Cell, finished
 from hqgs.pipeline import fitted
@@ -61,12 +62,28 @@ def levels(runs: DataFrame) -> list[str]:
     return words
 
 
+def chart(runs: DataFrame) -> Figure:
+    """Held-out PSNR against seconds of training, a panel for each scene."""
+    found, scenes = DataFrame(lines(runs)), list(runs["scene"].unique())
+    figure, grid = panels(4 * len(scenes), 4, 1, len(scenes))
+    for axes, scene in zip(grid, scenes, strict=True):
+        for history in runs.loc[(runs["scene"] == scene) & (runs["row"] == BASE), "history"]:
+            DataFrame(history).plot("seconds", "psnr", ax=axes, color=GREY, label=BASE)
+        mine = found[found["name"] == scene]
+        mine.plot("seconds", "psnr", ax=axes, color=BLUE, marker="o", label="hqgs --seconds")
+        axes.set(xscale="log", xlabel="training (s)", ylabel="held-out PSNR (dB)")
+        axes.set_xticks([3, 10, 30, 60, 180, 600], ["3", "10", "30", "60", "180", "600"])
+        title(axes, str(scene))
+    return figure
+
+
 def run(args: argparse.Namespace) -> Report:
     """Train what is not finished; each run is kept as soon as it is done."""
     _, report, runs = finished(args, PROTOCOLS, run_cell)
     if len(runs) and (found := lines(runs)):
         report.results["lines"] = found
         report.tables += [table("Held-out error against seconds of training", found, COLUMNS), *levels(runs)]
+        report.figures["error"] = chart(runs)
     return report
 
 
