@@ -13,6 +13,8 @@ from torch import Tensor
 from hqgs.base.left_out import LeftOut
 from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.scene import Inspector
+from hqgs.model.discs import as_discs
+from hqgs.model.first_points import Colors, Points
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.smoothing import enlarge
 from hqgs.photos.formula import LEARNED, OWN
@@ -56,6 +58,7 @@ class HQGS(Plain):
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
+      Gaussians are discs and needles then, as their neighbours lie (`as_discs`).
     - Noise: the learning rates are halved as often as a fiftieth of the pixels, which the loss leaves out,
       finds that nothing is gained any more (`Plateau`). At constant rates the Gaussians learn the noise.
     """
@@ -119,16 +122,15 @@ class HQGS(Plain):
             points, colors, _ = first_points(scene, wanted, config.seed, self._told)
             if self.as_photographed and len(points) > len(scene.points):
                 config = _coarse_first(config)
-            scene = replace(scene, points=points, point_colors=colors)
-            start = super().start(scene, targets, replace(config, method="3dgs") if plain else config)
-            return replace(start, left_out=left_out)
+            config = replace(config, method="3dgs") if plain else self.named(config)
+            return Start(config, _laid(scene, points, colors, config), left_out)
         least, densify = len(scene.points), config.densify
         budget = with_budget(densify, self.formation, targets, self.config.gaussians_per_pixel, least)
         if densify.reset_every < densify.stop:
             left_out.append(LeftOut("resets of the opacities", "a budget of Gaussians bears none"))
         wanted = int(self.config.first_points * budget.max_gaussians)
         points, colors, why = first_points(scene, wanted, config.seed, self._told)
-        gaussians = Gaussians.from_points(points, colors, config.sh_degree)
+        gaussians = _laid(scene, points, colors, config)
         self._measure(gaussians, 0)
         return Start(self.named(replace(config, densify=budget)), gaussians, left_out + why)
 
@@ -201,6 +203,12 @@ class HQGS(Plain):
         if self.config.smallest:
             pixels = photo_pixels(gaussians.means, self._views) * self.formation.factor
             self._smallest, self._since = (self.config.smallest * pixels).float(), iteration
+
+
+def _laid(scene: Scene, points: Points, colors: Colors, config: TrainConfig) -> Gaussians:
+    """Gaussians at these points; where there are more than the scene has, they lie as their neighbours do."""
+    gaussians = Gaussians.from_points(points, colors, config.sh_degree)
+    return as_discs(gaussians) if len(points) > len(scene.points) else gaussians
 
 
 def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
