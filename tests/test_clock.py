@@ -21,6 +21,7 @@ from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock
 from hqgs.training import schedule as schedule_module
 from hqgs.training.config import AUTOMATIC, DensifyConfig, TrainConfig, run_config
+from hqgs.training.methods.budget import PIXELS
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import with_iterations, with_plan
 from hqgs.training.trainer import Trainer
@@ -146,7 +147,7 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
         return Trainer(few, replace(run_config(iterations=50, method=method, formation="none"), **changes))
 
     dense = trainer()
-    assert 2 * len(few.points) < len(dense.gaussians) <= max(pixels // 100, len(few.points))
+    assert 2 * len(few.points) < len(dense.gaussians) <= max(pixels // PIXELS, len(few.points))
     assert (
         dense.config.leave_out == (*AUTOMATIC[:-1], *AUTOMATIC[-1:]) or "resolution" in dense.config.leave_out
     )
