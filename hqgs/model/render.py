@@ -13,6 +13,7 @@ from torch import Tensor
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.rasterization import RasterizationMeta, rasterization
+from hqgs.scene.geometry import resized_camera
 from hqgs.scene.scene import Camera, View
 
 if TYPE_CHECKING:
@@ -28,7 +29,46 @@ def render_view(
     """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
     # At degree 0 the higher harmonics are left out, so that they get no gradient full of zeros either.
     colors = (gaussians.sh0, gaussians.shN) if sh_degree else gaussians.sh0
-    images, _, meta = rasterization(
+    images, _, meta = _rasterized(gaussians, camera, colors, sh_degree, background)
+    return images[0], meta
+
+
+@torch.no_grad()
+def composited(
+    gaussians: Gaussians, camera: Camera, colors: Tensor, sh_degree: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """What the Gaussians look like with these colours, black behind them: [H, W, C], and alphas [H, W, 1].
+
+    `colors` [N, C], or with `sh_degree` harmonics, as `hqgs.rasterization` takes them. Without a gradient.
+    """
+    with one_torch_thread():
+        image, alpha, _ = _rasterized(gaussians, camera, colors, sh_degree)
+    return image[0], alpha[0]
+
+
+@torch.no_grad()
+def nearness_map(gaussians: Gaussians, camera: Camera, coarser: int) -> Tensor:
+    """1 / expected depth in pixels `coarser` times as large, [ceil(H / coarser), ceil(W / coarser)].
+
+    Where little is in the way of the light, the median of the rest; 0 where nothing is anywhere.
+    """
+    small = resized_camera(camera, -(-camera.width // coarser), -(-camera.height // coarser))
+    depths, alphas, _ = _rasterized(gaussians, small, gaussians.sh0[:, 0], render_mode="ED")
+    near, solid = 1 / depths[0, ..., 0].clamp(min=_rust.NEAR_PLANE), alphas[0, ..., 0] > 0.5
+    return torch.where(solid, near, near[solid].median() if solid.any() else 0.0)
+
+
+def _rasterized(
+    gaussians: Gaussians,
+    camera: Camera,
+    colors: Tensor | tuple[Tensor, Tensor],
+    sh_degree: int | None = None,
+    background: Sequence[float] | None = None,
+    render_mode: str = "RGB",
+) -> tuple[Tensor, Tensor, RasterizationMeta]:
+    """`hqgs.rasterization` of the Gaussians for one camera: [1, H, W, C], [1, H, W, 1] and meta data."""
+    backgrounds = None if background is None else torch.tensor([[*background]], dtype=gaussians.means.dtype)
+    return rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.activated_scales(),
@@ -39,58 +79,9 @@ def render_view(
         camera.width,
         camera.height,
         sh_degree=sh_degree,
-        backgrounds=torch.tensor([[*background]], dtype=gaussians.means.dtype),
+        backgrounds=backgrounds,
+        render_mode=render_mode,
     )
-    return images[0], meta
-
-
-def composited(
-    gaussians: Gaussians, camera: Camera, colors: Tensor, sh_degree: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """What the Gaussians look like with these colours, black behind them: [H, W, C], and alphas [H, W, 1].
-
-    `colors` [N, C], or with `sh_degree` harmonics, as `hqgs.rasterization` takes them. Without a gradient.
-    """
-    with one_torch_thread(), torch.no_grad():
-        image, alpha, _ = rasterization(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.activated_scales(),
-            gaussians.activated_opacities(),
-            colors,
-            torch.tensor(camera.viewmat[None]),
-            torch.tensor(camera.K[None]),
-            camera.width,
-            camera.height,
-            sh_degree=sh_degree,
-        )
-    return image[0], alpha[0]
-
-
-@torch.no_grad()
-def nearness_map(gaussians: Gaussians, camera: Camera, coarser: int) -> Tensor:
-    """1 / expected depth in pixels `coarser` times as large, [ceil(H / coarser), ceil(W / coarser)].
-
-    Where little is in the way of the light, the median of the rest; 0 where nothing is anywhere.
-    """
-    width, height = -(-camera.width // coarser), -(-camera.height // coarser)
-    K = camera.K.copy()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    depths, alphas, _ = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.activated_scales(),
-        gaussians.activated_opacities(),
-        gaussians.sh0[:, 0],
-        torch.tensor(camera.viewmat[None]),
-        torch.tensor(K[None]),
-        width,
-        height,
-        render_mode="ED",
-    )
-    near, solid = 1 / depths[0, ..., 0].clamp(min=_rust.NEAR_PLANE), alphas[0, ..., 0] > 0.5
-    return torch.where(solid, near, near[solid].median() if solid.any() else 0.0)
 
 
 def blending_weights(gaussians: Gaussians, camera: Camera) -> Tensor:
