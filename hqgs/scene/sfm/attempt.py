@@ -35,9 +35,14 @@ class Attempt:
     def __init__(
         self, directory: Path, given: dict[str, Any], threads: int, tolerant: bool, coarse: bool = False
     ) -> None:
-        self.directory, self.given, self.threads = directory, given, threads
-        self.tolerant, self.coarse = tolerant, coarse
-        self.database = directory / ("tolerant.db" if tolerant else "coarse.db" if coarse else "colmap.db")
+        self.directory: Path = directory
+        self.given: dict[str, Any] = given
+        self.threads: int = threads
+        self.tolerant: bool = tolerant
+        self.coarse: bool = coarse
+        self.database: Path = directory / (
+            "tolerant.db" if tolerant else "coarse.db" if coarse else "colmap.db"
+        )
         self.names: list[str] = given["names"].tolist()
         self.model: pycolmap.Reconstruction | None = None
         self._tell("features", 0)
