@@ -38,8 +38,8 @@ from hqgs.scene.formats.part_json import keep_part
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
-from hqgs.training.clock import fitting
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
+from hqgs.training.fitting import fitting
 from hqgs.training.notes import learned_record, run_notes
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values, with_iterations

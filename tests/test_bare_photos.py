@@ -20,12 +20,12 @@ from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, check_whole, decode
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm import program
+from hqgs.scene.sfm import attempt, program
 from hqgs.scene.sfm import run as colmap_run
+from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 from hqgs.scene.sfm.likely import likely_pairs
-from hqgs.scene.sfm.program import _Pass
 from hqgs.scene.sfm.run import LARGEST, expected_time, film_pairs
 
 ROOT = Path(__file__).parent.parent
@@ -251,7 +251,7 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     with LoadingScreen() as screen:
         screen.stage(Stage("COLMAP", 0, 200, text))
     assert capsys.readouterr().err.splitlines() == [text]
-    assert LARGEST == program.LARGEST
+    assert LARGEST == attempt.LARGEST
 
 
 def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_only_listed_pairs_of_a_film_are_matched(photos: list[np.ndarray], tmp_p
     given = {"names": np.array(found.names), "photos": np.array(str(work / "photos")), "pairs": pairs}
     given |= {"sizes": np.array(guess.sizes), "focals": np.array(guess.focals)}
     given["camera_of"] = np.array(guess.camera_of)
-    one = _Pass(work, given, 1, tolerant=False)
+    one = Attempt(work, given, 1, tolerant=False)
     one.run()
     assert len(one.facts()["matches"]) == 3
     import pycolmap
@@ -298,19 +298,19 @@ def test_photos_rich_in_detail_are_looked_at_coarsely_and_others_finely(
     import pycolmap
 
     given = work_on(photos, tmp_path / "a")
-    fine = _Pass(tmp_path / "a", given, 1, tolerant=False)
+    fine = Attempt(tmp_path / "a", given, 1, tolerant=False)
     fine.run()
-    poor = _Pass(tmp_path / "a", given, 1, tolerant=False, coarse=True)
+    poor = Attempt(tmp_path / "a", given, 1, tolerant=False, coarse=True)
     poor.run()
     assert not poor.coarse
     assert poor.facts() == fine.facts()
-    again = _Pass(tmp_path / "a", given, 1, tolerant=False, coarse=True)
+    again = Attempt(tmp_path / "a", given, 1, tolerant=False, coarse=True)
     assert not again._probe(
         tmp_path / "none", pycolmap.FeatureExtractionOptions()
     )  # it was interrupted: what is there is fine already
-    monkeypatch.setattr(program, "RICH", 20)
+    monkeypatch.setattr(attempt, "RICH", 20)
     given = work_on(photos, tmp_path / "b")
-    rich = _Pass(tmp_path / "b", given, 1, tolerant=False, coarse=True)
+    rich = Attempt(tmp_path / "b", given, 1, tolerant=False, coarse=True)
     rich.run()
     assert rich.coarse
     counts = [sum(one.facts()["features"].values()) for one in (rich, fine)]
@@ -320,8 +320,8 @@ def test_photos_rich_in_detail_are_looked_at_coarsely_and_others_finely(
 def test_photos_that_coarse_features_do_not_place_are_looked_at_finely(
     photos: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(program, "RICH", 0)
-    monkeypatch.setattr(program, "COARSE", 3)  # features, which place nothing
+    monkeypatch.setattr(attempt, "RICH", 0)
+    monkeypatch.setattr(attempt, "COARSE", 3)  # features, which place nothing
     work_on(photos, tmp_path)
     program.reconstruct(tmp_path, 2)
     (only,) = json.loads((tmp_path / "facts.json").read_text())["passes"]
@@ -368,7 +368,7 @@ def test_of_many_photos_those_that_are_alike_are_matched(tmp_path: Path) -> None
 
 def test_the_second_pass_takes_more() -> None:
     """A few photos of the first pass lead to a second one, whose thresholds are all lower."""
-    first, second = (_Pass.__new__(_Pass) for _ in range(2))
+    first, second = (Attempt.__new__(Attempt) for _ in range(2))
     first.tolerant, second.tolerant = False, True
     first.coarse = second.coarse = False
     assert second._geometry().min_num_inliers < first._geometry().min_num_inliers

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,3 +141,12 @@ def test_vector_instructions_that_are_not_there_are_refused(level: str, problem:
     done = with_simd(level)
     assert done.returncode == 1
     assert f'ValueError: HQGS_SIMD: {problem} "{level}"; use one of ' in done.stderr
+
+
+def test_what_valgrind_is_to_watch_can_be_called(tmp_path: Path) -> None:
+    """`rust/check_unsafe.sh` takes minutes and runs seldom; that its calls fit the binding is told here."""
+    shutil.copy(_rust.__file__, tmp_path / "_rust.abi3.so")
+    calls = Path(__file__).parent.parent / "rust" / "python" / "check_unsafe.py"
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, calls], env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()[1:]) == (0, ["looked", "at", "everything"]), done.stderr

@@ -18,7 +18,7 @@ from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
-from hqgs.training import clock
+from hqgs.training import clock, fitting
 from hqgs.training import schedule as schedule_module
 from hqgs.training.config import AUTOMATIC, DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.budget import PIXELS
@@ -69,16 +69,16 @@ def test_as_many_iterations_as_fit() -> None:
             self.iteration += 1
             self.seconds += 0.02 if coarse else 0.1
 
-    fits = clock.fitting(Fake(config), 60.0)  # type: ignore[arg-type]
-    assert (0.6 * 0.02 + 0.4 * 0.1) * clock.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
-    assert clock.fitting(Fake(config), 1e-3) == clock.FEWEST  # type: ignore[arg-type]
-    assert clock.fitting(Fake(config), 1e9) == pytest.approx(clock.MOST, abs=1)  # type: ignore[arg-type]
+    fits = fitting.fitting(Fake(config), 60.0)  # type: ignore[arg-type]
+    assert (0.6 * 0.02 + 0.4 * 0.1) * fitting.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
+    assert fitting.fitting(Fake(config), 1e-3) == fitting.FEWEST  # type: ignore[arg-type]
+    assert fitting.fitting(Fake(config), 1e9) == pytest.approx(fitting.MOST, abs=1)  # type: ignore[arg-type]
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schedule_module, "TAIL", 3)
-    monkeypatch.setattr(clock, "FEWEST", 30)
-    monkeypatch.setattr(clock, "MOST", 31)
+    monkeypatch.setattr(fitting, "FEWEST", 30)
+    monkeypatch.setattr(fitting, "MOST", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
     run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
     plan = json.loads((tmp_path / "a" / PLAN).read_text())
@@ -99,8 +99,8 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although it is prepared twice: to be timed, and to be trained."""
     seen = inspected(monkeypatch)
-    monkeypatch.setattr(clock, "FEWEST", 5)
-    monkeypatch.setattr(clock, "MOST", 6)
+    monkeypatch.setattr(fitting, "FEWEST", 5)
+    monkeypatch.setattr(fitting, "MOST", 6)
     scene = tiny_scene()
     hqgs.train(scene, seconds=0.1)
     assert sorted(seen) == sorted(view.name for view in scene.train)

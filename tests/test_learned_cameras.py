@@ -15,8 +15,10 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from hqgs.diagnosis import gains
-from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
+from hqgs.diagnosis import scene as scene_diagnosis
+from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, unlike_sharpness
 from hqgs.diagnosis.gains import log_gains
+from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.exposure import take_photo
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.scene.geometry import project
@@ -147,14 +149,28 @@ def with_gains(scene: Scene, logs: NDArray[np.float64]) -> Scene:
 
 def test_gains_are_found() -> None:
     scene = textured_scene()
-    clean = gain_spread(scene)
+    clean = log_gains(scene)
     assert clean is not None
-    assert clean < UNLIKE_GAINS / 3
+    assert clean.std(axis=0).max() < UNLIKE_GAINS / 3
     logs = np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3))
     logs -= logs.mean(0)
     found = log_gains(with_gains(scene, logs))
     assert found is not None
     assert np.abs(found - logs).max() < 0.05
+
+
+def test_gains_are_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The diagnosis and the method share what was found."""
+    found: list[Any] = []
+    monkeypatch.setattr(
+        scene_diagnosis, "log_gains", lambda scene: found.append(log_gains(scene)) or found[-1]
+    )
+    scene = textured_scene()
+    scene = with_gains(scene, np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3)))
+    trainer = Trainer(scene, learned_config("auto", leave_out=()), Inspector())
+    (logs,) = found
+    begun = [camera.gains for camera in trainer.method.found()]
+    np.testing.assert_allclose(begun, np.exp(logs))
 
 
 def test_gains_of_many_photos_come_from_the_points_that_most_of_them_show(

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import network
+import network_machines
 import pytest
 from network import Link, line
 from network_model import Model, main, table
@@ -26,8 +27,8 @@ def test_what_is_hidden_is_what_no_rank_waits_for() -> None:
 
 
 def test_namespaces_need_root(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(network.os, "geteuid", lambda: 1000)
-    with pytest.raises(RuntimeError, match="need root, and ip and tc"), network.machines(0.0):
+    monkeypatch.setattr(network_machines.os, "geteuid", lambda: 1000)
+    with pytest.raises(RuntimeError, match="need root, and ip and tc"), network_machines.machines(0.0):
         pass
     monkeypatch.setattr(sys, "argv", ["network.py", "nowhere", "--out", str(tmp_path)])
     assert network.main() == 1

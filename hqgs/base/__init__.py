@@ -1,1 +1,1 @@
-"""What every room stands on: files, threads, machine, text, records. It imports nothing of hqgs."""
+"""What every room stands on: files, threads, processes, machine, values, text. It imports nothing of hqgs."""

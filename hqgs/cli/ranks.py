@@ -5,14 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from hqgs.base.files import CHECKPOINT, lock_folder
 from hqgs.base.ranks import Ranks, was_restarted
-
-if TYPE_CHECKING:
-    from hqgs.cli.train import Train
 
 
 @contextmanager
@@ -29,11 +25,14 @@ def told_by_the_first(ranks: Ranks) -> Iterator[None]:
         yield
 
 
-def restarted(options: Train, ranks: Ranks) -> Train:
-    """The options; where torchrun has started the run again after a fault, those that go on with it."""
+def restarted(out: Path, overwrite: bool, ranks: Ranks) -> bool:
+    """Whether torchrun has started the run in `out` again after a fault, so that it goes on.
+
+    With `overwrite` a first start removes the checkpoint there, or a restart would go on with the older run.
+    """
     if was_restarted():
-        return replace(options, resume=True, overwrite=False)
-    if options.overwrite and ranks.count > 1 and ranks.first and options.out.is_dir():
-        with lock_folder(options.out):  # or a restart would go on with the older run
-            (options.out / CHECKPOINT).unlink(missing_ok=True)
-    return options
+        return True
+    if overwrite and ranks.count > 1 and ranks.first and out.is_dir():
+        with lock_folder(out):
+            (out / CHECKPOINT).unlink(missing_ok=True)
+    return False

@@ -217,7 +217,9 @@ def run(options: Train) -> int:
     started, out = time.perf_counter(), options.out
     try:
         with joined() as ranks, told_by_the_first(ranks):
-            done, live, screen, bar, loaded = _train(restarted(options, ranks), ranks)
+            if restarted(out, options.overwrite, ranks):
+                options = replace(options, resume=True, overwrite=False)
+            done, live, screen, bar, loaded = _train(options, ranks)
     except KeyboardInterrupt:
         if (out / CHECKPOINT).exists():
             return fail(130, "stopped at once; --resume goes on from the last checkpoint")

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.sharpness import Sharpness, look_at_photos
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.scene.scene import Scene
@@ -48,12 +47,6 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     directions -= np.median(directions, axis=0)
     directions -= directions.mean(1, keepdims=True)
     return Unlike(float(max(finer) - coarse), float(directions.std()))
-
-
-def gain_spread(scene: Scene) -> float | None:
-    """Standard deviation of the photos' own log gains, the largest of the channels; None: it is not told."""
-    gains = log_gains(scene)
-    return None if gains is None else float(np.std(gains, axis=0).max())
 
 
 def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:

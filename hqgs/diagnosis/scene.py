@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hqgs.base.stages import OnStage, Stage, untold
-from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, gain_spread, unlike_sharpness
+from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, unlike_sharpness
 from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
+from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import NONE, parse_formation
@@ -74,6 +76,7 @@ class Inspector:
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
         self._differences: dict[tuple[int, ...], tuple[Part, Part, Part]] = {}
+        self._gains: dict[tuple[int, ...], NDArray[np.float64] | None] = {}
         self.last: Diagnosis | None = None  # that was made
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
@@ -83,6 +86,13 @@ class Inspector:
             found = inspect_photo(view.name, view.image, view.low, enlargement=enlargement)
             self._inspected[key] = view, found
         return self._inspected[key][1]
+
+    def log_gains(self, scene: Scene) -> NDArray[np.float64] | None:
+        """`hqgs.diagnosis.gains.log_gains` of the training photos."""
+        key = tuple(map(id, scene.train))
+        if key not in self._gains:
+            self._gains[key] = log_gains(scene)
+        return self._gains[key]
 
     def diagnose(self, scene: Scene, max_photos: int = 16) -> Diagnosis:
         """As `diagnose_scene`."""
@@ -109,7 +119,8 @@ class Inspector:
         everyone = tuple(map(id, scene.train))
         if everyone not in self._differences:
             shake = _shake(scene)
-            self._differences[everyone] = _exposure(scene, photos), shake, _focus(scene, shake.needed)
+            exposure = _exposure(self.log_gains(scene), photos)
+            self._differences[everyone] = exposure, shake, _focus(scene, shake.needed)
         exposure, shake, focus = self._differences[everyone]
         blur = _blur(photos)
         if own := [part.name for part in (shake, focus) if part.needed]:
@@ -131,10 +142,11 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     return Inspector().diagnose(scene, max_photos)
 
 
-def _exposure(scene: Scene, photos: Sequence[PhotoDiagnosis]) -> Part:
-    spread = gain_spread(scene)
-    if spread is None:
+def _exposure(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Part:
+    """`log_gains` [N, 3], as `hqgs.diagnosis.gains` tells them."""
+    if log_gains is None:
         return Part("exposure", False, None, None, None, "the photos share too few points to tell")
+    spread = float(np.std(log_gains, axis=0).max())
     reason = f"gains differ by {spread:.1%} from photo to photo"
     # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
     noises = [noise for photo in photos if (noise := photo.told_noise) is not None]

@@ -18,7 +18,7 @@ from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE, SH_C0
 from hqgs.model.content import around
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.files import READERS, WRITERS, format_of, scene_file
-from hqgs.model.render import render_view
+from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import CAMERAS, load_cameras
 from hqgs.scene.paths import UP
@@ -125,7 +125,46 @@ class Gaussians:
         if len(background) != 3:
             raise ValueError(f"background is {background}, wanted three numbers: R, G, B")
         with one_torch_thread():
-            return render_view(self, camera, degree, background)[0]
+            return self.rasterize(camera, sh_degree=degree, background=background)[0][0]
+
+    def rasterize(
+        self,
+        camera: Camera,
+        colors: Tensor | None = None,
+        *,
+        sh_degree: int | None = None,
+        background: Sequence[float] | None = None,
+        render_mode: str = "RGB",
+    ) -> tuple[Tensor, Tensor, RasterizationMeta]:
+        """`hqgs.rasterization` of these Gaussians for one camera.
+
+        Args:
+            camera: size and pinhole intrinsics in pixels, world to camera.
+            colors: [N, D] channels, or with `sh_degree` harmonics, [N, K, 3]; None: the Gaussians' own
+                harmonics, for which `sh_degree` must be given.
+            sh_degree, render_mode: as `hqgs.rasterization` takes them.
+            background: D numbers behind everything; None: 0.
+
+        Returns:
+            [1, H, W, X], not clamped; alphas [1, H, W, 1]; and the meta data.
+        """
+        own: Tensor | tuple[Tensor, Tensor] = self.sh0
+        if sh_degree:  # or else the higher harmonics would get a gradient full of zeros
+            own = self.sh0, self.shN
+        return rasterization(
+            self.means,
+            self.quats,
+            self.activated_scales(),
+            self.activated_opacities(),
+            own if colors is None else colors,
+            torch.tensor(camera.viewmat[None]),
+            torch.tensor(camera.K[None]),
+            camera.width,
+            camera.height,
+            sh_degree=sh_degree,
+            backgrounds=None if background is None else torch.tensor([[*background]], dtype=self.means.dtype),
+            render_mode=render_mode,
+        )
 
     def save(self, path: str | Path, format: str | None = None) -> int:
         """Write a scene file atomically; return how many Gaussians were left out as NaN or Inf.

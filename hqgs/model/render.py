@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,11 +11,10 @@ from torch import Tensor
 
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.rasterization import RasterizationMeta, rasterization
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.rasterization import RasterizationMeta
+from hqgs.scene.geometry import resized_camera
 from hqgs.scene.scene import Camera, View
-
-if TYPE_CHECKING:
-    from hqgs.model.gaussians import Gaussians  # which has this file's `render_view` as its method
 
 # As `render_view` renders: near, far, radius_clip, eps2d, antialiased; and not to be differentiated.
 OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D, False, False)
@@ -26,24 +24,11 @@ def render_view(
     gaussians: Gaussians, camera: Camera, sh_degree: int, background: Sequence[float]
 ) -> tuple[Tensor, RasterizationMeta]:
     """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
-    # At degree 0 the higher harmonics are left out, so that they get no gradient full of zeros either.
-    colors = (gaussians.sh0, gaussians.shN) if sh_degree else gaussians.sh0
-    images, _, meta = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.activated_scales(),
-        gaussians.activated_opacities(),
-        colors,
-        torch.tensor(camera.viewmat[None]),
-        torch.tensor(camera.K[None]),
-        camera.width,
-        camera.height,
-        sh_degree=sh_degree,
-        backgrounds=torch.tensor([[*background]], dtype=gaussians.means.dtype),
-    )
+    images, _, meta = gaussians.rasterize(camera, sh_degree=sh_degree, background=background)
     return images[0], meta
 
 
+@torch.no_grad()
 def composited(
     gaussians: Gaussians, camera: Camera, colors: Tensor, sh_degree: int | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -51,19 +36,8 @@ def composited(
 
     `colors` [N, C], or with `sh_degree` harmonics, as `hqgs.rasterization` takes them. Without a gradient.
     """
-    with one_torch_thread(), torch.no_grad():
-        image, alpha, _ = rasterization(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.activated_scales(),
-            gaussians.activated_opacities(),
-            colors,
-            torch.tensor(camera.viewmat[None]),
-            torch.tensor(camera.K[None]),
-            camera.width,
-            camera.height,
-            sh_degree=sh_degree,
-        )
+    with one_torch_thread():
+        image, alpha, _ = gaussians.rasterize(camera, colors, sh_degree=sh_degree)
     return image[0], alpha[0]
 
 
@@ -73,22 +47,8 @@ def nearness_map(gaussians: Gaussians, camera: Camera, coarser: int) -> Tensor:
 
     Where little is in the way of the light, the median of the rest; 0 where nothing is anywhere.
     """
-    width, height = -(-camera.width // coarser), -(-camera.height // coarser)
-    K = camera.K.copy()
-    K[0] *= width / camera.width
-    K[1] *= height / camera.height
-    depths, alphas, _ = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.activated_scales(),
-        gaussians.activated_opacities(),
-        gaussians.sh0[:, 0],
-        torch.tensor(camera.viewmat[None]),
-        torch.tensor(K[None]),
-        width,
-        height,
-        render_mode="ED",
-    )
+    small = resized_camera(camera, -(-camera.width // coarser), -(-camera.height // coarser))
+    depths, alphas, _ = gaussians.rasterize(small, gaussians.sh0[:, 0], render_mode="ED")
     near, solid = 1 / depths[0, ..., 0].clamp(min=_rust.NEAR_PLANE), alphas[0, ..., 0] > 0.5
     return torch.where(solid, near, near[solid].median() if solid.any() else 0.0)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hqgs.photos.pixels import floats
+
 # Sobel sums of equal numbers differ by rounding alone up to about this, times the largest |value|. 8-bit
 # photos have steps of at least 1/255, far above it.
 ROUNDING = 1e-5
@@ -64,7 +66,7 @@ def _checked(image: Tensor, mask: Tensor | None) -> Tensor:
     if mask is not None and (mask.dtype != torch.bool or mask.shape != image.shape[:2]):
         wanted = list(image.shape[:2])
         raise ValueError(f"mask: must be bool {wanted} as the image, got {mask.dtype} {list(mask.shape)}")
-    values = image / 255.0 if image.dtype == torch.uint8 else image.detach()
+    values = floats(image.detach())
     if not torch.isfinite(values).all():
         raise ValueError(f"image: {int((~torch.isfinite(values)).sum())} values are not finite")
     return values

@@ -17,10 +17,10 @@ from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_fol
 from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
-from hqgs.scene.formats.part_json import Part, read_part
+from hqgs.scene.formats.part_json import read_part
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.random_points import random_points
-from hqgs.scene.scene import Scene, Tracks, View
+from hqgs.scene.scene import Part, Scene, Tracks, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
 from hqgs.scene.views import load_views

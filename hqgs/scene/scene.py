@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from hqgs.scene.formats.part_json import Part
+from hqgs.scene.cells import Cells
 
 
 @dataclass(frozen=True)
@@ -101,6 +100,21 @@ class Scene:
             depths.append(depth[depth > 0])
         seen = np.concatenate(depths)
         return max(self.extent, float(np.median(seen))) if seen.size else self.extent
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a scene: its cell, and what all parts have in common."""
+
+    scene: str  # name of the whole
+    split: str  # the same for all parts of one split, another for every other
+    part: int  # from 0; from 1 in names and for people
+    parts: int
+    cells: Cells  # of all parts, world
+    held_out: list[str]  # of the whole scene; a part has some of them
+
+    def __str__(self) -> str:
+        return f"part {self.part + 1} of {self.parts} of {self.scene}"
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.scene.capture import Photo
 from hqgs.scene.cells import Cells, cell_of, cut_space, sight_shares
 from hqgs.scene.formats.degradation_json import read_degraded_folder
-from hqgs.scene.formats.part_json import VERSION, Part, keep_part, read_part
+from hqgs.scene.formats.part_json import VERSION, keep_part, read_part
 from hqgs.scene.geometry import project
 from hqgs.scene.listing import Listed, binary_model, listed
 from hqgs.scene.load import held_out_names
 from hqgs.scene.part_folders import Rows, bring_photos, read_positions, write_models
-from hqgs.scene.scene import Camera
+from hqgs.scene.scene import Camera, Part
 
 PLAN = "parts.json"  # beside the parts' folders
 MOST_PARTS = 256

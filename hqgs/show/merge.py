@@ -23,8 +23,9 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.scene.camera_files import load_cameras
 from hqgs.scene.cells import cell_of
-from hqgs.scene.formats.part_json import Part, read_part
+from hqgs.scene.formats.part_json import read_part
 from hqgs.scene.listing import some_views
+from hqgs.scene.scene import Part
 from hqgs.show.dome import Dome
 
 STEP = 1e-3  # of a colour, in which its change with the light is measured

@@ -278,20 +278,10 @@ def run_config(
     formation: str = AUTO,
     eval_every: int | None = None,
 ) -> TrainConfig:
-    """The configuration of a run as users ask for it, its schedule fitted to its length.
+    """The configuration of a run as users ask for it: these are the options of `hqgs.train`.
 
-    Args:
-        batch: training views in a step; rates and moments follow it (docs/ranks.md).
-        iterations: None: at most 30,000, with `leave_out` "auto" fewer where the scene has stopped improving.
-        method: one of METHODS.
-        leave_out: "auto", "none" or some of ITEMS with commas.
-        seed: of everything random.
-        max_gaussians: bounds the memory.
-        guidance: of the method hqgs, one of GUIDANCES.
-        formation: what happened to the photos, as `parse_formation` reads it; "auto": hqgs looks.
-        eval_every: iterations between evaluations; None: a tenth of the run, and at least CLOSEST.
-
-    Raises ValueError for a name that there is not, or a number out of range.
+    The schedule is fitted to the length; without `eval_every` evaluations are at least CLOSEST iterations
+    apart. ValueError for a name that there is not, or a number out of range.
     """
     items = parse_leave_out(leave_out)
     if iterations is None and leave_out == AUTO:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import cast
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,18 +19,6 @@ LISTED = 10  # Gaussians that an event names, the first ones
 KEPT = 20  # events that are kept, the first ones; all are counted
 
 
-@dataclass(frozen=True)
-class Event:
-    """Something that was not finite. `gaussians` are row numbers at that iteration."""
-
-    iteration: int
-    view: str  # the training view of the step
-    what: str  # "photo", "loss", "gradient" or "parameter"
-    tensors: list[str]  # where it was found: "render", "means", ...; empty for a photo or the loss
-    count: int  # pixels' values of a photo, Gaussians elsewhere; 0 where no Gaussian is at fault
-    gaussians: list[int]
-
-
 @dataclass
 class Guard:
     """What was not finite in a run so far. Plain JSON values, so that a checkpoint can hold it."""
@@ -42,16 +29,21 @@ class Guard:
     num_events: int = 0
     events: list[GuardEvent] = field(default_factory=list)  # the first ones
 
-    def add(self, event: Event) -> None:
-        self.num_events += 1
-        if len(self.events) < KEPT:
-            self.events.append(cast(GuardEvent, asdict(event)))
-
     def note(self, iteration: int, view: View, fault: Fault) -> None:
         """Add what one look has found."""
+        self.num_events += 1
+        if len(self.events) == KEPT:
+            return
         indices = torch.nonzero(fault.rows)[:, 0]
-        count, listed = fault.values + len(indices), indices[:LISTED].tolist()
-        self.add(Event(iteration, view.name, fault.what, fault.tensors, count, listed))
+        event: GuardEvent = {
+            "iteration": iteration,
+            "view": view.name,
+            "what": fault.what,
+            "tensors": fault.tensors,
+            "count": fault.values + len(indices),
+            "gaussians": indices[:LISTED].tolist(),
+        }
+        self.events.append(event)
 
     def summary(self) -> GuardRecord:
         """For report.json."""
@@ -67,7 +59,7 @@ class Guard:
 class Fault:
     """What was not finite in one look."""
 
-    what: str  # as that of an `Event`
+    what: str  # as that of a `GuardEvent`
     tensors: list[str]
     rows: Tensor  # bool [N], the Gaussians at fault
     values: int = 0  # of a photo

@@ -46,7 +46,8 @@ def rasterize(dtype: type, degree: int | None) -> None:
         means2d.reshape(1, COUNT, 2), whitened.reshape(1, COUNT, 3), opacities.reshape(1, COUNT), None, None,
         None if degree is None else v_colors.reshape(1, COUNT, 3),
     )  # fmt: skip
-    wanted = [True] * 4 + [degree is not None, False, True]
+    harmonics = degree is not None
+    wanted = [True] * 4 + [False, harmonics, False, True]  # no covariances, and no harmonics that lie apart
     look(*_rust.project_backward(frame, inputs, cotangents, wanted)[:-1])
 
 
@@ -69,8 +70,35 @@ def train(dtype: type) -> None:
     look(param, first, second)
 
 
+def photograph(dtype: type) -> None:
+    """A photo that a camera took while it moved, and its gradient."""
+    rng = np.random.default_rng(3)
+    image = rng.uniform(size=(HEIGHT + 4, WIDTH + 4, 3)).astype(dtype)
+    nearness = rng.uniform(size=(HEIGHT, WIDTH)).astype(dtype)
+    warps = 1e-3 * rng.normal(size=(3, 3, 4))
+    state, photo = _rust.exposure_forward(image, [HEIGHT, WIDTH], nearness, warps, [0.9, 1.0, 1.1])
+    look(photo)
+    v_image, v_warps, v_gains = _rust.exposure_backward(state, np.ones_like(photo))
+    look(v_image, v_warps, np.array(v_gains))
+
+
+def add_views() -> None:
+    """The gradients of several views, each of some of the Gaussians."""
+    rng = np.random.default_rng(4)
+    views = [np.flatnonzero(rng.uniform(size=COUNT) > 0.4).astype(np.int32) for _ in range(3)]
+    sums, high = np.empty((COUNT, 5), np.float32), np.empty((COUNT, 15, 3), np.float32)
+    means = rng.normal(size=(COUNT, 3)).astype(np.float32)
+    values = [(rows, np.ones((len(rows), 5), np.float32)) for rows in views]
+    colors = [(rows, np.ones((len(rows), 3), np.float32), [0.0, 0.0, -4.0], 3) for rows in views]
+    _rust.add_rows(values, sums, 0.5)
+    _rust.add_harmonics(colors, means, high, 0.5)
+    look(sums, high)
+
+
 for kind in (np.float32, np.float64):
     rasterize(kind, 3)
     rasterize(kind, None)
     train(kind)
+    photograph(kind)
+add_views()
 print(_rust.simd_level(), "looked at everything")

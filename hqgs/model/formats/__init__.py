@@ -1,1 +1,1 @@
-"""Files of Gaussians, PLY and SPZ: each format reads and writes arrays by the names of `Gaussians`."""
+"""Files of Gaussians: PLY, SPZ, .splat, glTF. Each reads and writes arrays by the names of `Gaussians`."""

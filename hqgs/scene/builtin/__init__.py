@@ -1,4 +1,4 @@
-"""The embedded scene: a ray-cast room that needs no download and holds no Gaussian."""
+"""Scenes that need no download: a ray-cast room, which holds no Gaussian, photographed well and badly."""
 
 from hqgs.scene.builtin.rooms import room
 from hqgs.scene.builtin.scene import embedded_cameras, embedded_scene

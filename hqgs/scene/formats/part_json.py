@@ -4,30 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from hqgs.base.files import write_json
 from hqgs.scene.cells import Cells, Cut, count
+from hqgs.scene.scene import Part
 
 FILE = "part.json"
 VERSION = 1
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a scene: its cell, and what all parts have in common."""
-
-    scene: str  # name of the whole
-    split: str  # the same for all parts of one split, another for every other
-    part: int  # from 0; from 1 in names and for people
-    parts: int
-    cells: Cells  # of all parts, world
-    held_out: list[str]  # of the whole scene; a part has some of them
-
-    def __str__(self) -> str:
-        return f"part {self.part + 1} of {self.parts} of {self.scene}"
 
 
 def keep_part(folder: Path, part: Part | None) -> None:

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from hqgs.base.threads import one_torch_thread
 from hqgs.photos.edges import edge_aware_map
+from hqgs.photos.pixels import floats
 from hqgs.scene.scene import View
 from hqgs.training.config import ESFGConfig
 from hqgs.training.methods.base import photo_tensors
@@ -111,8 +112,7 @@ def _tokens(views: Sequence[View], count: int, downscale: int) -> tuple[Tensor, 
     runs: tuple[list[Tensor], list[Tensor]] = ([], [])
     for view in views:
         photo, mask = photo_tensors(view)
-        values = photo / 255.0 if photo.dtype == torch.uint8 else photo
-        for image, found in zip((values, edge_aware_map(photo, mask)), runs, strict=True):
+        for image, found in zip((floats(photo), edge_aware_map(photo, mask)), runs, strict=True):
             pixels = _downscaled(image, mask, downscale)
             if pixels.shape[1]:
                 found.append(functional.adaptive_avg_pool1d(pixels, count))

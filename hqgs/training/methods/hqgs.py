@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
-from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.discs import as_discs
 from hqgs.model.first_points import Colors, Points
@@ -84,7 +83,7 @@ class HQGS(Plain):
         if kinds & set(LEARNED):
             gains = None
             if "exposure" in kinds:
-                gains = log_gains(scene)
+                gains = inspector.log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
         self._plateau = Plateau(len(scene.train)) if self.noise and "jpeg" not in kinds else None

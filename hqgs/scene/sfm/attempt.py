@@ -1,0 +1,251 @@
+"""A pass from photos to a COLMAP model: features, matches, geometry, mapping, and how far it is.
+
+It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from hqgs.scene.sfm.database import known_cameras, new_cameras
+from hqgs.scene.sfm.likely import MANY, likely_pairs
+
+LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
+PROBED, RICH = 8, 1000  # photos that tell whether coarse features are enough, and how many they need (median)
+SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
+COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
+BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
+LISTED = 64  # blocks of pairs that are listed
+EVERY = 0.5  # s between looks into the log
+BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
+
+
+class Attempt:
+    """A pass from photos to a model; the tolerant one takes weaker features, and fewer matches as enough."""
+
+    def __init__(
+        self, directory: Path, given: dict[str, Any], threads: int, tolerant: bool, coarse: bool = False
+    ) -> None:
+        self.directory: Path = directory
+        self.given: dict[str, Any] = given
+        self.threads: int = threads
+        self.tolerant: bool = tolerant
+        self.coarse: bool = coarse
+        self.database: Path = directory / (
+            "tolerant.db" if tolerant else "coarse.db" if coarse else "colmap.db"
+        )
+        self.names: list[str] = given["names"].tolist()
+        self.model: pycolmap.Reconstruction | None = None
+        self._tell("features", 0)
+
+    @property
+    def registered(self) -> int:
+        return 0 if self.model is None else self.model.num_reg_images()
+
+    def run(self) -> None:
+        fixed = "Ks" in self.given
+        if not self.database.exists():
+            new = self.database.with_suffix(".new")
+            new.unlink(missing_ok=True)
+            known_cameras(self.given, new) if fixed else new_cameras(self.given, new)
+            new.rename(self.database)
+        extraction = pycolmap.FeatureExtractionOptions()
+        extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
+        if self.tolerant:
+            extraction.sift.peak_threshold /= 4
+        photos = Path(str(self.given["photos"]))
+        if self.coarse:
+            self.coarse = self._probe(photos, extraction)
+        todo = self.directory, photos, self.names, extraction, self.threads, self.database
+        match(*todo, self._watched, self._pairs)
+        self._tell("verify", 0)
+        verifier = pycolmap.GeometricVerifierOptions()
+        verifier.num_threads = self.threads
+        pycolmap.geometric_verification(self.database, verifier, two_view_geometry_options=self._geometry())
+        models = pycolmap.incremental_mapping(
+            self.database,
+            photos,
+            self.directory / f"models_{self.database.stem}",
+            options=self._mapping(fixed),
+            initial_image_pair_callback=lambda: self._place(2),
+            next_image_callback=lambda: self._place(1),
+        )
+        if models:
+            best = max(sorted(models), key=lambda k: (models[k].num_reg_images(), models[k].num_points3D()))
+            self.model = models[best]
+
+    def _probe(self, photos: Path, extraction: pycolmap.FeatureExtractionOptions) -> bool:
+        """Whether a few photos show enough where they are not enlarged; if so, `extraction` is to do without.
+
+        SIFT looks at each photo at twice its size first, which takes three quarters of its time.
+        """
+        poor = self.directory / "poor"  # there: what was found coarsely is gone
+        if poor.exists():
+            return False
+        fine = extraction.sift.first_octave, extraction.sift.max_num_features
+        extraction.sift.first_octave, extraction.sift.max_num_features = 0, COARSE
+        some = self.names[:: -(-len(self.names) // PROBED)]
+        extract(self.directory, photos, some, extraction, self.database)
+        with pycolmap.Database.open(self.database) as db:
+            found = [db.num_keypoints_for_image(self.names.index(name) + 1) for name in some]
+            if np.median(found) >= RICH:
+                return True
+            db.clear_keypoints()
+            db.clear_descriptors()
+        poor.touch()
+        extraction.sift.first_octave, extraction.sift.max_num_features = fine
+        return False
+
+    def _pairs(self) -> Any:
+        """Pairs [P, 2] of photos that are to be matched; None: all."""
+        if self.tolerant:
+            return None
+        if "pairs" in self.given:
+            return self.given["pairs"]
+        if len(self.names) <= MANY:
+            return None
+        self._tell("matches", 0)
+        with pycolmap.Database.open(self.database) as db:
+            return likely_pairs(db, len(self.names))
+
+    def facts(self) -> dict[str, Any]:
+        """Features of each photo, matches and those that a geometry bears out of each pair, both sorted."""
+        with pycolmap.Database.open(self.database) as db:
+            images = {image.image_id: image.name for image in db.read_all_images()}
+            features = {name: int(db.num_keypoints_for_image(k)) for k, name in images.items()}
+            _, matches = db.read_num_matches()
+            _, inliers = db.read_two_view_geometry_num_inliers()
+        return {
+            "tolerant": self.tolerant,
+            "registered": self.registered,
+            "features": features,
+            "matches": sorted(matches, reverse=True),
+            "inliers": sorted(inliers, reverse=True),
+        }
+
+    def _geometry(self) -> pycolmap.TwoViewGeometryOptions:
+        geometry = pycolmap.TwoViewGeometryOptions()
+        geometry.ransac.random_seed = 0
+        if self.tolerant:
+            geometry.min_num_inliers = 10
+        return geometry
+
+    def _mapping(self, fixed: bool) -> pycolmap.IncrementalPipelineOptions:
+        options = pipeline_options()
+        options.min_model_size = 3
+        mapper = options.mapper
+        if self.coarse:
+            options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM
+            options.ba_global_max_refinements = 2
+        if self.tolerant:
+            options.min_num_matches = 10
+            mapper.init_min_num_inliers, mapper.init_min_tri_angle = 50, 6.0
+            mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = 15, 0.15
+        if fixed:
+            options.ba_refine_focal_length = options.ba_refine_extra_params = False
+            mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
+        return options
+
+    def _place(self, photos: int) -> None:
+        """Photos have a place; two: a model begins."""
+        self._placed = photos if photos == 2 else self._placed + photos
+        self._tell("place", self._placed, len(self.names))
+
+    @contextmanager
+    def _watched(self, stage: str, total: int) -> Iterator[None]:
+        """Tell how far COLMAP's log says that it is, until the work is done.
+
+        Not its database: two libraries of SQLite in a process take each other's locks away.
+        """
+        log = self.directory / "log.txt"
+        start = log.stat().st_size if log.exists() else 0
+        done = threading.Event()
+
+        def watch() -> None:
+            while not done.wait(EVERY):
+                text = log.read_bytes()[start:].decode(errors="replace") if log.exists() else ""
+                count = text.count("Processed file [")
+                if blocks := BLOCK.findall(text):
+                    row, rows, column, columns = (int(part or 1) for part in blocks[-1])
+                    count = round(total * ((row - 1) * columns + column - 1) / (rows * columns))
+                self._tell(stage, count, total)
+
+        self._tell(stage, 0, total)
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            done.set()
+            watcher.join()
+
+    def _tell(self, stage: str, done: int, total: int = 0) -> None:
+        """What is being done, for whoever waits."""
+        now = {"tolerant": self.tolerant, "stage": stage, "done": done, "total": total}
+        new = self.directory / "stage.new"
+        new.write_text(json.dumps(now), encoding="utf-8")
+        new.replace(self.directory / "stage.json")
+
+
+@contextmanager
+def _unwatched(stage: str, total: int) -> Iterator[None]:
+    yield
+
+
+def match(
+    directory: Path,
+    photos: Path,
+    names: list[str],
+    extraction: pycolmap.FeatureExtractionOptions,
+    threads: int,
+    database: Path,
+    watched: Callable[[str, int], AbstractContextManager[None]] = _unwatched,
+    wanted: Callable[[], Any] = lambda: None,
+) -> None:
+    """Features, and matches of the pairs [P, 2] that are wanted then, or of all; geometry is not checked."""
+    with watched("features", len(names)):
+        extract(directory, photos, names, extraction, database)
+    pairs = wanted()
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = threads
+    matching.skip_geometric_verification = True
+    if pairs is not None:
+        listed = pycolmap.ImportedPairingOptions()
+        listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // LISTED)
+        listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist()))
+        with watched("matches", len(pairs)):
+            pycolmap.match_image_pairs(
+                database, matching_options=matching, pairing_options=listed, device=pycolmap.Device.cpu
+            )
+        return
+    pairing = pycolmap.ExhaustivePairingOptions()
+    pairing.block_size = max(2, -(-len(names) // BLOCKS))
+    with watched("matches", len(names) * (len(names) - 1) // 2):
+        pycolmap.match_exhaustive(
+            database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
+        )
+
+
+def extract(directory: Path, photos: Path, names: list[str], extraction: Any, database: Path) -> None:
+    """Features of photos that have none yet."""
+    reader = pycolmap.ImageReaderOptions()
+    if (directory / "masks").is_dir():
+        reader.mask_path = directory / "masks"
+    found = {"reader_options": reader, "extraction_options": extraction, "device": pycolmap.Device.cpu}
+    pycolmap.extract_features(database, photos, image_names=names, **found)
+
+
+def pipeline_options() -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
+    return options

@@ -1,0 +1,47 @@
+"""The length of a run that has so many seconds, from steps timed before it; clock.py corrects it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hqgs.training.settings import with_iterations
+from hqgs.training.trainer import Trainer
+
+WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
+# A mean step of a run over one at its start. One that starts from points all over the photos grows little,
+# and its Gaussians hide more of each other as they become opaque.
+GROWTH, GROWTH_DENSE = 2.0, 1.0
+DENSE = 2  # times the scene's own points
+FEWEST, MOST = 50, 30_000  # iterations
+
+
+def fitting(trainer: Trainer, seconds: float) -> int:
+    """As many iterations as fit into `seconds` of training on this machine, now.
+
+    The trainer is a fresh one; it has made steps then, and is of no more use.
+    """
+    config, schedule = trainer.config, trainer.schedule
+    growth = GROWTH_DENSE if trainer.first_points > DENSE * len(trainer.scene.points) else GROWTH
+    costs = {coarse: growth * _timed(trainer, coarse) for coarse in (True, False)}
+
+    def needed(iterations: int) -> float:
+        coarse = replace(schedule, config=with_iterations(config, iterations)).coarse_end
+        return coarse * costs[True] + (iterations - coarse) * costs[False]
+
+    few, many = FEWEST, MOST
+    while many - few > 1:
+        middle = (few + many) // 2
+        few, many = (middle, many) if needed(middle) <= seconds else (few, middle)
+    return few
+
+
+def _timed(trainer: Trainer, coarse: bool) -> float:
+    """Mean seconds of a step's view at the smaller or at full size."""
+    if coarse and not trainer.schedule.coarse_end:
+        return 0.0
+    for _ in range(WARM):
+        trainer.step(coarse)
+    started, before = trainer.seconds, trainer.iteration
+    for _ in range(TIMED):
+        trainer.step(coarse)
+    return (trainer.seconds - started) / (trainer.iteration - before)

@@ -1,0 +1,39 @@
+"""The floor plan stays what docs/architecture.md draws: few rooms, small files, a sentence at each door."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FOLDERS = ("benchmarks", "examples", "hqgs", "scripts")
+FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
+PACKAGES = [path for path in FILES if path.name == "__init__.py"]
+OF_PYTHON = {"__init__.py", "__main__.py", "__pycache__", "_rust.abi3.so", "_rust.pyi", "py.typed"}
+MOST_ROOMS, MOST_LINES = 12, 350
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_a_newcomer_sees_few_rooms_and_the_map_has_each() -> None:
+    """Beside the files that Python itself wants in a package."""
+    rooms = {path.name for path in (ROOT / "hqgs").iterdir()} - OF_PYTHON
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    assert len(rooms) <= MOST_ROOMS
+    assert [room for room in sorted(rooms) if f"| `hqgs/{room}" not in page] == []
+
+
+def test_no_file_is_long() -> None:
+    lines = {relative(path): len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+    assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=relative)
+def test_a_folder_says_in_a_sentence_what_lives_there(package: Path) -> None:
+    told = ast.get_docstring(ast.parse(package.read_text(encoding="utf-8")))
+    assert told is not None
+    assert told.splitlines()[0].endswith(".")
