@@ -263,10 +263,8 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
     together = _correlation(photos)
     kind, more = "white noise of", ""
     if together > WHITE:
-        kind, more = (
-            "noise of at least",
-            f"; neighbouring pixels go together by {together:.2f} at least: not white",
-        )
+        kind = "noise of at least"
+        more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
     if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:
         reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
         return Part("noise", True, level, spread, "grain", reason)
