@@ -59,7 +59,9 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     details = [[photo.film for photo in found.photos] for found in (good, coarse)]
     assert all(a is not None and b is not None and a > 1.2 * b for a, b in zip(*details, strict=True))
     why = {name: reason for name, _, reason in good.needs()}["video"]
-    assert why.startswith("3 of 3 photos are a film's frames as they were decoded; the codec left 0.")
+    assert why.startswith(
+        "3 of 3 photos are a film's frames as they were decoded; the finest details have 0."
+    )
 
 
 def test_a_coarse_film_has_the_rates_of_3dgs() -> None:

@@ -69,7 +69,7 @@ class Diagnosis:
         ]
         lines += ["", f"{self.scene}: {self.formation}"]
         for name, needed, reason in self.needs():
-            lines.append(f"  {name:8}{'needed   ' if needed else 'not seen '} {reason}")
+            lines.append(f"  {name:9}{'needed   ' if needed else 'not seen '} {reason}")
         lines += [f"  left out: {item.what}: {item.why}" for item in self.passed_over]
         return "\n".join(lines)
 
@@ -246,7 +246,7 @@ def _video(photos: Sequence[PhotoDiagnosis]) -> Part:
     if 2 * len(details) <= len(photos):
         return Part("video", False, None, None, None, reason)
     detail, spread = float(np.median(details)), _spread_of(details)
-    reason += f"; the codec left {detail:.2f} of the coarser details to the finest"
+    reason += f"; the finest details have {detail:.2f} of the coarser ones' strength"
     if detail >= COARSE_FILM:
         return Part("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
     return Part("video", True, detail, spread, "video", reason)
