@@ -60,7 +60,7 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     assert all(a is not None and b is not None and a > 1.2 * b for a, b in zip(*details, strict=True))
     why = {name: reason for name, _, reason in good.needs()}["video"]
     assert why.startswith(
-        "3 of 3 photos are a film's frames as they were decoded; the finest details have 0."
+        "3 of 3 photos are frames of a film as they were decoded; the finest details are 0."
     )
 
 

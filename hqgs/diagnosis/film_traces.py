@@ -9,7 +9,7 @@ from hqgs.photos.pixels import LUMA, Floats, luma
 
 LUMA_709 = np.array([0.2126, 0.7152, 0.0722])  # of films in HD (ITU-R BT.709); LUMA is that of the others
 STEP = 255 / 219  # levels: of the luma of 8 bits from 16 (black) to 235 (white), which films store
-DECODED = 0.35  # decoded frames have 0.49 and more, frames made smaller since 0.13 at most, photos 0.02
+DECODED = 0.35  # decoded frames have 0.48 and more, frames made smaller since 0.15 at most, photos 0.02
 FEWEST_PIXELS, FEWEST_LEVELS = 10, 48  # of each level of the luma that counts, and of these
 MAX_BLOCKS = 4_000
 _WAVES = np.add.outer(np.arange(8), np.arange(8))

@@ -242,11 +242,11 @@ def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Part:
 
 def _video(photos: Sequence[PhotoDiagnosis]) -> Part:
     details = [photo.film for photo in photos if photo.film is not None]
-    reason = f"{len(details)} of {len(photos)} photos are a film's frames as they were decoded"
+    reason = f"{len(details)} of {len(photos)} photos are frames of a film as they were decoded"
     if 2 * len(details) <= len(photos):
         return Part("video", False, None, None, None, reason)
     detail, spread = float(np.median(details)), _spread_of(details)
-    reason += f"; the finest details have {detail:.2f} of the coarser ones' strength"
+    reason += f"; the finest details are {detail:.2f} times as strong as coarser ones"
     if detail >= COARSE_FILM:
         return Part("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
     return Part("video", True, detail, spread, "video", reason)
