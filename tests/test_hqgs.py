@@ -189,7 +189,7 @@ def test_the_budget_follows_the_pixels_of_degraded_photos() -> None:
         config = tiny_config(method="hqgs", hqgs=fixed(formation, gaussians_per_pixel=0.2))
         trainer = Trainer(scene, config)
         assert trainer.config.densify.max_gaussians == int(0.2 * pixels / share), formation
-    shares = {"noise:6": 2, "noise:12": 5, "noise:6+jpeg:10": 2, "blur:0.5+noise:12": 5 + np.pi, "video": 10}
+    shares = {"noise:6": 2, "noise:12": 5, "noise:6+jpeg:10": 2, "blur:0.5+noise:12": 5 + np.pi}
     for formation, share in shares.items():
         config = tiny_config(method="hqgs", hqgs=fixed(formation, gaussians_per_pixel=1e3))
         trainer = Trainer(scene, config)

@@ -15,7 +15,7 @@ from scipy import ndimage
 from hqgs.photos.camera import draw_gains
 from hqgs.photos.degrade import degrade_image, degrade_sequence, shake
 from hqgs.photos.formation import formation
-from hqgs.photos.formula import FOUND, KINDS, parse_degradation, parse_formation
+from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.phone import WHITE_BALANCE, bayer_mosaic, demosaic, denoise, phone_jpeg
 from hqgs.photos.shake import (
@@ -30,7 +30,7 @@ from hqgs.photos.shake import (
 from hqgs.photos.video import film
 
 NEW = ("shake", "exposure", "chat", "phone", "video", "video265")
-NOT_TOLD = tuple(kind for kind in NEW if kind not in FOUND)
+NOT_TOLD = tuple(kind for kind in NEW if kind not in OWN)
 
 
 def picture(height: int = 61, width: int = 90, shift: float = 0.0) -> NDArray[np.float32]:
@@ -434,7 +434,7 @@ def test_a_method_cannot_be_told_of_these(kind: str) -> None:
     assert [k for k, v in KINDS.items() if not v.formation] == list(NOT_TOLD)
 
 
-@pytest.mark.parametrize("kind", FOUND)
+@pytest.mark.parametrize("kind", OWN)
 def test_what_is_learned_takes_no_value(kind: str) -> None:
     assert str(parse_formation(f"{kind}+noise:5")) == f"{kind}+noise:5"
     assert formation(parse_formation(kind), 40, 50) is None

@@ -40,8 +40,7 @@ NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
 VIDEOS = ("video", "video265")
 LEARNED = ("shake", "focus", "exposure")  # of each photo its own, which is learned with the scene
-OWN = (*LEARNED, "grain")  # of each photo its own; grain is noise, which is measured before
-FOUND = (*OWN, "video")  # a method is told of these without a value
+OWN = (*LEARNED, "grain", "video")  # of each photo its own; the last two are noise and a film's codec
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
     "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
@@ -169,7 +168,7 @@ def check_formation(degradation: Degradation) -> Degradation:
                 f"{step} differs from photo to photo and has no operator in the loss; a formation is made of "
                 f"{known}"
             )
-        if step.kind in FOUND and step.value is not None:
+        if step.kind in OWN and step.value is not None:
             raise ValueError(f"{step}: each photo has its own of it, which is found; write {step.kind}")
     return degradation
 

@@ -18,7 +18,6 @@ from hqgs.training.methods.formed import Formation, FormedTarget
 
 PIXELS = 100  # of the photos, for each point to start from where they are as photographed
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
-CODEC = 18.0  # levels: how far a film's codec is off that left little detail (H.264 at crf 36, small frames)
 DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 
 
@@ -37,7 +36,6 @@ def with_budget(
     - Noise: growth ends at a multiple of E^(1/3), where E counts a pixel less for its noise. With M
       anisotropic atoms the error of a picture with edges falls as M^-2 (Candes and Donoho 2004), and that by
       the noise grows as M / E: their sum is least at an M that goes with E^(1/3).
-    - A film's codec: as under noise of `CODEC` levels. More Gaussians paint its blocks and what it got wrong.
     - JPEG without noise: growth asks for less gradient, since within the cells there is none. A share k of
       coefficients outside their cells, of any sign, adds up to sqrt(k) of the gradient of all; the share that
       the codec kept stands for it.
@@ -52,9 +50,8 @@ def with_budget(
         threshold = min(threshold, DensifyConfig.grad_threshold * math.sqrt(min(kept / pixels, 1.0)))
         told = min(told, kept)
     most = gaussians_per_pixel * told
-    noise = max(formation.noise, CODEC / 255 if "video" in formation.kinds else 0.0)
-    if noise:
-        told = sum(_sharp_pixels(formation, target, noise) for target in targets)
+    if formation.noise:
+        told = sum(_sharp_pixels(formation, target, formation.noise) for target in targets)
         most = min(most, DETERMINED * told ** (1 / 3))
     return replace(
         densify,

@@ -51,7 +51,7 @@ class HQGS(Plain):
     - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
       Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
-    - A film's codec (video): 3DGS's loss and rates, and few Gaussians.
+    - A film's codec (video): 3DGS's loss and rates.
     - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG or video alone.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
