@@ -141,6 +141,7 @@ def test_diagnose_prints_and_writes_what_it_found(
         "lowres",
         "noise",
         "jpeg",
+        "video",
     ]
     assert all(view["name"] in printed for view in written["photos"])
     assert f": {written['formation']}\n" in printed

@@ -18,7 +18,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 import hqgs.diagnosis.scene as module
 from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
@@ -26,8 +26,11 @@ from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation, parse_formation
 from hqgs.photos.jpeg import encode_jpeg
+from hqgs.photos.pixels import as_floats
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.config import HQGSConfig
 from hqgs.training.methods.formed import find_formation
+from hqgs.training.methods.hqgs import HQGS
 
 WIDTH, HEIGHT, PHOTOS = 272, 208, 3  # px; multiples of 8 and 16
 
@@ -226,6 +229,7 @@ def test_report_is_json_and_names_every_part() -> None:
         ("lowres", True),
         ("noise", False),
         ("jpeg", False),
+        ("video", False),
     ]
     text = str(found)
     assert all(view.name in text for view in scene.train)
@@ -282,3 +286,50 @@ def test_bad_input_is_named() -> None:
         diagnose_scene(degraded_scene("none", photos=1), max_photos=0)
     with pytest.raises(FileNotFoundError):
         diagnose_photo(photo, path=Path("missing.jpg"))
+
+
+def blurred_noise(sigma: float, level: float) -> Scene:
+    """Noise of this level whose neighbours go together, by a Gaussian of `sigma` px."""
+    clean, rng = degraded_scene("none"), np.random.default_rng(3)
+    views = []
+    for view in clean.train:
+        noise = gaussian_filter(rng.standard_normal(view.image.shape), (sigma, sigma, 0))
+        noise *= level / 255 / noise.std()
+        views.append(replace(view, image=as_floats(view.image) + noise.astype(np.float32)))
+    return replace(clean, train=views)
+
+
+def test_noise_whose_neighbours_go_together_is_not_white() -> None:
+    """Then no pixels tell when the noise is learned. A Gaussian of 0.6 px is 1 to 0.25 to 0.004 in pixels."""
+    white, soft = degraded_scene("noise:25"), blurred_noise(0.6, 40)
+    inspectors = Inspector(), Inspector()
+    (first, said), (second, left) = (
+        find_formation(scene, "auto", inspector)
+        for scene, inspector in zip((white, soft), inspectors, strict=True)
+    )
+    found = inspectors[1].last
+    assert found is not None
+    assert found.together == pytest.approx(2 * 0.249 / (1 + 2 * 0.249**2), abs=0.08)
+    assert (first.white, second.white) == (True, False)
+    assert first.noise
+    assert second.noise
+    what = "pixels held back to tell when noise is learned"
+    assert [what in {item.what for item in items} for items in (said, left)] == [False, True]
+    assert "at least: not white" in str(found)
+    for scene, inspector, told in zip((white, soft), inspectors, (True, False), strict=True):
+        method = HQGS(scene, HQGSConfig(), inspector)
+        assert (method.prepare(scene.train[0]).held is not None) == told
+
+
+def test_photos_that_were_not_looked_at_are_told() -> None:
+    """On the screen of `diagnose` and in what a run left out."""
+    scene, inspector = degraded_scene("none", photos=5), Inspector()
+    found = inspector.diagnose(scene, max_photos=3)
+    (spared,) = found.passed_over
+    assert spared.what == "a diagnosis of 2 of 5 training photos"
+    assert f"left out: {spared.what}: the 3 that were looked at are spread over the scene" in str(found)
+    said = find_formation(scene, "auto", inspector)[1]
+    (taken,) = inspector.diagnose(scene).passed_over
+    assert taken.what == "the search for an enlargement in 1 of 5 photos"
+    assert taken in said
+    assert not inspector.diagnose(replace(scene, train=scene.train[:3])).passed_over

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from hqgs.diagnosis.blur import Blur, estimate_blur, extra_sigma
 from hqgs.diagnosis.coefficients import MAX_BLOCKS, Hidden, estimate_hidden, quantised
+from hqgs.diagnosis.film_traces import film_detail
 from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
-from hqgs.diagnosis.noise import estimate_noise
+from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
 from hqgs.photos.pixels import Floats, to_levels
 
@@ -41,6 +42,8 @@ class PhotoDiagnosis:
     noise_limit: float  # levels: weaker noise is not told from texture, or hidden by the JPEG
     blur: Blur | None  # beyond a sharp photo's own, px of the full-size photo; None: not told from this photo
     blur_limit: float  # px of the full-size photo, a Gaussian's sigma: sharp photos can look as soft
+    film: float | None = None  # `film_detail`: of a film's frame, as it was decoded; None: it is none
+    correlation: float | None = None  # of neighbours in its noise, at least; None: not told from this photo
 
     @property
     def told_noise(self) -> float | None:
@@ -103,6 +106,7 @@ def inspect_photo(
     jpeg = find_jpeg(levels, path)
     limit = _least_blur(LEAST_BLUR, enlargement) * width / enlargement.width
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
+    found = replace(found, film=film_detail(levels), correlation=neighbour_correlation(levels))
     if not found.hiding and (noise := estimate_noise(levels)) is not None:
         found = replace(found, noise=noise.level, noise_limit=noise.limit)
     return Inspected(found, levels)

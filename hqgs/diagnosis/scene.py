@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, unlike_sharpness
-from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
+from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, MOST_PHOTOS, focus_signs
 from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
@@ -21,14 +22,18 @@ from hqgs.scene.scene import Scene, View
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
 PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
 UNLIKE_NOISE = 2.5  # times the noise of the quieter photos in the noisier ones: each has its own
+WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
 VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
+COARSE_FILM = (
+    0.24  # of `film_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5
+)
 
 
 @dataclass(frozen=True)
 class Part:
     """One step of how the photos were made, and whether the method must undo it."""
 
-    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise" or "jpeg"
+    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise", "jpeg" or "video"
     needed: bool
     value: float | None  # median over photos: px, factor, levels or quality; None: not told
     spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
@@ -44,6 +49,13 @@ class Diagnosis:
     formation: str  # the degradation that best explains the photos, as `parse_formation` reads it
     parts: tuple[Part, ...]  # in the order of the formation
     photos: tuple[PhotoDiagnosis, ...]  # those looked at
+    passed_over: tuple[LeftOut, ...]  # looks that photos were spared, since others stand for them
+
+    @property
+    def together(self) -> float | None:
+        """How far neighbours go together in the photos' noise; None where it is white, or not told."""
+        together = _correlation(self.photos)
+        return together if together > WHITE else None
 
     def needs(self) -> list[tuple[str, bool, str]]:
         """Per part: its name, whether the method needs it, and why, in one sentence."""
@@ -59,7 +71,8 @@ class Diagnosis:
         ]
         lines += ["", f"{self.scene}: {self.formation}"]
         for name, needed, reason in self.needs():
-            lines.append(f"  {name:8}{'needed   ' if needed else 'not seen '} {reason}")
+            lines.append(f"  {name:9}{'needed   ' if needed else 'not seen '} {reason}")
+        lines += [f"  left out: {item.what}: {item.why}" for item in self.passed_over]
         return "\n".join(lines)
 
 
@@ -100,6 +113,7 @@ class Inspector:
             raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
         chosen = np.unique(np.linspace(0, len(scene.train) - 1, max_photos).round().astype(np.int64))
         found: list[Inspected] = []
+        taken = 0  # to be like the probes
         for view in (scene.train[k] for k in chosen):
             probes = [f.diagnosis for f in found[:PROBES] if f.diagnosis.enlargement.evidence is not None]
             known = None
@@ -110,6 +124,7 @@ class Inspector:
                 first = probes[0]
                 if view.image.shape[:2] == (first.height, first.width):
                     known = first.enlargement
+                    taken += 1
             found.append(self.inspect(view, known))
             self.told(Stage("photos diagnosed", len(found), len(chosen)))
         key = tuple(map(id, found))
@@ -126,9 +141,10 @@ class Inspector:
         if own := [part.name for part in (shake, focus) if part.needed]:
             reason = f"each photo has its own, see {' and '.join(own)}"
             blur = replace(blur, needed=False, step=None, reason=reason)
-        parts = (exposure, shake, focus, blur, _lowres(photos), _noise(photos), _jpeg(photos))
+        parts = (exposure, shake, focus, blur, _lowres(photos), _noise(photos), _jpeg(photos), _video(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
-        self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos)
+        passed_over = _passed_over(len(scene.train), len(photos), taken)
+        self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
         return self.last
 
 
@@ -140,6 +156,22 @@ def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     of all photos together. ValueError for `max_photos` below 1, or a bad photo, which is named.
     """
     return Inspector().diagnose(scene, max_photos)
+
+
+def _passed_over(total: int, looked_at: int, taken: int) -> tuple[LeftOut, ...]:
+    """What was not looked at of `total` photos; `taken`: those that count as enlarged like the probes."""
+    spread = "are spread over the scene and stand for all"
+    looks = []
+    if looked_at < total:
+        what = f"a diagnosis of {total - looked_at} of {total} training photos"
+        looks.append(LeftOut(what, f"the {looked_at} that were looked at {spread}"))
+    if taken:
+        what = f"the search for an enlargement in {taken} of {looked_at} photos"
+        looks.append(LeftOut(what, f"{looked_at - taken} others agree on it"))
+    if total > MOST_PHOTOS:
+        what = f"a look at the focus of {total - MOST_PHOTOS} of {total} training photos"
+        looks.append(LeftOut(what, f"{MOST_PHOTOS} {spread}"))
+    return tuple(looks)
 
 
 def _exposure(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Part:
@@ -220,6 +252,18 @@ def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Part:
     return Part("jpeg", True, quality, spread, f"jpeg:{quality:.0f}", f"{of} of quality {quality:.0f}")
 
 
+def _video(photos: Sequence[PhotoDiagnosis]) -> Part:
+    details = [photo.film for photo in photos if photo.film is not None]
+    reason = f"{len(details)} of {len(photos)} photos are frames of a film as they were decoded"
+    if 2 * len(details) <= len(photos):
+        return Part("video", False, None, None, None, reason)
+    detail, spread = float(np.median(details)), _spread_of(details)
+    reason += f"; the finest details are {detail:.2f} times as strong as coarser ones"
+    if detail >= COARSE_FILM:
+        return Part("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
+    return Part("video", True, detail, spread, "video", reason)
+
+
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
     told = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
     if not told:
@@ -228,11 +272,16 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
     spread = None if _pooled(photos) else _spread_of([noise for noise, _ in told])
     noisy = sum(photo.told_noise is not None for photo in photos)
     quiet, loud = np.quantile([max(noise, 0.5 * least) for noise, least in told], [0.1, 0.9])
+    together = _correlation(photos)
+    kind, more = "white noise of", ""
+    if together > WHITE:
+        kind = "noise of at least"
+        more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
     if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:
-        reason = f"white noise of {quiet:.1f} levels in some photos and {loud:.1f} in others"
+        reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
         return Part("noise", True, level, spread, "grain", reason)
     if level >= limit:
-        return Part("noise", True, level, spread, f"noise:{level:.0f}", f"white noise of {level:.1f} levels")
+        return Part("noise", True, level, spread, f"noise:{level:.0f}", f"{kind} {level:.1f} levels{more}")
     if spread is None:
         reason = f"below {limit:.0f} levels the JPEG hides it, and no more than that is seen"
     else:
@@ -265,6 +314,12 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Part:
     return Part(
         "blur", True, amount, spread, step, f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
     )
+
+
+def _correlation(photos: Sequence[PhotoDiagnosis]) -> float:
+    """Of neighbours in the noise, the median over photos in which noise is told; 0: it is told in none."""
+    told = [p.correlation for p in photos if p.told_noise is not None and p.correlation is not None]
+    return float(np.median(told)) if told else 0.0
 
 
 def _pooled(photos: Sequence[PhotoDiagnosis]) -> bool:

@@ -33,14 +33,14 @@ KINDS = {
     "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
     "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
-    "video": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
+    "video": Kind(0, 51, "a constant rate factor", integer=True, default=36, some=False),
     "video265": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
 }
 NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
 VIDEOS = ("video", "video265")
 LEARNED = ("shake", "focus", "exposure")  # of each photo its own, which is learned with the scene
-OWN = (*LEARNED, "grain")  # of each photo its own; grain is noise, which is measured before
+OWN = (*LEARNED, "grain", "video")  # of each photo its own; the last two are noise and a film's codec
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
     "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
@@ -153,8 +153,8 @@ def parse_degradation(text: str) -> Degradation:
 def parse_formation(text: str) -> Degradation:
     """Read what a method is told of the photos: as `parse_degradation`, and ValueError for other kinds.
 
-    `shake`, `focus`, `exposure` and `grain` (noise) stand without a value: each photo has its own, which is
-    learned with the scene, or, as noise, measured before.
+    `shake`, `focus`, `exposure`, `grain` (noise) and `video` (a film's codec) stand without a value: each
+    photo has its own, which is learned with the scene, or, as noise, measured before.
     """
     return check_formation(_parsed(text))
 

@@ -45,13 +45,19 @@ class Formation:
     """How a scene's photos were made."""
 
     def __init__(
-        self, degradation: Degradation, directions: Mapping[str, float], noises: Mapping[str, float]
+        self,
+        degradation: Degradation,
+        directions: Mapping[str, float],
+        noises: Mapping[str, float],
+        white: bool = True,
     ) -> None:
         """`directions`: of each photo's motion, radians from x towards y (down), where it is known.
 
-        `noises`: of the photos that have noise of their own, where 1 is white.
+        `noises`: of the photos that have noise of their own, where 1 is white. `white`: whether the noise in
+        a pixel tells nothing of that beside it.
         """
         self.degradation = degradation
+        self.white = white
         kinds = {step.kind: step.value for step in degradation.steps}
         self.kinds: frozenset[str] = frozenset(kinds)
         self.noise: float = float(kinds.get("noise") or 0.0) / 255  # standard deviation, where 1 is white
@@ -97,15 +103,21 @@ class Formation:
 def find_formation(scene: Scene, text: str, inspector: Inspector) -> tuple[Formation, list[LeftOut]]:
     """The formation that `text` names, with "auto" the diagnosed one; and what the loss leaves out."""
     left_out: list[LeftOut] = []
+    white = True
     if text == AUTO:
         diagnosis = inspector.diagnose(scene)
         text = diagnosis.formation
         needs = diagnosis.needs()
+        left_out += diagnosis.passed_over
         left_out += [
             LeftOut(f"a correction for {part}", f"not needed: {why}")
             for part, needed, why in needs
             if not needed
         ]
+        if diagnosis.together is not None and any(name == "noise" and needed for name, needed, _ in needs):
+            white = False
+            why = f"the noise of neighbouring pixels goes together by {diagnosis.together:.2f} at least"
+            left_out.append(LeftOut("pixels held back to tell when noise is learned", why))
     degradation = parse_formation(text)
     directions: dict[str, float] = {}
     if any(step.kind == "motion" for step in degradation.steps):
@@ -118,7 +130,7 @@ def find_formation(scene: Scene, text: str, inspector: Inspector) -> tuple[Forma
         noises = _noises(scene, inspector)
         what = f"D-SSIM in the loss of {len(noises)} of {len(scene.train)} photos"
         left_out.append(LeftOut(what, "it asks for the noise that they have"))
-    return Formation(degradation, directions, noises), left_out
+    return Formation(degradation, directions, noises, white), left_out
 
 
 def _motion_directions(scene: Scene, inspector: Inspector) -> dict[str, float]:

@@ -52,7 +52,8 @@ class HQGS(Plain):
     - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
       Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
-    - Short runs have higher rates than 3DGS (`learning_rates`).
+    - A film's codec (video): 3DGS's loss and rates.
+    - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG or video alone.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
@@ -86,7 +87,8 @@ class HQGS(Plain):
                 gains = inspector.log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
-        self._plateau = Plateau(len(scene.train)) if self.noise and "jpeg" not in kinds else None
+        holds = self.noise and self.formation.white and "jpeg" not in kinds
+        self._plateau = Plateau(len(scene.train)) if holds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
         self._since = 0  # the iteration after which they were computed
 
@@ -109,7 +111,8 @@ class HQGS(Plain):
             left_out.append(LeftOut(what, "they tell when the scene would start to learn the noise"))
         known = replace(config.hqgs, formation=str(degradation))
         # What a codec leaves open is learned sooner at higher rates, and nothing holds it back.
-        brisk = self.formation.kinds != {"jpeg"} if config.brisk is None else config.brisk
+        coded = self.formation.kinds in ({"jpeg"}, {"video"})
+        brisk = not coded if config.brisk is None else config.brisk
         config = replace(config, hqgs=known, brisk=brisk)
         if self._cameras is not None:
             config, why = _without_held_photos(config)

@@ -1,0 +1,74 @@
+"""Frames of films are told by their luma's levels, and what their codec left of fine details."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_diagnose import clean_photo, degraded_scene
+from test_hqgs import fixed
+
+from hqgs.diagnosis.film_traces import film_detail
+from hqgs.diagnosis.scene import diagnose_scene
+from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
+from hqgs.photos.pixels import as_floats
+from hqgs.photos.resize import area_downscale
+from hqgs.training.methods.hqgs import HQGS
+from tests.tiny_scene import tiny_config, tiny_scene
+
+Levels = NDArray[np.float64]
+BT601, BT709 = (0.299, 0.114), (0.2126, 0.0722)  # red's and blue's share of the luma
+
+
+def decoded(photo: NDArray[np.uint8], red: float, blue: float) -> Levels:
+    """A frame whose luma and chroma a film held with 8 bits, by the definition of ITU-R BT.601 and BT.709."""
+    r, g, b = np.moveaxis(photo / 255, -1, 0)
+    y = red * r + (1 - red - blue) * g + blue * b
+    luma = np.rint(16 + 219 * y)
+    cb, cr = np.rint(112 * (b - y) / (1 - blue)), np.rint(112 * (r - y) / (1 - red))
+    y = (luma - 16) / 219
+    r, b = y + cr / 112 * (1 - red), y + cb / 112 * (1 - blue)
+    g = (y - red * r - blue * b) / (1 - red - blue)
+    return np.rint(255 * np.stack([r, g, b], -1)).clip(0, 255)
+
+
+@pytest.mark.parametrize("weights", [BT601, BT709])
+def test_a_decoded_frame_is_told(weights: tuple[float, float]) -> None:
+    assert film_detail(decoded(clean_photo(0), *weights)) is not None
+
+
+def test_what_is_no_frame_or_was_changed_since_is_not() -> None:
+    frame = decoded(clean_photo(0), *BT601)
+    photo = as_floats(frame.astype(np.uint8))
+    smaller = area_downscale(photo, None, 136, 104)[0]
+    drawing = np.repeat(np.random.default_rng(0).choice([16.0, 93.0, 220.0], (200, 200, 1)), 3, axis=2)
+    for levels in (
+        clean_photo(0).astype(np.float64),
+        np.rint(255 * smaller).astype(np.float64),
+        decode_jpeg(encode_jpeg(photo, 90)).astype(np.float64) * 255,
+        drawing,
+        frame + np.random.default_rng(0).normal(0, 2, frame.shape),
+    ):
+        assert film_detail(levels) is None
+
+
+def test_the_codec_decides_what_is_left_of_fine_details() -> None:
+    """A good film is told and left alone; a coarse one is a part of the formation."""
+    good, coarse = (diagnose_scene(degraded_scene(f"video:{crf}")) for crf in (12, 40))
+    assert (good.formation, coarse.formation) == ("none", "video")
+    details = [[photo.film for photo in found.photos] for found in (good, coarse)]
+    assert all(a is not None and b is not None and a > 1.2 * b for a, b in zip(*details, strict=True))
+    why = {name: reason for name, _, reason in good.needs()}["video"]
+    assert why.startswith(
+        "3 of 3 photos are frames of a film as they were decoded; the finest details are 0."
+    )
+
+
+def test_a_coarse_film_has_the_rates_of_3dgs() -> None:
+    """Alone; what else happened to the photos asks for the higher ones."""
+    scene, brisk = tiny_scene(), {}
+    for kind in ("none", "video", "jpeg:30", "video+exposure", "noise:10"):
+        method = HQGS(scene, fixed(kind))
+        targets = [method.prepare(view) for view in scene.train]
+        brisk[kind] = method.start(scene, targets, tiny_config()).config.brisk
+    assert brisk == {"none": True, "video": False, "jpeg:30": False, "video+exposure": True, "noise:10": True}
