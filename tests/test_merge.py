@@ -18,7 +18,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.cells import Cut, cell_of
 from hqgs.scene.formats.part_json import Part, keep_part, read_part
-from hqgs.show.merge import brighter, merge
+from hqgs.training.merge import brighter, merge
 
 HALVES = Cut((1.0, 0.0, 0.0), 0.25, 0, 1)
 

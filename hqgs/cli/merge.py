@@ -15,7 +15,7 @@ from hqgs.model.formats.files import READERS, format_of
 
 if TYPE_CHECKING:
     from hqgs.evaluation.seams import SeamRow
-    from hqgs.show.merge import Merged
+    from hqgs.training.merge import Merged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ def run(options: MergeParts) -> int:
             if getattr(options, name) is not None and options.scene is None:
                 raise ValueError(f"--{name} is given without --scene, which names the photos to measure with")
         ready(str(options.runs[0] if options.scene is None else options.scene))
-        from hqgs.show.merge import check_seams, merge  # here: they load torch
+        from hqgs.training.merge import check_seams, merge  # here: they load torch
 
         merged = merge(options.runs, options.out)
         print(_parts_table(options, merged), end="\n\n")

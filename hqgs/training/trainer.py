@@ -34,6 +34,7 @@ from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
 from hqgs.training.state import TrainState
+from hqgs.training.surroundings import fixed_in_number, with_surroundings
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
@@ -72,7 +73,7 @@ class Trainer:
         self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
         self._looks = Looks(scene.train, self.method, config.background)
         with one_torch_thread():
-            start = self.method.start(scene, self._looks.targets, config)
+            start = with_surroundings(self.method.start(scene, self._looks.targets, config), scene)
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
         self.config: TrainConfig = start.config
         self.method_left_out: list[LeftOut] = start.left_out
@@ -277,7 +278,8 @@ class Trainer:
         state, finest = self.state, None
         if plan.finest is not None:
             finest = (plan.finest * photo_pixels(state.gaussians.means, self.scene.train)).float()
-        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest)
+        fixed = fixed_in_number(self.scene, state.gaussians)
+        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest, fixed)
         if growth.parents is not None:
             self.method.rows_changed(state, growth.parents)
         return growth

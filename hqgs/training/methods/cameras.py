@@ -2,7 +2,7 @@
 
 One render, warped along the way and over the lens (`hqgs/photos/exposure.py`), stands for the whole exposure.
 What photos cannot tell is fixed by construction: the mean of a way is the photo's pose, the mean of the log
-gains is 0.
+gains is that which they start with.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class LearnedCameras:
     def __init__(
         self, scene: Scene, shake: bool, focus: bool, log_gains: NDArray[np.float64] | None, seed: int
     ) -> None:
-        """`log_gains` [N, 3]: to start from; None: all gains are 1 and stay so."""
+        """`log_gains` [N, 3]: to start from, and their mean stays; None: all gains are 1 and stay so."""
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
         self._depths = [median_depth(scene, view) for view in scene.train]
         self._widths = [max(view.camera.width, NARROW) for view in scene.train]
@@ -99,6 +99,7 @@ class LearnedCameras:
             torch.from_numpy(gains.copy()).requires_grad_()
             for gains in (log_gains if log_gains is not None else [])
         ]
+        self._mean = torch.stack([gains.detach() for gains in self._gains] or [torch.zeros(3)]).mean(0)
         self._lenses = [first_lens(width).requires_grad_() for width in (self._widths if focus else [])]
         self._nearness: list[Tensor | None] = [None] * count
         self._visits = torch.zeros(count, dtype=torch.int64)
@@ -135,9 +136,7 @@ class LearnedCameras:
                 gains = self._gains[number].exp()
             full = None if near is None else _enlarged(near, size).to(render)
             taken = take_photo(render, size, full, warps, gains)
-            if self._gains and photo.shape == taken.shape:  # what the sensor could not hold may be brighter
-                taken = torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
-            return taken
+            return as_held(taken, photo) if self._gains and photo.shape == taken.shape else taken
 
         return Shot(wide, develop)
 
@@ -145,7 +144,7 @@ class LearnedCameras:
         """What ages, and which photos stand still from now on."""
         number = self._numbers[view.name]
         if self._gains:
-            _center(self._gains)
+            _center(self._gains, self._mean)
         if not self._paths and not self._lenses:
             return
         self._active = iteration >= self._begin
@@ -241,6 +240,12 @@ class LearnedCameras:
         return warps
 
 
+def as_held(taken: Tensor, photo: Tensor) -> Tensor:
+    """What was taken, [H, W, 3], where the photo is not saturated: what its sensor could not hold may be
+    brighter."""
+    return torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
+
+
 def no_shot(view: View) -> Shot:
     """That of a still camera with gains of 1."""
     return Shot(view.camera, lambda render: render)
@@ -262,11 +267,11 @@ def _way_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def _center(tensors: Sequence[Tensor]) -> None:
-    """Take their mean off each."""
-    mean = torch.stack([*tensors]).mean(0)
+def _center(tensors: Sequence[Tensor], wanted: Tensor) -> None:
+    """Give them this mean."""
+    shift = torch.stack([*tensors]).mean(0) - wanted
     for tensor in tensors:
-        tensor -= mean
+        tensor -= shift
 
 
 def _middle(path: Tensor) -> Tensor:
