@@ -75,13 +75,19 @@ def merge(
     Args:
         runs: folders of the runs, one of each part, in any order.
         out: the scene file, in a format that `Gaussians.save` writes. It is written whole or not at all.
+        scene: folder of the whole scene, whose training photos polish what was merged
+            (`hqgs/training/polish.py`); None: it stays as it was merged.
+        polish: steps. Runs that made up for degraded photos are not polished: `Merged.polished` is 0 then.
+        told: hears of each step.
 
     Raises:
         FileNotFoundError: a run without a scene.
         ValueError: a run of no part, of another split or of a part that came before, a part that is missing,
-            or a file that is not a scene.
+            a file that is not a scene, or steps below 0.
     """
     out = Path(out)
+    if polish < 0:
+        raise ValueError(f"polish is {polish}, wanted at least 0")
     format_of(out)
     given = parts_of(runs)
     for run, _ in given:
