@@ -1,4 +1,4 @@
-"""Parts that start from the coarse whole: what they start with, what grows, in which brightness; polishing."""
+"""Parts that start from the coarse whole: with what, beside which photos, how bright; and polishing."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ import hqgs
 from benchmarks.parts import photo_name, write_city
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import split as splitting
+from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.cells import Cut, cell_of
 from hqgs.scene.formats.part_json import Part, read_part
-from hqgs.scene.geometry import in_picture
+from hqgs.scene.geometry import in_picture, project
 from hqgs.scene.scene import Scene
 from hqgs.scene.split import Split, split
 from hqgs.training.config import HQGSConfig
@@ -25,6 +26,7 @@ from hqgs.training.methods.cameras import LearnedCameras
 from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.methods.shared_gains import beside
 from hqgs.training.polish import polished
+from hqgs.training.schedule import GUEST_EVERY, Schedule
 from hqgs.training.trainer import Trainer
 
 PHOTOS, POINTS = 36, 1440
@@ -152,6 +154,45 @@ def test_a_part_keeps_the_brightness_of_the_coarse_whole(tmp_path: Path) -> None
     logs = np.log([found.gains for found in cameras.found()])
     np.testing.assert_allclose(logs.mean(0), np.log(gains).mean(0))
     assert logs[0, 0] - logs[1, 0] > 0.4
+
+
+def test_small_photos_of_other_parts_are_guests(made: Split, tmp_path: Path) -> None:
+    coarse = hqgs.load(made.folder / "coarse", downscale=2)
+    save_cameras(tmp_path, coarse)
+    file = coarse_file(tmp_path)
+    part = hqgs.load(made.folder / "part2", around=file)
+    own = {view.name for view in [*part.train, *part.test]}
+    names = [view.name for view in part.guests]
+    assert names == sorted(names)
+    assert names
+    assert not {*names} & own
+    assert not {*names} & {view.name for view in coarse.test}
+    assert part.part is not None
+    inside = part.points[cell_of(part.part.cells, part.points) == 1].astype(float)
+    for view in coarse.train:
+        pixels, depths = project(view.camera, inside)
+        shown = (
+            (depths > 0) & (pixels >= 0).all(1) & (pixels < (view.camera.width, view.camera.height)).all(1)
+        )
+        stands = cell_of(part.part.cells, view.camera.center[None])[0] == 1
+        wanted = view.name not in own and bool(stands or shown.mean() >= 0.01)
+        assert (view.name in names) == wanted
+    (first,) = [view for view in coarse.train if view.name == names[0]]
+    assert part.guests[0].image.shape == first.image.shape
+    np.testing.assert_allclose(part.guests[0].camera.K, first.camera.K)
+
+
+def test_guests_come_now_and_then_and_nothing_grows_by_them() -> None:
+    scene = tiny_scene()
+    schedule = Schedule.of(tiny_config(iterations=90), scene.train, True, guests=4)
+    plans = [schedule.plan(k, schedule.start()) for k in range(1, 91)]
+    guests = [plan for plan in plans if plan.view >= len(scene.train)]
+    assert [plan.iteration for plan in guests] == [*range(GUEST_EVERY, 91, GUEST_EVERY)]
+    assert not any(plan.observes or plan.coarse for plan in guests)
+    counts = np.bincount([plan.view for plan in plans])
+    assert len(counts) == len(scene.train) + 4
+    assert np.ptp(counts[: len(scene.train)]) <= 1
+    assert np.ptp(counts[len(scene.train) :]) <= 1
 
 
 def test_polishing_brings_a_scene_to_its_photos_in_their_exposure(made: Split) -> None:

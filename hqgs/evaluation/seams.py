@@ -59,7 +59,14 @@ def measure_seams(
     """
     rows: dict[str, list[list[float | None]]] = {
         name: []
-        for name in ("all", ALIGNED, "views without a seam", "views with a seam", "beside the seam", "elsewhere")
+        for name in (
+            "all",
+            ALIGNED,
+            "views without a seam",
+            "views with a seam",
+            "beside the seam",
+            "elsewhere",
+        )
     }
     for view in views:
         with torch.no_grad():

@@ -71,6 +71,7 @@ class Scene:
     )
     part: Part | None = None  # of a larger scene, which `hqgs split` made; None: it is whole
     around: Path | None = None  # of a part: the run of the coarse whole, or its file; None: it has none
+    guests: list[View] = field(default_factory=list)  # small photos of other parts, which see into this one
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""

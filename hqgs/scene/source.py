@@ -17,6 +17,7 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import film_frames
+from hqgs.scene.guests import guests_of
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
@@ -127,7 +128,9 @@ def load(
     scene = scene if restore is None else restore_scene(scene, restore)
     if around is not None and scene.part is None:
         raise ValueError(f"{path} is no part that hqgs split made: there is nothing around it")
-    return replace(scene, origin=origin, around=around)
+    if around is not None:
+        scene = replace(scene, around=around, guests=guests_of(scene, around))
+    return replace(scene, origin=origin)
 
 
 def load_again(run: str | Path, told: OnStage = untold) -> Scene:

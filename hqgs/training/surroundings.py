@@ -7,6 +7,7 @@ sky and the same neighbours; what none of a part's photos shows stays as all pho
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,7 +17,8 @@ from hqgs.scene.cells import cell_of
 from hqgs.scene.formats.part_json import Part
 from hqgs.scene.geometry import in_picture
 from hqgs.scene.scene import Scene
-from hqgs.training.methods.base import Start
+from hqgs.training.methods.base import Method, Start
+from hqgs.training.methods.hqgs import HQGS
 
 
 def with_surroundings(start: Start, scene: Scene) -> Start:
@@ -38,6 +40,11 @@ def with_surroundings(start: Start, scene: Scene) -> Start:
     densify = start.config.densify
     densify = replace(densify, reset_every=max(densify.reset_every, densify.stop))
     return replace(start, config=replace(start.config, leave_out=items, densify=densify), gaussians=both)
+
+
+def fits_guests(method: Method[Any]) -> bool:
+    """Whether small photos are to be compared with renders as they are, but for their exposure."""
+    return not isinstance(method, HQGS) or method.formation.kinds <= {"exposure"}
 
 
 def fixed_in_number(scene: Scene, gaussians: Gaussians) -> Tensor | None:

@@ -84,12 +84,16 @@ class LearnedCameras:
     def __init__(
         self, scene: Scene, shake: bool, focus: bool, log_gains: NDArray[np.float64] | None, seed: int
     ) -> None:
-        """`log_gains` [N, 3]: to start from, and their mean stays; None: all gains are 1 and stay so."""
-        self._numbers = {view.name: k for k, view in enumerate(scene.train)}
-        self._depths = [median_depth(scene, view) for view in scene.train]
-        self._widths = [max(view.camera.width, NARROW) for view in scene.train]
-        self._sizes = [(view.camera.height, view.camera.width) for view in scene.train]
-        rng, count = np.random.default_rng([seed, 6]), len(scene.train)
+        """`log_gains` [N, 3] of the training photos and the guests: to start from, and their mean stays.
+
+        None: all gains are 1 and stay so.
+        """
+        views, self._own = [*scene.train, *scene.guests], len(scene.train)
+        self._numbers = {view.name: k for k, view in enumerate(views)}
+        self._depths = [median_depth(scene, view) for view in views]
+        self._widths = [max(view.camera.width, NARROW) for view in views]
+        self._sizes = [(view.camera.height, view.camera.width) for view in views]
+        rng, count = np.random.default_rng([seed, 6]), len(views)
         first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
         self._paths = [
             torch.from_numpy(path * width).requires_grad_()
@@ -165,7 +169,7 @@ class LearnedCameras:
                     self._nearness[k] = None
 
     def found(self) -> list[Found]:
-        """For each photo."""
+        """For each training photo."""
         return [
             Found(
                 name,
@@ -173,7 +177,7 @@ class LearnedCameras:
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
             )
-            for name, k in self._numbers.items()
+            for name, k in [*self._numbers.items()][: self._own]
         ]
 
     def param_groups(self) -> list[dict[str, Any]]:

@@ -86,6 +86,8 @@ class HQGS(Plain):
                 gains = log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
                 gains = beside(gains, [known.get(view.name) for view in scene.train])
+                guests = [known.get(view.name, np.zeros(3)) for view in scene.guests]
+                gains = np.concatenate([gains, np.reshape(guests, (-1, 3))])
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
         self._plateau = Plateau(len(scene.train)) if self.noise and "jpeg" not in kinds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
