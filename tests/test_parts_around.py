@@ -28,6 +28,7 @@ from hqgs.training.methods.shared_gains import beside
 from hqgs.training.polish import polished
 from hqgs.training.schedule import GUEST_EVERY, Schedule
 from hqgs.training.trainer import Trainer
+from hqgs.training.veils import veils
 
 PHOTOS, POINTS = 36, 1440
 HALVES = Cut((1.0, 0.0, 0.0), 0.25, 0, 1)
@@ -193,6 +194,21 @@ def test_guests_come_now_and_then_and_nothing_grows_by_them() -> None:
     assert len(counts) == len(scene.train) + 4
     assert np.ptp(counts[: len(scene.train)]) <= 1
     assert np.ptp(counts[len(scene.train) :]) <= 1
+
+
+def test_what_holds_a_camera_is_a_veil() -> None:
+    """Needles 1 long and 0.1 thin, 2 away: along x the camera is 2 standard deviations off, along y 20."""
+    points = np.array([[2, 0, 0], [2, 0, 0], [0, 0, 5], [9, 0, 0]], np.float32)
+    gaussians = Gaussians.from_points(points, np.full((4, 3), 99, np.uint8), 0)
+    gaussians.scales[:] = torch.tensor([1.0, 0.1, 0.1]).log()
+    gaussians.quats[1] = torch.tensor([1.0, 0.0, 0.0, 1.0])  # a quarter turn about z
+    assert veils(gaussians, np.zeros((1, 3))).tolist() == [True, False, False, False]
+    assert veils(gaussians, np.array([[50.0, 0, 0], [2, 2, 0], [9, 0, 0]])).tolist() == [
+        False,
+        True,
+        False,
+        True,
+    ]
 
 
 def test_polishing_brings_a_scene_to_its_photos_in_their_exposure(made: Split) -> None:

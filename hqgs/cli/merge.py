@@ -81,6 +81,7 @@ def _parts_table(options: MergeParts, merged: Merged) -> str:
         ]
         for part in merged.parts
     ]
+    rows.append(["veils before cameras", "", f"{-merged.veils:,}", "", ""])
     rows.append(["the dome", "", f"{merged.dome:,}", "", ""])
     rows.append(
         [str(options.out), "", f"{len(merged.model):,}", f"{sum(p.cropped for p in merged.parts):,}", ""]

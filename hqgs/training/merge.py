@@ -28,6 +28,7 @@ from hqgs.scene.scene import extent_of
 from hqgs.show.dome import Dome
 from hqgs.training.methods.shared_gains import learned_gains
 from hqgs.training.polish import polished
+from hqgs.training.veils import veils
 
 POLISH = 300  # steps
 STEP = 1e-3  # of a colour, in which its change with the light is measured
@@ -52,6 +53,7 @@ class Merged:
     model: Gaussians  # those of the parts, then those of the dome
     part_of: NDArray[np.uint16]  # [N], the part that each of the parts' Gaussians came from, from 0
     parts: list[MergedPart]
+    veils: int  # of the parts' Gaussians that were left out, since a camera stood within them
     dome: int  # Gaussians of the sky behind all
     polished: int  # steps that all of them were polished for
     left_out: int  # Gaussians that are not finite, and not in the file
@@ -101,10 +103,12 @@ def merge(
         cropped.append(brighter(whole.rows(torch.from_numpy(own)), gain))
         part_of.append(np.full(int(own.sum()), part.part, np.uint16))
         facts.append(MergedPart(run, part.part + 1, int(own.sum()), int((~own).sum()), np.exp(gain).tolist()))
-    model = Gaussians.joined(cropped)
-    del cropped
     cameras = [load_cameras(run) for run, _ in given]
     centers = np.stack([camera.center for some in cameras for camera in some.train])
+    model, owner = Gaussians.joined(cropped), np.concatenate(part_of)
+    del cropped
+    veil = veils(model, centers)
+    model, owner = model.rows(~veil), owner[~veil.numpy()]
     dome = Dome(model, centers)
     for (run, _), gain, some in zip(given, bright.parts, cameras, strict=True):
         dome.look(brighter(Gaussians.load(run), gain), some.train)
@@ -113,7 +117,8 @@ def merge(
     steps = polish if scene is not None and all(_as_photographed(run) for run, _ in given) else 0
     if scene is not None and steps:
         model = polished(model, scene, bright.photos, _size(given[0][0]), extent_of(centers), steps, told)
-    return Merged(out, model, np.concatenate(part_of), facts, len(sky), steps, model.save(out))
+    left_out = model.save(out)
+    return Merged(out, model, owner, facts, int(veil.sum()), len(sky), steps, left_out)
 
 
 def _size(run: Path) -> tuple[float, int | None]:
