@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from hqgs.scene.source import degrade, load
     from hqgs.scene.split import split
     from hqgs.show.frames import render_frames
-    from hqgs.show.merge import merge
     from hqgs.training.config import TrainConfig
+    from hqgs.training.merge import merge
     from hqgs.training.progress import Progress
     from hqgs.training.trainer import TrainingError
 
@@ -82,7 +82,7 @@ _HOMES = {
     "load": "hqgs.scene.source",
     "load_cameras": "hqgs.scene.camera_files",
     "look_at": "hqgs.scene.paths",
-    "merge": "hqgs.show.merge",
+    "merge": "hqgs.training.merge",
     "orbit": "hqgs.model.orbit",
     "picture": "hqgs.photos.pixels",
     "rasterization": "hqgs.model.rasterization",

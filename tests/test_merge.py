@@ -19,7 +19,7 @@ from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.cells import Cut, cell_of
 from hqgs.scene.formats.part_json import keep_part, read_part
 from hqgs.scene.scene import Part
-from hqgs.show.merge import brighter, merge
+from hqgs.training.merge import brighter, merge
 
 HALVES = Cut((1.0, 0.0, 0.0), 0.25, 0, 1)
 
@@ -115,8 +115,8 @@ def test_shared_photos_bring_parts_to_one_brightness(tmp_path: Path) -> None:
 
 def test_brighter_light_is_that_of_linear_light() -> None:
     gaussians = cloud(0, sh_degree=0)
-    bright = brighter(gaussians.arrays(), np.log([2.0, 1.0, 0.5]))
-    colors = [0.5 + 0.28209479177387814 * arrays for arrays in (gaussians.sh0.numpy(), bright["sh0"])]
+    bright = brighter(gaussians, np.log([2.0, 1.0, 0.5]))
+    colors = [0.5 + 0.28209479177387814 * one.sh0.numpy() for one in (gaussians, bright)]
     linear = [np.where(c <= 0.04045, c / 12.92, ((np.maximum(c, 0) + 0.055) / 1.055) ** 2.4) for c in colors]
     np.testing.assert_allclose(linear[1], linear[0] * (2.0, 1.0, 0.5), atol=1e-5)
 
@@ -138,15 +138,25 @@ def test_from_a_scene_to_its_parts_and_back(tmp_path: Path, capsys: pytest.Captu
     city = tmp_path / "city"
     write_city(city, 16, 640)
     assert main(["split", str(city), "--parts", "2", "--out", str(tmp_path / "parts")]) == 0
-    assert "hqgs train" in capsys.readouterr().out
-    runs = []
+    assert "--around COARSE" in capsys.readouterr().out
+    runs, coarse = list[str](), str(tmp_path / "coarse")
+    options = ["--method", "3dgs", "--iterations", "8", "--leave-out", "none", "--threads", "1"]
+    assert main(["train", str(tmp_path / "parts" / "coarse"), "--out", coarse, *options]) == 0
+    options += ["--around", coarse]
     for k in (1, 2):
         runs.append(str(tmp_path / f"run{k}"))
-        options = ["--method", "3dgs", "--iterations", "8", "--leave-out", "none", "--threads", "1"]
         assert main(["train", str(tmp_path / "parts" / f"part{k}"), "--out", runs[-1], *options]) == 0
+    longer = ["--out", runs[0], "--resume", "--iterations", "10", "--threads", "1"]  # it knows the coarse one
+    assert main(["train", str(tmp_path / "parts" / "part1"), *longer]) == 0
     capsys.readouterr()
+    out = tmp_path / "polished.ply"
+    assert main(["merge", *runs, "--out", str(out), "--scene", str(city), "--polish", "4"]) == 0
+    assert "polished: 4 steps" in capsys.readouterr().out
+    polished = out.read_bytes()
     out = tmp_path / "scene.ply"
-    assert main(["merge", *runs, "--out", str(out), "--scene", str(city), "--whole", runs[0]]) == 0
+    rest = ["--scene", str(city), "--polish", "0", "--whole", runs[0]]
+    assert main(["merge", *runs, "--out", str(out), *rest]) == 0
+    assert out.read_bytes() != polished
     told = capsys.readouterr().out
     assert "| run" in told
     assert "PSNR (dB) on the held-out photos" in told

@@ -10,12 +10,13 @@ import tyro
 
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import Factor, ready
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import Factor, Number, ready
 from hqgs.model.formats.files import READERS, format_of
 
 if TYPE_CHECKING:
     from hqgs.evaluation.seams import SeamRow
-    from hqgs.show.merge import Merged
+    from hqgs.training.merge import Merged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +29,9 @@ class MergeParts:
         Path, tyro.conf.arg(metavar="FILE", help=f"The file to write; it ends in .{', .'.join(READERS)}.")
     ]
     scene: Annotated[Path | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
-    """Measure it on the held-out photos of the whole scene, in this folder, at its seams too."""
+    """Folder of the whole scene: its photos polish the merged scene, and those held out measure it."""
+    polish: Number = None
+    """With --scene: steps of all parts together on photos of all (300); 0: none."""
     whole: Annotated[Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint="")] = None
     """With --scene: measure this run of the whole scene, or scene file, in the same pixels."""
     downscale: Factor = None
@@ -42,14 +45,18 @@ def run(options: MergeParts) -> int:
     """Write the file and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
     try:
         format_of(options.out)
-        for name in ("whole", "downscale"):
+        for name in ("whole", "downscale", "polish"):
             if getattr(options, name) is not None and options.scene is None:
-                raise ValueError(f"--{name} is given without --scene, which names the photos to measure with")
+                raise ValueError(f"--{name} is given without --scene, which names the photos")
         ready(str(options.runs[0] if options.scene is None else options.scene))
-        from hqgs.show.merge import check_seams, merge  # here: they load torch
+        from hqgs.training.merge import check_seams, merge  # here: they load torch
 
-        merged = merge(options.runs, options.out)
+        steps = {} if options.polish is None else {"polish": options.polish}
+        with LoadingScreen() as screen:
+            merged = merge(options.runs, options.out, scene=options.scene, told=screen.stage, **steps)
         print(_parts_table(options, merged), end="\n\n")
+        if options.scene is not None:
+            print(f"polished: {merged.polished} steps on photos of all parts", end="\n\n")
         if merged.left_out:
             print(f"left out: {merged.left_out:,} Gaussians that hold NaN or Inf")
         if options.scene is not None:
@@ -74,6 +81,7 @@ def _parts_table(options: MergeParts, merged: Merged) -> str:
         ]
         for part in merged.parts
     ]
+    rows.append(["veils before cameras", "", f"{-merged.veils:,}", "", ""])
     rows.append(["the dome", "", f"{merged.dome:,}", "", ""])
     rows.append(
         [str(options.out), "", f"{len(merged.model):,}", f"{sum(p.cropped for p in merged.parts):,}", ""]

@@ -64,10 +64,14 @@ def run(options: SplitScene) -> int:
             f"{part.own_points:,}",
             f"{part.points:,}",
         ]
-        for part in made.parts
+        for part in [*made.parts, *([] if made.coarse is None else [made.coarse])]
     ]
     rows.append([made.scene, f"{made.train:,}", f"{made.held_out:,}", f"{made.points:,}", f"{made.points:,}"])
     print(markdown_table(f"{made.scene} in {len(made.parts)} parts", head, rows))
-    print(f"\nnow, each on any machine: hqgs train {options.out / made.parts[0].folder} --out RUN1")
+    around = ""
+    if made.coarse is not None:
+        print(f"\nfirst: hqgs train {options.out / made.coarse.folder} --out COARSE --preset quick")
+        around = " --around COARSE"
+    print(f"now, each on any machine: hqgs train {options.out / made.parts[0].folder} --out RUN1{around}")
     print(f"then: hqgs merge RUN1 RUN2 ... --out scene.ply --scene {options.scene}")
     return 0

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from hqgs.evaluation.metrics import psnr
+from hqgs.evaluation.metrics import psnr, psnr_aligned
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import composited
 from hqgs.scene.scene import Camera, View
 
+Metric = Callable[[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"], "float | None"]
+ALIGNED = "all, brightness and tint set aside"
 NEAR = 8  # px on either side of a seam
 LEAST = 0.01  # of a view's pixels lie beside a seam; else it shows none
 
@@ -37,7 +40,7 @@ def seams(gaussians: Gaussians, parts: NDArray[np.integer], camera: Camera) -> N
     """
     digits = max(1, int(parts.max(initial=0)).bit_length())
     bits = parts[:, None] >> np.arange(digits) & 1
-    gaussians = Gaussians(**{name: rows[: len(parts)] for name, rows in gaussians.named().items()})
+    gaussians = gaussians.rows(torch.arange(len(parts)))
     shares, alphas = composited(gaussians, camera, torch.from_numpy(bits.astype(np.float32)))
     label = ((shares > alphas / 2).numpy() << np.arange(digits)).sum(2)
     size = 2 * NEAR + 1
@@ -56,7 +59,14 @@ def measure_seams(
     """
     rows: dict[str, list[list[float | None]]] = {
         name: []
-        for name in ("all", "views without a seam", "views with a seam", "beside the seam", "elsewhere")
+        for name in (
+            "all",
+            ALIGNED,
+            "views without a seam",
+            "views with a seam",
+            "beside the seam",
+            "elsewhere",
+        )
     }
     for view in views:
         with torch.no_grad():
@@ -64,10 +74,11 @@ def measure_seams(
         beside = seams(scenes[0], parts, view.camera)
         counts = np.ones_like(beside) if view.mask is None else view.mask
 
-        def add(name: str, mask: NDArray[np.bool_]) -> None:
-            rows[name].append([psnr(render, view.image, mask) for render in renders])  # noqa: B023
+        def add(name: str, mask: NDArray[np.bool_], metric: Metric = psnr) -> None:
+            rows[name].append([metric(render, view.image, mask) for render in renders])  # noqa: B023
 
         add("all", counts)
+        add(ALIGNED, counts, psnr_aligned)
         if beside.mean() < LEAST:
             add("views without a seam", counts)
         else:

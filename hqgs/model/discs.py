@@ -23,8 +23,8 @@ def as_discs(gaussians: Gaussians) -> Gaussians:
     Round Gaussians become such discs by training, which takes hundreds of steps.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
-    _, nearest = KDTree(means).query(means, min(NEIGHBORS + 1, len(means)))
-    away = means[nearest[:, 1:]] - means[:, None]
+    _, nearest = KDTree(means).query(means, min(NEIGHBORS + 1, len(means)))  # the first is itself
+    away = means[np.asarray(nearest)[:, 1:]] - means[:, None]
     away /= np.maximum(np.linalg.norm(away, axis=2, keepdims=True), np.finfo(float).tiny)
     squares, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))
     squares, axes = squares[:, ::-1], axes[:, :, ::-1]  # the longest first

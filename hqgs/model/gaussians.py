@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 
 from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
@@ -82,6 +83,10 @@ class Gaussians:
     def detached(self) -> Gaussians:
         """The same values (shared memory) without a gradient history."""
         return Gaussians(**{name: tensor.detach() for name, tensor in self.named().items()})
+
+    def rows(self, chosen: Tensor) -> Gaussians:
+        """Some of them: `chosen` bool [N], or the rows' numbers [M]."""
+        return Gaussians(**{name: tensor[chosen] for name, tensor in self.named().items()})
 
     def arrays(self) -> Arrays:
         """The same values (shared memory) as numpy arrays, by the names of the fields."""
@@ -209,6 +214,17 @@ class Gaussians:
         )
         made.look = look
         return made
+
+    @classmethod
+    def joined(cls, several: Sequence[Gaussians]) -> Gaussians:
+        """All of them in this order, with zeros where some have fewer harmonics than others."""
+        most = max(some.shN.shape[1] for some in several)
+
+        def tensor(some: Gaussians, name: str) -> Tensor:
+            lacking = most - some.shN.shape[1]
+            return pad(some.shN, (0, 0, 0, lacking)) if name == "shN" else some.named()[name]
+
+        return cls(**{name: torch.cat([tensor(one, name) for one in several]) for name in several[0].named()})
 
     @classmethod
     def from_points(

@@ -111,7 +111,9 @@ def listed(root: Path, model: Path, downscale: float = 1.0) -> Listed:
 def some_views(
     path: str | Path, names: Sequence[str], downscale: float = 1.0, longest: int | None = None
 ) -> Iterator[View]:
-    """The views of these photos of a COLMAP folder, as `hqgs.load` has them, a few in memory at a time.
+    """The views of these photos of a COLMAP folder, as `hqgs.load` has them, in the order of the names.
+
+    A few are in memory at a time. A name may come more than once.
 
     Raises FileNotFoundError or ValueError for what is wrong with the folder or a photo, or a name that it
     does not have.
@@ -123,6 +125,7 @@ def some_views(
         raise ValueError(f"{root} has no photo {some(missing)}")
     if longest is not None:
         capture = bounded(capture, longest)
-    photos = [photo for photo in capture.photos if photo.name in set(names)]
+    of_name = {photo.name: photo for photo in capture.photos}
+    photos = [of_name[name] for name in names]
     for first in range(0, len(photos), AT_ONCE):
         yield from load_views(photos[first : first + AT_ONCE], capture.downscale)[0]

@@ -82,6 +82,7 @@ def write_models(
     rows_of: Rows,
     own: NDArray[np.uint16],
     spare: int | None,
+    thin: int | None,
     told: OnStage,
 ) -> list[int]:
     """Write `sparse/0` of each part, and tell how many points it has.
@@ -94,6 +95,7 @@ def write_models(
         rows_of: rows of the points by their ids.
         own: [P], the part in whose cell each point lies.
         spare: of a model without tracks, every point whose row is a multiple of it is in all parts.
+        thin: the last folder is no part's, and has the points whose row is a multiple of this; None: it is.
         told: hears where it is.
     """
     with ExitStack() as stack:
@@ -119,6 +121,8 @@ def write_models(
                 )
                 if spare is not None:
                     kept |= np.arange(rows.start, rows.stop) % spare == 0
+                if thin is not None and file is points[-1]:
+                    kept = np.arange(rows.start, rows.stop) % thin == 0
                 has[rows, k // 8] |= (kept << (k % 8)).astype(np.uint8)
                 counts[k] += int(kept.sum())
                 write_points(file, _kept(piece, owner, kept, shown))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,8 @@ class Scene:
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
     part: Part | None = None  # of a larger scene, which `hqgs split` made; None: it is whole
+    around: Path | None = None  # of a part: the run of the coarse whole, or its file; None: it has none
+    guests: list[View] = field(default_factory=list)  # small photos of other parts, which see into this one
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""
@@ -84,9 +87,7 @@ class Scene:
     @property
     def extent(self) -> float:
         """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera."""
-        centers = np.stack([v.camera.center for v in self.train])
-        radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-        return 1.1 * radius if radius > 0 else 1.0
+        return extent_of(np.stack([v.camera.center for v in self.train]))
 
     @property
     def reach(self) -> float:
@@ -100,6 +101,12 @@ class Scene:
             depths.append(depth[depth > 0])
         seen = np.concatenate(depths)
         return max(self.extent, float(np.median(seen))) if seen.size else self.extent
+
+
+def extent_of(centers: NDArray[np.float64]) -> float:
+    """The extent of a scene whose training cameras are at `centers` [C, 3]."""
+    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    return 1.1 * radius if radius > 0 else 1.0
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ from hqgs.scene.scene import Camera, Part
 
 PLAN = "parts.json"  # beside the parts' folders
 MOST_PARTS = 256
+COARSE = "coarse"  # beside them, the whole with few photos and points
+COARSE_PHOTOS, COARSE_POINTS = 512, 1 << 18  # at most
 SHARE = 0.15  # of a photo's lines of sight that end in a cell or run through it: then its part has the photo
 LEAST_POINTS = 4  # fewer start no Gaussians
 SAMPLED = 1 << 20  # points that the cuts are balanced by
@@ -51,6 +53,9 @@ class Split:
     held_out: int
     points: int
     parts: list[PartFacts]
+    coarse: (
+        PartFacts | None
+    )  # the whole, with few points and photos, which all parts start from; None: one part
 
 
 def split(
@@ -65,9 +70,10 @@ def split(
     """Cut a COLMAP folder into parts that are trained each for itself, and put together by `hqgs.merge`.
 
     Each part is a folder that `hqgs.load` takes: the points of its cell, the photos that see enough of it,
-    whatever else these show, all in the whole scene's frame. The cells tile space, so that each Gaussian
-    belongs to one part. The same scene gives the same parts. Photos are never decoded, and points never held
-    with their tracks.
+    whatever else these show, all in the whole scene's frame. Beside them lies `coarse`, the whole with few
+    photos and points, for any machine: a run of it is what the parts start from (`around`). The cells tile
+    space, so that each Gaussian belongs to one part. The same scene gives the same parts. Photos are never
+    decoded, and points never held with their tracks.
 
     Args:
         path: a folder with a COLMAP model, binary or text.
@@ -115,22 +121,29 @@ def split(
         )
         with new_folder(out) as folder:
             width = len(str(parts))
+            whose = [replace(of_all, part=k) for k in range(parts)]
             folders = [folder / f"part{k + 1:0{width}}" for k in range(parts)]
-            counts = write_models(model, folders, scene, member, rows_of, own, spare, told)
+            thin = None
+            if parts > 1:
+                thin = -(-len(own) // COARSE_POINTS)
+                member = np.column_stack([member, _spread(len(names), COARSE_PHOTOS)])
+                whose.append(replace(of_all, split=f"{of_all.split}-{COARSE}", parts=1, cells=0))
+                folders.append(folder / COARSE)
+            counts = write_models(model, folders, scene, member, rows_of, own, spare, thin, told)
             facts = []
             for k, part in enumerate(folders):
                 rows = np.flatnonzero(member[:, k])
                 bring_photos(root, part, out / part.name, [names[row] for row in rows], copy)
-                keep_part(part, replace(of_all, part=k))
+                keep_part(part, whose[k])
                 photos, trained = len(rows), int(train[rows].sum())
                 facts.append(
                     PartFacts(part.name, trained, photos - trained, int((own == k).sum()), counts[k])
                 )
-                told(Stage("parts written", k + 1, parts))
+                told(Stage("parts written", k + 1, len(folders)))
             summary = {"version": VERSION, "scene": root.name, "split": of_all.split}
-            write_json(folder / PLAN, summary | {"parts": [asdict(one) for one in facts]})
-    trained = int(train.sum())
-    return Split(out, root.name, trained, len(names) - trained, len(own), facts)
+            write_json(folder / PLAN, summary | {"parts": [asdict(one) for one in facts[:parts]]})
+    trained, coarse = int(train.sum()), next(iter(facts[parts:]), None)
+    return Split(out, root.name, trained, len(names) - trained, len(own), facts[:parts], coarse)
 
 
 def _cells(root: Path, shown: list[NDArray[np.float64]], xyz: NDArray[np.float32], parts: int) -> Cells:
@@ -154,6 +167,13 @@ def members(
     member = shares >= SHARE
     member[np.arange(len(shares)), shares.argmax(1)] = True
     return member
+
+
+def _spread(total: int, most: int) -> NDArray[np.bool_]:
+    """Which of so many photos stand for all, evenly spread, [N]."""
+    chosen = np.zeros(total, np.bool_)
+    chosen[np.linspace(0, total - 1, min(total, most)).round().astype(int)] = True
+    return chosen
 
 
 def _shown(

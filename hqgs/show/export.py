@@ -90,7 +90,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]
         (finite & visible, int(finite.sum()), "no pixel can show them: opacity below 1/255 or no rotation"),
     ):
         if (gone := others - int(keep.sum())) > 0:
-            steps.append(Step(_select(gaussians.detached(), keep), f"{gone:,} Gaussians", why))
+            steps.append(Step(gaussians.detached().rows(keep), f"{gone:,} Gaussians", why))
     g = steps[-1].gaussians if steps else g
 
     degrees = needed_degrees(g, options.band_tolerance)
@@ -147,11 +147,7 @@ def file_degree(degrees: Tensor, most: int) -> int:
 def along_a_curve(gaussians: Gaussians) -> Gaussians:
     """The Gaussians along a Morton curve: neighbours in the file are neighbours in space, and pack better."""
     order = curve_order(gaussians.means.detach().numpy())
-    return _select(gaussians, torch.from_numpy(order))
-
-
-def _select(gaussians: Gaussians, rows: Tensor) -> Gaussians:
-    return Gaussians(**{name: tensor[rows] for name, tensor in gaussians.named().items()})
+    return gaussians.rows(torch.from_numpy(order))
 
 
 def _cut(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -244,10 +244,12 @@ def give_others(
     return views_of
 
 
-def note_views(parts: Sequence[Part], rests: Sequence[Rest], densifier: Densifier) -> None:
-    """What growth goes by."""
-    for part, rest in zip(parts, rests, strict=True):
-        if part.fault is None:
+def note_views(
+    parts: Sequence[Part], rests: Sequence[Rest], observe: Sequence[bool], densifier: Densifier
+) -> None:
+    """What growth goes by; `observe`: whether it goes by each of them."""
+    for part, rest, observes in zip(parts, rests, observe, strict=True):
+        if observes and part.fault is None:
             densifier.note(part.rows[rest.seen].long(), rest.values[rest.seen, OBSERVED])
 
 

@@ -22,6 +22,7 @@ FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standar
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
 EARLIEST = 2_000  # iterations before which they cannot tell yet
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
+GUEST_EVERY = 3  # steps of a part, of which one is on a small photo of another part
 EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
 CHECKS = 500  # iterations from one look at whether the run still improves to the next
 TAIL = 50  # steps after the end of growth that tell what the rest costs
@@ -67,9 +68,12 @@ class Schedule:
     items: frozenset[str]  # of `config.leave_out`: what this run may do without
     num_views: int  # for training
     held: tuple[int, ...]  # numbers of those that are held back at first
+    guests: int = 0  # views after those: a part takes one every GUEST_EVERY steps, and nothing grows by it
 
     @classmethod
-    def of(cls, config: TrainConfig, views: Sequence[View], as_photographed: bool) -> Schedule:
+    def of(
+        cls, config: TrainConfig, views: Sequence[View], as_photographed: bool, guests: int = 0
+    ) -> Schedule:
         """`views`: those for training; `as_photographed`: whether the method takes them as they are."""
         items = set(config.leave_out)
         if not as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
@@ -81,7 +85,7 @@ class Schedule:
         count = 0
         if items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
-        return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)))
+        return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)), guests)
 
     def start(self) -> Decisions:
         """Before the first step."""
@@ -91,19 +95,23 @@ class Schedule:
         """What step number `iteration` (1, 2, ...) does."""
         densify, stop = self.config.densify, self.growth_end(decisions)
         before = iteration - 1
-        coarse = self.is_coarse(iteration)
+        view = self.view(iteration, decisions)
+        own = view < self.num_views
+        coarse = self.is_coarse(iteration) and own
         return Plan(
             iteration=iteration,
             # Not after the step that it is due at: what is looked at or written in between is the scene
             # before its opacities are cut, and a run that ends there keeps it.
             resets=0 < before < stop and before % densify.reset_every == 0,
-            view=self.view(iteration, decisions),
+            view=view,
             coarse=coarse,
             part=self.part(iteration, decisions),
             degree=self.degree(iteration, decisions),
-            observes=iteration < stop,
+            observes=iteration < stop and own,
             grows=densify.start < iteration < stop and iteration % densify.every == 0,
-            finest=FINEST * (COARSE_FACTOR if coarse else 1) if "growth" in self.items else None,
+            finest=FINEST * (COARSE_FACTOR if self.is_coarse(iteration) else 1)
+            if "growth" in self.items
+            else None,
         )
 
     def batch(self, iteration: int, decisions: Decisions) -> list[Plan]:
@@ -137,10 +145,15 @@ class Schedule:
 
     def view(self, iteration: int, decisions: Decisions) -> int:
         """Each epoch visits all views once, in an order of its own."""
-        views = list(range(self.num_views))
+        views, step = list(range(self.num_views)), iteration - 1
         if self.holds(decisions):
             views = [k for k in views if k not in self.held]
-        epoch, index = divmod(iteration - 1, len(views))
+        if self.guests:
+            if iteration % GUEST_EVERY == 0:
+                views, step = [self.num_views + k for k in range(self.guests)], iteration // GUEST_EVERY - 1
+            else:
+                step -= iteration // GUEST_EVERY
+        epoch, index = divmod(step, len(views))
         order = np.random.default_rng([self.config.seed, epoch]).permutation(len(views))
         return views[order[index]]
 

@@ -34,6 +34,7 @@ from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
 from hqgs.training.state import TrainState
+from hqgs.training.surroundings import fits_guests, fixed_in_number, with_surroundings
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
@@ -70,14 +71,17 @@ class Trainer:
         self.extent: float = scene.extent
         self.method: Method[Any] = make_method(scene, config, inspector)
         self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
-        self._looks = Looks(scene.train, self.method, config.background)
+        guests = scene.guests if fits_guests(self.method) else []
+        self._looks = Looks([*scene.train, *guests], self.method, config.background)
         with one_torch_thread():
-            start = self.method.start(scene, self._looks.targets, config)
+            own = self._looks.targets[: len(scene.train)]
+            start = with_surroundings(self.method.start(scene, own, config), scene)
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
         self.config: TrainConfig = start.config
         self.method_left_out: list[LeftOut] = start.left_out
         self.first_points: int = len(start.gaussians)
-        self.schedule: Schedule = Schedule.of(self.config, scene.train, self.method.as_photographed)
+        plain = self.method.as_photographed
+        self.schedule: Schedule = Schedule.of(self.config, scene.train, plain, len(guests))
         self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
         self.state: TrainState = TrainState(
             start.gaussians,
@@ -267,8 +271,7 @@ class Trainer:
                 modulated = self.method.modulate(state.gaussians)
             selective = self.config.selective_adam
             rests = descend(parts, others, state.gaussians, modulated, state.optimizer, selective)
-            if plans[0].observes:  # the end of growth ends a step: none of it grows any more
-                note_views(parts, rests, state.densifier)
+            note_views(parts, rests, [plan.observes for plan in plans], state.densifier)
         step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
         return step, [part.measured for part in parts]
 
@@ -277,7 +280,8 @@ class Trainer:
         state, finest = self.state, None
         if plan.finest is not None:
             finest = (plan.finest * photo_pixels(state.gaussians.means, self.scene.train)).float()
-        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest)
+        fixed = fixed_in_number(self.scene, state.gaussians)
+        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest, fixed)
         if growth.parents is not None:
             self.method.rows_changed(state, growth.parents)
         return growth

@@ -70,7 +70,7 @@ def fewest_gaussians(
         faint = weights < limit
         if not 0 < int(faint.sum()) < len(shown):
             continue
-        rest = Gaussians(**{name: tensor[~faint] for name, tensor in shown.named().items()})
+        rest = shown.rows(~faint)
         cost = whole - psnr(rest)
         if cost <= TOLERANCE:
             return FewerGaussians(whole, cost, limit, faint)

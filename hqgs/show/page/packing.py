@@ -70,7 +70,7 @@ def pack_scene(gaussians: Gaussians, most: int = MOST) -> PackedScene:
         shown = torch.where(keep, area + torch.nn.functional.logsigmoid(g.opacities.double()), -torch.inf)
         keep = torch.zeros_like(keep)
         keep[shown.topk(most).indices] = True
-    g = along_a_curve(Gaussians(**{name: t[keep] for name, t in g.named().items()}))
+    g = along_a_curve(g.rows(keep))
     n = len(g)
     degree = min(g.sh_degree, next((d for count, d in DEGREES if n <= count), 0))
     means, low, size = _blocks(g.means.double().numpy())

@@ -30,7 +30,7 @@ def browser_splats(gaussians: Gaussians) -> Splats:
     that is not finite are left out.
     """
     rows = torch.cat([tensor.detach().flatten(1) for tensor in _columns(gaussians)], dim=1)
-    g = Gaussians(**{name: t.detach()[rows.isfinite().all(1)] for name, t in gaussians.named().items()})
+    g = gaussians.detached().rows(rows.isfinite().all(1))
     w, x, y, z = torch.nn.functional.normalize(g.quats, dim=1).unbind(1)
     rotations = torch.stack(
         [

@@ -2,7 +2,7 @@
 
 One render, warped along the way and over the lens (`hqgs/photos/exposure.py`), stands for the whole exposure.
 What photos cannot tell is fixed by construction: the mean of a way is the photo's pose, the mean of the log
-gains is 0.
+gains is that which they start with.
 """
 
 from __future__ import annotations
@@ -84,12 +84,16 @@ class LearnedCameras:
     def __init__(
         self, scene: Scene, shake: bool, focus: bool, log_gains: NDArray[np.float64] | None, seed: int
     ) -> None:
-        """`log_gains` [N, 3]: to start from; None: all gains are 1 and stay so."""
-        self._numbers = {view.name: k for k, view in enumerate(scene.train)}
-        self._depths = [median_depth(scene, view) for view in scene.train]
-        self._widths = [max(view.camera.width, NARROW) for view in scene.train]
-        self._sizes = [(view.camera.height, view.camera.width) for view in scene.train]
-        rng, count = np.random.default_rng([seed, 6]), len(scene.train)
+        """`log_gains` [N, 3] of the training photos and the guests: to start from, and their mean stays.
+
+        None: all gains are 1 and stay so.
+        """
+        views, self._own = [*scene.train, *scene.guests], len(scene.train)
+        self._numbers = {view.name: k for k, view in enumerate(views)}
+        self._depths = [median_depth(scene, view) for view in views]
+        self._widths = [max(view.camera.width, NARROW) for view in views]
+        self._sizes = [(view.camera.height, view.camera.width) for view in views]
+        rng, count = np.random.default_rng([seed, 6]), len(views)
         first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
         self._paths = [
             torch.from_numpy(path * width).requires_grad_()
@@ -99,6 +103,7 @@ class LearnedCameras:
             torch.from_numpy(gains.copy()).requires_grad_()
             for gains in (log_gains if log_gains is not None else [])
         ]
+        self._mean = torch.stack([gains.detach() for gains in self._gains] or [torch.zeros(3)]).mean(0)
         self._lenses = [first_lens(width).requires_grad_() for width in (self._widths if focus else [])]
         self._nearness: list[Tensor | None] = [None] * count
         self._visits = torch.zeros(count, dtype=torch.int64)
@@ -135,9 +140,7 @@ class LearnedCameras:
                 gains = self._gains[number].exp()
             full = None if near is None else _enlarged(near, size).to(render)
             taken = take_photo(render, size, full, warps, gains)
-            if self._gains and photo.shape == taken.shape:  # what the sensor could not hold may be brighter
-                taken = torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
-            return taken
+            return as_held(taken, photo) if self._gains and photo.shape == taken.shape else taken
 
         return Shot(wide, develop)
 
@@ -145,7 +148,7 @@ class LearnedCameras:
         """What ages, and which photos stand still from now on."""
         number = self._numbers[view.name]
         if self._gains:
-            _center(self._gains)
+            _center(self._gains, self._mean)
         if not self._paths and not self._lenses:
             return
         self._active = iteration >= self._begin
@@ -166,7 +169,7 @@ class LearnedCameras:
                     self._nearness[k] = None
 
     def found(self) -> list[Found]:
-        """For each photo."""
+        """For each training photo."""
         return [
             Found(
                 name,
@@ -174,7 +177,7 @@ class LearnedCameras:
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
             )
-            for name, k in self._numbers.items()
+            for name, k in [*self._numbers.items()][: self._own]
         ]
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -241,6 +244,12 @@ class LearnedCameras:
         return warps
 
 
+def as_held(taken: Tensor, photo: Tensor) -> Tensor:
+    """What was taken, [H, W, 3], where the photo is not saturated: what its sensor could not hold may be
+    brighter."""
+    return torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
+
+
 def no_shot(view: View) -> Shot:
     """That of a still camera with gains of 1."""
     return Shot(view.camera, lambda render: render)
@@ -262,11 +271,11 @@ def _way_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def _center(tensors: Sequence[Tensor]) -> None:
-    """Take their mean off each."""
-    mean = torch.stack([*tensors]).mean(0)
+def _center(tensors: Sequence[Tensor], wanted: Tensor) -> None:
+    """Give them this mean."""
+    shift = torch.stack([*tensors]).mean(0) - wanted
     for tensor in tensors:
-        tensor -= mean
+        tensor -= shift
 
 
 def _middle(path: Tensor) -> Tensor:

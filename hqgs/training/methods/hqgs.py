@@ -28,6 +28,7 @@ from hqgs.training.methods.cameras import Found, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.methods.shared_gains import beside, known_gains
 from hqgs.training.state import TrainState
 
 LAMBDA_DSSIM = 0.2
@@ -73,7 +74,8 @@ class HQGS(Plain):
         inspector = inspector or Inspector()
         self._told = inspector.told
         found = find_formation(scene, config.formation, inspector)
-        self.formation: Formation = found[0]
+        known = known_gains(scene)
+        self.formation: Formation = found[0].exposed() if known else found[0]
         self._left_out: list[LeftOut] = found[1]
         kinds = self.formation.kinds
         self.as_photographed: bool = not kinds
@@ -86,6 +88,9 @@ class HQGS(Plain):
             if "exposure" in kinds:
                 gains = inspector.log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
+                gains = beside(gains, [known.get(view.name) for view in scene.train])
+                guests = [known.get(view.name, np.zeros(3)) for view in scene.guests]
+                gains = np.concatenate([gains, np.reshape(guests, (-1, 3))])
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
         holds = self.noise and self.formation.white and "jpeg" not in kinds
         self._plateau = Plateau(len(scene.train)) if holds else None
