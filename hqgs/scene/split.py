@@ -53,9 +53,7 @@ class Split:
     held_out: int
     points: int
     parts: list[PartFacts]
-    coarse: (
-        PartFacts | None
-    )  # the whole, with few points and photos, which all parts start from; None: one part
+    coarse: PartFacts | None  # the whole with few points and photos, to start from; None: one part
 
 
 def split(

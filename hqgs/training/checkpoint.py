@@ -132,9 +132,9 @@ def scene_fingerprint(scene: Scene) -> dict[str, str]:
 
     views = [*scene.train, *scene.test]
     names = "\n".join([*(v.name for v in scene.train), "", *(v.name for v in scene.test)])
-    around = (
-        {} if scene.around is None else {"around": digest([np.fromfile(scene_file(scene.around), np.uint8)])}
-    )
+    around = {}
+    if scene.around is not None:
+        around["around"] = digest([np.fromfile(scene_file(scene.around), np.uint8)])
     return around | {
         "views": hashlib.sha256(names.encode()).hexdigest()[:16],
         "cameras": digest(

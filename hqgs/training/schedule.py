@@ -97,21 +97,19 @@ class Schedule:
         before = iteration - 1
         view = self.view(iteration, decisions)
         own = view < self.num_views
-        coarse = self.is_coarse(iteration) and own
+        smaller_part = self.is_coarse(iteration)
         return Plan(
             iteration=iteration,
             # Not after the step that it is due at: what is looked at or written in between is the scene
             # before its opacities are cut, and a run that ends there keeps it.
             resets=0 < before < stop and before % densify.reset_every == 0,
             view=view,
-            coarse=coarse,
+            coarse=smaller_part and own,
             part=self.part(iteration, decisions),
             degree=self.degree(iteration, decisions),
             observes=iteration < stop and own,
             grows=densify.start < iteration < stop and iteration % densify.every == 0,
-            finest=FINEST * (COARSE_FACTOR if self.is_coarse(iteration) else 1)
-            if "growth" in self.items
-            else None,
+            finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,
         )
 
     def batch(self, iteration: int, decisions: Decisions) -> list[Plan]:

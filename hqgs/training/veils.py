@@ -11,9 +11,7 @@ from torch import Tensor
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.densify import quats_to_matrices
 
-WITHIN = (
-    3.0  # standard deviations from a Gaussian's mean to a camera: what is nearer hangs before its picture
-)
+WITHIN = 3.0  # standard deviations from a camera to a Gaussian's mean: it hangs before the picture then
 
 
 @torch.no_grad()
