@@ -20,7 +20,7 @@ import hqgs
 from benchmarks.speed.timing import using_threads
 from hqgs import _rust
 from hqgs._rust import ALPHA_MIN, TRANSMITTANCE_MIN
-from hqgs.model import render
+from hqgs.model import gaussians
 from hqgs.model.rasterization import RasterizationMeta
 from hqgs.training import looks, trainer
 from hqgs.training.methods import base
@@ -30,7 +30,7 @@ Place = tuple[Any, str]  # a module or class, and the name that its users look u
 
 # Replaced by the switches below.
 RENDER_VIEW: Place = (looks, "render_view")
-RASTERIZATION: Place = (render, "rasterization")
+RASTERIZATION: Place = (gaussians, "rasterization")
 ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
 ADAM: Place = (trainer, "Adam")
 LOSS: Place = (base, "photometric_loss")
