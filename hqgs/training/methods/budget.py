@@ -16,7 +16,7 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training.config import DensifyConfig
 from hqgs.training.methods.formed import Formation, FormedTarget
 
-PIXELS = 50  # of the photos, for each point to start from where they are as photographed
+PIXELS = 100  # of the photos, for each point to start from where they are as photographed
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 
