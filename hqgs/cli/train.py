@@ -41,15 +41,8 @@ if TYPE_CHECKING:
     from hqgs.training.progress import Progress
 
 EXPERT = "--config."
-LOADING = (
-    "downscale",
-    "test_every",
-    "sfm",
-    "degrade",
-    "restore",
-    "frames",
-    "around",
-)  # options that shape the scene
+# Options that shape the scene.
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "around")
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 

@@ -24,9 +24,8 @@ PROBES = 4  # photos searched for enlargement; if they agree, the others are tak
 UNLIKE_NOISE = 2.5  # times the noise of the quieter photos in the noisier ones: each has its own
 WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
 VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
-COARSE_FILM = (
-    0.24  # of `film_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5
-)
+# Of `film_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
+COARSE_FILM = 0.24
 
 
 @dataclass(frozen=True)
