@@ -159,7 +159,7 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
         == f"started from the scene's 20 points and {started.first_points - 20} more along the photos' edges"
     )
     assert len(trainer(sparse, first_points=0.0).gaussians) == 20
-    assert len(trainer(sparse, formation="none").gaussians) == 20 > pixels // PIXELS
+    assert 20 < len(trainer(sparse, formation="none").gaussians) <= max(30, pixels // PIXELS)
     enough = trainer(scene, first_points=0.01)
     assert len(enough.gaussians) == few
     assert "points for" in told(enough)["first points along edges"]

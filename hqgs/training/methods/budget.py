@@ -12,11 +12,12 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, untold
 from hqgs.model.consistency import Agreement
 from hqgs.model.first_points import Colors, Points, points_along_edges
-from hqgs.scene.scene import Scene, View
+from hqgs.scene.scene import Scene
 from hqgs.training.config import DensifyConfig
 from hqgs.training.methods.formed import Formation, FormedTarget
 
 PIXELS = 100  # of the photos, for each point to start from where they are as photographed
+BESIDE = 1.5  # times the scene's own points, at least
 HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 
@@ -61,9 +62,11 @@ def with_budget(
     )
 
 
-def start_points(views: Sequence[View], most: int) -> int:
-    """How many points photos without a fault call for, `most` at most."""
-    return min(most, sum(view.camera.width * view.camera.height for view in views) // PIXELS)
+def start_points(scene: Scene, most: int) -> int:
+    """How many points photos without a fault call for, `most` at most; some beside the scene's own always,
+    for these are where corners are, and a run from points all over the photos costs less."""
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
+    return min(most, max(pixels // PIXELS, int(BESIDE * len(scene.points))))
 
 
 def first_points(

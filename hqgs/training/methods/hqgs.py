@@ -125,7 +125,7 @@ class HQGS(Plain):
             self._cameras.schedule(config.iterations)
         if self.formation.kinds <= set(OWN):
             plain = self.as_photographed and config.method == AUTO
-            wanted = start_points(scene.train, min(config.start_points, config.densify.max_gaussians))
+            wanted = start_points(scene, min(config.start_points, config.densify.max_gaussians))
             points, colors, _ = first_points(scene, wanted, config.seed, self._told)
             if self.as_photographed and len(points) > len(scene.points):
                 config = _coarse_first(config)
