@@ -20,7 +20,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from hqgs.base.machine import give_back_memory
+from hqgs.base.machine import give_back_memory, keep_large_arrays_apart
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
@@ -61,6 +61,8 @@ def load_views(
         if not photo.path.is_file():
             raise FileNotFoundError(f"the camera of photo {photo.name!r} has no photo: {photo.path}")
         check_camera(photo.camera, photo.name)
+
+    keep_large_arrays_apart()
 
     @lru_cache(maxsize=_CAMERAS_KEPT)
     def made(key: _CameraKey) -> Pinhole:
