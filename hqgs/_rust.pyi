@@ -113,5 +113,8 @@ def set_num_threads(threads: int) -> None:
 def get_num_threads() -> int:
     """Number of threads in use."""
 
+def give_back_memory() -> None:
+    """Hand what the crate has freed back to the system, now and not ten seconds later."""
+
 def simd_level() -> str: ...
 def data_pointer(array: Array) -> int: ...

@@ -23,7 +23,7 @@ from hqgs.base.files import (
 )
 from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
-from hqgs.base.machine import peak_rss_mb
+from hqgs.base.machine import give_back_memory, peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, untold
 from hqgs.diagnosis.scene import Inspector
@@ -187,6 +187,7 @@ def open_run(
         config = config if going_on else fitted(scene, config, inspector, ranks)
         trainer = Trainer(scene, config, inspector, ranks)
         del inspector  # it holds what it has seen of the photos
+        give_back_memory()  # of the start
         if going_on:
             with _for_all(checkpoint, ranks) as path:
                 trainer.restore(path)

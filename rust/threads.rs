@@ -124,3 +124,13 @@ pub fn install<R: Send>(f: impl FnOnce() -> R + Send) -> Result<R, Error> {
     let pool = Arc::clone(&pool.pool.read().unwrap_or_else(PoisonError::into_inner));
     Ok(pool.install(f))
 }
+
+/// Run `f` once on each thread of the pool.
+///
+/// # Errors
+/// As for [`install`].
+pub fn on_each(f: impl Fn() + Sync) -> Result<(), Error> {
+    install(|| {
+        rayon::broadcast(|_| f());
+    })
+}

@@ -107,6 +107,54 @@ def test_freed_buffers_are_kept_for_the_next_iteration() -> None:
     assert max(waited, after) < first / 4
 
 
+GIVEN_BACK = """
+from pathlib import Path
+from benchmarks.speed.inputs import make_inputs
+from benchmarks.speed.rasterizer import RasterPass
+from hqgs.base.machine import give_back_memory
+
+raster = RasterPass(make_inputs(100_000))
+for _ in range(2):
+    for step in (give_back_memory, raster.run, raster.clear, give_back_memory):
+        step()
+        print(next(int(s.split()[1]) for s in Path("/proc/self/status").open() if s.startswith("VmRSS")))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's figures of the process")
+def test_freed_buffers_can_be_given_back() -> None:
+    run = subprocess.run([sys.executable, "-c", GIVEN_BACK], capture_output=True, text=True, check=True)
+    before, ran, cleared, after = list(map(int, run.stdout.split()))[4:]
+    assert ran - before > 20_000  # kB, and so it is
+    assert cleared - before > 20_000  # until it is asked for
+    assert after - before < 0.2 * (ran - before)
+
+
+APART = """
+from pathlib import Path
+import numpy as np
+from hqgs.base.machine import keep_large_arrays_apart
+
+def resident():
+    return next(int(s.split()[1]) for s in Path("/proc/self/status").open() if s.startswith("VmRSS"))
+
+keep_large_arrays_apart()
+for _ in range(2):
+    np.ones(3_000_000)  # from here on glibc by itself would keep arrays of 24 MB
+large = np.ones(2_000_000)
+stays = [np.ones(2_000) for _ in range(1000)]
+before = resident()
+del large
+print(before - resident())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc")
+def test_large_arrays_leave_no_holes() -> None:
+    run = subprocess.run([sys.executable, "-c", APART], capture_output=True, text=True, check=True)
+    assert int(run.stdout) > 15_000  # kB, of 16,000
+
+
 def test_threads_can_be_set_and_a_number_out_of_range_is_refused() -> None:
     before = hqgs.get_num_threads()
     try:

@@ -22,6 +22,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 import hqgs.diagnosis.scene as module
 from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
+from hqgs.diagnosis.photo import inspect_photo
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation, parse_formation
@@ -272,6 +273,18 @@ def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None
     targets = [formation.target(scene.train[0]).operator for formation in (again, alone)]
     image = torch.rand(208, 272, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(*(operator(image) for operator in targets if operator is not None))
+
+
+def test_an_inspected_photo_is_held_in_few_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hqgs.diagnosis.photo.LARGEST", 128)
+    photo, middle = clean_photo(0), np.s_[40:168, 72:200]
+    found = inspect_photo("photo", photo)
+    assert (found.kept.dtype, found.kept.nbytes, found.kept.base) == (np.uint8, 3 * 128**2, None)
+    assert np.array_equal(found.levels, photo[middle])
+    brighter = as_floats(photo) * np.float32(1.2)  # white goes beyond 255 levels
+    found = inspect_photo("photo", brighter)
+    assert found.kept.base is None  # which would be the whole photo
+    assert np.array_equal(found.levels, brighter[middle].astype(np.float64) * 255)
 
 
 def test_bad_input_is_named() -> None:

@@ -11,6 +11,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import TypedDict
 
+LARGE = 4 << 20  # bytes of an array
+KEPT_AT_THE_END = 64 << 20  # bytes of the heap's end that stay when they are free: glibc's own most
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
@@ -111,13 +114,33 @@ def _git(root: Path, *arguments: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
 
+def keep_large_arrays_apart() -> None:
+    """Let the C library, where it can be asked (glibc), take each array of 4 MB and more from the system, and
+    give it back when it is freed.
+
+    By itself it soon keeps those of up to 32 MB, between what stays: new ones do not fit into the holes, and
+    memory grows.
+    """
+    for parameter, size in ((MMAP_THRESHOLD, LARGE), (TRIM_THRESHOLD, KEPT_AT_THE_END)):
+        _of_glibc("mallopt", parameter, size)
+
+
 def give_back_memory() -> None:
-    """Hand freed memory back to the system, where the C library keeps it for later and can be asked (glibc).
+    """Hand freed memory back to the system: what the crate keeps for later, and the C library where it can be
+    asked (glibc).
 
     Arrays of a few MB that several threads made and freed would hold hundreds of MB else.
     """
+    from hqgs import _rust  # here, since the rest of this file loads nothing
+
+    _rust.give_back_memory()
+    _of_glibc("malloc_trim", 0)
+
+
+def _of_glibc(name: str, *numbers: int) -> None:
+    """Call a function of the C library, where it has it."""
     try:
-        trim = ctypes.CDLL(None).malloc_trim
+        function = getattr(ctypes.CDLL(None), name)
     except (AttributeError, OSError, TypeError):  # another system
         return
-    trim(0)
+    function(*numbers)

@@ -61,7 +61,12 @@ class Inspected:
     """A photo on the way to its diagnosis: noise under JPEG and blur are not told yet."""
 
     diagnosis: PhotoDiagnosis
-    levels: Floats  # [h, w, 3], 0..255: the middle of the photo before it was enlarged
+    kept: NDArray[np.uint8] | Floats  # `levels`, in 8 bits where that loses nothing: many photos are held
+
+    @property
+    def levels(self) -> Floats:
+        """[h, w, 3], 0..255: the middle of the photo before it was enlarged."""
+        return self.kept.astype(np.float64, copy=False)
 
     @property
     def table(self) -> Table:
@@ -109,7 +114,7 @@ def inspect_photo(
     found = replace(found, film=film_detail(levels), correlation=neighbour_correlation(levels))
     if not found.hiding and (noise := estimate_noise(levels)) is not None:
         found = replace(found, noise=noise.level, noise_limit=noise.limit)
-    return Inspected(found, levels)
+    return Inspected(found, _kept(levels))
 
 
 def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
@@ -125,7 +130,7 @@ def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
         members = [k for k, photo in enumerate(photos) if photo.table == table]
         hiding = table is not ROUNDING_ONLY
         shown = [d.noise - d.noise_limit for k in members if (d := diagnoses[k]).noise is not None]
-        large = min(min(photos[k].levels.shape[:2]) for k in members) >= LUMA_TELLS
+        large = min(min(photos[k].kept.shape[:2]) for k in members) >= LUMA_TELLS
         hidden = None
         if hiding or (large and shown and np.median(shown) < 0):
             share = -(-(MAX_BLOCKS if hiding else FEW_BLOCKS) // len(members))
@@ -181,3 +186,9 @@ def _middle(levels: Floats) -> Floats:
     """At most `LARGEST` px a side, cut so that blocks of 8 x 8 pixels stay whole."""
     top, left = (max(0, side - LARGEST) // 16 * 8 for side in levels.shape[:2])
     return levels[top : top + LARGEST, left : left + LARGEST]
+
+
+def _kept(levels: Floats) -> NDArray[np.uint8] | Floats:
+    """A copy, since `levels` may be a part of a photo that nobody needs any more."""
+    whole = levels.clip(0, 255).astype(np.uint8)
+    return whole if np.array_equal(whole, levels) else levels.copy()

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs._rust import get_num_threads
-from hqgs.base.machine import peak_rss_mb
+from hqgs.base.machine import give_back_memory, peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.metrics import ViewMetrics, evaluate_view, psnr, ssim
@@ -139,6 +139,7 @@ def measured(
             then(number, view, metrics)
         return metrics
 
+    give_back_memory()  # that the training had: HaarPSI alone takes 200 MB, its imports
     threads = get_num_threads()
     waiting: deque[Future[ViewMetrics]] = deque()
     done: list[ViewMetrics] = []

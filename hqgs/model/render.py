@@ -25,7 +25,7 @@ def render_view(
 ) -> tuple[Tensor, RasterizationMeta]:
     """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
     images, _, meta = gaussians.rasterize(camera, sh_degree=sh_degree, background=background)
-    return images[0], meta
+    return images.squeeze(0), meta  # the gradient of images[0] would be another image
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from hqgs.base.machine import give_back_memory
+from hqgs.base.machine import give_back_memory, keep_large_arrays_apart
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
@@ -32,7 +32,7 @@ STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is
 MAX_SHARE = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
 BAND = 1 << 20  # pixels mapped at a time, to bound memory
 SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
-GIVEN_BACK = 50  # photos after which freed memory goes back to the system
+GIVEN_BACK = 10  # photos after which freed memory goes back to the system
 MAX_WORKERS = 4  # each holds a few photos at their stored size
 DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
 LATTICE, EXACT = 8, 0.02  # px of such a grid: positions are computed so far apart, if that is exact enough
@@ -61,6 +61,8 @@ def load_views(
         if not photo.path.is_file():
             raise FileNotFoundError(f"the camera of photo {photo.name!r} has no photo: {photo.path}")
         check_camera(photo.camera, photo.name)
+
+    keep_large_arrays_apart()
 
     @lru_cache(maxsize=_CAMERAS_KEPT)
     def made(key: _CameraKey) -> Pinhole:

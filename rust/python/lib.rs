@@ -38,6 +38,21 @@ fn keep_freed_memory() {
     mi_option_set_default(PURGE_DELAY, KEEP_FREED_MS);
 }
 
+/// Hand freed memory back to the system now: what the threads hold for later, and then all that nobody uses.
+#[pyfunction]
+#[allow(unsafe_code)]
+fn give_back_memory(py: Python<'_>) -> BindingResult<()> {
+    unsafe extern "C" {
+        // SAFETY: any thread may call it, and the crate is linked with mimalloc.
+        safe fn mi_collect(force: bool);
+    }
+    Ok(py.detach(|| {
+        let each = threads::on_each(|| mi_collect(true));
+        mi_collect(true);
+        each
+    })?)
+}
+
 /// Use this many threads from now on, 1 to 1024; results do not depend on it.
 #[pyfunction]
 fn set_num_threads(threads: &Bound<'_, PyAny>) -> BindingResult<()> {
@@ -99,6 +114,7 @@ fn _rust(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(get_num_threads, m)?)?;
     m.add_function(wrap_pyfunction!(simd_level, m)?)?;
+    m.add_function(wrap_pyfunction!(give_back_memory, m)?)?;
     m.add_function(wrap_pyfunction!(data_pointer, m)?)?;
     add_constants(m)?;
     project::register(m)?;

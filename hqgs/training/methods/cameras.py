@@ -20,7 +20,6 @@ from torch import Tensor
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
 from hqgs.photos.exposure import take_photo
-from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.methods.lens import SMALLEST, first_lens, lens_warps, samples, sharp_at, widest
@@ -38,7 +37,7 @@ SPACING, MOST = 1.5, 17  # px of a way from one sample of the exposure to the ne
 MOST_MARGIN = 48  # px around a render
 REFRESH = 8  # visits of a photo until its depths are looked at again
 COARSER = 4  # times the photo's pixels: of the map of depths
-SATURATED = 254 / 255  # of white
+SATURATED = 254  # levels of 1/255
 
 
 @dataclass(frozen=True)
@@ -247,7 +246,8 @@ class LearnedCameras:
 def as_held(taken: Tensor, photo: Tensor) -> Tensor:
     """What was taken, [H, W, 3], where the photo is not saturated: what its sensor could not hold may be
     brighter."""
-    return torch.where((floats(photo) >= SATURATED) & (taken > 1), 1.0, taken)
+    saturated = photo >= (SATURATED / 255 if photo.is_floating_point() else SATURATED)
+    return torch.where(saturated & (taken > 1), 1.0, taken)
 
 
 def no_shot(view: View) -> Shot:
