@@ -162,7 +162,7 @@ class Attempt:
         """Poses and points without the sightings that lie far off.
 
         While photos are placed a sighting may be 4 px off. That is much in small photos, where false matches
-        so near turn the cameras: without them rotations are off 0.4 to 0.85 times as far.
+        so near turn the cameras: without them rotations are off 0.3 to 0.85 times as far.
         """
         mapping = self._mapping(fixed)
         for _ in range(ROUNDS):
