@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from hqgs.base.stages import Stage
 from hqgs.cli.progress import LoadingScreen
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, check_whole, decode
+from hqgs.scene.formats.colmap import registered
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm import attempt, program
 from hqgs.scene.sfm import run as colmap_run
+from hqgs.scene.sfm.align import rotation_angles
 from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
@@ -393,3 +396,29 @@ def test_few_photos_and_a_colmap_that_fails_are_told(tmp_path: Path, monkeypatch
     monkeypatch.setattr(colmap_run, "PROGRAM", tmp_path / "no such program.py")
     with pytest.raises(ValueError, match=r"COLMAP ended with status 2 .*no such program"):
         load_scene(tmp_path)
+
+
+def test_sightings_that_lie_far_off_do_not_turn_the_cameras(photos: list[np.ndarray], tmp_path: Path) -> None:
+    """3 px is near enough to be placed with, and far in photos of this size."""
+    import pycolmap
+
+    given = work_on(photos, tmp_path)
+    one = Attempt(tmp_path, given, 1, tolerant=False)
+    one.run()
+    assert one.model is not None
+    right = rotations(one.model)
+    for image in one.model.images.values():
+        for point in list(image.points2D)[::10]:
+            point.xy = np.add(point.xy, (3.0, 0.0))
+    pycolmap.bundle_adjustment(one.model, one._mapping(False).get_global_bundle_adjustment())
+    one.model.update_point_3d_errors()
+    turned = rotation_angles(rotations(one.model) @ right.swapaxes(1, 2))
+    one._settle(one.model, False)
+    settled = rotation_angles(rotations(one.model) @ right.swapaxes(1, 2))
+    assert np.median(settled) < 0.3 * np.median(turned)
+
+
+def rotations(model: Any) -> np.ndarray:
+    """[V, 3, 3] from the first camera to each other one."""
+    matrices = np.stack([pose[:3, :3] for pose in registered(model).values()])
+    return matrices[1:] @ matrices[0].T

@@ -9,12 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
+from test_diagnose import clean_photo
+from test_sfm import cards  # noqa: F401
 
 from hqgs.base.stages import Stage
-from hqgs.scene.film import film_frames
-from hqgs.scene.source import load
+from hqgs.diagnosis.scene import diagnose_scene
+from hqgs.photos.blocks import fine_detail
+from hqgs.scene.film import film_frames, frame_details
+from hqgs.scene.scene import Scene
+from hqgs.scene.source import degrade, load, pictures
 
 av = pytest.importorskip("av")
 RATE, EVERY = 30, 10  # frames a second; of ten frames one is sharp
@@ -25,15 +31,21 @@ def film(path: Path, frames: int) -> Path:
     rng = np.random.default_rng(0)
     texture = ndimage.gaussian_filter(rng.random((96, 128)), 1.0)
     texture = (texture - texture.min()) / np.ptp(texture)
+    images = list[NDArray[np.uint8]]()
+    for k in range(frames):
+        grey = texture if k % EVERY == 7 else ndimage.gaussian_filter(texture, 3.0)
+        images.append((255 * np.stack([grey * 0.5 + 0.5 * k / frames, grey, grey], -1)).astype(np.uint8))
+    return encoded(path, images, 10)
+
+
+def encoded(path: Path, images: list[NDArray[np.uint8]], crf: int) -> Path:
+    """Pictures [H, W, 3] of one size as a film."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=RATE)
-        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
-        stream.options = {"crf": "10"}
-        for k in range(frames):
-            grey = texture if k % EVERY == 7 else ndimage.gaussian_filter(texture, 3.0)
-            image = np.stack([grey * 0.5 + 0.5 * k / frames, grey, grey], -1)
-            frame = av.VideoFrame.from_ndarray((255 * image).astype(np.uint8), format="rgb24")
-            for packet in stream.encode(frame):
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": str(crf)}
+        for image in images:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
@@ -45,7 +57,9 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
     stages: list[Stage] = []
     folder, note = film_frames(source, tmp_path / "frames", 6, stages.append)
     names = sorted(path.name for path in folder.glob("*.jpg"))
-    assert json.loads((folder / "frames.json").read_text()) == {"film": "walk.mp4"}
+    facts = json.loads((folder / "frames.json").read_text())
+    assert facts == {"film": "walk.mp4", "details": frame_details(folder)}
+    assert sorted(facts["details"]) == names
     assert names == [f"{k:06d}.jpg" for k in (7, 17, 27, 37, 47, 57)]
     assert "sharpest 6 frames of walk.mp4" in note
     assert stages[-1].done == 60
@@ -78,3 +92,28 @@ def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.
         ValueError, match=r"is a film, which needs the extra 'video': pip install 'hqgs\[video\]'"
     ):
         load(tmp_path / "no.mp4")
+
+
+def test_frames_tell_what_the_codec_left_of_fine_details(tmp_path: Path) -> None:
+    """A coarse film is a part of the formation although its frames are stored; a good one is not."""
+    photos = [clean_photo(k) for k in range(3)]
+    found = {crf: diagnose_scene(pictures(encoded(tmp_path / f"{crf}.mp4", photos, crf))) for crf in (12, 40)}
+    assert {crf: one.formation for crf, one in found.items()} == {12: "none", 40: "video"}
+    details = [photo.film for photo in found[12].photos]
+    assert details == pytest.approx([fine_detail(photo.astype(np.float64)) for photo in photos], abs=0.05)
+
+
+def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: Path) -> None:  # noqa: F811
+    views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
+    source = encoded(tmp_path / "walk.mp4", [view.image.astype(np.uint8) for view in views], 20)
+    scene = load(source, frames=len(views), cache=tmp_path)
+    (folder,) = (tmp_path / "frames").iterdir()
+    details = frame_details(folder)
+    for view in (*scene.train, *scene.test):
+        assert view.film == details[view.name] > 0
+    smaller = load(source, frames=len(views), cache=tmp_path, downscale=2)
+    noisy = degrade(scene, "noise:5")
+    assert {view.film for view in (*smaller.train, *noisy.train)} == {None}
+    (folder / "frames.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"frames\.json is damaged: KeyError\('details'\)"):
+        load(source, frames=len(views), cache=tmp_path)

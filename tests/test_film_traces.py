@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -60,7 +62,7 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     assert all(a is not None and b is not None and a > 1.2 * b for a, b in zip(*details, strict=True))
     why = {name: reason for name, _, reason in good.needs()}["video"]
     assert why.startswith(
-        "3 of 3 photos are frames of a film as they were decoded; the finest details are 0."
+        "3 of 3 photos are told to be frames of a film; as decoded, the finest details are 0."
     )
 
 
@@ -72,3 +74,16 @@ def test_a_coarse_film_has_the_rates_of_3dgs() -> None:
         targets = [method.prepare(view) for view in scene.train]
         brisk[kind] = method.start(scene, targets, tiny_config()).config.brisk
     assert brisk == {"none": True, "video": False, "jpeg:30": False, "video+exposure": True, "noise:10": True}
+
+
+def test_a_shaken_film_trains_as_shaken_photos() -> None:
+    starts = []
+    for kind in ("shake", "shake+video"):
+        scene = tiny_scene()
+        method = HQGS(scene, fixed(kind))
+        starts.append(method.start(scene, [method.prepare(view) for view in scene.train], tiny_config()))
+    shaken, both = starts
+    assert both.config.hqgs.formation == "shake+video"
+    assert replace(both.config, hqgs=shaken.config.hqgs) == shaken.config
+    assert (both.gaussians.means == shaken.gaussians.means).all()
+    assert both.left_out == shaken.left_out

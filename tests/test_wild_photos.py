@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
+from test_diagnose import clean_photo
 
 from hqgs.photos.camera import draw_gains
 from hqgs.photos.degrade import degrade_image, degrade_sequence, shake
@@ -18,6 +19,7 @@ from hqgs.photos.formation import formation
 from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.phone import WHITE_BALANCE, bayer_mosaic, demosaic, denoise, phone_jpeg
+from hqgs.photos.pixels import as_floats
 from hqgs.photos.shake import (
     draw_path,
     exposure_times,
@@ -323,6 +325,20 @@ def test_a_film_comes_back(kind: str, size: tuple[int, int]) -> None:
     loss = [np.mean([np.square(f.image - i).mean() for f, i in zip(c, images, strict=True)])
             for c in (frames, coarse)]  # fmt: skip
     assert loss[1] > 4 * loss[0]
+
+
+def test_a_film_has_the_same_bits_in_every_call() -> None:
+    """Wherever its frames lie in memory; x264's vector code made another film of these in each call."""
+    pytest.importorskip("av")
+    rng = np.random.default_rng(0)
+    photo = as_floats(clean_photo(0))
+    corners = rng.integers(0, 28, (30, 2))
+    images = [photo[y : y + 180, x + k : x + k + 152] for k, (y, x) in enumerate(corners)]
+    held, films = list[np.ndarray](), set[bytes]()
+    for _ in range(4):
+        held.append(np.ones(int(rng.integers(1_000, 4_000_000)), np.uint8))
+        films.add(b"".join(frame.image.tobytes() for frame in film(images, 36)))
+    assert len(films) == 1
 
 
 def test_colours_survive_a_film() -> None:

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
-from hqgs.diagnosis.jpeg_traces import block_coefficients
+from hqgs.photos.blocks import block_coefficients
 from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 SLOPE, SLOPE_SPREAD = 2.55, 2.0  # of the power over frequency; the spread is that of one block

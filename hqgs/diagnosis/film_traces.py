@@ -1,32 +1,27 @@
-"""Traces of a film's codec in a frame: the levels that its luma had, and the fine details that it left."""
+"""Traces of a film's codec in a frame: the levels that its luma had."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hqgs.diagnosis.jpeg_traces import block_coefficients
-from hqgs.photos.pixels import LUMA, Floats, luma
+from hqgs.photos.blocks import fine_detail
+from hqgs.photos.pixels import LUMA, Floats
 
 LUMA_709 = np.array([0.2126, 0.7152, 0.0722])  # of films in HD (ITU-R BT.709); LUMA is that of the others
 STEP = 255 / 219  # levels: of the luma of 8 bits from 16 (black) to 235 (white), which films store
 DECODED = 0.35  # decoded frames have 0.48 and more, frames made smaller since 0.15 at most, photos 0.02
 FEWEST_PIXELS, FEWEST_LEVELS = 10, 48  # of each level of the luma that counts, and of these
-MAX_BLOCKS = 4_000
-_WAVES = np.add.outer(np.arange(8), np.arange(8))
-_FINE, _COARSE = _WAVES >= 7, (_WAVES >= 3) & (_WAVES <= 5)
 
 
 def film_detail(levels: Floats) -> float | None:
-    """How much fine detail a film's codec left in a frame [H, W, 3] of levels 0..255; None: no such frame.
+    """The `fine_detail` that a film's codec left in a frame [H, W, 3] of levels 0..255; None: no such frame.
 
-    The ratio of the root mean squares of fine and coarser coefficients of the codec's 8 x 8 blocks. A frame
-    that was decoded, and neither resized nor compressed since, has a luma of whole steps of `STEP` levels,
-    but for the rounding of its colours, which blurs them by 0.19 levels.
+    A frame that was decoded, and neither resized nor compressed since, has a luma of whole steps of `STEP`
+    levels, but for the rounding of its colours, which blurs them by 0.19 levels.
     """
     if max(_comb(levels @ weights) for weights in (LUMA, LUMA_709)) < DECODED:
         return None
-    power = np.square(block_coefficients(luma(levels), MAX_BLOCKS)).mean(0)
-    return float(np.sqrt(power[_FINE].mean() / max(power[_COARSE].mean(), 1e-9)))
+    return fine_detail(levels)
 
 
 def _comb(grey: Floats) -> float:

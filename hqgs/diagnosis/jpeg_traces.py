@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import dctn
 
+from hqgs.photos.blocks import block_coefficients
 from hqgs.photos.jpeg import read_table, standard_tables
 from hqgs.photos.pixels import Floats, luma
 
 MAX_BLOCKS = 200  # looked at; they are spread over the photo
-ENOUGH_BLOCKS = 40  # without clipped pixels; where there are fewer, all blocks are taken
 MIN_COEFFICIENTS = 40  # fewer that are not zero prove nothing
 MIN_FREQUENCIES = 4  # in which coefficients must show: few repeat in a drawing
 MIN_EVIDENCE = 0.5  # nats per coefficient; photos that were never JPEG have -0.25, quality 90 has 0.8
@@ -81,22 +80,6 @@ def measure_blocking(grey: Floats) -> tuple[float, tuple[int, int]]:
         strengths.append(float((means.max() - np.median(means)) / max(np.median(means), 0.1)))
         phases.append((int(means.argmax()) + 1) % 8)
     return min(strengths), (phases[0], phases[1])
-
-
-def block_coefficients(grey: Floats, most: int, usable: NDArray[np.bool_] | None = None) -> Floats:
-    """DCT coefficients [n, 8, 8] of up to `most` of the whole 8 x 8 blocks of a luma [H, W], in levels.
-
-    Only blocks all of whose pixels are `usable`, where there are enough of them.
-    """
-    rows, columns = grey.shape[0] // 8, grey.shape[1] // 8
-    blocks = grey[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8).swapaxes(1, 2).reshape(-1, 8, 8)
-    chosen = np.arange(len(blocks))
-    if usable is not None:
-        whole = usable[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8).all(axis=(1, 3)).ravel()
-        chosen = np.flatnonzero(whole) if whole.sum() >= ENOUGH_BLOCKS else chosen
-    # A stride would fall in step with the rows of blocks; a fixed shuffle spreads the choice.
-    chosen = np.random.default_rng(0).permutation(chosen)[:most]
-    return np.asarray(dctn(blocks[chosen] - 128, axes=(1, 2), norm="ortho"))
 
 
 def nearest_quality(steps: NDArray[np.int64], at: Index) -> int:

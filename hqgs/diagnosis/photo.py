@@ -42,7 +42,7 @@ class PhotoDiagnosis:
     noise_limit: float  # levels: weaker noise is not told from texture, or hidden by the JPEG
     blur: Blur | None  # beyond a sharp photo's own, px of the full-size photo; None: not told from this photo
     blur_limit: float  # px of the full-size photo, a Gaussian's sigma: sharp photos can look as soft
-    film: float | None = None  # `film_detail`: of a film's frame, as it was decoded; None: it is none
+    film: float | None = None  # `fine_detail` of a film's frame, as it was decoded; None: it is none
     correlation: float | None = None  # of neighbours in its noise, at least; None: not told from this photo
 
     @property
@@ -91,8 +91,9 @@ def inspect_photo(
     low: Photo | None = None,
     path: Path | None = None,
     enlargement: Enlargement | None = None,
+    film: float | None = None,
 ) -> Inspected:
-    """The first half of `diagnose_photo`, errors included; `enlargement` where it is known."""
+    """The first half of `diagnose_photo`, errors included; `enlargement`, and `View.film`, where known."""
     levels = to_levels(image, f"photo {name!r}")
     height, width = levels.shape[:2]
     if low is not None:
@@ -111,7 +112,8 @@ def inspect_photo(
     jpeg = find_jpeg(levels, path)
     limit = _least_blur(LEAST_BLUR, enlargement) * width / enlargement.width
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
-    found = replace(found, film=film_detail(levels), correlation=neighbour_correlation(levels))
+    film = film_detail(levels) if film is None else film
+    found = replace(found, film=film, correlation=neighbour_correlation(levels))
     if not found.hiding and (noise := estimate_noise(levels)) is not None:
         found = replace(found, noise=noise.level, noise_limit=noise.limit)
     return Inspected(found, _kept(levels))

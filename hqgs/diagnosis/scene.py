@@ -24,7 +24,7 @@ PROBES = 4  # photos searched for enlargement; if they agree, the others are tak
 UNLIKE_NOISE = 2.5  # times the noise of the quieter photos in the noisier ones: each has its own
 WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
 VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
-# Of `film_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
+# Of `fine_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
 COARSE_FILM = 0.24
 
 
@@ -95,7 +95,7 @@ class Inspector:
         """`inspect_photo` of a view; `enlargement` where it is known."""
         key = id(view), enlargement
         if key not in self._inspected:
-            found = inspect_photo(view.name, view.image, view.low, enlargement=enlargement)
+            found = inspect_photo(view.name, view.image, view.low, enlargement=enlargement, film=view.film)
             self._inspected[key] = view, found
         return self._inspected[key][1]
 
@@ -253,11 +253,11 @@ def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Part:
 
 def _video(photos: Sequence[PhotoDiagnosis]) -> Part:
     details = [photo.film for photo in photos if photo.film is not None]
-    reason = f"{len(details)} of {len(photos)} photos are frames of a film as they were decoded"
+    reason = f"{len(details)} of {len(photos)} photos are told to be frames of a film"
     if 2 * len(details) <= len(photos):
         return Part("video", False, None, None, None, reason)
     detail, spread = float(np.median(details)), _spread_of(details)
-    reason += f"; the finest details are {detail:.2f} times as strong as coarser ones"
+    reason += f"; as decoded, the finest details are {detail:.2f} times as strong as coarser ones"
     if detail >= COARSE_FILM:
         return Part("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
     return Part("video", True, detail, spread, "video", reason)

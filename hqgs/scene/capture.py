@@ -26,6 +26,7 @@ class Photo:
     camera: pycolmap.Camera
     viewmat: NDArray[np.float64]  # [4, 4], world to camera, OpenCV frame
     mask_path: Path | None = None
+    film: float | None = None  # as `View.film`
 
 
 @dataclass(frozen=True)

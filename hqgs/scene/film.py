@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from PIL import Image
 
 from hqgs.base.files import FRAMES, missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.photos.blocks import fine_detail
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
 LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
@@ -28,14 +30,15 @@ def film_frames(
     """The sharpest frame of each of `count` intervals of a film, as JPEG files, upright.
 
     `count` None: two a second, at least 30 and at most 90, as far as the film has them. The files lie in a
-    folder below `folder`, where the next call finds them. Returns their folder and what was done, in words.
-    ValueError where PyAV (the extra `video`) is missing, or the film cannot be read.
+    folder below `folder`, where the next call finds them, with the fine detail that each frame had before it
+    was stored (`frame_details`). Returns their folder and what was done, in words. ValueError where PyAV
+    (the extra `video`) is missing, or the film cannot be read.
     """
     if count is not None and count < 3:
         raise ValueError(f"frames is {count}, wanted at least 3")
     av = _pyav(path)
     state = path.stat()
-    name = f"2 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
+    name = f"3 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -43,9 +46,12 @@ def film_frames(
         made = missing_folders(folder)
         new.mkdir(parents=True)
         try:
+            details: dict[str, float] = {}
             for number, frame in _sharpest(av, path, count, told):
-                Image.fromarray(frame).save(new / f"{number:06d}.jpg", quality=QUALITY, subsampling=0)
-            write_json(new / FRAMES, {"film": path.name})
+                file = new / f"{number:06d}.jpg"
+                Image.fromarray(frame).save(file, quality=QUALITY, subsampling=0)
+                details[file.name] = fine_detail(frame.astype(np.float64))
+            write_json(new / FRAMES, {"film": path.name, "details": details})
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
@@ -54,6 +60,21 @@ def film_frames(
         target,
         f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval",
     )
+
+
+def frame_details(folder: Path) -> dict[str, float]:
+    """`fine_detail` by photo of a folder that `film_frames` wrote; none of another folder.
+
+    ValueError where its file is damaged.
+    """
+    path = folder / FRAMES
+    if not path.is_file():
+        return {}
+    try:
+        details = json.loads(path.read_text(encoding="utf-8"))["details"]
+        return {name: float(detail) for name, detail in details.items()}
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
 
 
 def _sharpest(

@@ -14,6 +14,7 @@ from hqgs.base.stages import OnStage, untold
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
+from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
@@ -138,10 +139,11 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
         )
         for k in chosen
     ]
+    names, details = [photos.names[k] for k in chosen], frame_details(photos.folder)
     views, _ = load_views(
         [
-            Photo(photos.names[k], photos.folder / photos.names[k], camera, np.eye(4))
-            for k, camera in zip(chosen, cameras, strict=True)
+            Photo(name, photos.folder / name, camera, np.eye(4), film=details.get(name))
+            for name, camera in zip(names, cameras, strict=True)
         ],
         photos.downscale,
     )

@@ -38,6 +38,7 @@ DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is un
 LATTICE, EXACT = 8, 0.02  # px of such a grid: positions are computed so far apart, if that is exact enough
 FAR = 1.25  # pixels of the photo between samples; where they are farther apart, means come first
 DENSE = 1.75  # the same, at which it may be decoded: 6000 px go to 1600 by way of 3000
+FILM = 1.5  # until a frame is so much smaller it shows as much of the film's codec as at its own size
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
 
@@ -139,7 +140,8 @@ def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], P
     if mask is not None and mask.all():
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
-    return View(photo.name, camera_now, image, mask, turn=read_exif(photo.path).turn)
+    film = photo.film if downscale <= FILM else None
+    return View(photo.name, camera_now, image, mask, turn=read_exif(photo.path).turn, film=film)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hqgs.base.stages import OnStage, untold
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
+from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, Tracks
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
@@ -81,10 +82,12 @@ def read_photos(
     cameras = find_cameras(root, photos, keep, told, coarse)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
-    found = [
-        Photo(names[name], folder / names[name], of_image[name], viewmat, find_mask(root, names[name]))
-        for name, viewmat in registered(model).items()
-    ]
+    details = frame_details(folder)
+    found: list[Photo] = []
+    for file, viewmat in registered(model).items():
+        name = names[file]
+        mask = find_mask(root, name)
+        found.append(Photo(name, folder / name, of_image[file], viewmat, mask, details.get(name)))
     notes = [str(cameras.report), *cameras.photos.notes]
     points, colors = keep_finite(*model_points(model), notes)
     seen = None

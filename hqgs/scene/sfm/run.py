@@ -28,7 +28,7 @@ from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
-PARTS = [PROGRAM, *(PROGRAM.with_name(name) for name in ("database.py", "likely.py"))]  # files that it is of
+PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in ("attempt", "database", "likely"))]
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each

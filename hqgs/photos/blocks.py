@@ -1,0 +1,40 @@
+"""The 8 x 8 blocks in which JPEG and films store pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dctn
+
+from hqgs.photos.pixels import Floats, luma
+
+ENOUGH_BLOCKS = 40  # without clipped pixels; where there are fewer, all blocks are taken
+MAX_BLOCKS = 4_000  # whose details are looked at
+_WAVES = np.add.outer(np.arange(8), np.arange(8))
+_FINE, _COARSE = _WAVES >= 7, (_WAVES >= 3) & (_WAVES <= 5)
+
+
+def block_coefficients(grey: Floats, most: int, usable: NDArray[np.bool_] | None = None) -> Floats:
+    """DCT coefficients [n, 8, 8] of up to `most` of the whole 8 x 8 blocks of a luma [H, W], in levels.
+
+    Only blocks all of whose pixels are `usable`, where there are enough of them.
+    """
+    rows, columns = grey.shape[0] // 8, grey.shape[1] // 8
+    blocks = grey[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8).swapaxes(1, 2).reshape(-1, 8, 8)
+    chosen = np.arange(len(blocks))
+    if usable is not None:
+        whole = usable[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8).all(axis=(1, 3)).ravel()
+        chosen = np.flatnonzero(whole) if whole.sum() >= ENOUGH_BLOCKS else chosen
+    # A stride would fall in step with the rows of blocks; a fixed shuffle spreads the choice.
+    chosen = np.random.default_rng(0).permutation(chosen)[:most]
+    return np.asarray(dctn(blocks[chosen] - 128, axes=(1, 2), norm="ortho"))
+
+
+def fine_detail(levels: Floats) -> float:
+    """How much fine detail a picture [H, W, 3] of levels 0..255 has, at least 8 px a side.
+
+    The ratio of the root mean squares of fine and coarser coefficients of its blocks. A film's codec leaves
+    the less of it the coarser it is.
+    """
+    power = np.square(block_coefficients(luma(levels), MAX_BLOCKS)).mean(0)
+    return float(np.sqrt(power[_FINE].mean() / max(power[_COARSE].mean(), 1e-9)))
