@@ -63,8 +63,11 @@ def with_budget(
 
 
 def start_points(scene: Scene, most: int) -> int:
-    """How many points photos without a fault call for, `most` at most; some beside the scene's own always,
-    for these are where corners are, and a run from points all over the photos costs less."""
+    """How many points photos without a fault call for, `most` at most.
+
+    More than the scene's own always: those lie at corners alone, and a run from points all over the photos
+    costs less.
+    """
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     return min(most, max(pixels // PIXELS, int(BESIDE * len(scene.points))))
 
