@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -19,8 +18,11 @@ from hqgs.base.stages import Stage
 from hqgs.diagnosis.scene import diagnose_scene
 from hqgs.photos.blocks import fine_detail
 from hqgs.scene.film import film_frames, frame_details
+from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
+from hqgs.scene.sfm.folder import write_colmap_folder
 from hqgs.scene.source import degrade, load, pictures
+from hqgs.scene.split import split
 
 av = pytest.importorskip("av")
 RATE, EVERY = 30, 10  # frames a second; of ten frames one is sharp
@@ -57,9 +59,7 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
     stages: list[Stage] = []
     folder, note = film_frames(source, tmp_path / "frames", 6, stages.append)
     names = sorted(path.name for path in folder.glob("*.jpg"))
-    facts = json.loads((folder / "frames.json").read_text())
-    assert facts == {"film": "walk.mp4", "details": frame_details(folder)}
-    assert sorted(facts["details"]) == names
+    assert sorted(frame_details(folder)) == names
     assert names == [f"{k:06d}.jpg" for k in (7, 17, 27, 37, 47, 57)]
     assert "sharpest 6 frames of walk.mp4" in note
     assert stages[-1].done == 60
@@ -99,6 +99,7 @@ def test_frames_tell_what_the_codec_left_of_fine_details(tmp_path: Path) -> None
     photos = [clean_photo(k) for k in range(3)]
     found = {crf: diagnose_scene(pictures(encoded(tmp_path / f"{crf}.mp4", photos, crf))) for crf in (12, 40)}
     assert {crf: one.formation for crf, one in found.items()} == {12: "none", 40: "video"}
+    assert found[40].scene == "40"
     details = [photo.film for photo in found[12].photos]
     assert details == pytest.approx([fine_detail(photo.astype(np.float64)) for photo in photos], abs=0.05)
 
@@ -114,6 +115,11 @@ def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: 
     smaller = load(source, frames=len(views), cache=tmp_path, downscale=2)
     noisy = degrade(scene, "noise:5")
     assert {view.film for view in (*smaller.train, *noisy.train)} == {None}
+    write_colmap_folder(source, tmp_path / "walk", tmp_path / "work", len(views))
+    made = split(tmp_path / "walk", tmp_path / "parts", 2)
+    for place in (tmp_path / "walk", *(made.folder / part.folder for part in made.parts)):
+        there = load_scene(place)
+        assert all(view.film == details[view.name] for view in (*there.train, *there.test))
     (folder / "frames.json").write_text("{}")
     with pytest.raises(ValueError, match=r"frames\.json is damaged: KeyError\('details'\)"):
         load(source, frames=len(views), cache=tmp_path)

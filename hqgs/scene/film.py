@@ -51,7 +51,7 @@ def film_frames(
                 file = new / f"{number:06d}.jpg"
                 Image.fromarray(frame).save(file, quality=QUALITY, subsampling=0)
                 details[file.name] = fine_detail(frame.astype(np.float64))
-            write_json(new / FRAMES, {"film": path.name, "details": details})
+            write_details(new, details)
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
@@ -62,8 +62,13 @@ def film_frames(
     )
 
 
+def write_details(folder: Path, details: dict[str, float]) -> None:
+    """Say that photos of a folder are frames of a film: the `fine_detail` of each as it was decoded."""
+    write_json(folder / FRAMES, {"details": details})
+
+
 def frame_details(folder: Path) -> dict[str, float]:
-    """`fine_detail` by photo of a folder that `film_frames` wrote; none of another folder.
+    """`fine_detail` by photo of a folder of a film's frames; none of another folder.
 
     ValueError where its file is damaged.
     """

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.files import FRAMES
 from hqgs.base.stages import OnStage, Stage
 from hqgs.scene.capture import find_mask, inside
 from hqgs.scene.formats.colmap import match_files
@@ -190,6 +191,8 @@ def bring_photos(root: Path, folder: Path, final: Path, names: list[str], copy: 
             continue  # scaled photos that do not belong to these cameras
         for name, file in files.items():
             bring(file, images.name, str(PurePosixPath(name).with_suffix(file.suffix)))
+        if (images / FRAMES).is_file():
+            bring(images / FRAMES, images.name, FRAMES)
     for name in names:
         if (mask := find_mask(root, name)) is not None:
             bring(mask, "masks", mask.relative_to(root / "masks").as_posix())

@@ -157,7 +157,7 @@ def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = 
         with TemporaryDirectory(prefix="hqgs-film-") as name:
             source = film_frames(Path(path), Path(name))[0] if is_film(path) else path
             if (scene := load_pictures(source, downscale)) is not None:
-                return scene
+                return replace(scene, name=Path(path).stem) if is_film(path) else scene
     return load(path, downscale=downscale, longest=longest, skip_unreadable=False)
 
 

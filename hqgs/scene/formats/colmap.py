@@ -19,6 +19,7 @@ from hqgs.scene.capture import (
     photo_folder,
     viewmat_from_pose,
 )
+from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model
 from hqgs.scene.geometry import project
 from hqgs.scene.scene import Camera, Tracks
@@ -75,12 +76,14 @@ def read_colmap(root: Path, downscale: float) -> Capture:
         raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
 
     files = match_files(names, root, folder, notes)
+    details = frame_details(folder)
     photos = []
     for name, image_id in by_name:
         image = model.images[image_id]
         camera = model.cameras[image.camera_id]
         viewmat = pose_viewmat(image.cam_from_world(), name)
-        photos.append(Photo(name, files[name], camera, viewmat, find_mask(root, name)))
+        film = details.get(files[name].relative_to(folder).as_posix())
+        photos.append(Photo(name, files[name], camera, viewmat, find_mask(root, name), film))
     used = set(files.values())
     if len(used) < len(files):
         shared = [n for n, p in files.items() if list(files.values()).count(p) > 1]

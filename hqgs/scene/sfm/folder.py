@@ -12,7 +12,7 @@ from PIL import Image
 from hqgs.base.files import existing_folder, is_film
 from hqgs.base.stages import OnStage, untold
 from hqgs.photos.files import decode
-from hqgs.scene.film import film_frames
+from hqgs.scene.film import film_frames, frame_details, write_details
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos
 from hqgs.scene.sfm.photos_alone import find_cameras
@@ -23,9 +23,10 @@ def write_colmap_folder(
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 
-    `images` has every photo with a place: those of WebP or HEIC as JPEG, the others as they are. `work` is a
-    folder for what the next call goes on with if this one is stopped; it is removed at the end. ValueError
-    where there are no photos, or COLMAP finds no scene in them.
+    `images` has every photo with a place: those of WebP or HEIC as JPEG, the others as they are; of a film
+    also what its frames had of fine details. `work` is a folder for what the next call goes on with if this
+    one is stopped; it is removed at the end. ValueError where there are no photos, or COLMAP finds no scene
+    in them.
     """
     with TemporaryDirectory(prefix="hqgs-film-") as name:
         if is_film(source):
@@ -36,15 +37,21 @@ def write_colmap_folder(
             raise ValueError(f"{root} holds no photos")
         found = find_cameras(root, photos, work, told)
         images = out / "images"
+        details = frame_details(found.photos.folder)
+        kept: dict[str, float] = {}
         for image in found.model.images.values():
             original = found.photos.colmap_names[image.name]
             target = images / image.name
             target.parent.mkdir(parents=True, exist_ok=True)
+            if original in details:
+                kept[image.name] = details[original]
             if original.lower().endswith(FOR_COLMAP):
                 shutil.copyfile(found.photos.folder / original, target)
             else:
                 pixels = decode(found.photos.folder / original)[0]
                 Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
+        if kept:
+            write_details(images, kept)
         (out / "sparse" / "0").mkdir(parents=True)
         model: pycolmap.Reconstruction = found.model
         model.write_binary(out / "sparse" / "0")
