@@ -19,9 +19,9 @@ from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, fitting
-from hqgs.training import schedule as schedule_module
-from hqgs.training.config import AUTOMATIC, DensifyConfig, TrainConfig, run_config
+from hqgs.training.config import DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.budget import PIXELS
+from hqgs.training.methods.hqgs import GROWS_FROM
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import with_iterations, with_plan
 from hqgs.training.trainer import Trainer
@@ -44,12 +44,12 @@ def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
 
 
 def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
-    at = STOP + schedule_module.TAIL
+    at = STOP + 33  # a third of what is left
     assert turned_at(seconds=30.0, step=0.1) == (at, 300)
     assert turned_at(seconds=35.0, step=0.1) == (at, 350)
     assert turned_at(seconds=27.0, step=0.1) == (at, 270)
-    assert turned_at(seconds=1.0, step=0.1) == (at, at + 5)  # a tenth of what was planned is left
-    assert turned_at(seconds=1e6, step=0.1) == (at, at + 200)  # four times as much
+    assert turned_at(seconds=1.0, step=0.1) == (at, at + 7)  # a tenth of what was planned is left
+    assert turned_at(seconds=1e6, step=0.1) == (at, at + 268)  # four times as much
     assert turned_at(seconds=1.0, step=0.1, turn=(260, 280)) == (260, 280)  # a plan, not the clock
 
 
@@ -76,7 +76,6 @@ def test_as_many_iterations_as_fit() -> None:
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule_module, "TAIL", 3)
     monkeypatch.setattr(fitting, "FEWEST", 30)
     monkeypatch.setattr(fitting, "MOST", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
@@ -148,10 +147,12 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
 
     dense = trainer()
     assert 2 * len(few.points) < len(dense.gaussians) <= max(pixels // PIXELS, 1.5 * len(few.points))
-    assert (
-        dense.config.leave_out == (*AUTOMATIC[:-1], *AUTOMATIC[-1:]) or "resolution" in dense.config.leave_out
-    )
-    assert len(trainer(start_points=0).gaussians) == len(few.points)
+    assert "resolution" in dense.config.leave_out
+    assert dense.config.densify.start == GROWS_FROM
+    assert any(item.what == f"growth in the first {GROWS_FROM} iterations" for item in dense.left_out())
+    own = trainer(start_points=0)
+    assert len(own.gaussians) == len(few.points)
+    assert own.config.densify.start < GROWS_FROM
     plain = trainer("3dgs")
     assert len(plain.gaussians) == len(few.points)
     assert "resolution" not in plain.config.leave_out

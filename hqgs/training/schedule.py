@@ -25,7 +25,7 @@ BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained,
 GUEST_EVERY = 3  # steps of a part, of which one is on a small photo of another part
 EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
 CHECKS = 500  # iterations from one look at whether the run still improves to the next
-TAIL = 50  # steps after the end of growth that tell what the rest costs
+TAIL, TAIL_PART = 50, 1 / 3  # steps after the end of growth that tell what the rest costs; of that rest
 FASTER, LAST_OF_FIRST = 2.0, 1 / 3  # at most, of the rates of short runs
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 
@@ -135,7 +135,10 @@ class Schedule:
 
     def turn_at(self, decisions: Decisions) -> int:
         """The iteration after which the clock may give the run another length."""
-        return self.growth_end(decisions) + TAIL if self.config.turn is None else self.config.turn[0]
+        if self.config.turn is not None:
+            return self.config.turn[0]
+        end = self.growth_end(decisions)
+        return end + min(TAIL, max(1, int(TAIL_PART * (self.config.iterations - end))))
 
     def holds(self, decisions: Decisions) -> bool:
         """Whether photos are held back."""

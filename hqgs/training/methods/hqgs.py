@@ -35,6 +35,7 @@ LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
 ENOUGH = 7_000  # iterations where cameras are learned and no number is given
+GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -127,8 +128,10 @@ class HQGS(Plain):
             plain = self.as_photographed and config.method == AUTO
             wanted = start_points(scene, min(config.start_points, config.densify.max_gaussians))
             points, colors, _ = first_points(scene, wanted, config.seed, self._told)
-            if self.as_photographed and len(points) > len(scene.points):
-                config = _coarse_first(config)
+            if len(points) > len(scene.points):
+                config, why = _growing_later(config)
+                left_out += why
+                config = _coarse_first(config) if self.as_photographed else config
             config = replace(config, method="3dgs") if plain else self.named(config)
             return Start(config, _laid(scene, points, colors, config), left_out)
         least, densify = len(scene.points), config.densify
@@ -227,6 +230,15 @@ def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut
     what = f"iterations {ENOUGH + 1} to {config.iterations}"
     why = "no photo can be held back to tell when to end: its camera would not be learned"
     return short, [LeftOut(what, why)]
+
+
+def _growing_later(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
+    """For a short run that starts from points all over the photos."""
+    if config.densify.start >= GROWS_FROM:
+        return config, []
+    what = f"growth in the first {GROWS_FROM} iterations"
+    why = "until sizes and colours are about right, gradients do not tell where something is missing"
+    return replace(config, densify=replace(config.densify, start=GROWS_FROM)), [LeftOut(what, why)]
 
 
 def _coarse_first(config: TrainConfig) -> TrainConfig:
