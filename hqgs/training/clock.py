@@ -12,7 +12,7 @@ SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
 
 
 def turned(config: TrainConfig, schedule: Schedule, state: TrainState, step: float) -> Decisions:
-    """The decisions after a step: steps (TAIL) after growth the rest gets the length that the clock allows.
+    """The decisions after a step: at `Schedule.turn_at` the rest gets the length that the clock allows.
 
     `step`: seconds of a step now. A configuration with a `turn` follows that in place of the clock.
     """
