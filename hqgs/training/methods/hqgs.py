@@ -13,7 +13,6 @@ from torch import Tensor
 from hqgs.base.left_out import LeftOut
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.discs import as_discs
-from hqgs.model.first_points import Colors, Points
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.smoothing import enlarge
 from hqgs.photos.formula import LEARNED, OWN
@@ -60,7 +59,8 @@ class HQGS(Plain):
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
-      Gaussians are discs and needles then, as their neighbours lie (`as_discs`).
+      Where the pixels are the scene's own, Gaussians are discs and needles then, as their neighbours lie
+      (`as_discs`); under noise, blur and JPEG, depths are too rough to tell.
     - Noise: the learning rates are halved as often as a fiftieth of the pixels, which the loss leaves out,
       finds that nothing is gained any more (`Plateau`). At constant rates the Gaussians learn the noise.
     """
@@ -128,19 +128,21 @@ class HQGS(Plain):
             plain = self.as_photographed and config.method == AUTO
             wanted = start_points(scene, min(config.start_points, config.densify.max_gaussians))
             points, colors, _ = first_points(scene, wanted, config.seed, self._told)
+            gaussians = Gaussians.from_points(points, colors, config.sh_degree)
             if len(points) > len(scene.points):
+                gaussians = as_discs(gaussians)
                 config, why = _growing_later(config)
                 left_out += why
                 config = _coarse_first(config) if self.as_photographed else config
             config = replace(config, method="3dgs") if plain else self.named(config)
-            return Start(config, _laid(scene, points, colors, config), left_out)
+            return Start(config, gaussians, left_out)
         least, densify = len(scene.points), config.densify
         budget = with_budget(densify, self.formation, targets, self.config.gaussians_per_pixel, least)
         if densify.reset_every < densify.stop:
             left_out.append(LeftOut("resets of the opacities", "a budget of Gaussians bears none"))
         wanted = int(self.config.first_points * budget.max_gaussians)
         points, colors, why = first_points(scene, wanted, config.seed, self._told)
-        gaussians = _laid(scene, points, colors, config)
+        gaussians = Gaussians.from_points(points, colors, config.sh_degree)
         self._measure(gaussians, 0)
         return Start(self.named(replace(config, densify=budget)), gaussians, left_out + why)
 
@@ -213,12 +215,6 @@ class HQGS(Plain):
         if self.config.smallest:
             pixels = photo_pixels(gaussians.means, self._views) * self.formation.factor
             self._smallest, self._since = (self.config.smallest * pixels).float(), iteration
-
-
-def _laid(scene: Scene, points: Points, colors: Colors, config: TrainConfig) -> Gaussians:
-    """Gaussians at these points; where there are more than the scene has, they lie as their neighbours do."""
-    gaussians = Gaussians.from_points(points, colors, config.sh_degree)
-    return as_discs(gaussians) if len(points) > len(scene.points) else gaussians
 
 
 def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
