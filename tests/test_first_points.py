@@ -134,6 +134,11 @@ def told(trainer: Trainer) -> dict[str, str]:
     return {item.what: item.why for item in trainer.left_out()}
 
 
+def longest_to_shortest(trainer: Trainer) -> np.ndarray:
+    scales = trainer.gaussians.scales.detach().exp().numpy()
+    return scales.max(1) / scales.min(1)
+
+
 def run_report(trainer: Trainer, out: Path) -> str:
     run_to_end(trainer, out)
     return (out / "report.json").read_text()
@@ -151,6 +156,7 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
 
     started = trainer(sparse)
     assert 3 * 20 < len(started.gaussians) <= int(0.2 * pixels)
+    assert (longest_to_shortest(started) == 1).all()
     np.testing.assert_array_equal(started.gaussians.means[:20].detach().numpy(), sparse.points)
     assert "first points along edges" not in told(started)
     (note,) = json.loads(run_report(started, tmp_path))["notes"]
@@ -159,7 +165,9 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
         == f"started from the scene's 20 points and {started.first_points - 20} more along the photos' edges"
     )
     assert len(trainer(sparse, first_points=0.0).gaussians) == 20
-    assert 20 < len(trainer(sparse, formation="none").gaussians) <= max(30, pixels // PIXELS)
+    clean = trainer(sparse, formation="none")
+    assert 20 < len(clean.gaussians) <= max(30, pixels // PIXELS)
+    assert (longest_to_shortest(clean) > 2).all()
     enough = trainer(scene, first_points=0.01)
     assert len(enough.gaussians) == few
     assert "points for" in told(enough)["first points along edges"]

@@ -59,8 +59,8 @@ class HQGS(Plain):
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
-      Where the pixels are the scene's own, Gaussians are discs and needles then, as their neighbours lie
-      (`as_discs`); under noise, blur and JPEG, depths are too rough to tell.
+      Gaussians are discs and needles then, as their neighbours lie (`as_discs`); but not under noise, blur,
+      JPEG or low resolution, where depths are too rough for that.
     - Noise: the learning rates are halved as often as a fiftieth of the pixels, which the loss leaves out,
       finds that nothing is gained any more (`Plateau`). At constant rates the Gaussians learn the noise.
     """
