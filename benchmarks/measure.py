@@ -61,9 +61,10 @@ class Training:
             "config": asdict(self.trainer.config),
         }
 
-    def judged(self) -> Run:
-        """The record with the held-out means of where it is."""
-        self.trainer.evaluate(self.held_out())
+    def judged(self, views: HeldOutViews | None = None) -> Run:
+        """The record with the held-out means of where it is. `views`: its held-out views, where they are
+        rendered already."""
+        self.trainer.evaluate(self.held_out() if views is None else views)
         last = self.trainer.history[-1]
         return self.record() | {"psnr": last["psnr"], "ssim": last["ssim"]}
 

@@ -33,8 +33,9 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
     """Train one row; what came of it, as plain JSON values."""
     config = fitted(photos, cell.config)
     done = train(photos, config, evaluate=config.seconds is None)
-    (mean,) = held_out_means([haarpsi], done.held_out())
-    return done.judged() | {"haarpsi": mean}
+    views = done.held_out()
+    (mean,) = held_out_means([haarpsi], views)
+    return done.judged(views) | {"haarpsi": mean}
 
 
 def others() -> Curves:
