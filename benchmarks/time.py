@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from hqgs.evaluation.held_out import held_out_means
 from hqgs.evaluation.metrics import haarpsi
 from hqgs.pipeline import fitted
 from hqgs.scene.scene import Scene
+from hqgs.training.config import TrainConfig
+from hqgs.training.settings import with_iterations
 
 FILE = Path(__file__).with_suffix(".toml")
 PROTOCOLS, COLUMNS = read_protocols(FILE), read_toml(FILE)["columns"]
@@ -31,7 +34,10 @@ SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
 
 def run_cell(cell: Cell, photos: Scene) -> Run:
     """Train one row; what came of it, as plain JSON values."""
-    config = fitted(photos, cell.config)
+    config = cell.config
+    if config.seconds is not None:  # as without a number of iterations: no more than pay
+        config = with_iterations(config, TrainConfig.iterations)
+        config = fitted(photos, replace(config, leave_out=(*config.leave_out, "iterations")))
     done = train(photos, config, evaluate=config.seconds is None)
     views = done.held_out()
     (mean,) = held_out_means([haarpsi], views)

@@ -17,11 +17,13 @@ import hqgs
 from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
+from hqgs.pipeline import fitted
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, fitting
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config
 from hqgs.training.methods.budget import PIXELS
-from hqgs.training.methods.hqgs import GROWS_FROM
+from hqgs.training.methods.hqgs import ENOUGH, GROWS_FROM, LOOKS
+from hqgs.training.notes import run_notes
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import with_iterations, with_plan
 from hqgs.training.trainer import Trainer
@@ -159,6 +161,52 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
     assert asdict(trainer(leave_out=("growth",)).config)["leave_out"] == ("growth",)
 
 
+def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no number of iterations is given, or more seconds than that takes."""
+    scene = textured_scene(8, 96)
+    length = "iterations 7001 to 30000"
+
+    def trainer(**changes: Any) -> Trainer:
+        return Trainer(scene, run_config(formation="none", **changes))
+
+    short = trainer()
+    assert short.config.iterations == ENOUGH == 7_000
+    assert short.config.densify.stop == run_config(iterations=ENOUGH).densify.stop
+    assert "iterations" not in short.schedule.items  # nothing is held back for it
+    assert length in [item.what for item in short.left_out()]
+    assert trainer(eval_every=123).config.eval_every == 123
+    assert trainer(iterations=9_000).config.iterations == 9_000
+    assert trainer(leave_out="none").config.iterations == 30_000
+    assert trainer(method="3dgs").config.iterations == 30_000
+    monkeypatch.setattr("hqgs.training.methods.hqgs.ENOUGH", 700)
+    many = trainer()
+    assert many.config.iterations == LOOKS * len(scene.train) == 1_050
+    assert "iterations" in many.schedule.items
+
+    asked = replace(run_config(formation="none"), seconds=1e6)
+    config = fitted(scene, asked)
+    assert (config.iterations, config.turn) == (1_050, (1_049, 1_050))
+    assert fitted(scene, config) == config
+    assert any(
+        "more looks at the same photos do not pay" in note for note in run_notes(Trainer(scene, config))
+    )
+    short_of = fitted(scene, replace(asked, seconds=1e-3))
+    assert (short_of.iterations, short_of.turn) == (fitting.FEWEST, None)
+
+
+def test_a_run_without_a_number_can_be_made_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hqgs.training.methods.hqgs.ENOUGH", 20)
+    monkeypatch.setattr("hqgs.training.methods.hqgs.LOOKS", 1)
+    scene, out = tmp_path / "desk", tmp_path / "run"
+    write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)
+    argv = ["train", str(scene), "--out", str(out), "--formation", "none"]
+    assert main(argv) == 0
+    assert json.loads((out / "report.json").read_text())["iterations"] == 20
+    assert main([*argv, "--resume", "--iterations", "30"]) == 0
+    assert json.loads((out / "report.json").read_text())["iterations"] == 30
+    assert main([*argv, "--resume", "--iterations", "25"]) == 2
+
+
 def test_a_run_of_seconds_can_be_stopped_resumed_and_made_longer(tmp_path: Path) -> None:
     scene, out = tmp_path / "desk", tmp_path / "run"
     write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)
@@ -166,7 +214,8 @@ def test_a_run_of_seconds_can_be_stopped_resumed_and_made_longer(tmp_path: Path)
     assert main([*argv, "--seconds", "0.3"]) == 0
     first = json.loads((out / "report.json").read_text())
     assert first["config"]["seconds"] == 0.3
-    longer = first["iterations"] + 20
+    planned = first["config"]["iterations"]
+    longer = first["iterations"] + (20 if planned != first["iterations"] + 20 else 21)  # of fewer or more
     assert main([*argv, "--resume", "--iterations", str(longer)]) == 0
     assert json.loads((out / "report.json").read_text())["iterations"] == longer
     assert main([*argv, "--overwrite", "--seconds", "0"]) == 2

@@ -56,7 +56,8 @@ class Train(Photos):
     """quick: 1,000 iterations on small photos, a first look. standard: until the scene has stopped improving,
     photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
     iterations: Number = None
-    """Training views to see (standard: at most 30,000, fewer where the scene has stopped improving)."""
+    """Training views to see (standard: 7,000 of clean photos or 150 for each, at most 30,000, fewer where the
+    scene has stopped improving)."""
     batch: Number = None
     """Views in a step (1). Several processes of torchrun share them out: docs/ranks.md."""
     seconds: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
@@ -175,7 +176,9 @@ def config_of(options: Train) -> TrainConfig:
         raise ValueError(f"only one of --{' and --'.join(given)} can be given")
     if file is not None:
         config = read_config(file)
-        if file == kept and iterations is not None and iterations < config.iterations:
+        # Else the checkpoint alone knows how long the run was.
+        known = "iterations" not in config.leave_out and config.seconds is None
+        if known and file == kept and iterations is not None and iterations < config.iterations:
             raise ValueError(
                 f"iterations is {iterations}, and the run in {options.out} has {config.iterations}: --resume "
                 "can make it longer, not shorter"

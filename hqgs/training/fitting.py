@@ -15,8 +15,8 @@ DENSE = 2  # times the scene's own points
 FEWEST, MOST = 50, 30_000  # iterations
 
 
-def fitting(trainer: Trainer, seconds: float) -> int:
-    """As many iterations as fit into `seconds` of training on this machine, now.
+def fitting(trainer: Trainer, seconds: float, most: int | None = None) -> int:
+    """As many iterations as fit into `seconds` of training on this machine, now; `most` of them at most.
 
     The trainer is a fresh one; it has made steps then, and is of no more use.
     """
@@ -28,7 +28,7 @@ def fitting(trainer: Trainer, seconds: float) -> int:
         coarse = replace(schedule, config=with_iterations(config, iterations)).coarse_end
         return coarse * costs[True] + (iterations - coarse) * costs[False]
 
-    few, many = FEWEST, MOST
+    few, many = FEWEST, MOST if most is None else max(most, FEWEST) + 1
     while many - few > 1:
         middle = (few + many) // 2
         few, many = (middle, many) if needed(middle) <= seconds else (few, middle)

@@ -21,7 +21,9 @@ def run_notes(trainer: Trainer) -> list[str]:
         )
     if (seconds := trainer.config.seconds) is not None:
         text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
-        if at := trainer.state.decisions.turned:
+        if trainer.config.turn == (trainer.config.iterations - 1, trainer.config.iterations):
+            text += ", and more looks at the same photos do not pay"
+        elif at := trainer.state.decisions.turned:
             text += f"; after iteration {at}, {trainer.length} in all"
         notes.append(f"{text}. `--plan` with plan.json trains the same again, bit for bit")
     if trainer.lengthened is not None:

@@ -19,7 +19,7 @@ GROWTH = ("start", "stop", "every")  # those of `TrainConfig.densify`
 class Preset:
     """How long to train, and on photos of which size."""
 
-    iterations: int | None  # None: at most 30,000, fewer where the scene has stopped improving
+    iterations: int | None  # None: as many as pay, 30,000 at most
     longest: int | None  # px: photos with a longer side are scaled down; None: as they are
     about: str
 

@@ -28,12 +28,15 @@ from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.methods.shared_gains import beside, known_gains
+from hqgs.training.settings import with_iterations
 from hqgs.training.state import TrainState
 
 LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
-ENOUGH = 7_000  # iterations where cameras are learned and no number is given
+# Where no number of iterations is given, and cameras are learned or photos are as photographed: so many are
+# enough; of the latter also so many for each photo. More would learn what no other photo shows.
+ENOUGH, LOOKS = 7_000, 150
 GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
@@ -134,6 +137,9 @@ class HQGS(Plain):
                 config, why = _growing_later(config)
                 left_out += why
                 config = _coarse_first(config) if self.as_photographed else config
+            if self.as_photographed:
+                config, why = _long_enough(config, len(scene.train))
+                left_out += why
             config = replace(config, method="3dgs") if plain else self.named(config)
             return Start(config, gaussians, left_out)
         least, densify = len(scene.points), config.densify
@@ -219,13 +225,23 @@ class HQGS(Plain):
 
 def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
     """The same where no photo can be held back: what its camera did would not be learned."""
-    kept = tuple(item for item in config.leave_out if item == "photos")
-    if "iterations" not in config.leave_out or config.iterations <= ENOUGH:
-        return replace(config, leave_out=kept), []
-    short = replace(config, iterations=ENOUGH, leave_out=kept).scaled()
-    what = f"iterations {ENOUGH + 1} to {config.iterations}"
     why = "no photo can be held back to tell when to end: its camera would not be learned"
-    return short, [LeftOut(what, why)]
+    config, left_out = _no_longer(config, ENOUGH, why)
+    return replace(config, leave_out=tuple(item for item in config.leave_out if item == "photos")), left_out
+
+
+def _long_enough(config: TrainConfig, photos: int) -> tuple[TrainConfig, list[LeftOut]]:
+    """As many looks at each of the photos as pay; in a long run held-back photos tell whether fewer do."""
+    most = max(ENOUGH, LOOKS * photos)
+    shorter, left_out = _no_longer(config, most, "more looks at the same photos do not pay")
+    return (shorter if most == ENOUGH else replace(shorter, leave_out=config.leave_out)), left_out
+
+
+def _no_longer(config: TrainConfig, most: int, why: str) -> tuple[TrainConfig, list[LeftOut]]:
+    """With at most so many iterations, if no number is given."""
+    if "iterations" not in config.leave_out or config.iterations <= most:
+        return config, []
+    return with_iterations(config, most), [LeftOut(f"iterations {most + 1} to {config.iterations}", why)]
 
 
 def _growing_later(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
