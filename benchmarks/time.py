@@ -18,9 +18,9 @@ from benchmarks.protocol import read_protocols, read_toml
 from benchmarks.study import Cell, finished
 from hqgs.evaluation.held_out import held_out_means
 from hqgs.evaluation.metrics import haarpsi
-from hqgs.pipeline import fitted
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
+from hqgs.training.fitting import fitted
 from hqgs.training.settings import with_iterations
 
 FILE = Path(__file__).with_suffix(".toml")

@@ -39,10 +39,10 @@ from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
-from hqgs.training.fitting import fitting
+from hqgs.training.fitting import fitted
 from hqgs.training.notes import learned_record, run_notes
 from hqgs.training.progress import OnProgress, progress_of
-from hqgs.training.settings import config_values, plan_values, with_iterations
+from hqgs.training.settings import config_values, plan_values
 from hqgs.training.trainer import Trainer
 
 LEARNED = "learned.png"  # what was learned of the photos' cameras
@@ -103,13 +103,11 @@ def train(
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
         out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, report.html,
             `comparison/*.png`, error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
-        iterations: training views to see; None: 7,000 of clean photos, or 150 for each where there are more
-            than 46; at most 30,000, fewer where the scene has stopped improving.
+        iterations: training views to see; None: as many as pay (docs/frugality.md), at most 30,000.
         batch: of them in a step: one after the other in one process, shared out by several.
-        seconds: of training, in place of `iterations`: as many as fit in, by the steps of this machine before
-            the run and once more after growth, and no more than pay. `iterations` and `turn` of the
-            configuration in the report, and plan.json, tell what that came to: a run with these makes the
-            same bits again.
+        seconds: of training, in place of `iterations`: as many as fit in and pay, by the steps of this
+            machine before the run and once more after growth. `iterations` and `turn` of the configuration
+            in the report, and plan.json, tell what that came to: a run with these makes the same bits again.
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
             "srgs" or "hqgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
@@ -222,20 +220,6 @@ def _check_agreement(trainer: Trainer) -> None:
     """RankError where a rank has come to another state than the first one."""
     if trainer.ranks.count > 1:
         trainer.ranks.agree(checksum(trainer.state.tensors()), f"the state at iteration {trainer.iteration}")
-
-
-def fitted(
-    scene: Scene, config: TrainConfig, inspector: Inspector | None = None, ranks: Ranks = ALONE
-) -> TrainConfig:
-    """The configuration with the iterations that fit into its seconds, if it has any."""
-    if config.seconds is None or config.turn is not None:
-        return config
-    trainer = Trainer(scene, config, inspector, ranks)
-    known = "iterations" in config.leave_out and trainer.method.as_photographed
-    most = trainer.config.iterations if known and trainer.config.iterations < config.iterations else None
-    planned = ranks.tell(fitting(trainer, config.seconds, most))[0]
-    enough = planned == most  # more do not pay: the clock is not to lengthen the run
-    return replace(with_iterations(config, planned), turn=(planned - 1, planned) if enough else None)
 
 
 def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProgress | None = None) -> Run:

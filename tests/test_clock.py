@@ -17,10 +17,10 @@ import hqgs
 from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
-from hqgs.pipeline import fitted
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, fitting
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config
+from hqgs.training.fitting import fitted
 from hqgs.training.methods.budget import PIXELS
 from hqgs.training.methods.hqgs import ENOUGH, GROWS_FROM, LOOKS
 from hqgs.training.notes import run_notes

@@ -114,6 +114,32 @@ def test_short_runs_may_have_higher_rates(iterations: int, faster: float, last: 
     assert learning_rates(brisk, 2.0, 0.0)["means"] == learning_rates(plain, 2.0, 0.0)["means"]
 
 
+def test_means_move_in_units_of_the_reach_in_short_runs() -> None:
+    """Of clean photos; of others, and where 3DGS is asked for, in units of the extent."""
+
+    def times(iterations: int, reach: float, brisk: bool = True) -> list[float]:
+        config = TrainConfig(iterations=iterations, brisk=brisk)
+        pairs = [(learning_rates(config, 2.0, p, r) for r in (reach, None)) for p in (0.0, 1.0)]
+        return [mine["means"] / other["means"] for mine, other in pairs]
+
+    assert times(600, 8.0) == pytest.approx([4.0, 4.0])
+    assert times(600, 200.0) == pytest.approx([50**0.6, 50**0.6])
+    assert times(30_000, 8.0) == times(600, 8.0, brisk=False) == times(600, 1.0) == [1.0, 1.0]
+    scene = tiny_scene()
+    far = replace(scene, points=scene.points + 100 * scene.train[0].camera.viewmat[2, :3].astype(np.float32))
+    assert far.reach > 9 * far.extent
+
+    def rate(method: str, formation: str) -> float:
+        config = tiny_config(600, method=method, hqgs=HQGSConfig(formation=formation))
+        trainer = Trainer(far, config)
+        trainer.step()
+        groups = {group["name"]: group["lr"] for group in trainer.state.optimizer.param_groups}
+        return groups["means"] / learning_rates(trainer.config, far.extent, 1 / 600)["means"]
+
+    assert rate("hqgs", "none") == pytest.approx(min(50**0.6, far.reach / far.extent))
+    assert rate("hqgs", "noise:10") == rate("3dgs", "none") == pytest.approx(1.0)
+
+
 def test_methods_of_our_own_have_them_unless_asked_not_to() -> None:
     def brisk(method: str, asked: bool | None) -> bool | None:
         return Trainer(tiny_scene(), tiny_config(method=method, brisk=asked)).config.brisk

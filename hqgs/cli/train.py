@@ -53,7 +53,7 @@ class Train(Photos):
     out: Folder
     """Folder for the scene, the report and what is needed to go on."""
     preset: Literal["quick", "standard", "best"] = "standard"
-    """quick: 1,000 iterations on small photos, a first look. standard: until the scene has stopped improving,
+    """quick: 1,000 iterations on small photos, a first look. standard: as long as it pays,
     photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
     iterations: Number = None
     """Training views to see (standard: 7,000 of clean photos or 150 for each, at most 30,000, fewer where the

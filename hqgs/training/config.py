@@ -22,7 +22,7 @@ ITEMS = {
     "weight": "Gaussians that no photo shows",
     "harmonics": "bands of the harmonics that held-back photos do not ask for",
     "resolution": "full resolution in the first part of the run",
-    "iterations": "the rest of a run that has stopped improving",
+    "iterations": "steps that no longer pay",
 }
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
@@ -212,7 +212,7 @@ class TrainConfig:
     batch: int = 1  # views in a step, at most
     sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained
-    lr_means: float = 1.6e-4  # times the scene extent; falls exponentially to
+    lr_means: float = 1.6e-4  # times the scene extent (`learning_rates`: or more); falls exponentially to
     lr_means_final: float = 1.6e-6  # this at the end of the run
     lr_scales: float = 5e-3
     lr_quats: float = 1e-3

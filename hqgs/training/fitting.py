@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from hqgs.base.ranks import ALONE, Ranks
+from hqgs.diagnosis.scene import Inspector
+from hqgs.scene.scene import Scene
+from hqgs.training.config import TrainConfig
 from hqgs.training.settings import with_iterations
 from hqgs.training.trainer import Trainer
 
@@ -13,6 +17,20 @@ WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start th
 GROWTH, GROWTH_DENSE = 2.0, 1.0
 DENSE = 2  # times the scene's own points
 FEWEST, MOST = 50, 30_000  # iterations
+
+
+def fitted(
+    scene: Scene, config: TrainConfig, inspector: Inspector | None = None, ranks: Ranks = ALONE
+) -> TrainConfig:
+    """The configuration with the iterations that fit into its seconds, if it has any, and pay."""
+    if config.seconds is None or config.turn is not None:
+        return config
+    trainer, most = Trainer(scene, config, inspector, ranks), None
+    if trainer.method.as_photographed and trainer.config.iterations < config.iterations:
+        most = trainer.config.iterations
+    planned = ranks.tell(fitting(trainer, config.seconds, most))[0]
+    # Where more do not pay, the clock is not to lengthen the run.
+    return replace(with_iterations(config, planned), turn=(planned - 1, planned) if planned == most else None)
 
 
 def fitting(trainer: Trainer, seconds: float, most: int | None = None) -> int:

@@ -196,21 +196,29 @@ class Schedule:
         return iteration <= self.coarse_end
 
 
-def learning_rates(config: TrainConfig, extent: float, part: float) -> dict[str, float]:
+def learning_rates(
+    config: TrainConfig, extent: float, part: float, reach: float | None = None
+) -> dict[str, float]:
     """Of each tensor of the Gaussians. The means' is in units of the extent and falls exponentially.
 
     Those of 3DGS suit its 30,000 iterations: in a tenth of them a Gaussian cannot become as large, as thin or
     as bright as it should, and stands still before it is where it should be. `brisk` lets sizes, rotations
     and colours of a run of n iterations change (30,000 / n)^0.3 times as fast, twice at most, and the means'
     rate end (30,000 / n)^1.5 times as high, at a third of the first at most.
+
+    With `reach`, that of the scene, the means of such a run move (30,000 / n)^0.6 times as fast, at most
+    reach / extent times: where cameras stand close together before a distant scene, the extent tells how far
+    they are apart, and not how large the scene is that the means move in.
     """
     names = ("scales", "quats", "sh0", "shN")
-    faster, last = 1.0, config.lr_means_final
+    faster, farther, last = 1.0, 1.0, config.lr_means_final
     if config.brisk:
         shorter = max(1.0, TrainConfig.iterations / config.iterations)
         faster = min(shorter**0.3, FASTER)
         last = max(last, min(last * shorter**1.5, LAST_OF_FIRST * config.lr_means))
-    means = extent * config.lr_means ** (1 - part) * last**part
+        if reach is not None:
+            farther = max(1.0, min(shorter**0.6, reach / extent))
+    means = farther * extent * config.lr_means ** (1 - part) * last**part
     others = {name: faster * getattr(config, f"lr_{name}") for name in names}
     return {"means": means, "opacities": config.lr_opacities, **others}
 

@@ -26,7 +26,7 @@ class Preset:
 
 PRESETS = {
     "quick": Preset(1_000, 480, "a first look"),
-    "standard": Preset(None, 1600, "until the scene has stopped improving"),
+    "standard": Preset(None, 1600, "as long as it pays"),
     "best": Preset(30_000, None, "photos as they are, the whole schedule of 3DGS"),
 }
 
