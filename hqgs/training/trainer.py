@@ -80,14 +80,14 @@ class Trainer:
         self.config: TrainConfig = start.config
         self.method_left_out: list[LeftOut] = start.left_out
         self.first_points: int = len(start.gaussians)
-        plain = self.method.as_photographed
-        self._reach: float | None = scene.reach if plain else None
+        plain, reach = self.method.as_photographed, scene.reach
+        self._reach: float | None = reach if plain else None
         self.schedule: Schedule = Schedule.of(self.config, scene.train, plain, len(guests))
         self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
         self.state: TrainState = TrainState(
             start.gaussians,
             self._optimizer(start.gaussians),
-            Densifier(self.config.densify, self.extent, scene.reach, self.config.seed, self.first_points),
+            Densifier(self.config.densify, self.extent, reach, self.config.seed, self.first_points),
             self.schedule.start(),
         )
 
