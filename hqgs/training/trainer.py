@@ -81,7 +81,7 @@ class Trainer:
         self.method_left_out: list[LeftOut] = start.left_out
         self.first_points: int = len(start.gaussians)
         plain, reach = self.method.as_photographed, scene.reach
-        self._reach: float | None = reach if plain else None
+        self._reach: float = reach
         self.schedule: Schedule = Schedule.of(self.config, scene.train, plain, len(guests))
         self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
         self.state: TrainState = TrainState(
