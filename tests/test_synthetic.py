@@ -347,7 +347,7 @@ def test_scene_without_cache_takes_points_from_training_photos(monkeypatch: pyte
     made = embedded_scene(width=16, height=12, num_views=17)
     assert asked == [v.name for v in made.train]
     assert [v.name for v in made.test] == ["view_00.png", "view_08.png", "view_16.png"]
-    assert made.notes == ["limit 60"]
+    assert made.notes == ["limit 300"]
 
 
 def test_surfaces_are_described_well() -> None:

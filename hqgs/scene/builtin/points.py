@@ -19,6 +19,7 @@ from hqgs.scene.scene import View
 from hqgs.scene.sfm.run import PROGRAM, surroundings
 
 MIN_POINTS = 200  # fewer are no basis for a reconstruction
+TIME_LIMIT = 300.0  # s: for a COLMAP that hangs; a slow or busy machine is to get the same points as others
 
 
 class SparsePoints(NamedTuple):
@@ -31,7 +32,7 @@ class SparsePoints(NamedTuple):
     note: str  # for the report
 
 
-def sfm_points(views: Sequence[View], time_limit: float = 60.0, seed: int = 0) -> SparsePoints:
+def sfm_points(views: Sequence[View], time_limit: float = TIME_LIMIT, seed: int = 0) -> SparsePoints:
     """Points of the views by COLMAP.
 
     COLMAP (SIFT, exhaustive matching, triangulation with the known cameras) runs in its own process and is

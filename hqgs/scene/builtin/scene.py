@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
-from hqgs.scene.builtin.points import SparsePoints, sfm_points
+from hqgs.scene.builtin.points import TIME_LIMIT, SparsePoints, sfm_points
 from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.scene import Camera, Scene, View
 
@@ -26,7 +26,7 @@ def embedded_scene(
     width: int = WIDTH,
     height: int = HEIGHT,
     num_views: int = 24,
-    time_limit: float = 60.0,
+    time_limit: float = TIME_LIMIT,
     threads: int | None = None,
     gloss: float | None = None,
 ) -> Scene:

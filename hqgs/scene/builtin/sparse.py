@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hqgs.scene.builtin.points import SparsePoints
+from hqgs.scene.builtin.points import TIME_LIMIT, SparsePoints
 from hqgs.scene.builtin.scene import FOCAL, HEIGHT, WIDTH, assemble, look_at
 from hqgs.scene.scene import Camera, Scene
 
@@ -22,7 +22,7 @@ def sparse_room(
     height: int = HEIGHT,
     num_views: int = 25,
     num_points: int = 3000,
-    time_limit: float = 120.0,
+    time_limit: float = TIME_LIMIT,
     threads: int | None = None,
 ) -> Scene:
     """The room by `num_views` cameras on an arc of 130 degrees around its table; every 8th is a test view.

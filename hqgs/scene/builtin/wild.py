@@ -15,6 +15,7 @@ from hqgs.photos.formula import Kind
 from hqgs.photos.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.exposure import Exposure, rolling, shaken, still, through_lens
+from hqgs.scene.builtin.points import TIME_LIMIT
 from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene
 from hqgs.scene.builtin.shading import render_exposure, sample_pattern
 from hqgs.scene.scene import Camera, Scene
@@ -75,7 +76,7 @@ def wild_room(
     width: int = WIDTH,
     height: int = HEIGHT,
     num_views: int = 24,
-    time_limit: float = 60.0,
+    time_limit: float = TIME_LIMIT,
     threads: int | None = None,
 ) -> WildRoom:
     """`embedded_scene` with training photos that a camera has truly taken so, by ray casting.
