@@ -80,14 +80,13 @@ class Trainer:
         self.config: TrainConfig = start.config
         self.method_left_out: list[LeftOut] = start.left_out
         self.first_points: int = len(start.gaussians)
-        plain, reach = self.method.as_photographed, scene.reach
-        self._reach: float = reach
+        plain = self.method.as_photographed
         self.schedule: Schedule = Schedule.of(self.config, scene.train, plain, len(guests))
         self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
         self.state: TrainState = TrainState(
             start.gaussians,
             self._optimizer(start.gaussians),
-            Densifier(self.config.densify, self.extent, reach, self.config.seed, self.first_points),
+            Densifier(self.config.densify, self.extent, scene.reach, self.config.seed, self.first_points),
             self.schedule.start(),
         )
 
@@ -121,8 +120,7 @@ class Trainer:
         return self.state.decisions.length
 
     def step(self, coarse: bool | None = None) -> Step:
-        """Train on the next views: `batch` of the configuration, and fewer where something is due between
-        two. `coarse`: at the smaller size or not; None: as the schedule says."""
+        """Train on the next views (`Schedule.batch`). `coarse`: at the smaller size; None: as planned."""
         started = time.perf_counter()
         state, method = self.state, self.method
         plans = self.schedule.batch(self.iteration + 1, state.decisions)
@@ -227,7 +225,8 @@ class Trainer:
     def _set_rates(self, plan: Plan) -> None:
         """As far as the method leaves them; harmonics above the degree in use never had a gradient."""
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
-        for name, rate in learning_rates(self.config, self.extent, plan.part, self._reach).items():
+        rates = learning_rates(self.config, self.extent, plan.part, self.state.densifier.reach)
+        for name, rate in rates.items():
             groups[name]["lr"] = self.method.rate_left * rate
         for name, rate in self.method.rates(plan.part).items():
             groups[name]["lr"] = rate
