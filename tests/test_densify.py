@@ -8,12 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene.cells import Cut
+from hqgs.scene.scene import Part
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.config import DensifyConfig
 from hqgs.training.densify import Densifier, Growth, quats_to_matrices
+from hqgs.training.free_space import NEXT, FreeSpace
+from hqgs.training.trainer import Trainer
 
 SIZE = 100  # pixels: a gradient of g per pixel counts as 50 g
 CONFIG = DensifyConfig(start=0, stop=1_000, every=10, reset_every=35)
@@ -294,3 +299,42 @@ def test_what_is_fixed_in_number_does_not_grow() -> None:
     growth = growing.update(10, gaussians, optimizer, fixed=fixed)
     assert growth.parents is not None
     assert sorted(growth.parents.tolist()) == [0, 1, 2, 2, 3, 3]
+
+
+def test_nothing_may_hang_right_before_a_camera() -> None:
+    scene = tiny_scene()  # the points are at depth 3, the cameras at 0, their centres 0.3 from the axis
+    free = FreeSpace(scene, 0.5)
+    center = torch.from_numpy(scene.train[0].camera.center).float()
+    depths = torch.tensor([-1.0, 0.1, 1.4, 2.0, 3.0])
+    means = center + depths[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    assert free.holds(means).tolist() == [True, True, True, False, False]
+
+    g, optimizer = make([KEPT] * 5)
+    with torch.no_grad():
+        g.means[:] = means
+    d = Densifier(CONFIG, 1.0, 1.0, 0, len(g), free)
+    growth = d.update(30, g, optimizer)
+    assert (growth.pruned, identity(g)) == (3, [3, 4])
+    assert growth.parents is not None
+    assert growth.parents.tolist() == [3, 4]
+
+
+def test_where_points_are_few_or_of_a_part_space_is_not_free() -> None:
+    scene = tiny_scene()
+    near = torch.from_numpy(scene.train[0].camera.center).float()[None]
+    few = replace(scene, points=scene.points[: NEXT - 1], point_colors=scene.point_colors[: NEXT - 1])
+    assert not FreeSpace(few, 0.9).holds(near).any()
+    part = Part("tiny", "", 0, 2, Cut((1.0, 0.0, 0.0), 0.25, 0, 1), [])
+    assert not FreeSpace(replace(scene, part=part), 0.9).holds(near).any()
+
+
+def test_methods_of_our_own_keep_the_space_free_unless_asked_not_to() -> None:
+    def clearance(method: str, asked: float | None = None) -> float | None:
+        config = tiny_config(method=method)
+        config = replace(config, densify=replace(config.densify, clearance=asked))
+        return Trainer(tiny_scene(), config).state.densifier.config.clearance
+
+    assert [clearance(method) for method in ("auto", "hqgs", "3dgs", "srgs")] == [0.7, 0.7, None, None]
+    assert (clearance("auto", 0.0), clearance("3dgs", 0.5)) == (0.0, 0.5)
+    with pytest.raises(ValueError, match=r"clearance is 1\.0, wanted at least 0 and below 1"):
+        DensifyConfig(clearance=1.0)

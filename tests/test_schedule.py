@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 import hqgs.training.schedule as module
-from hqgs.scene.scene import View
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import render_view
+from hqgs.scene.scene import Camera, View
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
-from hqgs.training.schedule import FINEST, Decisions, Plan, Schedule, learning_rates
+from hqgs.training.schedule import FINEST, Decisions, Plan, Schedule, learning_rates, low_pass
 from hqgs.training.trainer import Trainer
 
 DENSIFY = DensifyConfig(start=20, stop=61, every=10, reset_every=25)
@@ -191,3 +194,28 @@ def test_the_example_resumes_with_the_same_bits_at_any_number_of_threads(
     while second.iteration < 30:
         second.step()
     assert_same(whole_state(second, tmp_path / "a"), whole_state(whole, tmp_path / "b"))
+
+
+def test_a_small_render_is_the_full_one_made_smaller() -> None:
+    """One Gaussian of 0.6 to 1.5 px, at places within a pixel: with the filter of its own size it is not."""
+    K = np.array([[64.0, 0.0, 32.0], [0.0, 64.0, 32.0], [0.0, 0.0, 1.0]])
+    half = np.diag([0.5, 0.5, 1.0]) @ K
+    errors = {True: 0.0, False: 0.0}
+    for k, sigma in enumerate((0.6, 0.8, 1.1, 1.5)):
+        gaussian = Gaussians(
+            means=torch.tensor([[0.013 * k, 0.007 * k, 1.0]]),
+            scales=torch.full((1, 3), math.log(sigma / 64)),
+            quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+            opacities=torch.tensor([2.0]),
+            sh0=torch.ones(1, 1, 3),
+            shN=torch.zeros(1, 0, 3),
+        )
+
+        def render(size: int, K: np.ndarray, eps2d: float, of: Gaussians = gaussian) -> torch.Tensor:
+            return render_view(of, Camera(size, size, K, np.eye(4)), 0, (0.0, 0.0, 0.0), eps2d)[0]
+
+        full = render(64, K, low_pass(False)).reshape(32, 2, 32, 2, 3).mean(dim=(1, 3))
+        for coarse in errors:
+            errors[coarse] += float((render(32, half, low_pass(coarse)) - full).square().sum())
+    assert low_pass(False) == 0.3
+    assert errors[True] < errors[False] / 4

@@ -137,9 +137,9 @@ def test_the_sh_degree_rises_by_one_per_interval(monkeypatch: pytest.MonkeyPatch
     degrees = []
     real = looks.render_view
 
-    def spy(gaussians: Gaussians, camera: Any, sh_degree: int, background: Any) -> Any:
+    def spy(gaussians: Gaussians, camera: Any, sh_degree: int, *more: Any) -> Any:
         degrees.append(sh_degree)
-        return real(gaussians, camera, sh_degree, background)
+        return real(gaussians, camera, sh_degree, *more)
 
     monkeypatch.setattr(looks, "render_view", spy)
     trainer = Trainer(tiny_scene(), tiny_config(sh_interval=4, sh_degree=2, densify=ONLY_TRAIN))

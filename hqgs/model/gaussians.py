@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from hqgs._rust import EPS2D
 from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE, SH_C0
@@ -140,6 +141,7 @@ class Gaussians:
         sh_degree: int | None = None,
         background: Sequence[float] | None = None,
         render_mode: str = "RGB",
+        eps2d: float = EPS2D,
     ) -> tuple[Tensor, Tensor, RasterizationMeta]:
         """`hqgs.rasterization` of these Gaussians for one camera.
 
@@ -147,7 +149,7 @@ class Gaussians:
             camera: size and pinhole intrinsics in pixels, world to camera.
             colors: [N, D] channels, or with `sh_degree` harmonics, [N, K, 3]; None: the Gaussians' own
                 harmonics, for which `sh_degree` must be given.
-            sh_degree, render_mode: as `hqgs.rasterization` takes them.
+            sh_degree, render_mode, eps2d: as `hqgs.rasterization` takes them.
             background: D numbers behind everything; None: 0.
 
         Returns:
@@ -169,6 +171,7 @@ class Gaussians:
             sh_degree=sh_degree,
             backgrounds=None if background is None else torch.tensor([[*background]], dtype=self.means.dtype),
             render_mode=render_mode,
+            eps2d=eps2d,
         )
 
     def save(self, path: str | Path, format: str | None = None) -> int:

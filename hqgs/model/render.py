@@ -21,10 +21,17 @@ OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D, False, False)
 
 
 def render_view(
-    gaussians: Gaussians, camera: Camera, sh_degree: int, background: Sequence[float]
+    gaussians: Gaussians,
+    camera: Camera,
+    sh_degree: int,
+    background: Sequence[float],
+    eps2d: float = _rust.EPS2D,
 ) -> tuple[Tensor, RasterizationMeta]:
-    """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data."""
-    images, _, meta = gaussians.rasterize(camera, sh_degree=sh_degree, background=background)
+    """Rasterize for one camera: the image [H, W, 3] (not clamped) and the rasterizer's meta data.
+
+    `eps2d`: the low-pass filter, px^2.
+    """
+    images, _, meta = gaussians.rasterize(camera, sh_degree=sh_degree, background=background, eps2d=eps2d)
     return images.squeeze(0), meta  # the gradient of images[0] would be another image
 
 

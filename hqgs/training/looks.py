@@ -21,7 +21,7 @@ from hqgs.scene.scene import Camera, View
 from hqgs.training.adam import Adam
 from hqgs.training.guard import Fault, bad_values, gradient_fault
 from hqgs.training.methods.base import Method, Target
-from hqgs.training.schedule import Plan, smaller
+from hqgs.training.schedule import Plan, low_pass, smaller
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ class Looks:
         """The look that a plan asks for, at the Gaussians to rasterize; its loss can be differentiated."""
         method, (view, target) = self.method, self.target(plan.view, plan.coarse)
         shot = method.shot(view, target)
-        render, meta = render_view(gaussians, shot.camera, plan.degree, self.background)
+        eps2d = low_pass(plan.coarse)
+        render, meta = render_view(gaussians, shot.camera, plan.degree, self.background, eps2d)
         meta["means2d"].retain_grad()  # [1, N, 2]
         photo = shot.develop(render)
         image = method.compare(photo, target)
@@ -95,7 +96,7 @@ class Looks:
         def error(number: int) -> float:
             view, target = self.target(number, coarse)
             shot = self.method.shot(view, target)
-            render, _ = render_view(gaussians, shot.camera, degree, self.background)
+            render, _ = render_view(gaussians, shot.camera, degree, self.background, low_pass(coarse))
             image = self.method.compare(shot.develop(render), target)
             difference = (image - floats(target.photo)).square()
             if target.mask is not None:

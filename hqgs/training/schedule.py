@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from hqgs._rust import EPS2D
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
@@ -239,6 +240,19 @@ def smaller(view: View) -> View:
     """The view with photo and camera at 1 / COARSE_FACTOR of the size."""
     camera = view.camera
     return resized(view, round(camera.width / COARSE_FACTOR), round(camera.height / COARSE_FACTOR))
+
+
+def low_pass(coarse: bool) -> float:
+    """The filter of the render that a photo is compared with, px^2 of that photo.
+
+    The filter stays that of the full size, F = COARSE_FACTOR, or else Gaussians would come out thinner than
+    the full size wants them. A pixel of the smaller photo is the mean of F x F of the photo's: its variance,
+    1/12 of its own px^2, is F^2 times that of one of them, and the difference is added.
+    """
+    if not coarse:
+        return EPS2D
+    own = 1 / COARSE_FACTOR**2  # a pixel of the full size, px^2 of the smaller one
+    return own * EPS2D + (1 - own) / 12
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:

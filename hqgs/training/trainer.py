@@ -86,7 +86,7 @@ class Trainer:
         self.state: TrainState = TrainState(
             start.gaussians,
             self._optimizer(start.gaussians),
-            Densifier(self.config.densify, self.extent, scene.reach, self.config.seed, self.first_points),
+            Densifier.of(scene, self.config, self.first_points),
             self.schedule.start(),
         )
 

@@ -38,6 +38,7 @@ STEEPER = 2.0  # on average the square is half as steep there as L1, and growth 
 # enough; of the latter also so many for each photo. More would learn what no other photo shows.
 ENOUGH, LOOKS = 7_000, 150
 GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
+CLEARANCE = 0.7  # of the distance from a camera to the points next to it: free space
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -58,6 +59,7 @@ class HQGS(Plain):
     - None of them: the loss of 3DGS, and the start below.
     - A film's codec (video): 3DGS's loss and rates.
     - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG or video alone.
+    - Nothing may hang right before a camera (`FreeSpace`).
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
@@ -122,7 +124,10 @@ class HQGS(Plain):
         # What a codec leaves open is learned sooner at higher rates, and nothing holds it back.
         coded = self.formation.kinds in ({"jpeg"}, {"video"})
         brisk = not coded if config.brisk is None else config.brisk
-        config = replace(config, hqgs=known, brisk=brisk)
+        densify = config.densify
+        if densify.clearance is None:
+            densify = replace(densify, clearance=CLEARANCE)
+        config = replace(config, hqgs=known, brisk=brisk, densify=densify)
         if self._cameras is not None:
             config, why = _without_held_photos(config)
             left_out += why
