@@ -68,7 +68,12 @@ class Deblur(ThreeDGS):
         return torch.linalg.matrix_exp(twists) @ torch.from_numpy(camera.viewmat)
 
     def render(
-        self, gaussians: Gaussians, camera: Camera, sh_degree: int, background: Sequence[float]
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        sh_degree: int,
+        background: Sequence[float],
+        eps2d: float,
     ) -> tuple[Tensor, RasterizationMeta]:
         """In the place of `hqgs.model.render.render_view`, for the view that `shot` was last asked for."""
         images, _, meta = rasterization(
@@ -82,6 +87,7 @@ class Deblur(ThreeDGS):
             camera.width,
             camera.height,
             sh_degree=sh_degree,
+            eps2d=eps2d,
             backgrounds=torch.tensor([[*background]] * VIRTUAL, dtype=gaussians.means.dtype),
         )
         # Growth goes by how the loss changes when a Gaussian moves in all renders alike.
