@@ -308,6 +308,8 @@ def test_nothing_may_hang_right_before_a_camera() -> None:
     depths = torch.tensor([-1.0, 0.1, 1.4, 2.0, 3.0])
     means = center + depths[:, None] * torch.tensor([0.0, 0.0, 1.0])
     assert free.holds(means).tolist() == [True, True, True, False, False]
+    broken = torch.cat([means[:1], torch.full((1, 3), math.nan), torch.full((1, 3), math.inf)])
+    assert free.holds(broken).tolist() == [True, False, False]
 
     g, optimizer = make([KEPT] * 5)
     with torch.no_grad():

@@ -33,8 +33,14 @@ class FreeSpace:
             self._radii = clearance * distances[:, -1]
 
     def holds(self, means: Tensor) -> Tensor:
-        """Which of the means [N, 3] lie in the ball of the camera that is nearest, bool [N]."""
-        if not self._radii.any():
-            return torch.zeros(len(means), dtype=torch.bool)
-        distances, nearest = self._cameras.query(means.detach().numpy().astype(np.float64))
-        return torch.from_numpy(distances < self._radii[nearest])
+        """Which of the means [N, 3] lie in the ball of the camera that is nearest, bool [N].
+
+        Those that are not finite do not: others have to find them.
+        """
+        held = torch.zeros(len(means), dtype=torch.bool)
+        places = means.detach().numpy().astype(np.float64)
+        finite = np.isfinite(places).all(axis=1)
+        if self._radii.any() and finite.any():
+            distances, nearest = self._cameras.query(places[finite])
+            held[torch.from_numpy(finite)] = torch.from_numpy(distances < self._radii[nearest])
+        return held
