@@ -307,8 +307,8 @@ def test_nothing_may_hang_right_before_a_camera() -> None:
     center = torch.from_numpy(scene.train[0].camera.center).float()
     depths = torch.tensor([-1.0, 0.1, 1.4, 2.0, 3.0])
     means = center + depths[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    assert free.holds(means).tolist() == [True, True, True, False, False]
-    broken = torch.cat([means[:1], torch.full((1, 3), math.nan), torch.full((1, 3), math.inf)])
+    assert free.holds(means).tolist() == [False, True, True, False, False]
+    broken = torch.cat([means[1:2], torch.full((1, 3), math.nan), torch.full((1, 3), math.inf)])
     assert free.holds(broken).tolist() == [True, False, False]
 
     g, optimizer = make([KEPT] * 5)
@@ -316,9 +316,9 @@ def test_nothing_may_hang_right_before_a_camera() -> None:
         g.means[:] = means
     d = Densifier(CONFIG, 1.0, 1.0, 0, len(g), free)
     growth = d.update(30, g, optimizer)
-    assert (growth.pruned, identity(g)) == (3, [3, 4])
+    assert (growth.pruned, identity(g)) == (2, [0, 3, 4])
     assert growth.parents is not None
-    assert growth.parents.tolist() == [3, 4]
+    assert growth.parents.tolist() == [0, 3, 4]
 
 
 def test_where_points_are_few_or_of_a_part_space_is_not_free() -> None:
