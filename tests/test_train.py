@@ -337,7 +337,7 @@ def test_rates_are_those_that_the_method_leaves() -> None:
         trainer._set_rates(trainer.schedule.plan(k, trainer.state.decisions))
         rates = {group["name"]: group["lr"] for group in trainer.state.optimizer.param_groups}
         means = config.lr_means * (config.lr_means_final / config.lr_means) ** (k / 10)
-        assert rates.pop("means") == pytest.approx(left * trainer.extent * means)
+        assert rates.pop("means") == pytest.approx(left * trainer.scene.extent * means)
         assert set(rates) == {"quats", "scales", "opacities", "sh0", "shN"}
         for name, rate in rates.items():
             assert rate == pytest.approx(left * getattr(config, f"lr_{name}")), name

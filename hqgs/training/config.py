@@ -71,8 +71,8 @@ class DensifyConfig:
     percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
     prune_opacity: float = 0.005  # more transparent Gaussians are removed
     prune_scale: float = 0.1  # of the scene's reach: larger Gaussians are removed, after the first reset
-    # Of the distance from a camera to the points next to it: Gaussians nearer than that are removed
-    # (`FreeSpace`). 0: none; None: as the method has it.
+    # Of the distance from a camera to the points next to it: Gaussians nearer than that, before the camera,
+    # are removed (`FreeSpace`). 0: none; None: as the method has it.
     clearance: float | None = None
     reset_every: int = 3_000  # iterations between opacity resets
     reset_opacity: float = 0.01  # opacities are cut to this

@@ -68,7 +68,6 @@ class Trainer:
         if "photos" in config.leave_out:
             scene, self.photos_left_out = choose_photos(scene, inspector)
         self.scene = scene
-        self.extent: float = scene.extent
         self.method: Method[Any] = make_method(scene, config, inspector)
         self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
         guests = scene.guests if fits_guests(self.method) else []
@@ -225,7 +224,8 @@ class Trainer:
     def _set_rates(self, plan: Plan) -> None:
         """As far as the method leaves them; harmonics above the degree in use never had a gradient."""
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
-        rates = learning_rates(self.config, self.extent, plan.part, self.state.densifier.reach)
+        extent, reach = self.state.densifier.extent, self.state.densifier.reach
+        rates = learning_rates(self.config, extent, plan.part, reach)
         for name, rate in rates.items():
             groups[name]["lr"] = self.method.rate_left * rate
         for name, rate in self.method.rates(plan.part).items():
