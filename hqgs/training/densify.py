@@ -162,7 +162,7 @@ class Densifier:
             if iteration > self.config.reset_every:
                 bad |= _largest_scale(gaussians) > self.config.prune_scale * self.reach
             if self.free is not None:
-                bad |= self.free.holds(gaussians.means)
+                bad |= self.free.wrongly_held(gaussians)
         pruned = int(bad.sum())
         if not pruned:
             return growth
