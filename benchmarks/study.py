@@ -144,11 +144,8 @@ def key_of(cell: Cell, fingerprint: dict[str, str]) -> str:
     if not config["leave_out"]:
         del config["leave_out"]  # runs from before there was such a choice are the same
     paper = row.method == "hqgs" and cell.config.hqgs.guidance == PAPER
-    if paper or row.method in ("3dgs", "srgs"):
-        # So are those of methods without higher rates, and whose Gaussians may be anywhere.
-        for part, name in ((config, "brisk"), (config["densify"], "clearance")):
-            if part[name] is None:
-                del part[name]
+    if config["brisk"] is None and (paper or row.method in ("3dgs", "srgs")):
+        del config["brisk"]  # so are those of methods without higher rates
     if paper:
         del config["hqgs"]["first_points"]  # and the paper's, which has no use for it
     facts = {"format": FORMAT, "version": hqgs.__version__, "config": config, "degradation": cell.degradation}

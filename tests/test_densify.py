@@ -8,18 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
 
-from hqgs.model.constants import SH_C0
 from hqgs.model.gaussians import Gaussians
-from hqgs.scene.cells import Cut
-from hqgs.scene.scene import Part
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.config import DensifyConfig
 from hqgs.training.densify import Densifier, Growth, quats_to_matrices
-from hqgs.training.free_space import ALIKE, NEXT, SHOWING, FreeSpace
-from hqgs.training.trainer import Trainer
 
 SIZE = 100  # pixels: a gradient of g per pixel counts as 50 g
 CONFIG = DensifyConfig(start=0, stop=1_000, every=10, reset_every=35)
@@ -49,14 +43,6 @@ def make(scales: list[float], opacity: float = 0.5) -> tuple[Gaussians, Adam]:
         with torch.no_grad():
             for key in ("exp_avg", "exp_avg_sq"):
                 optimizer.state[tensor][key].copy_(ramp.expand(tensor.shape))
-    return gaussians, optimizer
-
-
-def placed(means: Tensor) -> tuple[Gaussians, Adam]:
-    """Those of `make`, at these means [N, 3]."""
-    gaussians, optimizer = make([KEPT] * len(means))
-    with torch.no_grad():
-        gaussians.means[:] = means
     return gaussians, optimizer
 
 
@@ -308,65 +294,3 @@ def test_what_is_fixed_in_number_does_not_grow() -> None:
     growth = growing.update(10, gaussians, optimizer, fixed=fixed)
     assert growth.parents is not None
     assert sorted(growth.parents.tolist()) == [0, 1, 2, 2, 3, 3]
-
-
-def test_nothing_may_hang_right_before_a_camera() -> None:
-    scene = tiny_scene()  # the points are at depth 3, the cameras at 0, their centres 0.3 from the axis
-    free = FreeSpace(scene, 0.5)
-    center = torch.from_numpy(scene.train[0].camera.center).float()
-    depths = torch.tensor([-1.0, 0.1, 1.4, 2.0, 3.0])
-    means = center + depths[:, None] * torch.tensor([0.0, 0.0, 1.0])
-    g, optimizer = placed(means)
-    assert free.wrongly_held(g).tolist() == [False, True, True, False, False]
-    broken = torch.cat([means[1:2], torch.full((1, 3), math.nan), torch.full((1, 3), math.inf)])
-    assert free.wrongly_held(placed(broken)[0]).tolist() == [True, False, False]
-
-    d = Densifier(CONFIG, 1.0, 1.0, 0, len(g), free)
-    growth = d.update(30, g, optimizer)
-    assert (growth.pruned, identity(g)) == (2, [0, 3, 4])
-    assert growth.parents is not None
-    assert growth.parents.tolist() == [0, 3, 4]
-
-
-def test_a_bare_thing_before_the_cameras_stays_where_several_photos_show_it() -> None:
-    scene = tiny_scene()
-    center = scene.train[0].camera.center
-    g, _ = placed(torch.from_numpy(center + np.array([0.0, 0.0, 1.4])).float()[None])
-    color = (0.5 + SH_C0 * g.sh0[0, 0]).detach().numpy()
-
-    def held(photos: int, off: float = 0.0, shown: bool = True) -> bool:
-        views = list(scene.train)
-        for k, view in enumerate(views[:photos]):
-            image = np.broadcast_to(color + np.float32(off), view.image.shape).astype(np.float32)
-            views[k] = replace(view, image=image, mask=np.full(image.shape[:2], shown))
-        return bool(FreeSpace(replace(scene, train=views), 0.5).wrongly_held(g)[0])
-
-    assert [held(0), held(SHOWING - 1), held(SHOWING)] == [True, True, False]
-    assert [held(SHOWING, 0.9 * ALIKE), held(SHOWING, 1.1 * ALIKE), held(SHOWING, 0, False)] == [
-        False,
-        True,
-        True,
-    ]
-
-
-def test_where_points_are_few_or_of_a_part_space_is_not_free() -> None:
-    scene = tiny_scene()
-    before = scene.train[0].camera.center + np.array([0.0, 0.0, 0.1])
-    near, _ = placed(torch.from_numpy(before).float()[None])
-    assert FreeSpace(scene, 0.9).wrongly_held(near).all()
-    few = replace(scene, points=scene.points[: NEXT - 1], point_colors=scene.point_colors[: NEXT - 1])
-    assert not FreeSpace(few, 0.9).wrongly_held(near).any()
-    part = Part("tiny", "", 0, 2, Cut((1.0, 0.0, 0.0), 0.25, 0, 1), [])
-    assert not FreeSpace(replace(scene, part=part), 0.9).wrongly_held(near).any()
-
-
-def test_methods_of_our_own_keep_the_space_free_unless_asked_not_to() -> None:
-    def clearance(method: str, asked: float | None = None) -> float | None:
-        config = tiny_config(method=method)
-        config = replace(config, densify=replace(config.densify, clearance=asked))
-        return Trainer(tiny_scene(), config).state.densifier.config.clearance
-
-    assert [clearance(method) for method in ("auto", "hqgs", "3dgs", "srgs")] == [0.7, 0.7, None, None]
-    assert (clearance("auto", 0.0), clearance("3dgs", 0.5)) == (0.0, 0.5)
-    with pytest.raises(ValueError, match=r"clearance is 1\.0, wanted at least 0 and below 1"):
-        DensifyConfig(clearance=1.0)

@@ -71,9 +71,6 @@ class DensifyConfig:
     percent_dense: float = 0.01  # of the scene extent: smaller Gaussians are cloned, larger ones split
     prune_opacity: float = 0.005  # more transparent Gaussians are removed
     prune_scale: float = 0.1  # of the scene's reach: larger Gaussians are removed, after the first reset
-    # Of the distance from a camera to the points next to it: Gaussians nearer than that, before the camera,
-    # are removed (`FreeSpace`). 0: none; None: as the method has it.
-    clearance: float | None = None
     reset_every: int = 3_000  # iterations between opacity resets
     reset_opacity: float = 0.01  # opacities are cut to this
     max_gaussians: int = 1_000_000  # growth stops here, the highest gradients go first; bounds the memory
@@ -85,8 +82,6 @@ class DensifyConfig:
         for name in ("start", "stop", "grad_threshold", "percent_dense", "prune_scale"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
-        if self.clearance is not None and not 0 <= self.clearance < 1:
-            raise ValueError(f"clearance is {self.clearance}, wanted at least 0 and below 1")
         for name in ("prune_opacity", "reset_opacity"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted a value between 0 and 1")

@@ -1,7 +1,5 @@
 """Adaptive density control of 3DGS: grow where the image gradient is high, prune what is transparent or huge.
 
-And, where a run asks for it, what hangs right before a camera (`FreeSpace`).
-
 Kerbl et al. 2023, section 5.2. Every change of the number of Gaussians is a selection of rows, done by
 `select_rows` on the parameters and on the optimizer's state alike.
 """
@@ -17,10 +15,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from hqgs.model.gaussians import Gaussians
-from hqgs.scene.scene import Scene
 from hqgs.training.adam import select_rows
-from hqgs.training.config import DensifyConfig, TrainConfig
-from hqgs.training.free_space import FreeSpace
+from hqgs.training.config import DensifyConfig
 
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN  # a child's scales are its parent's over this
@@ -45,16 +41,9 @@ class Densifier:
     """
 
     def __init__(
-        self,
-        config: DensifyConfig,
-        extent: float,
-        reach: float,
-        seed: int,
-        num_gaussians: int,
-        free: FreeSpace | None = None,
+        self, config: DensifyConfig, extent: float, reach: float, seed: int, num_gaussians: int
     ) -> None:
-        """`extent`, `reach`: the scene's, world units. `num_gaussians`: N at the start. `free`: where no
-        Gaussian may be."""
+        """`extent`, `reach`: the scene's, world units. `num_gaussians`: N at the start."""
         if num_gaussians > config.max_gaussians:
             raise ValueError(
                 f"max_gaussians is {config.max_gaussians}, but the scene starts with {num_gaussians} points"
@@ -63,15 +52,8 @@ class Densifier:
         self.extent = extent
         self.reach = reach
         self.seed = seed
-        self.free = free
         self.grad_sum: Tensor = torch.zeros(num_gaussians)  # of gradient norms, half images
         self.count: Tensor = torch.zeros(num_gaussians)  # views in which the Gaussian was visible
-
-    @classmethod
-    def of(cls, scene: Scene, config: TrainConfig, num_gaussians: int) -> Densifier:
-        """For a run that starts with so many Gaussians."""
-        free = FreeSpace(scene, config.densify.clearance) if config.densify.clearance else None
-        return cls(config.densify, scene.extent, scene.reach, config.seed, num_gaussians, free)
 
     def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
@@ -161,8 +143,6 @@ class Densifier:
             bad = gaussians.activated_opacities() < self.config.prune_opacity
             if iteration > self.config.reset_every:
                 bad |= _largest_scale(gaussians) > self.config.prune_scale * self.reach
-            if self.free is not None:
-                bad |= self.free.wrongly_held(gaussians)
         pruned = int(bad.sum())
         if not pruned:
             return growth

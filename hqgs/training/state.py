@@ -36,8 +36,8 @@ class TrainState:
         """What is wrong where no Gaussian is left."""
         return (
             f"no Gaussians are left at iteration {self.iteration}: all were pruned as transparent, too "
-            f"large (scene's reach {self.densifier.reach:.3g}), too near to a camera or not finite "
-            f"({self.guard.culled}); are the cameras and points in one frame?"
+            f"large (scene's reach {self.densifier.reach:.3g}) or not finite ({self.guard.culled}); are the "
+            "cameras and points in one frame?"
         )
 
     def tensors(self) -> dict[str, Tensor]:

@@ -85,7 +85,7 @@ class Trainer:
         self.state: TrainState = TrainState(
             start.gaussians,
             self._optimizer(start.gaussians),
-            Densifier.of(scene, self.config, self.first_points),
+            Densifier(self.config.densify, scene.extent, scene.reach, self.config.seed, self.first_points),
             self.schedule.start(),
         )
 

@@ -38,7 +38,6 @@ STEEPER = 2.0  # on average the square is half as steep there as L1, and growth 
 # enough; of the latter also so many for each photo. More would learn what no other photo shows.
 ENOUGH, LOOKS = 7_000, 150
 GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
-CLEARANCE = 0.7  # of the distance from a camera to the points next to it: free space
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -59,8 +58,6 @@ class HQGS(Plain):
     - None of them: the loss of 3DGS, and the start below.
     - A film's codec (video): 3DGS's loss and rates.
     - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG or video alone.
-    - Nothing may hang right before a camera (`FreeSpace`), but under noise, blur, JPEG and low resolution,
-      where it gains nothing.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (`with_budget`).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
@@ -135,7 +132,6 @@ class HQGS(Plain):
             wanted = start_points(scene, min(config.start_points, config.densify.max_gaussians))
             points, colors, _ = first_points(scene, wanted, config.seed, self._told)
             gaussians = Gaussians.from_points(points, colors, config.sh_degree)
-            config = _space_free(config)
             if len(points) > len(scene.points):
                 gaussians = as_discs(gaussians)
                 config, why = _growing_later(config)
@@ -255,12 +251,6 @@ def _growing_later(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
     what = f"growth in the first {GROWS_FROM} iterations"
     why = "until sizes and colours are about right, gradients do not tell where something is missing"
     return replace(config, densify=replace(config.densify, start=GROWS_FROM)), [LeftOut(what, why)]
-
-
-def _space_free(config: TrainConfig) -> TrainConfig:
-    """With nothing right before the cameras, unless the configuration tells."""
-    asked = config.densify.clearance
-    return replace(config, densify=replace(config.densify, clearance=CLEARANCE if asked is None else asked))
 
 
 def _coarse_first(config: TrainConfig) -> TrainConfig:
