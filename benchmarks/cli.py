@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hqgs
-from benchmarks import accuracy, endurance, export, features, frugality, parts, time
+from benchmarks import accuracy, endurance, export, features, frugality, time
 from benchmarks.output import Benchmark, command_line, write_results
 from benchmarks.protocol import add_options
 from benchmarks.quality import run as quality
@@ -18,7 +18,7 @@ from benchmarks.stability import run as stability
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.training.trainer import TrainingError
 
-MODULES = (accuracy, endurance, export, features, frugality, parts, quality, speed, stability, time)
+MODULES = (accuracy, endurance, export, features, frugality, quality, speed, stability, time)
 BENCHMARKS: dict[str, Benchmark] = {m.__name__.split(".")[1]: m.BENCHMARK for m in MODULES}
 
 

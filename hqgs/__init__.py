@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from hqgs.scene.paths import camera_path, look_at
     from hqgs.scene.scene import Camera, Scene, View
     from hqgs.scene.source import degrade, load
-    from hqgs.scene.split import split
     from hqgs.show.frames import render_frames
     from hqgs.training.config import TrainConfig
-    from hqgs.training.merge import merge
     from hqgs.training.progress import Progress
     from hqgs.training.trainer import TrainingError
 
@@ -52,13 +50,11 @@ __all__ = [
     "load",
     "load_cameras",
     "look_at",
-    "merge",
     "orbit",
     "picture",
     "rasterization",
     "render_frames",
     "set_num_threads",
-    "split",
     "train",
 ]
 
@@ -82,13 +78,11 @@ _HOMES = {
     "load": "hqgs.scene.source",
     "load_cameras": "hqgs.scene.camera_files",
     "look_at": "hqgs.scene.paths",
-    "merge": "hqgs.training.merge",
     "orbit": "hqgs.model.orbit",
     "picture": "hqgs.photos.pixels",
     "rasterization": "hqgs.model.rasterization",
     "render_frames": "hqgs.show.frames",
     "set_num_threads": "hqgs._rust",
-    "split": "hqgs.scene.split",
     "train": "hqgs.pipeline",
 }
 

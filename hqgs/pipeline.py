@@ -34,7 +34,6 @@ from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
-from hqgs.scene.formats.part_json import keep_part
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
@@ -230,7 +229,6 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     with deferred_interrupt() as interrupted:
         if out is not None:
             save_cameras(out, trainer.scene)
-            keep_part(out, trainer.scene.part)
         while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):
             before = trainer.iteration
             step = trainer.step()

@@ -284,13 +284,3 @@ def test_the_same_seed_gives_the_same_children() -> None:
 def test_bad_settings_are_refused_by_name(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{field} is {value}"):
         DensifyConfig(**{field: value})  # type: ignore[arg-type]
-
-
-def test_what_is_fixed_in_number_does_not_grow() -> None:
-    gaussians, optimizer = make([CLONED, SPLIT, CLONED, SPLIT])
-    growing = densifier(gaussians)
-    growing.note(torch.arange(4), torch.full((4,), 10 * THRESHOLD))
-    fixed = torch.tensor([True, True, False, False])
-    growth = growing.update(10, gaussians, optimizer, fixed=fixed)
-    assert growth.parents is not None
-    assert sorted(growth.parents.tolist()) == [0, 1, 2, 2, 3, 3]

@@ -22,7 +22,6 @@ from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.folder import write_colmap_folder
 from hqgs.scene.source import degrade, load, pictures
-from hqgs.scene.split import split
 
 av = pytest.importorskip("av")
 RATE, EVERY = 30, 10  # frames a second; of ten frames one is sharp
@@ -116,10 +115,8 @@ def test_a_scene_from_a_film_knows_it_at_about_its_size(cards: Scene, tmp_path: 
     noisy = degrade(scene, "noise:5")
     assert {view.film for view in (*smaller.train, *noisy.train)} == {None}
     write_colmap_folder(source, tmp_path / "walk", tmp_path / "work", len(views))
-    made = split(tmp_path / "walk", tmp_path / "parts", 2)
-    for place in (tmp_path / "walk", *(made.folder / part.folder for part in made.parts)):
-        there = load_scene(place)
-        assert all(view.film == details[view.name] for view in (*there.train, *there.test))
+    there = load_scene(tmp_path / "walk")
+    assert all(view.film == details[view.name] for view in (*there.train, *there.test))
     (folder / "frames.json").write_text("{}")
     with pytest.raises(ValueError, match=r"frames\.json is damaged: KeyError\('details'\)"):
         load(source, frames=len(views), cache=tmp_path)

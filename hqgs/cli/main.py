@@ -33,8 +33,6 @@ COMMANDS = {
     "render": Command("hqgs.cli.render", "pictures and films of a trained scene"),
     "view": Command("hqgs.cli.view", "look at a scene in a browser (train --view: while it trains)"),
     "export": Command("hqgs.cli.export", "write a scene file with what the scene needs alone"),
-    "split": Command("hqgs.cli.split", "cut a scene into parts that are trained each for itself"),
-    "merge": Command("hqgs.cli.merge", "put the runs of all parts together as one scene file"),
     "diagnose": Command("hqgs.cli.diagnose", "say what degraded photos"),
     "degrade": Command("hqgs.cli.degrade", "write a scene with degraded training photos"),
     "info": Command("hqgs.cli.info", "say what a run, a scene file or a folder of photos holds"),

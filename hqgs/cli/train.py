@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 EXPERT = "--config."
 # Options that shape the scene.
-LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "around")
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames")
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
@@ -80,8 +80,6 @@ class Train(Photos):
     """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
-    around: Annotated[Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint="")] = None
-    """Of a part that hqgs split made: the run of the coarse scene beside it, which it starts from."""
     degrade: Kind = "none"
     restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="")] = None
     """Send the training photos through this restoration network first."""
@@ -325,7 +323,8 @@ def _asked(options: Train, config: TrainConfig) -> dict[str, Any]:
     if sized or not before:
         asked["longest"] = PRESETS[options.preset].longest if options.downscale is None else None
         before.pop("downscale", None)
-    asked |= {name: str(asked[name]) for name in {"restore", "around"} & asked.keys()}
+    if "restore" in asked:
+        asked["restore"] = str(asked["restore"])
     return before | asked | {"path": options.scene, "seed": config.seed}
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import pad
 
 from hqgs._rust import EPS2D
 from hqgs.base.files import PLY
@@ -217,17 +216,6 @@ class Gaussians:
         )
         made.look = look
         return made
-
-    @classmethod
-    def joined(cls, several: Sequence[Gaussians]) -> Gaussians:
-        """All of them in this order, with zeros where some have fewer harmonics than others."""
-        most = max(some.shN.shape[1] for some in several)
-
-        def tensor(some: Gaussians, name: str) -> Tensor:
-            lacking = most - some.shN.shape[1]
-            return pad(some.shN, (0, 0, 0, lacking)) if name == "shN" else some.named()[name]
-
-        return cls(**{name: torch.cat([tensor(one, name) for one in several]) for name in several[0].named()})
 
     @classmethod
     def from_points(

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs import _rust
-from hqgs.base.threads import one_torch_thread
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import RasterizationMeta
 from hqgs.scene.geometry import resized_camera
@@ -33,19 +32,6 @@ def render_view(
     """
     images, _, meta = gaussians.rasterize(camera, sh_degree=sh_degree, background=background, eps2d=eps2d)
     return images.squeeze(0), meta  # the gradient of images[0] would be another image
-
-
-@torch.no_grad()
-def composited(
-    gaussians: Gaussians, camera: Camera, colors: Tensor, sh_degree: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """What the Gaussians look like with these colours, black behind them: [H, W, C], and alphas [H, W, 1].
-
-    `colors` [N, C], or with `sh_degree` harmonics, as `hqgs.rasterization` takes them. Without a gradient.
-    """
-    with one_torch_thread():
-        image, alpha, _ = gaussians.rasterize(camera, colors, sh_degree=sh_degree)
-    return image[0], alpha[0]
 
 
 @torch.no_grad()

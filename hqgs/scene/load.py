@@ -18,10 +18,9 @@ from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
-from hqgs.scene.formats.part_json import read_part
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.random_points import random_points
-from hqgs.scene.scene import Part, Scene, Tracks, View
+from hqgs.scene.scene import Scene, Tracks, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
 from hqgs.scene.views import load_views
@@ -54,8 +53,8 @@ def load_scene(
     none. A Blender pair of files names its own test views; a marker file `hold=N` stands for test_every = N,
     counted over the photos in the folder. `Scene.notes` says which rule and which files were used.
 
-    A folder that `hqgs degrade` or `hqgs split` wrote names its held-out photos itself. Small photos of the
-    first go into `View.low` at downscale 1, the only one at which they stand for `View.image`.
+    A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
+    at downscale 1, the only one at which they stand for `View.image`.
 
     A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is a
     folder for that reconstruction, which the next call takes from there. `told` hears what takes long. Half
@@ -80,13 +79,11 @@ def load_scene(
     capture = _read(root, downscale, keep_sfm, told, sfm, coarse)
     if longest is not None:
         capture = bounded(capture, longest)
-    degraded, part = read_degraded_folder(root), read_part(root)
+    degraded = read_degraded_folder(root)
     if degraded is not None:
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
     notes = list(capture.notes)
-    if part is not None:
-        notes.insert(0, f"{part}; the photos held out are those of the whole")
-    test_names = held_out_names(root, capture, test_every, notes, part or degraded)
+    test_names = held_out_names(root, capture, test_every, notes, degraded)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
     views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
@@ -108,7 +105,7 @@ def load_scene(
         notes.append(note)
     tracks = _tracks(capture, views)
     return Scene(
-        root.name if part is None else f"{part.scene}, part {part.part + 1}",
+        root.name,
         train,
         test,
         points,
@@ -118,7 +115,6 @@ def load_scene(
         tracks,
         capture.seen,
         capture.sfm,
-        part=part,
     )
 
 
@@ -266,11 +262,11 @@ def _tracks(capture: Capture, views: list[View]) -> Tracks | None:
 
 
 def held_out_names(
-    root: Path, capture: Capture, test_every: int, notes: list[str], named: Part | DegradedFolder | None
+    root: Path, capture: Capture, test_every: int, notes: list[str], degraded: DegradedFolder | None
 ) -> frozenset[str]:
-    """Names of the photos to hold out, those of `named` if given; `notes` hears where the scene decides."""
-    if named is not None:
-        return frozenset(named.held_out)
+    """Names of the photos to hold out: `degraded`'s if given; `notes` hears where the scene decides."""
+    if degraded is not None:
+        return frozenset(degraded.held_out)
     if capture.test_names is not None:
         return capture.test_names
     hold = hold_marker(root)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from hqgs.scene.cells import Cells
 
 
 @dataclass(frozen=True)
@@ -69,9 +66,6 @@ class Scene:
     origin: dict[str, Any] | None = (
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
-    part: Part | None = None  # of a larger scene, which `hqgs split` made; None: it is whole
-    around: Path | None = None  # of a part: the run of the coarse whole, or its file; None: it has none
-    guests: list[View] = field(default_factory=list)  # small photos of other parts, which see into this one
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""
@@ -108,21 +102,6 @@ def extent_of(centers: NDArray[np.float64]) -> float:
     """The extent of a scene whose training cameras are at `centers` [C, 3]."""
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     return 1.1 * radius if radius > 0 else 1.0
-
-
-@dataclass(frozen=True)
-class Part:
-    """A part of a scene: its cell, and what all parts have in common."""
-
-    scene: str  # name of the whole
-    split: str  # the same for all parts of one split, another for every other
-    part: int  # from 0; from 1 in names and for people
-    parts: int
-    cells: Cells  # of all parts, world
-    held_out: list[str]  # of the whole scene; a part has some of them
-
-    def __str__(self) -> str:
-        return f"part {self.part + 1} of {self.parts} of {self.scene}"
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import film_frames
-from hqgs.scene.guests import guests_of
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.restore import restore_scene
 from hqgs.scene.scene import Scene
@@ -39,7 +38,6 @@ def load(
     cache: str | Path | None = None,
     longest: int | None = None,
     frames: int | None = None,
-    around: str | Path | None = None,
     told: OnStage = untold,
 ) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
@@ -63,8 +61,6 @@ def load(
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
         frames: how many of a film; None: two a second, 30 to 90.
-        around: of a part that `hqgs.split` made, the run of the coarse scene beside it, or its scene file:
-            what the part begins with, in its cell and all around (docs/parts.md).
         told: hears what is being done, and how far it is.
 
     Returns:
@@ -87,10 +83,6 @@ def load(
         "longest": longest,
         "frames": frames,
     }
-    if around is not None:
-        if not (around := Path(around).resolve()).exists():
-            raise FileNotFoundError(f"there is no {around}")
-        origin["around"] = str(around)
     degradation = parse_degradation(degrade)
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
@@ -126,10 +118,6 @@ def load(
     if sfm and (scene.source != "photos" or degradation.steps):
         scene = sfm_scene(scene, models, told)
     scene = scene if restore is None else restore_scene(scene, restore)
-    if around is not None and scene.part is None:
-        raise ValueError(f"{path} is no part that hqgs split made: there is nothing around it")
-    if around is not None:
-        scene = replace(scene, around=around, guests=guests_of(scene, around))
     return replace(scene, origin=origin)
 
 

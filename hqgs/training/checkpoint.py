@@ -17,7 +17,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from hqgs.base.files import atomic_path
-from hqgs.model.formats.files import scene_file
 from hqgs.scene.scene import Scene
 
 FORMAT = 4  # raised when a newer reader could not use an older file
@@ -82,7 +81,6 @@ OTHER = {  # what is other where a part of the fingerprint is
     "low": "its photos had other pixels (--degrade, --restore, --downscale)",
     "masks": "its photos had other masks",
     "points": "it began with other points (--sfm)",
-    "around": "it began with another coarse scene (--around)",
 }
 
 
@@ -132,10 +130,7 @@ def scene_fingerprint(scene: Scene) -> dict[str, str]:
 
     views = [*scene.train, *scene.test]
     names = "\n".join([*(v.name for v in scene.train), "", *(v.name for v in scene.test)])
-    around = {}
-    if scene.around is not None:
-        around["around"] = digest([np.fromfile(scene_file(scene.around), np.uint8)])
-    return around | {
+    return {
         "views": hashlib.sha256(names.encode()).hexdigest()[:16],
         "cameras": digest(
             np.round(array, 9).astype(np.float32) + 0.0  # -0 becomes 0

@@ -73,16 +73,12 @@ class Densifier:
         gaussians: Gaussians,
         optimizer: Optimizer,
         finest: Tensor | None = None,
-        fixed: Tensor | None = None,
     ) -> Growth:
         """One round of growth and pruning after this iteration (1, 2, ...).
 
         `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` [N], world units:
-        Gaussians whose largest scale is at most that are too fine to be cloned or split. `fixed` [N]: those
-        that are neither cloned nor split for another reason.
+        Gaussians whose largest scale is at most that are too fine to be cloned or split.
         """
-        if fixed is not None:
-            self.grad_sum[fixed] = 0.0
         growth = self._grow(iteration, gaussians, optimizer, finest)
         growth = self._prune(iteration, gaussians, optimizer, growth)
         self.grad_sum = torch.zeros(len(gaussians))

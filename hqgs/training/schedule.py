@@ -23,7 +23,6 @@ FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standar
 BAND_CHECK = 0.3  # of the run: when the harmonics are tried
 EARLIEST = 2_000  # iterations before which they cannot tell yet
 BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
-GUEST_EVERY = 3  # steps of a part, of which one is on a small photo of another part
 EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
 CHECKS = 500  # iterations from one look at whether the run still improves to the next
 TAIL, TAIL_PART = 50, 1 / 3  # steps after the end of growth that tell what the rest costs; of that rest
@@ -69,12 +68,9 @@ class Schedule:
     items: frozenset[str]  # of `config.leave_out`: what this run may do without
     num_views: int  # for training
     held: tuple[int, ...]  # numbers of those that are held back at first
-    guests: int = 0  # views after those: a part takes one every GUEST_EVERY steps, and nothing grows by it
 
     @classmethod
-    def of(
-        cls, config: TrainConfig, views: Sequence[View], as_photographed: bool, guests: int = 0
-    ) -> Schedule:
+    def of(cls, config: TrainConfig, views: Sequence[View], as_photographed: bool) -> Schedule:
         """`views`: those for training; `as_photographed`: whether the method takes them as they are."""
         items = set(config.leave_out)
         if not as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
@@ -86,7 +82,7 @@ class Schedule:
         count = 0
         if items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
-        return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)), guests)
+        return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)))
 
     def start(self) -> Decisions:
         """Before the first step."""
@@ -96,19 +92,17 @@ class Schedule:
         """What step number `iteration` (1, 2, ...) does."""
         densify, stop = self.config.densify, self.growth_end(decisions)
         before = iteration - 1
-        view = self.view(iteration, decisions)
-        own = view < self.num_views
         smaller_part = self.is_coarse(iteration)
         return Plan(
             iteration=iteration,
             # Not after the step that it is due at: what is looked at or written in between is the scene
             # before its opacities are cut, and a run that ends there keeps it.
             resets=0 < before < stop and before % densify.reset_every == 0,
-            view=view,
-            coarse=smaller_part and own,
+            view=self.view(iteration, decisions),
+            coarse=smaller_part,
             part=self.part(iteration, decisions),
             degree=self.degree(iteration, decisions),
-            observes=iteration < stop and own,
+            observes=iteration < stop,
             grows=densify.start < iteration < stop and iteration % densify.every == 0,
             finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,
         )
@@ -147,15 +141,10 @@ class Schedule:
 
     def view(self, iteration: int, decisions: Decisions) -> int:
         """Each epoch visits all views once, in an order of its own."""
-        views, step = list(range(self.num_views)), iteration - 1
+        views = list(range(self.num_views))
         if self.holds(decisions):
             views = [k for k in views if k not in self.held]
-        if self.guests:
-            if iteration % GUEST_EVERY == 0:
-                views, step = [self.num_views + k for k in range(self.guests)], iteration // GUEST_EVERY - 1
-            else:
-                step -= iteration // GUEST_EVERY
-        epoch, index = divmod(step, len(views))
+        epoch, index = divmod(iteration - 1, len(views))
         order = np.random.default_rng([self.config.seed, epoch]).permutation(len(views))
         return views[order[index]]
 

@@ -34,7 +34,6 @@ from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
 from hqgs.training.state import TrainState
-from hqgs.training.surroundings import fits_guests, fixed_in_number, with_surroundings
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
@@ -70,17 +69,15 @@ class Trainer:
         self.scene = scene
         self.method: Method[Any] = make_method(scene, config, inspector)
         self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
-        guests = scene.guests if fits_guests(self.method) else []
-        self._looks = Looks([*scene.train, *guests], self.method, config.background)
+        self._looks = Looks(scene.train, self.method, config.background)
         with one_torch_thread():
-            own = self._looks.targets[: len(scene.train)]
-            start = with_surroundings(self.method.start(scene, own, config), scene)
+            start = self.method.start(scene, self._looks.targets, config)
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
         self.config: TrainConfig = start.config
         self.method_left_out: list[LeftOut] = start.left_out
         self.first_points: int = len(start.gaussians)
         plain = self.method.as_photographed
-        self.schedule: Schedule = Schedule.of(self.config, scene.train, plain, len(guests))
+        self.schedule: Schedule = Schedule.of(self.config, scene.train, plain)
         self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
         self.state: TrainState = TrainState(
             start.gaussians,
@@ -278,8 +275,7 @@ class Trainer:
         state, finest = self.state, None
         if plan.finest is not None:
             finest = (plan.finest * photo_pixels(state.gaussians.means, self.scene.train)).float()
-        fixed = fixed_in_number(self.scene, state.gaussians)
-        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest, fixed)
+        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest)
         if growth.parents is not None:
             self.method.rows_changed(state, growth.parents)
         return growth

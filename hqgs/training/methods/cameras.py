@@ -83,11 +83,11 @@ class LearnedCameras:
     def __init__(
         self, scene: Scene, shake: bool, focus: bool, log_gains: NDArray[np.float64] | None, seed: int
     ) -> None:
-        """`log_gains` [N, 3] of the training photos and the guests: to start from, and their mean stays.
+        """`log_gains` [N, 3] of the training photos: to start from, and their mean stays.
 
         None: all gains are 1 and stay so.
         """
-        views, self._own = [*scene.train, *scene.guests], len(scene.train)
+        views = scene.train
         self._numbers = {view.name: k for k, view in enumerate(views)}
         self._depths = [median_depth(scene, view) for view in views]
         self._widths = [max(view.camera.width, NARROW) for view in views]
@@ -176,7 +176,7 @@ class LearnedCameras:
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
             )
-            for name, k in [*self._numbers.items()][: self._own]
+            for name, k in self._numbers.items()
         ]
 
     def param_groups(self) -> list[dict[str, Any]]:

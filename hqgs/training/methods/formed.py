@@ -67,13 +67,6 @@ class Formation:
         self._operators: dict[tuple[int, int, float | None], Operator | None] = {}
         self._cells: dict[tuple[int, int], JpegCells] = {}
 
-    def exposed(self) -> Formation:
-        """The same, each photo exposed in its own way too."""
-        if "exposure" in self.kinds:
-            return self
-        text = f"{self.degradation}+exposure" if self.kinds else "exposure"
-        return Formation(parse_formation(text), self._directions, self._noises)
-
     def target(self, view: View) -> FormedTarget:
         """Of a training view. ValueError, which names it, where the photo does not fit the formation."""
         size, direction = (view.camera.height, view.camera.width), self._directions.get(view.name)

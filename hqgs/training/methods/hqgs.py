@@ -27,7 +27,6 @@ from hqgs.training.methods.cameras import Found, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
-from hqgs.training.methods.shared_gains import beside, known_gains
 from hqgs.training.settings import with_iterations
 from hqgs.training.state import TrainState
 
@@ -77,10 +76,9 @@ class HQGS(Plain):
         self.config = config
         inspector = inspector or Inspector()
         self._told = inspector.told
-        found = find_formation(scene, config.formation, inspector)
-        known = known_gains(scene)
-        self.formation: Formation = found[0].exposed() if known else found[0]
-        self._left_out: list[LeftOut] = found[1]
+        self.formation: Formation
+        self._left_out: list[LeftOut]
+        self.formation, self._left_out = find_formation(scene, config.formation, inspector)
         kinds = self.formation.kinds
         self.as_photographed: bool = not kinds
         self.noise: float = self.formation.noise
@@ -92,9 +90,6 @@ class HQGS(Plain):
             if "exposure" in kinds:
                 gains = inspector.log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
-                gains = beside(gains, [known.get(view.name) for view in scene.train])
-                guests = [known.get(view.name, np.zeros(3)) for view in scene.guests]
-                gains = np.concatenate([gains, np.reshape(guests, (-1, 3))])
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
         holds = self.noise and self.formation.white and "jpeg" not in kinds
         self._plateau = Plateau(len(scene.train)) if holds else None
