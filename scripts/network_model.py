@@ -1,6 +1,6 @@
 """What a step of several ranks takes over a network, on paper.
 
-    python scripts/network_model.py     # prints the tables of docs/network.md
+    python scripts/network_model.py     # prints how many times as fast
 
 Of one view a rank computes for a + b M seconds of one core, where M Gaussians are visible: the line through
 two sizes of `docs/results/speed.json`. To each of the P - 1 others it sends 60 M bytes, 12 M of them first.

@@ -200,7 +200,7 @@ load_scene(Path({str(folder)!r}), keep_sfm=Path({str(keep)!r}), told=told)
     assert (left / "colmap.db").is_file()
     scene = load_scene(folder, keep_sfm=keep)
     assert [path.name for path in keep.iterdir()] == [left.name[1:]]
-    # One run that nothing stopped had other last bits, in some 300 (docs/poses.md): never twice in a row.
+    # One run that nothing stopped had other last bits, in some 300: never twice in a row.
     assert any(load_scene(folder).points.tobytes() == scene.points.tobytes() for _ in range(2))
 
 

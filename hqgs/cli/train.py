@@ -59,7 +59,7 @@ class Train(Photos):
     """Training views to see (standard: 7,000 of clean photos or 150 for each, at most 30,000, fewer where the
     scene has stopped improving)."""
     batch: Number = None
-    """Views in a step (1). Several processes of torchrun share them out: docs/ranks.md."""
+    """Views in a step (1). Several processes of torchrun share them out: docs/machines.md."""
     seconds: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
     """Train for S seconds, in place of --iterations: the best scene that this machine makes in them."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint="")] = None

@@ -178,7 +178,7 @@ class Gaussians:
 
         Args:
             path: ends in .ply (the layout of 3DGS, exact), .spz (a tenth as large), .compressed.ply
-                (SuperSplat), .splat (no harmonics) or .glb (glTF); docs/export.md states the errors.
+                (SuperSplat), .splat (no harmonics) or .glb (glTF); docs/files.md states the errors.
             format: that suffix without its first dot, for a file with another one.
 
         Raises:

@@ -61,7 +61,7 @@ class DensifyConfig:
     Pruning by size on the screen (20 px in the paper's code) is left out: there it tests radii that were
     just set to zero, so that no published figure contains it. Pruning by size in the world goes by the
     scene's reach, not its extent: photos taken side by side have a small extent, so that it would remove all
-    that is far away, in each round (docs/robustness.md has what that does).
+    that is far away, in each round.
     """
 
     start: int = 500  # iterations before the first round
