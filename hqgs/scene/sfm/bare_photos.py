@@ -18,6 +18,7 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import HEIC_SUFFIXES, PHOTO_SUFFIXES, UnreadableError, check_whole, decode
 from hqgs.scene.capture import photo_folder
+from hqgs.scene.photo_files import MASKS, is_run
 from hqgs.scene.sfm.run import Guess
 
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
@@ -77,11 +78,13 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
 
     Those of `photo_folder`, or in `root` itself, or, where there are none, in the folders of `root`.
     """
+    if is_run(root):
+        return None
     folder, left, notes = photo_folder(root, downscale) or (root, downscale, [])
     names = _photos_in(folder)
     if not names:
-        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "masks" and p.name[0] != ".")
-        found = {path.name: _photos_in(path) for path in below}
+        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != MASKS and p.name[0] != ".")
+        found = {path.name: _photos_in(path) for path in below if not is_run(path)}
         names = [f"{inner}/{name}" for inner, inside in found.items() for name in inside]
         inner = [name for name, inside in found.items() if inside]
         if len(inner) == 1:
