@@ -20,6 +20,7 @@ from hqgs.scene.formats.colmap import find_models, find_models_below, half_model
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
+from hqgs.scene.photo_files import is_run
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -193,6 +194,8 @@ def _broken(root: Path) -> str | None:
 
 def _nothing(root: Path) -> str:
     """What is wrong with a folder in which no format is recognised."""
+    if is_run(root):
+        return f"{root} is the folder of a run that hqgs wrote: give the folder with the photos"
     entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
     for suffixes, advice in (
         (ARCHIVE_SUFFIXES, "unpack it, and give the folder with the photos"),

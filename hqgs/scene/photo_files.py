@@ -14,7 +14,7 @@ from pathlib import Path
 from unicodedata import normalize
 from urllib.parse import unquote
 
-from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PLY
+from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, LOCK, PLY
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES
 
@@ -32,7 +32,8 @@ def below(folder: Path, suffixes: Iterable[str]) -> list[Path]:
     """Files below a folder that end so, sorted; nothing hidden, and nothing of a run."""
     found, wanted = list[Path](), tuple(suffixes)
     for place, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if name[0] != "." and not is_run(Path(place, name))]
+        inner = (name for name in folders if name[0] != "." and name != KEPT)
+        folders[:] = [name for name in inner if not is_run(Path(place, name))]
         found += [
             path
             for name in files

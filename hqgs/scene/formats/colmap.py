@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.base.files import KEPT
 from hqgs.base.text import some
 from hqgs.scene.capture import (
     Capture,
@@ -26,6 +27,7 @@ from hqgs.scene.photo_files import is_run
 from hqgs.scene.scene import Camera, Tracks
 
 _FILES = ("cameras", "images", "points3D")
+CALLED = ("colmap", "distorted", "model", "reconstruction")  # folders of a model
 DEEP = 3  # folders below the one named in which a model is looked for
 
 
@@ -37,19 +39,25 @@ def find_models(root: Path) -> list[Path]:
 
 
 def find_models_below(root: Path) -> list[Path]:
-    """The same for the folders of `root`, and theirs: the first that has a model (`colmap/sparse/0`)."""
+    """The same for the folders of `root`, and theirs: the first that has a model (`colmap/sparse/0`).
+
+    A model outside of any `sparse` counts beside photos, or in a folder that is called after one: what a run
+    keeps of COLMAP's work is none of the user's.
+    """
     inner = [root]
     for _ in range(DEEP):
         inner = [p for folder in inner for p in _folders(folder)]
         for folder in inner:
-            if models := find_models(folder):
+            models = find_models(folder)
+            if models and (models != [folder] or folder.name.lower() in CALLED or list_photos(folder)):
                 return models
     return []
 
 
 def _folders(folder: Path) -> list[Path]:
     """Those in which a scene may lie."""
-    return sorted(p for p in folder.iterdir() if p.is_dir() and p.name[0] != "." and not is_run(p))
+    inner = (p for p in folder.iterdir() if p.is_dir() and p.name[0] != "." and p.name != KEPT)
+    return sorted(p for p in inner if not is_run(p))
 
 
 def half_model(root: Path) -> Path | None:
