@@ -11,6 +11,7 @@ from pathlib import Path
 import hqgs
 from benchmarks import accuracy, endurance, export, features, frugality, time
 from benchmarks.output import Benchmark, command_line, write_results
+from benchmarks.pages import write as pages
 from benchmarks.protocol import add_options
 from benchmarks.quality import run as quality
 from benchmarks.speed import run as speed
@@ -40,6 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
             add_options(parser_of_one, benchmark.protocols["standard"])
         for flag, how in benchmark.options.items():
             add(flag, **how)
+    pages.add_options(names.add_parser("pages", help="write the pages of results from their tables"))
     return parser
 
 
@@ -49,6 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM counts as Ctrl-C
     try:
+        if args.benchmark == "pages":
+            pages.run(args)
+            return 0
         args.out.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
         if args.page is not None and args.page.is_dir():
             raise ValueError(f"--page {args.page} is a folder: name a file")

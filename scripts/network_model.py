@@ -3,7 +3,7 @@
     python scripts/network_model.py     # prints how many times as fast
 
 Of one view a rank computes for a + b M seconds of one core, where M Gaussians are visible: the line through
-two sizes of `docs/results/speed.json`. To each of the P - 1 others it sends 60 M bytes, 12 M of them first.
+two sizes of `docs/results/speed.csv`. To each of the P - 1 others it sends 60 M bytes, 12 M of them first.
 Views of a rank follow each other, and a view's bytes travel while the next one is computed; those of the last
 one while the harmonics are updated, but for the first message.
 """

@@ -30,7 +30,7 @@ from hqgs.evaluation.metrics import psnr
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.scene import Camera, Scene, SfmReport, View
 from hqgs.training.checkpoint import scene_fingerprint
-from hqgs.training.config import ESFGConfig, PaperConfig, SRGSConfig, TrainConfig
+from hqgs.training.config import SRGSConfig, TrainConfig
 from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import TrainingError
 from tests.tiny_scene import tiny_scene
@@ -419,9 +419,7 @@ def test_the_sources_are_those_that_make_a_result(tmp_path: Path, monkeypatch: p
 
 
 def test_protocols() -> None:
-    assert {"standard", "full", "long", "ablation", "loss", "downsampling", "grid", "guidance"} < set(
-        PROTOCOLS
-    )
+    assert {"standard", "full", "long", "ablation", "grid"} < set(PROTOCOLS)
     for protocol in PROTOCOLS.values():
         assert protocol.baseline in protocol.labels
         assert len(set(protocol.labels)) == len(protocol.rows)
@@ -430,22 +428,21 @@ def test_protocols() -> None:
         )  # spelled as the parser spells them
     scene = tiny_scene()
     standard = grid(PROTOCOLS["standard"], [scene, replace(scene, name="b")])
-    assert len(standard) == 2 * 6 * 2 * 3
-    assert [cell.row.label for cell in standard[:3]] == list(ROWS)
-    assert len({cell.group for cell in standard[:3]}) == 1
-    assert {cell.seed for cell in standard[:36]} == {0}
-    assert PROTOCOLS["ablation"].labels == [f"V{k}" for k in range(1, 8)]
+    assert len(standard) == 2 * 6 * 2 * 4
+    assert [cell.row.label for cell in standard[:4]] == ["3dgs", "srgs", "paper", "hqgs"]
+    assert len({cell.group for cell in standard[:4]}) == 1
+    assert {cell.seed for cell in standard[:48]} == {0}
+    assert PROTOCOLS["ablation"].labels == [*(f"V{k}" for k in range(1, 7)), "l1", "paper"]
     for cell in grid(PROTOCOLS["ablation"], [scene]):
         assert cell.config.hqgs.guidance == "paper"
-        assert cell.config.hqgs.paper == VARIANTS[cell.row.label]
-    losses = [cell.config.hqgs.paper for cell in grid(PROTOCOLS["loss"], [scene])]
-    assert losses == [PaperConfig(loss="l1"), PaperConfig(loss="l1+dssim"), PaperConfig(loss="l1+scs")]
-    sizes = [cell.config.hqgs.paper.esfg for cell in grid(PROTOCOLS["downsampling"], [scene])[1:]]
-    assert sizes == [ESFGConfig(downscale=k) for k in (1, 2, 4)]
+        if cell.row.label != "l1":
+            assert cell.config.hqgs.paper == VARIANTS[cell.row.label.replace("paper", "V7")]
     assert [cell.config.hqgs.first_points for cell in grid(PROTOCOLS["points"], [scene])[:2]] == [0.0, 1.0]
     assert [cell.config.batch for cell in grid(PROTOCOLS["ranks"], [scene])] == [1, 2, 4, 8]
     assert grid(PROTOCOLS["long"], [scene])[0].config.densify.stop == 15_000
     for cell in standard:
+        if cell.row.paper:
+            continue
         config = TrainConfig(3_000, cell.row.label, cell.seed, leave_out=()).scaled()
         assert cell.config == config
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from pandas import DataFrame
 
-from benchmarks.time import FIRST, levels, lines, others, then
+from benchmarks.time import FIRST, levels, lines, then
 
 
 def one(row: str, seconds: float, psnr: float, **more: Any) -> dict[str, Any]:
@@ -46,10 +46,3 @@ def test_lines_and_levels_by_hand() -> None:
     assert alone["gain"] is None
     (short,) = levels(DataFrame([reference, *seeds]))
     assert "more than were tried" in short
-
-
-def test_what_others_show_is_read() -> None:
-    assert all(
-        then(history, 1e9) for scenes in others().values() for seeds in scenes.values() for history in seeds
-    )
-    assert set(others()[FIRST]) == {"fern", "fox", "horns", "embedded"}

@@ -1,0 +1,249 @@
+"""What the pages compute of the tables: means, gains with their scatter, tables, where runs are from.
+
+A gain is the mean of differences between two rows in runs that share scene, photos, seed and length. Its
+scatter is the standard error of that mean; a difference of less than SURE of them is not called a gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from pandas import DataFrame
+
+from benchmarks.rows import RUN
+
+NOTHING = "–"  # in the place of a number that there is not
+SURE = 2.0  # standard errors
+MANY = 12  # commits are counted, not listed
+NONE = "none"  # the degradation of photos that are as they were
+GROUP = [name for name in RUN if name != "row"]  # what runs share that are compared
+
+
+def pick(frame: DataFrame, **wanted: Any) -> DataFrame:
+    """The runs with these values; of a column with a list of values, in its order."""
+    for name, value in wanted.items():
+        values = [value] if isinstance(value, (str, int, float)) else list(value)
+        frame = frame.loc[frame[name].isin(values)]
+        if len(values) > 1:
+            frame = frame.sort_values(name, key=lambda column: column.map(values.index), kind="stable")
+    return frame
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Of a row over another, run by run."""
+
+    runs: DataFrame  # the columns of `GROUP`, and `gain`
+    base: str = ""
+
+    @cached_property
+    def count(self) -> int:
+        return len(self.runs)
+
+    @cached_property
+    def mean(self) -> float:
+        return float(self.runs["gain"].mean())
+
+    @cached_property
+    def worst(self) -> float:
+        return float(self.runs["gain"].min())
+
+    @cached_property
+    def best(self) -> float:
+        return float(self.runs["gain"].max())
+
+    @cached_property
+    def error(self) -> float | None:
+        """Standard error of the mean; None of a single run."""
+        return float(self.runs["gain"].std(ddof=1) / np.sqrt(self.count)) if self.count > 1 else None
+
+    @property
+    def sure(self) -> bool:
+        return self.error is not None and abs(self.mean) > SURE * self.error
+
+    def text(self, form: str = "+.2f") -> str:
+        """`+1.99 ± 0.36`."""
+        if not self.count:
+            return NOTHING
+        return format(self.mean, form) + ("" if self.error is None else f" ± {format(self.error, form[1:])}")
+
+    def words(self, unit: str = "dB", form: str = ".2f") -> str:
+        """What may be said of it: that it gains, that it loses, or neither."""
+        if not self.count:
+            return "was not measured"
+        if self.error is None:
+            side = "above" if self.mean >= 0 else "below"
+            return f"is {abs(self.mean):{form}} {unit} {side} `{self.base}` in one run"
+        if not self.sure:
+            return f"does not differ from `{self.base}` beyond scatter ({self.text('+' + form)} {unit})"
+        verb, to = ("gains", "over") if self.mean > 0 else ("loses", "to")
+        return f"{verb} {abs(self.mean):{form}} ± {self.error:{form}} {unit} {to} `{self.base}`"
+
+
+def gain(
+    frame: DataFrame, row: str, base: str, value: str = "psnr", ratio: bool = False, **wanted: Any
+) -> Gain:
+    """Differences, or ratios, of two rows in the runs with these values."""
+    frame = pick(frame, **wanted)
+    sides = [frame.loc[frame["row"] == label].set_index(GROUP)[value] for label in (row, base)]
+    first, second = (side.dropna().astype(float) for side in sides)
+    joined = pd.concat([first, second], axis=1, join="inner", keys=["a", "b"])
+    values = joined["a"] / joined["b"] if ratio else joined["a"] - joined["b"]
+    return Gain(values.rename("gain").reset_index(), base)
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; the first column to the left, the others to the right."""
+    first, *others = (f"| {' | '.join(line)} |" for line in (heads, *rows))
+    return "\n".join([first, f"|---|{'--:|' * (len(heads) - 1)}", *others])
+
+
+def listed(frame: DataFrame, columns: Mapping[str, tuple[str, str]]) -> str:
+    """A line for each run. `columns`: head and format by the column's name."""
+    rows = [[number(line[name], form) for name, (_, form) in columns.items()] for line in records(frame)]
+    return table([head for head, _ in columns.values()], rows)
+
+
+def crossed(
+    frame: DataFrame,
+    value: str = "psnr",
+    form: str = ".2f",
+    down: str = "row",
+    across: str = "degradation",
+    corner: str = "",
+    also: Mapping[str, tuple[str, str]] | None = None,
+    whole: str = "",
+    name: Callable[[str], str] = str,
+) -> str:
+    """Means of the runs by two columns. `also`: further columns of each line, means of all of its runs;
+    `whole`: the head of the mean over all but clean photos."""
+    labels, heads = (list(dict.fromkeys(frame[column])) for column in (down, across))
+    body = []
+    for label in labels:
+        part = frame.loc[frame[down] == label]
+        line = [mean(part.loc[part[across] == head], value, form) for head in heads]
+        bad = part.loc[part["degradation"] != NONE]
+        line += [mean(bad, value, form)] if whole else []
+        line += [mean(bad if whole else part, key, one) for key, (_, one) in (also or {}).items()]
+        body.append([name(str(label)), *line])
+    more = [*([whole] if whole else []), *(head for head, _ in (also or {}).values())]
+    return table([corner, *map(str, heads), *more], body)
+
+
+def gains(
+    frame: DataFrame,
+    rows: Sequence[str],
+    base: str,
+    across: str = "degradation",
+    whole: str = "",
+    down: str = "row",
+    corner: str = "gain (dB)",
+) -> str:
+    """Gains over the base with their scatter: a line for each row, or of one row for each value of `down`."""
+    heads = list(dict.fromkeys(frame[across]))
+    labels = list(rows) if down == "row" else list(dict.fromkeys(frame[down]))
+    body = []
+    for label in labels:
+        part = frame if down == "row" else frame.loc[frame[down] == label]
+        row = label if down == "row" else rows[0]
+        line = [gain(part, row, base, **{across: head}).text() for head in heads]
+        line += [gain(part.loc[part["degradation"] != NONE], row, base).text()] if whole else []
+        body.append([str(label), *line])
+    return table([corner, *map(str, heads), *([whole] if whole else [])], body)
+
+
+def mean(frame: DataFrame, value: str = "psnr", form: str = ".2f") -> str:
+    """The mean over the runs, NOTHING where one of them lacks the number; of words each one, once."""
+    values = list(frame[value]) if value in frame else []
+    if any(isinstance(one, str) for one in values):
+        return ", ".join(dict.fromkeys(values)) or NOTHING
+    return number(sum(values) / len(values) if values else None, form)
+
+
+def number(value: Any, form: str) -> str:
+    """A value in a format; `ms` takes seconds, `yes|no` are the words for True and False."""
+    if value is None or value != value:
+        return NOTHING
+    if isinstance(value, str):
+        return value or NOTHING
+    if "|" in form:
+        return form.split("|")[not value]
+    if form == "ms":
+        return f"{1000 * value:.3g}" if value < 0.1 else f"{1000 * value:.0f}"
+    return format(value, form)
+
+
+def records(frame: DataFrame) -> list[dict[str, Any]]:
+    return [{str(name): value for name, value in line.items()} for line in frame.to_dict("records")]
+
+
+def and_list(words: Sequence[str]) -> str:
+    """`a, b and c`."""
+    return " and ".join([*([", ".join(words[:-1])] if len(words) > 1 else []), *words[-1:]])
+
+
+def made(*frames: DataFrame) -> str:
+    """Where the runs of a page are from: number, commits, machines, dates."""
+    parts = [frame[["commit", "machine", "date"]] for frame in frames if len(frame)]
+    if not parts:
+        return "Not measured yet."
+    runs = pd.concat(parts, ignore_index=True)
+    known = {(day, commit) for day, commit in zip(runs["date"], runs["commit"], strict=True) if commit}
+    commits = list(dict.fromkeys(commit for _, commit in sorted(known)))
+    dates = sorted({date for date in runs["date"] if date})
+    when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    machines = and_list(sorted({machine for machine in runs["machine"] if machine}))
+    several = (
+        f"{len(commits)} commits, {commits[0]} to {commits[-1]}"
+        if len(commits) > MANY
+        else f"commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
+    )
+    text = f"{len(runs)} lines; {several}; {machines}; {when}."
+    mixed = " They are not of one commit and machine: single cells and seconds compare roughly."
+    return text + (mixed if len(commits) > 1 else "")
+
+
+def weakest(frame: DataFrame, row: str = "hqgs", base: str = "3dgs") -> str:
+    """Where the row gains least, and most: `jpeg:20 (+0.34 dB), most under noise:50 (+6.54 dB)`."""
+    found = {kind: gain(frame, row, base, degradation=kind) for kind in dict.fromkeys(frame["degradation"])}
+    known = {kind: one.mean for kind, one in found.items() if one.count}
+    least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
+    return f"{least} ({known[least]:+.2f} dB), most under {most} ({known[most]:+.2f} dB)"
+
+
+def beyond(frame: DataFrame, rows: Sequence[str], base: str) -> str:
+    """Which of the rows differ from the base by more than their scatter, in words."""
+    found = {row: gain(frame, row, base) for row in rows}
+    sure = [f"{row} ({one.text()} dB)" for row, one in found.items() if one.count and one.sure]
+    verb = "differs" if len(sure) == 1 else "differ"
+    return (
+        f"{and_list(sure)} {verb} from {base} beyond scatter"
+        if sure
+        else f"none differs from {base} beyond scatter"
+    )
+
+
+def beside(
+    frame: DataFrame,
+    down: str = "degradation",
+    scenes: Sequence[str] = (),
+    row: str = "hqgs",
+    base: str = "3dgs",
+) -> str:
+    """A row beside the base, a line for each value of `down`: its gain in each scene, in all, at worst."""
+    body = []
+    for label in dict.fromkeys(frame[down]):
+        part = frame.loc[frame[down] == label]
+        whole = gain(part, row, base)
+        cells = [gain(part, row, base, scene=scene) for scene in scenes]
+        means = [mean(part.loc[part["row"] == name]) for name in (base, row)]
+        means += [format(one.mean, "+.2f") if one.count else NOTHING for one in cells]
+        body.append(
+            [str(label), *means, whole.text(), format(whole.worst, "+.2f") if whole.count else NOTHING]
+        )
+    return table(["", f"`{base}`", f"`{row}`", *scenes, "gain", "worst run"], body)

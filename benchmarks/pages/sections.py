@@ -1,0 +1,184 @@
+"""Tables and sentences that one page needs, of the frames of the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pandas as pd
+from pandas import DataFrame
+
+from benchmarks.pages.figures import NOTHING, Gain, and_list, gain, mean, number, pick, records, table
+from benchmarks.rows import RUN, pairs_of
+
+SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
+FIRST, OPENSPLAT, BASE = "first commit", "OpenSplat", "3dgs"
+
+
+def then(history: str, seconds: float) -> float | None:
+    """The PSNR of a run after so many of its seconds; None before its first evaluation."""
+    known = [psnr for at, psnr in pairs_of(history) if float(at) <= seconds]
+    return known[-1] if known else None
+
+
+def missing(poses: DataFrame) -> str:
+    """`12 of 43 (fox, noise:25)` for each line that lacks photos."""
+    found = [
+        f"{line['photos'] - line['registered']} of {line['photos']} ({line['scene']}, {line['degradation']})"
+        for line in records(poses)
+    ]
+    return and_list(found) or "none"
+
+
+def cost_of_poses(quality: DataFrame, kinds: Sequence[str], row: str = "hqgs") -> str:
+    """PSNR of a row with the scenes' own poses and with those from the photos, run by run."""
+    same = [name for name in RUN if name not in ("poses", "row")]
+    runs = pick(quality, degradation=kinds, row=row)
+    own, photos = (runs.loc[runs["poses"] == one].set_index(same)["psnr"] for one in ("own", "photos"))
+    both = pd.concat([own, photos], axis=1, join="inner", keys=["own", "photos"]).reset_index()
+    rows = []
+    for line in records(both):
+        psnrs = [number(line[name], ".2f") for name in ("own", "photos")]
+        cost = number(line["photos"] - line["own"], "+.2f")
+        rows.append([f"{line['scene']}, {line['degradation']}", *psnrs, cost])
+    return table(["", "own poses", "poses from the photos", "cost (dB)"], rows)
+
+
+def reconstructions(poses: DataFrame) -> str:
+    """Poses and points from degraded photos against the scenes' own."""
+    rows = []
+    for line in records(poses):
+        rotation, center = (
+            f"{line[f'{name}_median']:{form}}, {line[f'{name}_max']:{form}}"
+            for name, form in (("rotation", ".3f"), ("centre", ".1%"))
+        )
+        name, registered = f"{line['scene']}, {line['degradation']}", f"{line['registered']}/{line['photos']}"
+        points = f"{line['points']:,} ({line['own_points']:,})"
+        rows.append([name, registered, rotation, center, number(line["cameras_px"], ".2f"), points])
+    heads = ("rotation (deg), median, max", "centre, median, max", "own cameras off (px)", "points (own)")
+    return table(["", "registered", *heads], rows)
+
+
+def after(times: DataFrame, scene: str, row: str, seconds: float) -> float | None:
+    """The mean PSNR of the row's runs after so many of their seconds."""
+    known = [then(history, seconds) for history in pick(times, scene=scene, row=row)["history"]]
+    found = [value for value in known if value is not None]
+    return sum(found) / len(found) if found else None
+
+
+def asked(times: DataFrame) -> list[str]:
+    """The rows that had a number of seconds, by it: `30 s`."""
+    return sorted((row for row in set(times["row"]) if row.endswith(" s")), key=seconds_of)
+
+
+def seconds_of(row: str) -> float:
+    return float(row.removesuffix(" s"))
+
+
+def over_time(times: DataFrame, scenes: Sequence[str], against: str = "") -> str:
+    """PSNR after the seconds that were asked for, a line for each scene; `against`: its gain over that row
+    at as many of its own seconds."""
+    rows, body = asked(times), []
+    for scene in scenes:
+        line = []
+        for row in rows:
+            mine = pick(times, scene=scene, row=row)
+            other = after(times, scene, against, seconds_of(row)) if against else 0.0
+            known = len(mine) > 0 and other is not None
+            form = "+.2f" if against else ".2f"
+            line.append(format(mine["psnr"].mean() - other, form) if known else NOTHING)
+        body.append([scene, *line])
+    return table(["", *rows], body)
+
+
+def lead(times: DataFrame, row: str, against: str = FIRST) -> Gain:
+    """Of the row over another one at as many of its own seconds, over the scenes."""
+    found = []
+    for line in records(pick(times, row=row)):
+        other = after(times, line["scene"], against, seconds_of(row))
+        if other is not None:
+            found.append({"scene": line["scene"], "gain": line["psnr"] - other})
+    return Gain(DataFrame(found, columns=["scene", "gain"]), against)
+
+
+def levels(times: DataFrame, scenes: Sequence[str], base: str = BASE) -> str:
+    """When each scene comes within SHORT of where the base ends, a line each."""
+    body = []
+    for scene in scenes:
+        for line in records(pick(times, scene=scene, row=base)):
+            level = line["psnr"] - SHORT
+            mine = pick(times, scene=scene, row=asked(times))
+            enough = mine.loc[mine["psnr"] >= level, "seconds"]
+            took = f"{enough.min():.0f}" if len(enough) else NOTHING
+            body.append([scene, f"{level:.2f}", took, f"{line['seconds']:.0f}"])
+    return table(["", f"`{base}` at its end, less {SHORT} (dB)", "`hqgs` (s)", f"`{base}` (s)"], body)
+
+
+def left_out(runs: DataFrame, rows: Sequence[str], base: str = "none") -> str:
+    """What leaving out costs and saves: differences and ratios to the runs that left nothing out."""
+    body = []
+    for row in rows:
+        psnr = gain(runs, row, base)
+        if not psnr.count:
+            continue
+        worst = min(float(part["gain"].mean()) for _, part in psnr.runs.groupby("scene"))
+        shares = [share(runs, row, name, base) for name in ("cpu_seconds", "bytes", "gaussians")]
+        body.append([row, psnr.text(), f"{worst:+.2f}", *shares])
+    return table(["left out", "PSNR (dB)", "worst scene", "CPU time", "bytes", "Gaussians"], body)
+
+
+def share(runs: DataFrame, row: str, value: str, base: str = "none") -> str:
+    """The mean of the ratios to the runs that left nothing out."""
+    return f"{gain(runs, row, base, value=value, ratio=True).mean:.2f}"
+
+
+def files(export: DataFrame) -> str:
+    """Size of each file and what it costs in held-out PSNR."""
+    body = []
+    for line in records(export):
+        sizes = f"{line['bytes'] / 1e6:.2f}", f"{line['bytes'] / line['ply_bytes']:.1%}"
+        pareto = "yes" if line["pareto"] else ""
+        body.append([line["file"], *sizes, f"{0.0 - line['cost_db']:+.3f}", pareto])
+    return table(["file", "MB", "of 3DGS's PLY", "PSNR (dB)", "Pareto"], body)
+
+
+def files_head(export: DataFrame) -> str:
+    """What the files are of: `fern, 252 x 189 px, 78,002 Gaussians of degree 3.`"""
+    first = records(export)[0]
+    size = f"{first['width']:,} x {first['height']:,} px"
+    what = f"{first['gaussians']:,} Gaussians of degree {first['sh_degree']}"
+    return f"{first['scene'].capitalize()}, {size}, {what}."
+
+
+def after_best(times: DataFrame, scene: str) -> float:
+    """By how much the longest of a scene's runs ends below its best, dB."""
+    runs = [pick(times, scene=scene, row=row) for row in asked(times)]
+    psnrs = [float(part["psnr"].mean()) for part in runs if len(part)]
+    return max(psnrs) - psnrs[-1]
+
+
+def listed_views(runs: DataFrame) -> str:
+    """Steps of several views beside steps of one."""
+    body = []
+    for row in dict.fromkeys(runs["row"]):
+        part, over = pick(runs, row=row), gain(runs, row, "1 view")
+        words = [mean(part, "psnr"), over.text() if row != "1 view" else "", mean(part, "ssim", ".4f")]
+        body.append([row, str(len(part)), *words, mean(part, "gaussians", ",.0f")])
+    return table(["", "runs", "PSNR (dB)", "against 1 view (dB)", "SSIM", "Gaussians"], body)
+
+
+def like_mine(runs: DataFrame, kinds: Sequence[str], words: Sequence[str]) -> str:
+    """What `hqgs` gains on each kind of photos, as its user would call them."""
+    body = []
+    for kind, word in zip(kinds, words, strict=True):
+        part = pick(runs, degradation=kind)
+        both = [mean(pick(part, row=row)) for row in ("3dgs", "hqgs")]
+        found = gain(part, "hqgs", "3dgs")
+        body.append([word, kind, *both, found.text(), f"{found.worst:+.2f}"])
+    return table(["your photos", "in the test", "`3dgs`", "`hqgs`", "gain", "worst run"], body)
+
+
+def seeds_apart(quality: DataFrame, row: str = BASE) -> float:
+    """By how much PSNR differs at most between seeds of a row on the same clean photos."""
+    runs = pick(quality, row=row, degradation="none")
+    cells = [part["psnr"] for _, part in runs.groupby(["scene", "iterations", "downscale", "poses"])]
+    return max(float(psnr.max() - psnr.min()) for psnr in cells)

@@ -1,0 +1,215 @@
+"""The pages of results are those that their tables give, and call no difference within its scatter a gain."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+from docs_claims import ROOT, wrong_command
+from matplotlib.figure import Figure
+from pandas import DataFrame
+
+from benchmarks import cli
+from benchmarks.pages.figures import beside, crossed, gain, gains, made, mean, number, pick, weakest
+from benchmarks.pages.rasterizing import features_table
+from benchmarks.pages.sections import (
+    after,
+    cost_of_poses,
+    lead,
+    left_out,
+    levels,
+    like_mine,
+    over_time,
+    seeds_apart,
+    then,
+)  # fmt: skip
+from benchmarks.pages.write import RESULTS, STUDIES, pages
+from benchmarks.rows import KEYS, RUN, Table, pairs_of, text_of
+
+DOCS = ROOT / "docs"
+PAGES = pages(DOCS / RESULTS)
+MOST_WORDS, MOST_OF_ALL, MOST_OF_THE_LOG, MOST_BYTES = 1_500, 7_000, 2_000, 300_000
+
+
+def run_of(row: str, psnr: float, **changes: object) -> dict[str, object]:
+    facts = {"scene": "a", "degradation": "blur", "seed": 0, "iterations": 10, "downscale": 2, "poses": "own"}
+    made_by = {"commit": "abc", "machine": "CPU", "date": "2026-11-26"}
+    return facts | {"row": row, "psnr": psnr} | made_by | changes
+
+
+def frame(*runs: dict[str, object]) -> DataFrame:
+    return DataFrame(list(runs))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=str)
+def test_a_page_is_what_its_tables_give(page: Path) -> None:
+    """Else: `python -m benchmarks pages`."""
+    assert (DOCS / page).read_text(encoding="utf-8") == PAGES[page]
+
+
+def test_there_is_no_other_page_and_no_other_table() -> None:
+    names = {path.name for path in (DOCS / RESULTS).iterdir() if not path.name.startswith(".")}
+    assert names == {page.name for page in PAGES if page.parent == RESULTS} | {f"{name}.csv" for name in KEYS}
+
+
+def test_pages_and_tables_stay_small() -> None:
+    words = {page: len(text.split()) for page, text in PAGES.items()}
+    assert max(words.values()) <= MOST_WORDS
+    assert sum(words.values()) <= MOST_OF_ALL
+    assert len((DOCS / "log.md").read_text(encoding="utf-8").split()) <= MOST_OF_THE_LOG
+    assert sum(path.stat().st_size for path in DOCS.rglob("*") if path.suffix != ".png") <= MOST_BYTES
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_the_command_of_a_study_can_be_given(study: str) -> None:
+    assert wrong_command(["python", "-m", "benchmarks", *shlex.split(STUDIES[study])]) == []
+
+
+def test_a_table_keeps_one_line_a_key(tmp_path: Path) -> None:
+    table = Table(tmp_path / "quality.csv")
+    assert table.rows() == []
+    assert list(table.frame().columns) == list(RUN)
+    table.put([run_of("3dgs", 20.123456789), run_of("hqgs", 21.0, found="blur:1,2")])
+    table.put([run_of("3dgs", 22.0, commit="6230379", seconds=None)])
+    found = table.frame()
+    assert list(found["row"]) == ["3dgs", "hqgs"]  # in its place
+    assert list(found["psnr"]) == [22.0, 21.0]
+    assert list(found["commit"]) == ["6230379", "abc"]  # no number
+    assert found["seconds"].isna().all()
+    assert table.find(run_of("hqgs", 0.0))["found"] == "blur:1,2"  # type: ignore[index]
+    assert table.find(run_of("hqgs", 0.0, seed=1)) is None
+    assert pairs_of(text_of({"a:b": 1.0, "c": 0.25})) == [("a:b", 1.0), ("c", 0.25)]
+    table.path.write_text("scene,row\na,b\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"quality.csv is damaged: it has no column degradation"):
+        table.rows()
+    table.path.write_text(f"{','.join(RUN)}\na,b\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="too many or too few cells"):
+        table.rows()
+
+
+def test_gains_are_those_of_pairs() -> None:
+    runs = frame(
+        run_of("3dgs", 20.0), run_of("hqgs", 21.0),
+        run_of("3dgs", 30.0, scene="b"), run_of("hqgs", 32.0, scene="b"),
+        run_of("hqgs", 99.0, scene="c"), run_of("3dgs", 0.0, seed=1),
+    )  # fmt: skip
+    found = gain(runs, "hqgs", "3dgs")
+    assert (found.count, found.mean, found.worst, found.best) == (2, 1.5, 1.0, 2.0)
+    assert found.error == pytest.approx(0.5)  # std 0.707 over the root of 2
+    assert found.text() == "+1.50 ± 0.50"
+    assert gain(runs, "hqgs", "3dgs", ratio=True, scene="a").mean == pytest.approx(1.05)
+
+
+@pytest.mark.parametrize(
+    ("differences", "words"),
+    [
+        ([1.0, 1.2], "gains 1.10 ± 0.10 dB over `3dgs`"),
+        ([-1.0, -1.2], "loses 1.10 ± 0.10 dB to `3dgs`"),
+        ([1.0, -0.4], "does not differ from `3dgs` beyond scatter (+0.30 ± 0.70 dB)"),
+        ([1.0], "is 1.00 dB above `3dgs` in one run"),
+        ([], "was not measured"),
+    ],
+)
+def test_a_difference_within_its_scatter_is_no_gain(differences: list[float], words: str) -> None:
+    runs = [run_of("3dgs", 20.0, seed=k) for k in range(3)]
+    runs += [run_of("hqgs", 20.0 + gained, seed=k) for k, gained in enumerate(differences)]
+    assert gain(frame(*runs), "hqgs", "3dgs").words() == words
+
+
+def test_tables_by_hand() -> None:
+    runs = frame(
+        run_of("3dgs", 30.0, degradation="none"), run_of("hqgs", 30.5, degradation="none"),
+        run_of("3dgs", 20.0, gaussians=10), run_of("hqgs", 22.0, gaussians=20),
+        run_of("3dgs", 24.0, degradation="jpeg:5", gaussians=30), run_of("hqgs", 25.0, degradation="jpeg:5"),
+    )  # fmt: skip
+    assert crossed(runs, whole="bad", also={"gaussians": ("N", ".0f")}).splitlines() == [
+        "|  | none | blur | jpeg:5 | bad | N |", "|---|--:|--:|--:|--:|--:|",
+        "| 3dgs | 30.00 | 20.00 | 24.00 | 22.00 | 20 |",
+        "| hqgs | 30.50 | 22.00 | 25.00 | 23.50 | – |",  # never over fewer runs
+    ]  # fmt: skip
+    assert gains(runs, ["hqgs"], "3dgs", whole="bad").splitlines()[-1] == (
+        "| hqgs | +0.50 | +2.00 | +1.00 | +1.50 ± 0.50 |"
+    )
+    assert gains(runs, ["hqgs"], "3dgs", down="scene").splitlines()[-1] == "| a | +0.50 | +2.00 | +1.00 |"
+    assert beside(runs, scenes=["a"]).splitlines()[3] == "| blur | 20.00 | 22.00 | +2.00 | +2.00 | +2.00 |"
+    assert like_mine(runs, ["blur"], ["soft"]).endswith("| soft | blur | 20.00 | 22.00 | +2.00 | +2.00 |")
+    assert weakest(runs) == "none (+0.50 dB), most under blur (+2.00 dB)"
+    assert list(pick(runs, degradation=["jpeg:5", "none"])["degradation"]) == 2 * ["jpeg:5"] + 2 * ["none"]
+    assert mean(runs.iloc[:0]) == "–"
+    assert [number(0.0314, "ms"), number(True, "yes|no"), number(float("nan"), ".2f")] == ["31.4", "yes", "–"]
+
+
+def test_where_runs_are_from_is_said_once() -> None:
+    one = frame(run_of("3dgs", 20.0))
+    assert made(one) == "1 lines; commit abc; CPU; 2026-11-26."
+    two = made(one, frame(run_of("hqgs", 20.0, commit="def", date="2026-11-25")))
+    assert two.startswith(
+        "2 lines; commits def, abc; CPU; 2026-11-25 to 2026-11-26. They are not of one commit"
+    )
+    many = [frame(run_of("3dgs", 20.0, commit=str(k))) for k in range(13)]
+    assert "13 commits, 0 to 9" in made(*many)
+    assert made(one.iloc[:0]) == "Not measured yet."
+
+
+def test_seconds_by_hand() -> None:
+    times = frame(
+        run_of("3dgs", 28.0, seconds=100.0, history="9:20|31:25|90:28"),
+        run_of("first commit", 24.0, seconds=90.0, history="20:22|40:24"),
+        run_of("30 s", 26.0, seconds=29.0, history=""), run_of("60 s", 27.95, seconds=61.0, history=""),
+    )  # fmt: skip
+    assert [then("9:20|31:25", seconds) for seconds in (5.0, 30.0, 31.0)] == [None, 20.0, 25.0]
+    assert after(times, "a", "3dgs", 30.0) == 20.0
+    assert over_time(times, ["a"], "first commit").splitlines()[-1] == "| a | +4.00 | +3.95 |"
+    assert lead(times, "30 s").mean == pytest.approx(4.0)
+    assert levels(times, ["a"]).splitlines()[-1] == "| a | 27.90 | 61 | 100 |"
+    assert levels(times.iloc[:3], ["a"]).splitlines()[-1] == "| a | 27.90 | – | 100 |"
+
+
+def test_what_leaving_out_saves_and_what_poses_cost() -> None:
+    runs = frame(
+        run_of("none", 30.0, cpu_seconds=100.0, bytes=1000, gaussians=10),
+        run_of("auto", 29.9, cpu_seconds=40.0, bytes=300, gaussians=2),
+        run_of("none", 25.0, scene="b", cpu_seconds=100.0, bytes=1000, gaussians=10),
+        run_of("auto", 25.3, scene="b", cpu_seconds=60.0, bytes=500, gaussians=4),
+    )
+    assert left_out(runs, ["auto", "photos"]).splitlines()[2:] == [
+        "| auto | +0.10 ± 0.20 | -0.10 | 0.50 | 0.40 | 0.30 |"
+    ]
+    posed = frame(run_of("hqgs", 30.0), run_of("hqgs", 29.0, poses="photos"), run_of("hqgs", 9.0, seed=1))
+    assert cost_of_poses(posed, ["blur"]).splitlines()[-1] == "| a, blur | 30.00 | 29.00 | -1.00 |"
+    seeds = [run_of("3dgs", 20.0 + k / 4, seed=k, degradation="none") for k in range(3)]
+    assert seeds_apart(frame(*seeds)) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "grown", "verdict"),
+    [
+        ((30.5, 29.9), 31.0, "pass"),  # 0.2 dB with an error of 0.3
+        ((30.2, 30.21), 31.0, "FAIL"),
+        ((30.0, 30.0), 31.06, "FAIL"),  # scatters little, so it is held against the limit itself
+    ],
+)
+def test_a_feature_fails_where_it_surely_costs_too_much(
+    psnrs: tuple[float, float], grown: float, verdict: str
+) -> None:
+    """Of runs without the feature, beside two of 30 dB that have it."""
+    runs = [run_of("default", 30.0, seed=k, refined_psnr=31.0, step_ratio=None) for k in (0, 1)]
+    runs += [run_of("loss", p, seed=k, refined_psnr=grown, step_ratio=1.5) for k, p in enumerate(psnrs)]
+    line = features_table(frame(*runs)).splitlines()[-1]
+    assert line.endswith(f"| 1.50, 1.50 | {verdict} |")
+    assert f"| {sum(psnrs) / 2 - 30:+.3f} ±" in line
+
+
+def test_pages_are_written_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Into another folder, charts with them, which are drawn but not printed here: that takes long."""
+    monkeypatch.setattr(Figure, "savefig", lambda _, path: Path(path).write_bytes(b""))
+    (tmp_path / "images").mkdir()
+    assert cli.main(["pages", "--docs", str(tmp_path)]) == 0
+    assert {
+        path.relative_to(tmp_path): path.read_text(encoding="utf-8") for path in tmp_path.rglob("*.md")
+    } == PAGES
+    charts = {path.name for path in (tmp_path / "images").iterdir()}
+    shown = {line for text in PAGES.values() for line in text.splitlines() if line.startswith("![")}
+    assert charts <= {path.name for path in (DOCS / "images").iterdir()}
+    assert all(any(name in line for line in shown) for name in charts)
