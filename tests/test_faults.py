@@ -1,8 +1,6 @@
 """Faults of the machine: kill -9, a full disk, a read-only folder, lost photos, a clock that jumps.
 
 After each of them a run can be resumed or says in one line what is wrong, and nothing finished is lost.
-
-HQGS_LONG=1 kills 50 runs instead of 6.
 """
 
 from __future__ import annotations
@@ -44,7 +42,6 @@ from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
 from hqgs.training.config import DensifyConfig, TrainConfig
 from hqgs.training.trainer import Trainer
 
-KILLS = 50 if os.environ.get("HQGS_LONG") else 6
 NOBODY = 65534  # the user id without rights
 
 
@@ -148,17 +145,18 @@ def wait_for_writes(path: Path, count: int, child: ForkServerProcess) -> None:
         time.sleep(0.001)
 
 
+@pytest.mark.parametrize("count", [4, pytest.param(50, marks=pytest.mark.slow)])
 def test_runs_killed_at_random_moments_can_be_resumed(
-    undisturbed: tuple[State, bytes], processes: ForkServerContext, tmp_path: Path
+    count: int, undisturbed: tuple[State, bytes], processes: ForkServerContext, tmp_path: Path
 ) -> None:
     """Moments count in iterations, so that they spread over the run on any machine."""
     state, ply = undisturbed
     rng = np.random.default_rng(11)
     config = replace(tiny_config(), checkpoint_every=1)  # as many chances as there can be to hit a write
     kills = 0
-    for k in range(KILLS):
+    for k in range(count):
         out = tmp_path / str(k)
-        writes = round(k / KILLS * 24)  # of 30; the first one is killed before or at its first write
+        writes = round(k / count * 24)  # of 30; the first one is killed before or at its first write
         child = start(processes, out, config)
         wait_for_writes(out / CHECKPOINT, writes, child)
         time.sleep(rng.uniform(0.0, 0.05))
@@ -173,7 +171,7 @@ def test_runs_killed_at_random_moments_can_be_resumed(
         assert (out / PLY).read_bytes() == ply
         check_files(out)
         assert hidden(out) == []
-    assert kills >= KILLS // 3  # a slow observer may come too late for some
+    assert kills >= count // 3  # a slow observer may come too late for some
 
 
 def test_what_a_killed_writer_leaves_is_removed(tmp_path: Path) -> None:

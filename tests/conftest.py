@@ -1,0 +1,27 @@
+"""How the suite runs: the whole of it in a process for each core, a part of it in one."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+MOST = 4  # processes; each takes up to 1.5 GB
+IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+
+if IN_WORKER:  # before torch and the crate are imported: the cores are taken by the other processes
+    for name in ("OMP_NUM_THREADS", "RAYON_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """`pytest` alone: as many processes as there are cores. `-n 0` keeps it to one; where pytest-xdist is
+    missing it is one too."""
+    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    if IN_WORKER or not whole or not config.pluginmanager.hasplugin("xdist"):
+        return
+    if config.option.numprocesses is None and not config.option.usepdb:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        config.option.numprocesses = min(cores, MOST)
+        config.option.dist = "worksteal"
