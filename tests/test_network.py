@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,8 +10,6 @@ import network_machines
 import pytest
 from network import Link, line
 from network_model import Model, main, table
-
-ROOT = Path(__file__).parents[1]
 
 
 def step(waited: float) -> dict[str, float]:
@@ -45,15 +42,3 @@ def test_the_model_follows_its_words(capsys: pytest.CaptureFixture[str]) -> None
     assert main() == 0
     said = capsys.readouterr().out
     assert "\n".join(table(1)) in said
-
-
-def test_the_page_shows_what_the_model_says() -> None:
-    page = (ROOT / "docs" / "network.md").read_text(encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "network_model.py")],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    for row in done.stdout.splitlines():
-        assert not row.startswith("|") or row in page
