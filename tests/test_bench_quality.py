@@ -83,7 +83,9 @@ def stamps(out: Path) -> dict[str, int]:
 def bench_of(
     out: Path, protocol: Protocol, scenes: list[Scene], sfm: bool = False, pictures: int = 0
 ) -> quality.Quality:
-    args = argparse.Namespace(out=out, validate=False, sfm=sfm, pictures=pictures, known=None, finished=False)
+    args = argparse.Namespace(
+        out=out, validate=False, sfm=sfm, fit_cameras=False, pictures=pictures, known=None, finished=False
+    )
     return quality.Quality(Study(args, "quality", protocol, scenes, labelled=False))
 
 
@@ -292,6 +294,7 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
         assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image)
         report = SfmReport(5, ["lost"], [], error, error, 0.4, 40, 0.1, 3.5, 0.5, 40, None, 0.3)
+        report = replace(report, auc={"1": 0.25, "3": 0.5, "5": 0.75})
         return replace(scene, sfm=report, points=scene.points + np.float32(0.01))
 
     monkeypatch.setattr(study, "sfm_scene", sfm)
@@ -306,11 +309,16 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
     assert [run["sfm"]["points"] for run in runs] == [40, 40]
     assert all("-sfm-" in run["key"] for run in runs)
     assert "poses and points from the degraded photos" in report.tables[0].splitlines()[0]
+    assert all(
+        run["fitted"]["psnr"] >= run["metrics"]["psnr"] for run in runs
+    )  # the camera it had counts too
+    (fitted,) = (text for text in report.tables if "each held-out camera fitted" in text.splitlines()[0])
+    assert f"{runs[0]['fitted']['psnr']:.2f}/{runs[0]['fitted']['ssim']:.3f}" in fitted
     (table,) = (text for text in report.tables if text.startswith("**Poses and points"))
     cells_of_row = [cell.strip() for cell in table.splitlines()[-1].split("|")[1:-1]]
     assert cells_of_row == [
-        "tiny, noise:25, seed 0", "4 / 5", "0.125 / 0.500", "12.50% / 50.00%", "0.40", "40 (40)", "10.00%",
-        "3.5 (–)", "0.50 (0.30)",
+        "tiny, noise:25, seed 0", "4 / 5", "0.125 / 0.500", "0.25/0.50/0.75", "12.50% / 50.00%", "0.40",
+        "40 (40)", "10.00%", "3.5 (–)", "0.50 (0.30)",
     ]  # fmt: skip
 
 

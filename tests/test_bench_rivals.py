@@ -145,7 +145,9 @@ def test_rows_are_measured_as_all_others(tmp_path: Path, monkeypatch: pytest.Mon
     small_nerf(monkeypatch)
     rows = ["3dgs", "deblur", "nerf"]
     protocol = narrowed(quality.PROTOCOLS["wild"], rows=rows, degradations=["none"], seeds=[0], iterations=5)
-    args = argparse.Namespace(out=tmp_path, validate=False, sfm=False, pictures=1, known=None, finished=False)
+    args = argparse.Namespace(
+        out=tmp_path, validate=False, sfm=False, fit_cameras=False, pictures=1, known=None, finished=False
+    )
     bench = quality.Quality(Study(args, "quality", protocol, [tiny_scene()], labelled=False))
     assert bench.study.failures == {}
     bench.tables()

@@ -356,7 +356,14 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert call("info", tmp_path) == 0
     assert "3 of 3 iterations" in capsys.readouterr().out
     assert call("eval", tmp_path) == 0
-    assert "view0.png" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "view0.png" in told
+    assert "fitted" not in told
+    assert call("eval", tmp_path, "--fit-cameras", "--out", tmp_path / "eval.json") == 0
+    assert "cameras moved by" in capsys.readouterr().out
+    numbers = json.loads((tmp_path / "eval.json").read_text())
+    assert numbers["fitted"]["mean"]["psnr"] >= numbers["mean"]["psnr"]
+    assert set(numbers["fitted"]["views"]) == set(numbers["views"])
 
 
 def test_a_start_that_fails_leaves_no_folder(asked: list[dict[str, Any]], tmp_path: Path) -> None:

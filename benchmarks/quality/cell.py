@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ from benchmarks.study import Cell, Store, Study
 from hqgs._rust import NEAR_PLANE
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
+from hqgs.evaluation.fit_cameras import fit_cameras
+from hqgs.evaluation.held_out import held_out_renders, measured
 from hqgs.evaluation.metrics import METRICS, evaluate_view, mean_metrics, psnr
 from hqgs.evaluation.report import AMPLIFICATION, MASKED
 from hqgs.model.render import render_view
@@ -38,16 +40,18 @@ MAX_PHOTOS = 8  # of a scene, whose edge maps are compared
 RENDERS = 3  # times that each held-out view is rendered
 
 
-def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
+def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0, fit: bool = False) -> Run:
     """Train, measure and describe one cell; so many of its held-out views are kept in the store.
 
-    `photos` is what is trained. Raises ValueError as `Trainer` does, and TrainingError.
+    `photos` is what is trained; with `fit` the held-out views are measured a second time, each from the
+    camera from which the trained scene fits its photo best.
+    Raises ValueError as `Trainer` does, and TrainingError.
     """
     rival = cell.more.get("rival")
     done = RIVALS[rival](photos, cell.config) if rival else train(photos, cell.config)
     views = list(done.held_out())
-    measured = [evaluate_view(view.render, view.photo, view.mask) for view in views]
-    mean = asdict(mean_metrics(measured))
+    each = [evaluate_view(view.render, view.photo, view.mask) for view in views]
+    mean = asdict(mean_metrics(each))
     for k, view in enumerate(views[:renders]):
         with atomic_path(study.beside(cell, f"{k}.png")) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
@@ -59,9 +63,10 @@ def run_cell(cell: Cell, photos: Scene, study: Study, renders: int = 0) -> Run:
         "reasons": mean["reasons"],
         "views": [
             {"name": view.name} | {name: getattr(m, name) for name in METRICS}
-            for view, m in zip(views, measured, strict=True)
+            for view, m in zip(views, each, strict=True)
         ],
         **(_facts(done.trainer, cell) if isinstance(done, Training) else {}),
+        **(_fitted(done.trainer) if fit and isinstance(done, Training) else {}),
         "size": [views[0].photo.shape[1], views[0].photo.shape[0]],
         "notes": photos.notes,
         "sfm": None if photos.sfm is None else asdict(photos.sfm),
@@ -114,6 +119,16 @@ def _facts(trainer: Trainer, cell: Cell) -> dict[str, Any]:
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
         "left_out": [item.known() for item in trainer.method_left_out],
     }
+
+
+def _fitted(trainer: Trainer) -> dict[str, Any]:
+    """The means over the held-out views with their cameras fitted to the scene, and how far these moved."""
+    config, gaussians = trainer.config, trainer.shown()
+    fits = fit_cameras(trainer.scene.test, gaussians, config.sh_degree, config.background)
+    scene = replace(trainer.scene, test=[fit.view for fit in fits])
+    mean = mean_metrics(measured(held_out_renders(scene, gaussians, config.sh_degree, config.background)))
+    moved = float(np.median([fit.pixels for fit in fits]))
+    return {"fitted": {name: asdict(mean)[name] for name in METRICS} | {"moved_px": moved}}
 
 
 def _render_ms(trainer: Trainer) -> float:

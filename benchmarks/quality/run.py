@@ -32,7 +32,7 @@ class Quality:
 
     def measure(self, cell: Cell, photos: Scene) -> dict[str, Any]:
         renders = self.args.pictures if cell.seed == self.protocol.seeds[0] else 0
-        return run_cell(cell, photos, self.study, renders)
+        return run_cell(cell, photos, self.study, renders, self.args.sfm or self.args.fit_cameras)
 
     def compared(self) -> DataFrame:
         """The runs that see the same photos where every row is finished: only they are compared."""
@@ -76,6 +76,8 @@ class Quality:
         frame = tables.frame_of(runs, baseline)
         what = self.what(frame)
         report.tables.append(tables.metrics(frame, what))
+        if "fitted" in frame and frame["fitted"].notna().all():
+            report.tables.append(tables.fitted(frame, what))
         if baseline is not None:
             over = f"PSNR gain over {baseline}"
             for name, when in zip(tables.GAINS, ("", " when the faster of the two ends"), strict=True):
@@ -127,11 +129,13 @@ def run(args: argparse.Namespace) -> Report:
 
 LISTED = "; ".join(f"{name}: {protocol.help}" for name, protocol in PROTOCOLS.items())
 SFM = "poses and points from the degraded photos, the same for all rows"
+FIT = "measure a second time with each held-out camera fitted to the trained scene, as --sfm does"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": LISTED},
     "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
     "--validate": {"action": "store_true", "help": "for tuning: judge on training photos, not on test views"},
     "--sfm": {"action": "store_true", "help": SFM},
+    "--fit-cameras": {"action": "store_true", "help": FIT},
     "--pictures": {"type": int, "default": 1, "metavar": "N", "help": "sheets per scene and degradation"},
 }
 BENCHMARK = Benchmark("error of each method over scenes, degradations and seeds", run, PROTOCOLS, OPTIONS)

@@ -54,6 +54,19 @@ def metrics(frame: DataFrame, what: str, names: Sequence[str] = ("psnr", "ssim",
     )
 
 
+def fitted(frame: DataFrame, what: str) -> str:
+    """The means once each held-out camera was fitted to the trained scene, and how far the cameras moved."""
+    own = DataFrame(frame["fitted"].tolist(), frame.index).astype(float)
+
+    def text(part: DataFrame) -> str:
+        mean = own.loc[part["index"]].mean(skipna=False)
+        moved = number(mean["moved_px"], ".2f")
+        return f"{number(mean['psnr'], '.2f')}/{number(mean['ssim'], '.3f')}, {moved} px"
+
+    title = f"PSNR/SSIM, each held-out camera fitted to the trained scene, and its move (median), {what}"
+    return crossed(title, with_degraded(frame.reset_index()), text)
+
+
 def gains(frame: DataFrame, name: str, title: str, baseline: str) -> str:
     """Gains of the rows that have them: mean ± standard deviation over groups, and the worst group."""
 
@@ -172,6 +185,7 @@ def reconstructions(frame: DataFrame) -> str:
             "points": f"{s['points']:,} ({s['own_points']:,})",
             "track_length": f"{s['track_length']:.1f} ({number(s['own_track_length'], '.1f')})",
             "reprojection": f"{s['reprojection_error_px']:.2f} ({own_error})",
+            "auc": "/".join(f"{value:.2f}" for value in (s.get("auc") or {}).values()) or NOTHING,
         }
         lines.append(s | words)
     title = "Poses and points from the degraded photos (the scene's own); distances in scene extents"

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from hqgs.base.files import write_json
+from hqgs.base.stages import Stage
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, ready
 from hqgs.evaluation.verdict import verdict
 from hqgs.model.formats.files import scene_file
+
+if TYPE_CHECKING:
+    from hqgs.evaluation.metrics import ViewMetrics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +32,8 @@ class Evaluate:
     """The photos to measure with (those that the run was trained on)."""
     downscale: Factor = None
     """Divide the sides of the photos of --scene by F."""
+    fit_cameras: bool = False
+    """Also measure with each held-out camera fitted to the scene: what its pose costs is set aside."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the numbers as JSON."""
 
@@ -42,8 +49,10 @@ def run(options: Evaluate) -> int:
             raise ValueError(f"{options.source} is a file: --scene names the photos to measure it with")
         if options.scene is not None:
             ready(options.scene)
-        from hqgs.evaluation.held_out import held_out_renders, measured  # here: they load torch
-        from hqgs.evaluation.metrics import METRICS, mean_metrics
+        from hqgs.evaluation.fit_cameras import Fitted, fit_cameras  # here: they load torch
+        from hqgs.evaluation.held_out import held_out_renders, measured
+        from hqgs.evaluation.metrics import mean_metrics
+        from hqgs.model.constants import BACKGROUND
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.source import load, load_again
 
@@ -58,25 +67,56 @@ def run(options: Evaluate) -> int:
                 )
         if not scene.test:
             raise ValueError(f"{scene.name} has no held-out photo to measure with")
-        views = held_out_renders(scene, Gaussians.load(source))
+        gaussians = Gaussians.load(source)
+        views = held_out_renders(scene, gaussians)
         each = measured(views)
         mean = mean_metrics(each)
+        again: list[ViewMetrics] = []
+        fits: list[Fitted] = []
+        if options.fit_cameras:
+            with LoadingScreen() as screen:
+                fits = fit_cameras(
+                    scene.test,
+                    gaussians,
+                    gaussians.sh_degree,
+                    BACKGROUND,
+                    lambda done: screen.stage(Stage("held-out cameras fitted", done, len(scene.test))),
+                )
+            fitted_scene = replace(scene, test=[fit.view for fit in fits])
+            again = measured(held_out_renders(fitted_scene, gaussians))
         if options.out is not None:
             named = {name: asdict(one) for name, one in zip(views.names, each, strict=True)}
-            write_json(options.out, {"mean": asdict(mean), "views": named})
+            numbers: dict[str, Any] = {"mean": asdict(mean), "views": named}
+            if fits:
+                moved = [{"rotation_deg": fit.rotation_deg, "moved_px": fit.pixels} for fit in fits]
+                both = zip(views.names, again, moved, strict=True)
+                named = {name: asdict(one) | move for name, one, move in both}
+                numbers["fitted"] = {"mean": asdict(mean_metrics(again)), "views": named}
+            write_json(options.out, numbers)
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
         return fail(1, f"{options.source}: {error}")
-    shown = [name for name in METRICS if getattr(mean, name) is not None]
-    rows = [
-        [
-            name,
-            *(f"{getattr(one, metric):.4g}" if getattr(one, metric) is not None else "-" for metric in shown),
-        ]
-        for name, one in [*zip(views.names, each, strict=True), ("mean", mean)]
-    ]
-    print(markdown_table(f"{source} on the held-out photos of {scene.name}", ["photo", *shown], rows))
+    title = f"{source} on the held-out photos of {scene.name}"
+    print(_table(title, [*zip(views.names, each, strict=True), ("mean", mean)]))
+    if fits:
+        pixels = sorted(fit.pixels for fit in fits)
+        rows = [*zip(views.names, again, strict=True), ("mean", mean_metrics(again))]
+        print(f"\n{_table(f'{title}, each camera fitted to the scene', rows)}")
+        print(f"\ncameras moved by {pixels[len(pixels) // 2]:.2f} px (median), at most {pixels[-1]:.2f} px")
     word, why = verdict(mean.psnr)
     print(f"\nquality: {word} ({why})")
     return 0
+
+
+def _table(title: str, rows: Sequence[tuple[str, ViewMetrics]]) -> str:
+    """The metrics that the last row, the mean, has."""
+    from hqgs.evaluation.metrics import METRICS  # here: it loads torch
+
+    shown = [name for name in METRICS if getattr(rows[-1][1], name) is not None]
+    cells = [[name, *(_cell(getattr(one, metric)) for metric in shown)] for name, one in rows]
+    return markdown_table(title, ["photo", *shown], cells)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

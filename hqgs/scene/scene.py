@@ -132,6 +132,7 @@ class SfmReport:
     unreadable: dict[str, str] = field(default_factory=dict)  # files that were left out before, and why
     first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do
+    auc: dict[str, float] | None = None  # of pairs' pose errors up to "1", "3", "5" degrees; see `pose_auc`
 
     def __str__(self) -> str:
         text = self._found() if self.rotation_error_deg is None else self._compared()
@@ -173,6 +174,9 @@ class SfmReport:
             f"{self.own_points}, the nearest {self.point_distance:.2%} of the extent away (median); "
             f"{self.track_length:.1f} photos a point, {self.reprojection_error_px:.2f} px off (mean)"
         )
+        if self.auc is not None:
+            within = ", ".join(f"{value:.2f} at {limit} deg" for limit, value in self.auc.items())
+            text += f"; AUC {within}"
         if self.own_track_length is not None:
             text += f", its own {self.own_track_length:.1f} and {self.own_reprojection_error_px:.2f} px"
         return text

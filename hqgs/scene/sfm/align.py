@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,28 @@ def _umeyama(source: Floats, target: Floats, turns: Floats) -> Similarity | None
     R = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     scale = float((b * (a @ R.T)).sum()) / lengths[0] ** 2
     return Similarity(scale, R, target.mean(0) - scale * R @ source.mean(0)) if scale > 0 else None
+
+
+def pose_auc(found: Floats, own: Floats, photos: int, limits: Sequence[float] = (1, 3, 5)) -> list[float]:
+    """Area under the curve of pairs whose relative pose is right to so many degrees, for each limit.
+
+    `found` and `own` [V, 4, 4] are world-to-camera matrices of the same photos, in frames of their own;
+    `photos` counts those that have no place as well: each of their pairs is a failure. A pair's error is the
+    larger of the angles between its two relative rotations and between the two directions from one centre to
+    the other. 1: all pairs are exact.
+    """
+    pairs = photos * (photos - 1) // 2
+    first, second = np.triu_indices(len(found), 1)
+    turns, ways = [], []
+    for viewmats in (found, own):
+        R, centers = viewmats[:, :3, :3], camera_centers(viewmats)
+        turns.append(np.einsum("nij,nkj->nik", R[first], R[second]))
+        way = np.einsum("nij,nj->ni", R[first], centers[second] - centers[first])
+        ways.append(way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), ROUNDING**2))
+    turned = rotation_angles(np.einsum("nij,nkj->nik", *turns))
+    apart = 2 * np.arcsin(np.clip(np.linalg.norm(ways[0] - ways[1], axis=1) / 2, 0, 1))
+    errors = np.rad2deg(np.maximum(turned, apart))
+    return [float(np.maximum(1 - errors / limit, 0).sum() / max(pairs, 1)) for limit in limits]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from hqgs.base.stages import OnStage, untold
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import model_points, seen_points
 from hqgs.scene.scene import Scene, SfmReport, Tracks, View
-from hqgs.scene.sfm.align import Observations, align, camera_centers, refine, rotation_angles
+from hqgs.scene.sfm.align import Observations, align, camera_centers, pose_auc, refine, rotation_angles
 from hqgs.scene.sfm.run import run_colmap
 
 
@@ -69,6 +69,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) ->
         own_track_length=None if scene.tracks is None else scene.tracks.length,
         own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
         first_pass=ran.first_pass,
+        auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),
     )
     return replace(
         scene,
