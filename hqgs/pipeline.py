@@ -110,7 +110,7 @@ def train(
         method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
             "srgs" or "hqgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
-            photos, growth, weight, harmonics, resolution, iterations, with commas.
+            photos, growth, weight, resolution, iterations, with commas.
         seed: of everything random.
         max_gaussians: growth stops there; bounds the memory.
         guidance: of hqgs: "formation", or "paper", its published form.

@@ -16,19 +16,12 @@ import hqgs.training.schedule as schedule
 from hqgs.base.left_out import LeftOut, format_left_out
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
-from hqgs.training import trials
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig, parse_leave_out
 from hqgs.training.schedule import COARSE_PART, smaller
 from hqgs.training.trainer import Trainer
 
 VIEWS = 13  # one is a test view; of twelve, one is held back
 STILL = DensifyConfig(start=10_000, reset_every=10_000)
-
-
-@pytest.fixture(autouse=True)
-def early(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs of a few steps decide on the harmonics too."""
-    monkeypatch.setattr(schedule, "EARLIEST", 1)
 
 
 def run(scene: Scene, iterations: int, *items: str, **changes: object) -> Trainer:
@@ -43,9 +36,9 @@ def bits(trainer: Trainer) -> dict[str, bytes]:
 
 
 def test_the_items_by_name() -> None:
-    assert parse_leave_out("auto") == ("photos", "growth", "weight", "harmonics")
+    assert parse_leave_out("auto") == ("photos", "growth", "weight")
     assert parse_leave_out("none") == ()
-    assert parse_leave_out("harmonics, photos") == ("photos", "harmonics")
+    assert parse_leave_out("weight, photos") == ("photos", "weight")
     with pytest.raises(ValueError, match="there is no 'colour'; there are: auto, none, or some of photos"):
         parse_leave_out("photos,colour")
     with pytest.raises(ValueError, match="there is no 'colour'"):
@@ -61,25 +54,25 @@ def test_with_nothing_to_leave_out_all_photos_are_trained_at_full_size() -> None
     assert trainer.length == 24
 
 
-def test_some_photos_are_held_back_until_the_bands_are_tried() -> None:
-    trainer = Trainer(tiny_scene(VIEWS), tiny_config(60, leave_out=("harmonics",)))
+def test_some_photos_are_held_back_until_growth_ends() -> None:
+    trainer = Trainer(tiny_scene(VIEWS), tiny_config(60, leave_out=("iterations",)))
     names = [trainer.step().view.name for _ in range(60)]
     held = {trainer.scene.train[k].name for k in trainer.schedule.held}
     back = trainer.state.decisions.released
-    assert 0 < back < trainer.config.densify.stop  # so that growth sees them
+    assert back == trainer.config.densify.stop
     assert len(held) == 1
     assert not held & set(names[:back])
     assert set(names[back:]) == {view.name for view in trainer.scene.train}
 
 
 def test_few_photos_are_never_held_back() -> None:
-    trainer = run(tiny_scene(9), 30, "harmonics")
+    trainer = run(tiny_scene(9), 30, "iterations")
     assert trainer.schedule.held == ()
     assert trainer.frugality.left_out() == []
 
 
 def test_degraded_photos_have_a_budget_of_their_own() -> None:
-    scene, items = tiny_scene(VIEWS), ("photos", "growth", "weight", "harmonics", "resolution", "iterations")
+    scene, items = tiny_scene(VIEWS), ("photos", "growth", "weight", "resolution", "iterations")
     noisy = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:20"), leave_out=items)
     assert Trainer(scene, noisy).schedule.items == {"photos", "iterations"}
     clean = replace(noisy, hqgs=HQGSConfig(formation="none"))
@@ -94,44 +87,21 @@ def test_fine_gaussians_do_not_grow() -> None:
     assert coarse.frugality.left_out()[0].what == f"{refused} splits of small Gaussians"
 
 
-def shaded(scene: Scene) -> Scene:
-    """The scene as a surface would show it whose brightness follows the camera to the right."""
-    views = [
-        replace(v, image=(v.image * np.clip(0.6 + v.camera.center[0], 0, 1)).astype(np.uint8))
-        for v in scene.train
+@pytest.mark.parametrize(
+    ("items", "iterations", "interval"),
+    [((), 6_000, 857), (("growth",), 6_000, 300), (("growth",), 3_000, 428), ((), 30_000, 1_000)],
+)
+def test_the_next_degree_comes_sooner_where_growth_is_left_out(
+    items: tuple[str, ...], iterations: int, interval: int
+) -> None:
+    config = TrainConfig(iterations, "3dgs", leave_out=items).scaled()
+    schedule = Trainer(tiny_scene(), config).schedule
+    assert [schedule.degree(k) for k in (interval - 1, interval, 3 * interval - 1, 3 * interval)] == [
+        0,
+        1,
+        2,
+        3,
     ]
-    return replace(scene, train=views)
-
-
-def test_bands_go_where_the_held_back_photos_do_not_ask_for_them() -> None:
-    trainer = run(tiny_scene(VIEWS, num_points=150), 200, "harmonics", densify=STILL)
-    assert trainer.gaussians.sh_degree <= 1
-    (item,) = trainer.frugality.left_out()
-    assert item.what == f"harmonics above degree {trainer.gaussians.sh_degree}"
-    dropped = 16 - (trainer.gaussians.sh_degree + 1) ** 2
-    assert item.bytes == 12 * dropped * len(trainer.gaussians)
-    assert item.cost_db is not None
-    assert item.cost_db <= trials.TOLERANCE
-    assert item.seconds is not None
-
-
-def test_a_short_run_keeps_its_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule, "EARLIEST", 2_000)
-    for iterations in (200, 2_900):
-        trainer = Trainer(
-            tiny_scene(VIEWS), TrainConfig(iterations, "3dgs", leave_out=("harmonics",)).scaled()
-        )
-        assert trainer.schedule.items == set()
-        assert trainer.schedule.held == ()
-    config = TrainConfig(3_100, "3dgs", leave_out=("harmonics",)).scaled()
-    assert Trainer(tiny_scene(VIEWS), config).schedule.items == {"harmonics"}
-
-
-def test_bands_stay_where_the_view_matters() -> None:
-    scene = shaded(tiny_scene(VIEWS, num_points=150))
-    trainer = run(scene, 200, "harmonics", densify=STILL, lr_shN=2.5e-3)
-    assert trainer.gaussians.sh_degree == 3
-    assert trainer.frugality.left_out() == []
 
 
 def test_what_no_photo_shows_goes_when_growth_ends() -> None:
@@ -193,7 +163,7 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schedule, "SMALLEST_SIDE", 8)
-    items = ("growth", "weight", "harmonics", "resolution")
+    items = ("growth", "weight", "resolution")
     scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
     whole = Trainer(scene, config)
     for k in range(60):
@@ -230,7 +200,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     try:
         for threads in (1, 2):
             hqgs.set_num_threads(threads)
-            results.append(bits(run(tiny_scene(VIEWS), 40, "growth", "weight", "harmonics")))
+            results.append(bits(run(tiny_scene(VIEWS), 40, "growth", "weight")))
     finally:
         hqgs.set_num_threads(before)
     assert results[0] == results[1]

@@ -14,7 +14,6 @@ from run_state import assert_same, whole_state
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-import hqgs.training.schedule as module
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene.scene import Camera, View
@@ -54,8 +53,7 @@ def test_a_plan_follows_from_its_arguments_alone() -> None:
     assert again[::-1] == forwards
 
 
-def test_a_shortened_run_squeezes_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "EARLIEST", 1)
+def test_a_shortened_run_squeezes_the_rest() -> None:
     densify = replace(DENSIFY, stop=900)
     timetable = schedule(tiny_config(1_000, densify=densify, leave_out=("iterations",)), count=12)
     assert timetable.held == (6,)
@@ -83,9 +81,9 @@ def test_a_coarse_beginning_has_coarser_limits() -> None:
     assert not any(plan.coarse or plan.finest for plan in plans(degraded))
 
 
-def test_the_degree_stays_below_what_was_decided() -> None:
-    timetable = schedule(tiny_config(100, sh_interval=10))
-    degrees = [plan.degree for plan in plans(timetable, Decisions(100, 2), 40)]
+def test_the_degree_rises_to_that_of_the_configuration() -> None:
+    timetable = schedule(tiny_config(100, sh_interval=10, sh_degree=2))
+    degrees = [plan.degree for plan in plans(timetable, count=40)]
     assert degrees == [0] * 9 + [1] * 10 + [2] * 21
 
 

@@ -152,19 +152,6 @@ def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: i
         _replace(gaussians, optimizer, name, chosen, state)
 
 
-def cut_harmonics(gaussians: Gaussians, optimizer: Optimizer, sh0: Tensor, shN: Tensor) -> None:
-    """Take these coefficients over, fewer than before. The moments of what stays are kept."""
-    for name, new in (("sh0", sh0), ("shN", shN)):
-        old = getattr(gaussians, name)
-        state = {
-            key: value[:, : new.shape[1]].clone()
-            if isinstance(value, Tensor) and value.shape == old.shape
-            else value
-            for key, value in optimizer.state.pop(old, {}).items()
-        }
-        _replace(gaussians, optimizer, name, new.clone().requires_grad_(), state)
-
-
 def reset_opacities(gaussians: Gaussians, optimizer: Optimizer, highest: float) -> None:
     """Cut the opacities to `highest` and forget the moments that led to them."""
     old = gaussians.opacities

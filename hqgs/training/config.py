@@ -20,7 +20,6 @@ ITEMS = {
     "photos": "training photos that repeat others or show nothing",
     "growth": "Gaussians finer than the photos' pixels",
     "weight": "Gaussians that no photo shows",
-    "harmonics": "bands of the harmonics that held-back photos do not ask for",
     "resolution": "full resolution in the first part of the run",
     "iterations": "steps that no longer pay",
 }

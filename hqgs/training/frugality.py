@@ -1,8 +1,8 @@
 """What a run leaves out by itself, decided while it trains, from training photos that are held back.
 
-A few training photos are held back at first. Whether harmonics may go, and whether the run still improves, is
-tried on them: what costs no more than TOLERANCE dB goes. Then they come back, early enough that the scene can
-still grow where only they look. Test views are never looked at.
+A few training photos are held back at first, where it is not known how long a run pays: they tell whether it
+still improves. Then they come back, early enough that the scene can still grow where only they look. Test
+views are never looked at.
 """
 
 from __future__ import annotations
@@ -21,13 +21,10 @@ from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
 from hqgs.training.schedule import (
-    BAND_CHECK,
-    BAND_INTERVAL,
     CHECKS,
     COARSE_FACTOR,
     COARSE_MOST,
     COARSE_PART,
-    EARLIEST,
     FEWEST_VIEWS,
     FINEST,
     HELD_SHARE,
@@ -39,18 +36,17 @@ from hqgs.training.schedule import (
     spread,
 )
 from hqgs.training.state import TrainState
-from hqgs.training.trials import FOLDED, TOLERANCE, WEIGHTS, FewerBands, fewest_bands, fewest_gaussians
+from hqgs.training.trials import TOLERANCE, WEIGHTS, fewest_gaussians
 
 TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
 BETTER, PATIENCE = 0.05, 2_000  # dB, iterations: when a run has stopped improving
 WINDOW = 50  # steps before and after a decision that tell what it saves
 RULES: dict[str, object] = {  # what a result depends on beside the configuration
     "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
-    "tolerance": (TOLERANCE, TRIED, FOLDED),
+    "tolerance": (TOLERANCE, TRIED),
     "growth": FINEST,
     "resolution": (COARSE_PART, COARSE_MOST, COARSE_FACTOR, SMALLEST_SIDE),
     "weight": WEIGHTS,
-    "harmonics": (BAND_CHECK, EARLIEST, BAND_INTERVAL),
     "iterations": (BETTER, PATIENCE, CHECKS, REST),
 }
 
@@ -60,7 +56,6 @@ class Verdict:
     """What is decided after a step."""
 
     decisions: Decisions
-    colors: dict[str, Tensor] | None = None  # sh0 and shN of fewer bands to go on with; None: as they are
     faint: Tensor | None = None  # bool [N]: Gaussians to remove; None: none
 
 
@@ -148,40 +143,12 @@ class Frugality:
     def _of_held_photos(self, state: TrainState) -> Verdict:
         """What the held-back photos say, and whether they come back."""
         schedule, iteration, decisions = self.schedule, state.iteration, state.decisions
-        tries_bands = "harmonics" in schedule.items and iteration == schedule.band_check
-        tries_length = "iterations" in schedule.items and iteration % CHECKS == 0
-        tries_length &= not schedule.is_coarse(iteration)
-        colors = None
-        if tries_bands or tries_length:
-            shown = self._shown()
-            if tries_bands and (fewer := self._fewer_bands(state, shown)) is not None:
-                colors, decisions = fewer.colors, replace(decisions, degree=fewer.degree)
-                shown = Gaussians(**(shown.named() | colors))
-            if tries_length and (length := self._length(state, shown)) is not None:
-                decisions = replace(decisions, length=length, released=iteration)
-        last = schedule.config.densify.stop if "iterations" in schedule.items else schedule.band_check
-        if iteration == last:
+        tries = iteration % CHECKS == 0 and not schedule.is_coarse(iteration)
+        if tries and (length := self._length(state, self._shown())) is not None:
+            decisions = replace(decisions, length=length, released=iteration)
+        if iteration == schedule.config.densify.stop:
             decisions = replace(decisions, released=iteration)
-        return Verdict(decisions, colors)
-
-    def _fewer_bands(self, state: TrainState, shown: Gaussians) -> FewerBands | None:
-        """Bands that the held-back photos do not ask for; None: they ask for all."""
-        held = self.schedule.held
-        fewer = fewest_bands(state.gaussians, shown, self.views, lambda g: self._psnr(g, held))
-        if fewer is None:
-            return None
-        n = len(shown)
-        numbers = shown.shN.shape[1] - fewer.colors["shN"].shape[1]
-        left = LeftOut(
-            f"harmonics above degree {fewer.degree}",
-            f"the {len(held)} held-back photos do not ask for them",
-            fewer.evidence,
-            memory_mb=4 * 12e-6 * numbers * n,
-            bytes=12 * numbers * n,
-            cost_db=fewer.cost,
-        )
-        self._note(left, state)
-        return fewer
+        return Verdict(decisions)
 
     def _length(self, state: TrainState, shown: Gaussians) -> int | None:
         """Of the run, where the held-back photos have stopped improving; None: they have not."""

@@ -20,9 +20,8 @@ COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.6, 2, 32  # of the run; of the sid
 COARSE_MOST = 1_500  # iterations
 HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
 FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
-BAND_CHECK = 0.3  # of the run: when the harmonics are tried
-EARLIEST = 2_000  # iterations before which they cannot tell yet
-BAND_INTERVAL = 1 / 20  # of the run, at most, until the next degree is trained, so that all are there by then
+BAND_INTERVAL = 1 / 20  # of a run of more than SHORT iterations, at most, until the next degree is trained
+SHORT = 3_000
 EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
 CHECKS = 500  # iterations from one look at whether the run still improves to the next
 TAIL, TAIL_PART = 50, 1 / 3  # steps after the end of growth that tell what the rest costs; of that rest
@@ -35,14 +34,8 @@ class Decisions:
     """What a run has decided so far, as far as its steps depend on it."""
 
     length: int  # iterations of the run as far as it is known: those of the configuration, or fewer
-    degree: int  # of the harmonics, at most
     released: int = 0  # the iteration after which the held-back photos came back; 0: not yet
     turned: int = 0  # the iteration after which the clock gave the run another length; 0: it did not
-
-    @property
-    def num_higher(self) -> int:
-        """Coefficients above degree 0 of each Gaussian."""
-        return (self.degree + 1) ** 2 - 1
 
 
 @dataclass(frozen=True)
@@ -77,16 +70,14 @@ class Schedule:
             items &= {"photos", "iterations"}
         if min(min(v.camera.width, v.camera.height) for v in views) < COARSE_FACTOR * SMALLEST_SIDE:
             items -= {"resolution"}
-        if _band_check(config) >= config.densify.stop:  # a run that is too short to tell
-            items -= {"harmonics"}
         count = 0
-        if items & {"harmonics", "iterations"} and len(views) >= FEWEST_VIEWS:
+        if "iterations" in items and len(views) >= FEWEST_VIEWS:
             count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
         return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)))
 
     def start(self) -> Decisions:
         """Before the first step."""
-        return Decisions(self.config.iterations, self.config.sh_degree)
+        return Decisions(self.config.iterations)
 
     def plan(self, iteration: int, decisions: Decisions) -> Plan:
         """What step number `iteration` (1, 2, ...) does."""
@@ -101,7 +92,7 @@ class Schedule:
             view=self.view(iteration, decisions),
             coarse=smaller_part,
             part=self.part(iteration, decisions),
-            degree=self.degree(iteration, decisions),
+            degree=self.degree(iteration),
             observes=iteration < stop,
             grows=densify.start < iteration < stop and iteration % densify.every == 0,
             finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,
@@ -124,7 +115,7 @@ class Schedule:
     def _pauses(self, plan: Plan, decisions: Decisions) -> bool:
         """Whether something is due, or may be decided, after this plan's view."""
         iteration, growth_end = plan.iteration, self.growth_end(decisions)
-        due = {decisions.length, growth_end, self.config.densify.stop, self.coarse_end, self.band_check}
+        due = {decisions.length, growth_end, self.config.densify.stop, self.coarse_end}
         due.add(self.turn_at(decisions))
         return plan.grows or iteration in due or ("iterations" in self.items and iteration % CHECKS == 0)
 
@@ -157,12 +148,12 @@ class Schedule:
         start = changed / total  # what follows is squeezed into the rest, or stretched
         return start + (1 - start) * (iteration - changed) / (length - changed)
 
-    def degree(self, iteration: int, decisions: Decisions) -> int:
+    def degree(self, iteration: int) -> int:
         """Of the harmonics that are trained: it rises with the iterations."""
         interval = self.config.sh_interval
-        if "harmonics" in self.items:
+        if "growth" in self.items and self.config.iterations > SHORT:
             interval = min(interval, max(1, int(BAND_INTERVAL * self.config.iterations)))
-        return min(decisions.degree, iteration // interval)
+        return min(self.config.sh_degree, iteration // interval)
 
     def growth_end(self, decisions: Decisions) -> int:
         """The iteration from which on nothing grows; a shortened run ends growth sooner."""
@@ -170,11 +161,6 @@ class Schedule:
         if decisions.length == self.config.iterations or decisions.turned:
             return stop
         return min(stop, math.ceil((1 + REST / 2) * decisions.released))
-
-    @property
-    def band_check(self) -> int:
-        """The iteration after which the harmonics are tried."""
-        return _band_check(self.config)
 
     @property
     def coarse_end(self) -> int:
@@ -248,7 +234,3 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     """`count` of the items at most, evenly spread."""
     count = min(count, len(items))
     return [items[k] for k in np.linspace(0, len(items), 2 * count + 1)[1::2].astype(int)]
-
-
-def _band_check(config: TrainConfig) -> int:
-    return max(EARLIEST, round(BAND_CHECK * config.iterations), 1)

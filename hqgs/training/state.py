@@ -80,8 +80,7 @@ class TrainState:
                 )
 
         for name, tensor in self.gaussians.named().items():
-            row = tensor.shape[1:] if name != "shN" else (decisions.num_higher, 3)
-            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *row)))
+            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *tensor.shape[1:])))
         gaussians = Gaussians(**part("gaussians.", tensors))
         optimizer = optimizer_of(gaussians)
         for prefix, param in _moments(optimizer):

@@ -22,7 +22,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
-from hqgs.training.adam import Adam, cut_harmonics, reset_opacities
+from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.batch import Part, Rest, descend, exchanged, note_views, part_of, to_rasterize
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
@@ -155,7 +155,7 @@ class Trainer:
     def held_out(self, numbers: Sequence[int] | None = None) -> HeldOutViews:
         """The held-out views of these numbers (None: all), for use before the next step."""
         views = self.scene.test if numbers is None else [self.scene.test[k] for k in numbers]
-        degree = self.schedule.degree(self.iteration, self.state.decisions)
+        degree = self.schedule.degree(self.iteration)
         return HeldOutViews(views, self.shown(), degree, self.config.background)
 
     def evaluate(self, views: HeldOutViews | None = None) -> None:
@@ -285,8 +285,6 @@ class Trainer:
         state = self.state
         verdict = self.frugality.after_step(state, growth.refused, seconds)
         state.decisions = verdict.decisions
-        if verdict.colors is not None:
-            cut_harmonics(state.gaussians, state.optimizer, **verdict.colors)
         if verdict.faint is not None:
             self._remove(verdict.faint)
 
@@ -306,7 +304,7 @@ class Trainer:
     def _psnr(self, gaussians: Gaussians, numbers: Sequence[int]) -> float:
         """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize."""
         iteration = self.state.iteration
-        degree = min(gaussians.sh_degree, self.schedule.degree(iteration, self.state.decisions))
+        degree = self.schedule.degree(iteration)
         return self._looks.psnr(gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks)
 
     def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], loss: float) -> bool:
