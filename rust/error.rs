@@ -2,7 +2,8 @@
 
 use std::fmt;
 
-/// Why a call did not do its work. Nothing has been changed then, and the call can be made again.
+/// Why a call did not do its work. The call can be made again: what it reads and updates is as it was. A buffer that
+/// it was to fill, as the gradient of a loss, may be filled in part.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Error {
@@ -40,11 +41,6 @@ pub enum Error {
         /// Its size.
         bytes: u64,
     },
-    /// The threads cannot be started, or are no longer there.
-    Threads {
-        /// What failed.
-        message: String,
-    },
 }
 
 impl Error {
@@ -72,7 +68,6 @@ impl Error {
             | Self::Shape { name, .. }
             | Self::OutOfMemory { name, .. } => name,
             Self::TooManyPairs { .. } => "means",
-            Self::Threads { .. } => "threads",
         }
     }
 }
@@ -81,9 +76,7 @@ impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}: ", self.name())?;
         match self {
-            Self::InvalidArgument { message, .. } | Self::Threads { message } => {
-                f.write_str(message)
-            }
+            Self::InvalidArgument { message, .. } => f.write_str(message),
             Self::Shape { expected, got, .. } => {
                 write!(f, "expected shape {expected}, got {got}")
             }
@@ -148,12 +141,6 @@ mod tests {
                     bytes: 1 << 40,
                 },
                 "image: cannot allocate 1099511627776 bytes",
-            ),
-            (
-                Error::Threads {
-                    message: "cannot start 9 threads".into(),
-                },
-                "threads: cannot start 9 threads",
             ),
         ] {
             assert_eq!(error.to_string(), message);

@@ -72,7 +72,6 @@ mod counts;
 mod error;
 mod memory;
 mod simd;
-mod threads;
 mod uninit;
 
 pub use error::Error;
@@ -94,7 +93,6 @@ pub mod internals {
         project,
         simd,
         stereo,
-        threads,
         tiles
     );
 

@@ -5,7 +5,9 @@
 
 use crate::{error::Error, memory, simd::Real};
 use std::{
+    marker::PhantomData,
     mem::MaybeUninit,
+    ptr,
     sync::atomic::{AtomicUsize, Ordering},
 };
 
@@ -22,15 +24,27 @@ pub(crate) struct UninitVec<T> {
     set: AtomicUsize,
 }
 
-/// A piece of a vector in the making, from its first element on that is not yet set.
+/// A piece of a vector in the making, none of which is set yet.
 #[derive(Debug)]
 pub(crate) struct UninitPiece<'a, T> {
+    memory: &'a mut [MaybeUninit<T>],
+    set: &'a AtomicUsize,
+    /// Whether what is put goes around the cache.
+    streamed: bool,
+}
+
+/// The same while one thread sets it, element after element: what is left of it.
+///
+/// What goes around the cache is ordered before what follows only on the thread that wrote it, so that this type
+/// cannot be sent to another one: the thread that drops it is the one that put.
+#[derive(Debug)]
+pub(crate) struct PieceWriter<'a, T> {
     memory: &'a mut [MaybeUninit<T>],
     /// Elements that were set.
     done: usize,
     set: &'a AtomicUsize,
-    /// Whether what is put goes around the cache.
     streamed: bool,
+    stays: PhantomData<*mut T>,
 }
 
 impl<T: Copy> UninitVec<T> {
@@ -70,7 +84,6 @@ impl<T: Copy> UninitVec<T> {
                 rest = tail;
                 UninitPiece {
                     memory,
-                    done: 0,
                     set,
                     streamed,
                 }
@@ -83,33 +96,38 @@ impl<T: Copy> UninitVec<T> {
     pub fn finish(mut self) -> Vec<T> {
         assert_eq!(*self.set.get_mut(), self.len, "a piece was not set");
         // SAFETY: `new` made room for `len` elements. The pieces of one cut do not overlap, and each counts an
-        // element once, after it was set; together they count `len`, so that all are set.
+        // element once, after it was set; together they count `len`, so that all are set. They borrow `self`, so
+        // that none is left, and whatever waited for the threads that set them sees what they wrote: a writer
+        // fences its streaming stores before it counts, on the thread that made them.
         unsafe { self.memory.set_len(self.len) };
         self.memory
     }
 }
 
 impl<'a, T: Copy> UninitPiece<'a, T> {
-    /// Set every element that is left.
-    #[inline(always)]
-    pub fn fill(mut self, value: T) -> &'a mut [T] {
-        self.next(self.memory.len(), value)
-    }
-
-    /// Set the next `n` elements.
+    /// Set every element.
     #[inline(always)]
     #[allow(unsafe_code)]
-    pub fn next(&mut self, n: usize, value: T) -> &'a mut [T] {
-        let (memory, rest) = std::mem::take(&mut self.memory).split_at_mut(n);
-        self.memory = rest;
-        memory.fill(MaybeUninit::new(value));
-        self.done += n;
+    pub fn fill(self, value: T) -> &'a mut [T] {
+        self.memory.fill(MaybeUninit::new(value));
+        self.set.fetch_add(self.memory.len(), Ordering::Relaxed);
         // SAFETY: every element was just set, and `MaybeUninit<T>` has the layout of `T`.
-        unsafe { &mut *(std::ptr::from_mut(memory) as *mut [T]) }
+        unsafe { &mut *(ptr::from_mut(self.memory) as *mut [T]) }
+    }
+
+    /// To set it part by part.
+    pub fn writer(self) -> PieceWriter<'a, T> {
+        PieceWriter {
+            memory: self.memory,
+            done: 0,
+            set: self.set,
+            streamed: self.streamed,
+            stays: PhantomData,
+        }
     }
 }
 
-impl<T: Real> UninitPiece<'_, T> {
+impl<T: Real> PieceWriter<'_, T> {
     /// Set the next elements to those of a slice.
     #[inline(always)]
     pub fn put(&mut self, from: &[T]) {
@@ -125,7 +143,7 @@ impl<T: Real> UninitPiece<'_, T> {
 }
 
 /// Copy around the cache, in pieces of 16 bytes; returns whether that was possible. What was written may not be
-/// read before `fence`.
+/// read by another thread before `fence` on this one.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 #[allow(unsafe_code)]
@@ -140,7 +158,8 @@ fn stream<T: Real>(to: &mut [MaybeUninit<T>], from: &[T]) -> bool {
         return false;
     }
     for k in 0..pieces {
-        // SAFETY: both slices have `16 * pieces` bytes, `to` is aligned, and any x86_64 has SSE2.
+        // SAFETY: `to` has as many elements as `from`, which are `16 * pieces` bytes; `to` is aligned and borrowed
+        // mutably, and any x86_64 has SSE2. Every bit pattern of `from` is a float.
         unsafe { _mm_stream_si128(to.add(k), _mm_loadu_si128(source.add(k))) };
     }
     true
@@ -162,7 +181,7 @@ fn stream<T: Real>(_: &mut [MaybeUninit<T>], _: &[T]) -> bool {
 #[cfg(not(target_arch = "x86_64"))]
 fn fence() {}
 
-impl<T> Drop for UninitPiece<'_, T> {
+impl<T> Drop for PieceWriter<'_, T> {
     fn drop(&mut self) {
         if self.streamed {
             fence(); // before another thread learns that this job is done
@@ -183,12 +202,10 @@ mod tests {
             let pieces = vector.cut(lengths.iter().copied());
             assert_eq!(pieces.len(), lengths.len());
             pieces.into_par_iter().enumerate().for_each(|(k, piece)| {
-                let mut piece = piece;
-                let first = piece.next(lengths[k] / 2, k as f64);
-                let rest = piece.fill(0.5);
-                assert_eq!(first.len() + rest.len(), lengths[k]);
-                assert!(rest.iter().all(|x| *x == 0.5));
-                rest.fill(k as f64);
+                let all = piece.fill(0.5);
+                assert_eq!(all.len(), lengths[k]);
+                assert!(all.iter().all(|x| *x == 0.5));
+                all.fill(k as f64);
             });
             let expected: Vec<f64> = lengths
                 .iter()
@@ -207,18 +224,10 @@ mod tests {
             let mut vector = UninitVec::new(len, "test").unwrap();
             let parts: Vec<_> = expected.chunks(len / 5 + 1).collect();
             let pieces = vector.cut(parts.iter().map(|part| part.len()));
-            pieces
-                .into_par_iter()
-                .zip(parts)
-                .for_each(|(mut piece, part)| {
-                    for (k, rows) in part.chunks(48).enumerate() {
-                        if k % 7 == 3 {
-                            piece.next(rows.len(), 0.0).copy_from_slice(rows);
-                        } else {
-                            piece.put(rows);
-                        }
-                    }
-                });
+            pieces.into_par_iter().zip(parts).for_each(|(piece, part)| {
+                let mut piece = piece.writer();
+                part.chunks(48).for_each(|rows| piece.put(rows));
+            });
             assert!(vector.finish() == expected, "{len} elements");
         }
     }
@@ -227,7 +236,8 @@ mod tests {
     #[should_panic(expected = "a piece was not set")]
     fn a_piece_that_was_put_in_part_is_found() {
         let mut vector = UninitVec::new(4, "test").unwrap();
-        vector.cut([4].into_iter()).pop().unwrap().put(&[1.0f32; 3]);
+        let piece = vector.cut([4].into_iter()).pop().unwrap();
+        piece.writer().put(&[1.0f32; 3]);
         vector.finish();
     }
 
@@ -236,16 +246,6 @@ mod tests {
     fn a_piece_that_was_not_set_is_found() {
         let mut vector = UninitVec::new(5, "test").unwrap();
         vector.cut([2, 3].into_iter()).pop().unwrap().fill(1u8);
-        vector.finish();
-    }
-
-    #[test]
-    #[should_panic(expected = "a piece was not set")]
-    fn a_piece_that_was_set_in_part_is_found() {
-        let mut vector = UninitVec::new(5, "test").unwrap();
-        for mut piece in vector.cut([2, 3].into_iter()) {
-            piece.next(2, 1u8);
-        }
         vector.finish();
     }
 

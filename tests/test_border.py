@@ -332,6 +332,44 @@ def test_too_many_pairs_are_refused_before_they_are_made() -> None:
     assert 24 * 2**30 - 1000 < size <= 24 * 2**30
 
 
+def test_the_gradient_of_an_exposure_holds_a_few_bands_at_a_time() -> None:
+    """A warp that nearly folds the picture over lets each band reach every row: 2.4 GB, all at once."""
+    script = LIMITED.replace(
+        "{call}",
+        "image, warps = np.full((6144, 64, 3), 0.5, np.float32), np.zeros((2, 3, 4)); "
+        "warps[0, 2, 0] = -1 / 32; "
+        "taken, _ = _rust.exposure_forward(image, [6144, 64], None, warps, [1.0] * 3); limit(1000); "
+        "print([x.shape for x in _rust.exposure_backward(taken, image)[:2]])",
+    )
+    done = run(script)
+    assert (done.returncode, done.stdout) == (0, "[(1179648,), (24,)]\n"), done.stderr[-2000:]
+
+
+def test_depths_are_sought_at_the_corner_of_a_wide_photo() -> None:
+    """From 2^15 px on a float just below the last pixel is that pixel: a patch there reached past the end."""
+    width = 33_000
+    grey = np.random.default_rng(0).random((16, width), dtype=np.float32)
+    pixels = np.array([[width - 3.501, 12.499], [width - 3.5, 12.5], [width - 4.0, 12.0]])
+    pixels = np.concatenate([pixels, pixels + 0.001, pixels - 0.001])
+    for end in (0.5, 0.4995, 0.499, 0.498, 0.5005, 0.501):
+        corner = np.array([[width - end - 3.0, 16 - end - 3.0]])
+        for step in np.linspace(-0.01, 0.01, 41):
+            some = np.concatenate([pixels, corner]) + step
+            depths, scores = _rust.agreed_depths(
+                grey, [grey], np.eye(3, 4)[None], some, np.tile([1.0, 2.0], (len(some), 1)), 1
+            )
+            assert np.isfinite(depths).all()
+            assert (scores >= -1).all()
+
+
+def test_a_gradient_of_a_photo_has_its_shape() -> None:
+    """Before, any array with as many numbers would do."""
+    taken = calls()["exposure_backward"][1]["exposure"]
+    for shape in ((30, 20, 3), (1800,), (20, 30, 1, 3)):
+        with pytest.raises(ValueError, match=r"^v_photo: expected shape \[20, 30, 3\], got"):
+            _rust.exposure_backward(taken, np.ones(shape))
+
+
 # --- messages
 
 
@@ -350,6 +388,21 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         values = list(arrays.values())
         return _rust.project_backward(differentiable, tuple(values[:4]), tuple(values[4:]), [True] * 8)
 
+    def add_rows(rows: Any, values: Any, sums: Any) -> None:
+        _rust.add_rows([(rows, values)], sums, 0.5)
+
+    def add_harmonics(rows: Any, colors: Any, means: Any, high: Any) -> None:
+        _rust.add_harmonics([(rows, colors, (0.0, 0.0, 0.0), 1)], means, high, 0.5)
+
+    def agreed_depths(others: Any, **arguments: Any) -> Any:
+        return _rust.agreed_depths(others=[others], **arguments)
+
+    rows = {"rows": np.array([0, 2], np.int32)}
+    photographed = {
+        "image": np.ones((24, 34, 3)), "size": [20, 30], "nearness": np.ones((20, 30)),
+        "warps": np.full((2, 3, 4), 0.01), "gains": [1.0, 1.0, 1.0],
+    }  # fmt: skip
+    grey = np.random.default_rng(0).random((20, 30), dtype=np.float32)
     shaded = {**harmonics, "viewmats": forward["viewmats"], "ks": forward["ks"]}
     differentiable = _rust.project_forward(**shaded)[0]
     pictures = [np.zeros((20, 30, 3)) for _ in range(2)]
@@ -385,6 +438,28 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         "adam_step": (_rust.adam_step, {**adam, **options, "visible": np.ones(12, np.uint8), "used": 2}),
         "Separable": (
             _rust.Separable, {"rows": np.eye(20), "columns": np.eye(30), "channels": np.eye(3)}
+        ),
+        "add_rows": (
+            add_rows, {**rows, "values": np.ones((2, 5), np.float32), "sums": np.zeros((4, 5), np.float32)}
+        ),
+        "add_harmonics": (
+            add_harmonics,
+            {
+                **rows, "colors": np.ones((2, 3), np.float32), "means": np.ones((4, 3), np.float32),
+                "high": np.zeros((4, 3, 3), np.float32),
+            },
+        ),
+        "exposure_forward": (_rust.exposure_forward, photographed),
+        "exposure_backward": (
+            _rust.exposure_backward,
+            {"exposure": _rust.exposure_forward(**photographed)[0], "v_photo": np.ones((20, 30, 3))},
+        ),
+        "agreed_depths": (
+            agreed_depths,
+            {
+                "first": grey, "others": grey.copy(), "maps": np.eye(3, 4)[None],
+                "pixels": np.full((2, 2), 9.0), "ranges": np.tile([1.0, 2.0], (2, 1)), "agreeing": 1,
+            },
         ),
         "apply": (operator.apply, {"image": pictures[0], "transposed": False}),
         "apply_absolute": (operator.apply_absolute, {"image": pictures[0].astype(np.float32)}),
@@ -425,9 +500,12 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         ("cell_distance", "x"),
         ("photometric", "render"),
         ("ssim", "a"),
+        ("add_rows", "sums"),
+        ("agreed_depths", "first"),
+        ("agreed_depths", "others"),
     }
     free = call == "data_pointer" or (
-        leading and (call not in ("photometric", "ssim") or change == "one more")
+        leading and (call in ("adam_step", "cell_distance") or change == "one more")
     )
     free |= change == "one more" and (call == "Separable" or (call, name) == ("project_forward", "colors"))
     if free:
@@ -441,10 +519,10 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
 @pytest.mark.parametrize(("call", "name"), ARRAYS)
 def test_a_wrong_dtype_is_named(call: str, name: str) -> None:
     array = calls()[call][1][name]
-    message, public = refusal(call, name, array.astype(np.int32))
-    assert re.fullmatch(rf"{public}: expected an array of (float|uint).*, got int32", message), message
+    message, public = refusal(call, name, array.astype(np.int64))
+    assert re.fullmatch(rf"{public}: expected an array of (float|u?int).*, got int64", message), message
     message, public = refusal(call, name, [1.0])
-    assert re.fullmatch(rf"{public}: expected an array of (float|uint).*, got list", message), message
+    assert re.fullmatch(rf"{public}: expected an array of (float|u?int).*, got list", message), message
 
 
 @pytest.mark.parametrize(("call", "name"), ARRAYS)

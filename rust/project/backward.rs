@@ -20,7 +20,7 @@ use crate::{
         sums::{self, MAX_PARTS},
         vec3::splat3,
     },
-    uninit::{UninitPiece, UninitVec},
+    uninit::{PieceWriter, UninitPiece, UninitVec},
 };
 use fearless_simd::{Select, Simd, dispatch};
 use rayon::prelude::*;
@@ -211,7 +211,7 @@ pub struct GaussianGrads<T> {
 /// What one job fills of it: empty where not wanted.
 struct BackwardChunk<'a, T> {
     /// Of the means, quaternions, scales, opacities, covariances, harmonics and their rest.
-    outs: [UninitPiece<'a, T>; 7],
+    outs: [PieceWriter<'a, T>; 7],
     /// Numbers per Gaussian, in that order.
     rows: [usize; 7],
 }
@@ -288,7 +288,7 @@ pub fn backward<T: Real>(
         .enumerate()
         .map(|(chunk, ((((((means, quats), scales), opacities), covars), sh), rest))| {
             let out = BackwardChunk {
-                outs: [means, quats, scales, opacities, covars, sh, rest],
+                outs: [means, quats, scales, opacities, covars, sh, rest].map(UninitPiece::writer),
                 rows,
             };
             dispatch!(level, simd => backward_chunk(

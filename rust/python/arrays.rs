@@ -1,40 +1,52 @@
-//! Arrays in and out.
+//! Arrays in and out. They come in as [`Array`] or [`ArrayMut`] alone, which check all that can be wrong with them,
+//! overlaps among them.
 
 use crate::error::BindingResult;
 use hqgs::internals::{Error, simd::Real};
-use numpy::{Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{
+    Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
+    PyUntypedArrayMethods,
+};
 use pyo3::{exceptions::PyValueError, prelude::*};
-use std::{any::Any, collections::HashMap, fmt::Display, ops::Range};
+use std::{
+    any::Any,
+    collections::HashMap,
+    fmt::Display,
+    ops::Range,
+    process,
+    sync::{Mutex, PoisonError},
+};
 
-/// A borrowed C-contiguous array of known type.
+/// A borrowed C-contiguous array of known type, to read.
+///
+/// Python can still write to the memory while the GIL is released, as any thread can that has a view of it; nothing
+/// here can prevent that. What this file does prevent is that calls of the binding do.
 pub(crate) struct Array<'py, T: Element> {
-    name: &'static str,
+    lease: Lease,
     /// A copy: numpy's own lies in memory that another thread may free while the GIL is released, by setting
     /// the array's `shape`.
     shape: Vec<usize>,
     array: PyReadonlyArrayDyn<'py, T>,
 }
 
+/// The same to write.
+pub(crate) struct ArrayMut<'py, T: Element> {
+    lease: Lease,
+    shape: Vec<usize>,
+    array: PyReadwriteArrayDyn<'py, T>,
+}
+
 impl<'py, T: Element> Array<'py, T> {
-    /// Borrow `value`. rust-numpy's own `as_slice` accepts Fortran order, which would read a transposed
-    /// array silently wrong, so the layout is checked here.
+    /// Borrow `value`, unless it cannot be read as it is or is being written.
     pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
-        let array = value
-            .cast::<PyArrayDyn<T>>()
-            .map_err(|_| wrong_type(name, T::get_dtype(value.py()), value))?;
-        if !array.is_c_contiguous() {
-            return Err(PyValueError::new_err(format!(
-                "{name}: must be C-contiguous, got shape {:?} with strides {:?}",
-                array.shape(),
-                array.strides()
-            ))
-            .into());
-        }
-        let shape = array.shape().to_vec();
-        let array = array
-            .try_readonly()
-            .map_err(|e| PyValueError::new_err(format!("{name}: {e}")))?;
-        Ok(Self { name, shape, array })
+        let array = as_it_is::<T>(name, value)?;
+        let (lease, shape) = (Lease::new(name, array, false)?, array.shape().to_vec());
+        let array = array.try_readonly().map_err(|e| refused(name, e))?;
+        Ok(Self {
+            lease,
+            shape,
+            array,
+        })
     }
 
     pub(crate) fn slice(&self) -> BindingResult<&[T]> {
@@ -47,11 +59,7 @@ impl<'py, T: Element> Array<'py, T> {
 
     /// The array, if it has this shape.
     pub(crate) fn of_shape(self, expected: &[usize]) -> Result<Self, Error> {
-        if self.shape == expected {
-            return Ok(self);
-        }
-        let (expected, got) = (format!("{expected:?}"), format!("{:?}", self.shape));
-        Err(Error::shape(self.name, expected, got))
+        check_shape(self.lease.name, &self.shape, expected).map(|()| self)
     }
 
     /// The array and N, if it is [N, width].
@@ -60,9 +68,140 @@ impl<'py, T: Element> Array<'py, T> {
             [n, w] if w == width => Ok((self, n)),
             _ => {
                 let (expected, got) = (format!("[N, {width}]"), format!("{:?}", self.shape));
-                Err(Error::shape(self.name, expected, got))
+                Err(Error::shape(self.lease.name, expected, got))
             }
         }
+    }
+}
+
+impl<'py, T: Element> ArrayMut<'py, T> {
+    /// Borrow `value`, unless it cannot be written as it is or is in use.
+    pub(crate) fn new(name: &'static str, value: &Bound<'py, PyAny>) -> BindingResult<Self> {
+        let array = as_it_is::<T>(name, value)?;
+        let (lease, shape) = (Lease::new(name, array, true)?, array.shape().to_vec());
+        let array = array.try_readwrite().map_err(|e| refused(name, e))?;
+        Ok(Self {
+            lease,
+            shape,
+            array,
+        })
+    }
+
+    pub(crate) fn slice(&mut self) -> BindingResult<&mut [T]> {
+        Ok(self.array.as_slice_mut()?)
+    }
+
+    pub(crate) fn shape(&self) -> &[usize] {
+        &self.shape
+    }
+
+    /// The array, if it has this shape.
+    pub(crate) fn of_shape(self, expected: &[usize]) -> Result<Self, Error> {
+        check_shape(self.lease.name, &self.shape, expected).map(|()| self)
+    }
+}
+
+fn check_shape(name: &str, shape: &[usize], expected: &[usize]) -> Result<(), Error> {
+    if shape == expected {
+        return Ok(());
+    }
+    let (expected, got) = (format!("{expected:?}"), format!("{shape:?}"));
+    Err(Error::shape(name, expected, got))
+}
+
+fn refused(name: &str, error: impl Display) -> PyErr {
+    PyValueError::new_err(format!("{name}: {error}"))
+}
+
+/// `value` as an array of this type that can be borrowed without a copy. rust-numpy's own `as_slice` accepts
+/// Fortran order, which would read a transposed array silently wrong, so the layout is checked here.
+fn as_it_is<'a, 'py, T: Element>(
+    name: &'static str,
+    value: &'a Bound<'py, PyAny>,
+) -> BindingResult<&'a Bound<'py, PyArrayDyn<T>>> {
+    let array = value
+        .cast::<PyArrayDyn<T>>()
+        .map_err(|_| wrong_type(name, T::get_dtype(value.py()), value))?;
+    if !array.is_c_contiguous() {
+        let (shape, strides) = (array.shape(), array.strides());
+        let message = format!("must be C-contiguous, got shape {shape:?} with strides {strides:?}");
+        return Err(Error::new(name, message).into());
+    }
+    let address = array.data().addr();
+    if !array.is_empty() && !address.is_multiple_of(align_of::<T>()) {
+        let message = format!(
+            "must lie at a multiple of {} bytes, got the address {address:#x}",
+            align_of::<T>()
+        );
+        return Err(Error::new(name, message).into());
+    }
+    Ok(array)
+}
+
+/// Memory that a call of the binding reads or writes at this moment.
+struct Place {
+    name: &'static str,
+    addresses: Range<usize>,
+    written: bool,
+    number: u64,
+    /// The calls of the process that this one was forked from are not its own.
+    process: u32,
+}
+
+/// Those of all calls, in the order in which they were borrowed, and the number of the next one.
+static PLACES: Mutex<(Vec<Place>, u64)> = Mutex::new((Vec::new(), 0));
+
+/// The entry of one array in [`PLACES`], as long as it is borrowed.
+///
+/// Memory that is written under one name and read or written under another is refused, in one call and in calls
+/// from several threads. rust-numpy knows views of one array, but two tensors over the same memory come as arrays
+/// that know nothing of each other.
+struct Lease {
+    name: &'static str,
+    number: u64,
+}
+
+impl Lease {
+    fn new<T: Element>(
+        name: &'static str,
+        array: &Bound<'_, PyArrayDyn<T>>,
+        written: bool,
+    ) -> Result<Self, Error> {
+        let begin = array.data().addr();
+        let addresses = begin..begin + array.len() * size_of::<T>();
+        let process = process::id();
+        let (places, next) = &mut *PLACES.lock().unwrap_or_else(PoisonError::into_inner);
+        places.retain(|place| place.process == process);
+        for other in places.iter() {
+            let both =
+                addresses.start.max(other.addresses.start) < addresses.end.min(other.addresses.end);
+            if both && (written || other.written) {
+                let (of, writes) = if other.written {
+                    (name, other.name)
+                } else {
+                    (other.name, name)
+                };
+                let message = format!("shares memory with {writes}, which is written");
+                return Err(Error::new(of, message));
+            }
+        }
+        let number = *next;
+        *next += 1;
+        places.push(Place {
+            name,
+            addresses,
+            written,
+            number,
+            process,
+        });
+        Ok(Self { name, number })
+    }
+}
+
+impl Drop for Lease {
+    fn drop(&mut self) {
+        let (places, _) = &mut *PLACES.lock().unwrap_or_else(PoisonError::into_inner);
+        places.retain(|place| place.number != self.number);
     }
 }
 
@@ -96,29 +235,6 @@ pub(crate) fn optional_of_shape<'py, T: Element>(
 ) -> BindingResult<Option<Array<'py, T>>> {
     let array = optional::<T>(name, value)?;
     Ok(array.map(|a| a.of_shape(expected)).transpose()?)
-}
-
-/// An array's name and addresses.
-pub(crate) type Place = (&'static str, Range<usize>);
-
-/// Where a slice lies.
-pub(crate) fn place<T>(name: &'static str, data: &[T]) -> Place {
-    let Range { start, end } = data.as_ptr_range();
-    (name, start.addr()..end.addr())
-}
-
-/// Refuse memory that is written under one name and read or written under another. rust-numpy knows views of
-/// one array, but two tensors over the same memory come as arrays that know nothing of each other.
-pub(crate) fn check_apart(written: &[Place], read: &[Place]) -> Result<(), Error> {
-    for (i, (name, a)) in written.iter().enumerate() {
-        for (other, b) in written[i + 1..].iter().chain(read) {
-            if a.start.max(b.start) < a.end.min(b.end) {
-                let message = format!("shares memory with {name}, which is written");
-                return Err(Error::new(*other, message));
-            }
-        }
-    }
-    Ok(())
 }
 
 /// Whether `value` is an array of f32; otherwise it is one of f64.

@@ -1,5 +1,6 @@
 //! The binding of the tile lists and of compositing.
 
+use crate::threads;
 use crate::{
     arrays::{
         AnyType, Array, CountsByName, Optional, Scalar, by_dtype, join, of_type, optional_of_shape,
@@ -11,7 +12,6 @@ use hqgs::internals::{
     Error,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
     counts::Counts,
-    threads,
     tiles::{self, Tiles},
 };
 use numpy::IntoPyArray;

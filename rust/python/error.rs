@@ -4,7 +4,7 @@ use hqgs::Error;
 use numpy::AsSliceError;
 use pyo3::{
     CastError, PyErr,
-    exceptions::{PyMemoryError, PyRuntimeError, PyValueError},
+    exceptions::{PyMemoryError, PyValueError},
 };
 
 /// An error of the crate, or one of Python's own.
@@ -18,7 +18,6 @@ impl From<Error> for BindingError {
         let message = error.to_string();
         Self(match error {
             Error::OutOfMemory { .. } => PyMemoryError::new_err(message),
-            Error::Threads { .. } => PyRuntimeError::new_err(message),
             // What the caller can mend by giving something else.
             _ => PyValueError::new_err(message),
         })

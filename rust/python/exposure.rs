@@ -1,11 +1,12 @@
 //! The binding of the exposure.
 
+use crate::threads;
 use crate::{
     arrays::{AnyType, Array, Scalar, by_dtype, filled, of_type, optional_of_shape},
     error::BindingResult,
 };
 use hqgs::internals::{
-    Error, threads,
+    Error,
     training::exposure::{Frame, Light, Photograph, Warp},
 };
 use numpy::IntoPyArray;
@@ -75,10 +76,13 @@ fn forward_as<'py, T: Scalar + Light>(
             .transpose()?
             .unwrap_or(&[]),
     );
-    let taken = py.detach(|| {
-        threads::install(|| Photograph::<T>::take(frame, image, near, warps, gains))
+    let (taken, photo) = py.detach(|| {
+        threads::install(|| -> Result<_, Error> {
+            let taken = Photograph::<T>::take(frame, image, near, warps, gains)?;
+            let photo = filled(taken.photo.iter().copied(), "photo")?;
+            Ok((taken, photo))
+        })
     })??;
-    let photo = filled(taken.photo.iter().copied(), "photo")?;
     let photo = photo.into_pyarray(py).into_any();
     Ok((
         Exposure {
@@ -90,7 +94,8 @@ fn forward_as<'py, T: Scalar + Light>(
 
 type Gradients<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, [f64; 3]);
 
-/// `Photograph::backward`: the flat gradients of the image and of the warps, and that of the gains.
+/// `Photograph::backward` of `v_photo` [H, W, 3]: the flat gradients of the image and of the warps, and that of the
+/// gains.
 #[pyfunction]
 fn exposure_backward<'py>(
     exposure: &Bound<'py, Exposure>,
@@ -105,7 +110,8 @@ fn backward_as<'py, T: Scalar + Light>(
 ) -> BindingResult<Gradients<'py>> {
     let py = v_photo.py();
     let taken: &Photograph<T> = of_type(&exposure.get().taken, "v_photo")?;
-    let v_photo = Array::<T>::new("v_photo", v_photo)?;
+    let [height, width] = taken.size();
+    let v_photo = Array::<T>::new("v_photo", v_photo)?.of_shape(&[height, width, 3])?;
     let v_photo = v_photo.slice()?;
     let out = py.detach(|| threads::install(|| taken.backward(v_photo)))??;
     Ok((

@@ -9,11 +9,12 @@ mod max_weights;
 mod pictures;
 mod project;
 mod stereo;
+mod threads;
 mod training;
 
 use arrays::{Array, by_dtype};
 use error::{BindingError, BindingResult};
-use hqgs::internals::{constants, simd, threads};
+use hqgs::internals::{constants, simd};
 use numpy::Element;
 use pyo3::{exceptions::PyOverflowError, prelude::*};
 use std::ffi::{c_int, c_long};
@@ -46,18 +47,18 @@ fn give_back_memory(py: Python<'_>) -> BindingResult<()> {
         // SAFETY: any thread may call it, and the crate is linked with mimalloc.
         safe fn mi_collect(force: bool);
     }
-    Ok(py.detach(|| {
+    py.detach(|| {
         let each = threads::on_each(|| mi_collect(true));
         mi_collect(true);
         each
-    })?)
+    })
 }
 
 /// Use this many threads from now on, 1 to 1024; results do not depend on it.
 #[pyfunction]
 fn set_num_threads(threads: &Bound<'_, PyAny>) -> BindingResult<()> {
     match threads.extract() {
-        Ok(count) => Ok(threads::set(count)?),
+        Ok(count) => threads::set(count),
         // Below 0, or beyond what fits.
         Err(error) if error.is_instance_of::<PyOverflowError>(threads.py()) => {
             Err(threads::out_of_range(threads).into())
@@ -69,7 +70,7 @@ fn set_num_threads(threads: &Bound<'_, PyAny>) -> BindingResult<()> {
 /// Number of threads in use.
 #[pyfunction]
 fn get_num_threads() -> BindingResult<usize> {
-    Ok(threads::get()?)
+    threads::get()
 }
 
 /// The vector instructions in use: the best of this CPU, or those that HQGS_SIMD names.

@@ -1,5 +1,6 @@
 //! The binding of the blending weights.
 
+use crate::threads;
 use crate::{
     arrays::{Array, optional_of_shape},
     error::BindingResult,
@@ -9,7 +10,7 @@ use hqgs::internals::{
     Error,
     composite::{self, CompositeInput},
     simd::Real,
-    threads, tiles,
+    tiles,
 };
 use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;

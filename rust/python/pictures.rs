@@ -2,10 +2,10 @@
 
 use crate::arrays::{Array, by_dtype, gradient};
 use crate::error::BindingResult;
+use crate::threads;
 use hqgs::internals::{
     Error,
     simd::Real,
-    threads,
     training::{
         jpeg_cells,
         separable::{self, Dense},

@@ -2,10 +2,10 @@
 
 use crate::arrays::{Array, filled};
 use crate::error::BindingResult;
+use crate::threads;
 use hqgs::internals::{
     Error,
     stereo::{Other, Picture, Sweep},
-    threads,
 };
 use numpy::IntoPyArray;
 use pyo3::prelude::*;

@@ -1,19 +1,19 @@
 //! The binding of the loss and of the optimizer.
 
-use crate::arrays::{Array, check_apart, gradient, is_f32, optional_of_shape, place};
+use crate::arrays::{Array, ArrayMut, gradient, is_f32, optional_of_shape};
 use crate::error::BindingResult;
+use crate::threads;
 use hqgs::internals::{
     Error,
     simd::Real,
-    threads,
     training::{
         adam::{self, AdamArrays, AdamOptions, Selection},
         loss::{self, LossScratch, Sample},
         rows::{self, ViewColors, ViewRows},
     },
 };
-use numpy::{Element, IntoPyArray, PyArrayDyn, PyArrayMethods, PyReadwriteArrayDyn};
-use pyo3::{exceptions::PyValueError, prelude::*};
+use numpy::{Element, IntoPyArray, PyArrayDyn};
+use pyo3::prelude::*;
 use std::cell::RefCell;
 
 /// Add the functions of this file to the module.
@@ -196,12 +196,10 @@ fn adam_step_as<T: Real + Element>(
     used: Option<usize>,
 ) -> BindingResult<()> {
     let py = grad.py();
-    let shape = Array::<T>::new("param", in_place[0])?.shape().to_vec();
-    let [mut param, mut exp_avg, mut exp_avg_sq] = [
-        writable::<T>("param", &shape, in_place[0])?,
-        writable::<T>("exp_avg", &shape, in_place[1])?,
-        writable::<T>("exp_avg_sq", &shape, in_place[2])?,
-    ];
+    let mut param = ArrayMut::<T>::new("param", in_place[0])?;
+    let shape = param.shape().to_vec();
+    let mut exp_avg = ArrayMut::<T>::new("exp_avg", in_place[1])?.of_shape(&shape)?;
+    let mut exp_avg_sq = ArrayMut::<T>::new("exp_avg_sq", in_place[2])?.of_shape(&shape)?;
     let grad = Array::<T>::new("grad", grad)?.of_shape(&shape)?;
     let rows = &shape[..shape.len().min(1)];
     let visible = optional_of_shape::<u8>("visible", visible, rows)?;
@@ -215,20 +213,11 @@ fn adam_step_as<T: Real + Element>(
         width,
         used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
     };
-    let written = [
-        place("param", param.as_slice()?),
-        place("exp_avg", exp_avg.as_slice()?),
-        place("exp_avg_sq", exp_avg_sq.as_slice()?),
-    ];
-    check_apart(&written, &[place("grad", grad.slice()?)])?;
-    if let Some(visible) = selection.visible {
-        check_apart(&written, &[place("visible", visible)])?;
-    }
     let arrays = AdamArrays {
-        param: param.as_slice_mut()?,
+        param: param.slice()?,
         grad: grad.slice()?,
-        exp_avg: exp_avg.as_slice_mut()?,
-        exp_avg_sq: exp_avg_sq.as_slice_mut()?,
+        exp_avg: exp_avg.slice()?,
+        exp_avg_sq: exp_avg_sq.slice()?,
     };
     Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
@@ -240,9 +229,11 @@ fn add_rows(
     sums: &Bound<'_, PyAny>,
     scale: f32,
 ) -> BindingResult<()> {
-    let shape = Array::<f32>::new("sums", sums)?.shape().to_vec();
-    let width = shape.get(1).copied().unwrap_or(0);
-    let mut held = writable::<f32>("sums", &[shape.first().copied().unwrap_or(0), width], sums)?;
+    let mut held = ArrayMut::<f32>::new("sums", sums)?;
+    let &[_, width] = held.shape() else {
+        let got = format!("{:?}", held.shape());
+        return Err(Error::shape("sums", "[N, W]", got).into());
+    };
     let views = views
         .iter()
         .map(|(rows, values)| rows_of("values", rows, values, width))
@@ -256,9 +247,7 @@ fn add_rows(
             })
         })
         .collect::<BindingResult<Vec<_>>>()?;
-    let read: Vec<_> = views.iter().map(|v| place("values", v.values)).collect();
-    check_apart(&[place("sums", held.as_slice()?)], &read)?;
-    let target = held.as_slice_mut()?;
+    let target = held.slice()?;
     Ok(sums
         .py()
         .detach(|| threads::install(|| rows::add(&views, target, width, scale)))??)
@@ -276,9 +265,9 @@ fn add_harmonics(
     scale: f32,
 ) -> BindingResult<()> {
     let (means_of, n) = Array::<f32>::new("means", means)?.of_width(3)?;
-    let shape = Array::<f32>::new("high", high)?.shape().to_vec();
-    let coefficients = shape.get(1).copied().unwrap_or(0);
-    let mut high = writable::<f32>("high", &[n, coefficients, 3], high)?;
+    let high = ArrayMut::<f32>::new("high", high)?;
+    let coefficients = high.shape().get(1).copied().unwrap_or(0);
+    let mut high = high.of_shape(&[n, coefficients, 3])?;
     let held = views
         .iter()
         .map(|(rows, colors, center, degree)| {
@@ -299,10 +288,7 @@ fn add_harmonics(
             })
         })
         .collect::<BindingResult<Vec<_>>>()?;
-    let mut read = vec![place("means", means_of.slice()?)];
-    read.extend(views.iter().map(|view| place("colors", view.colors.values)));
-    check_apart(&[place("high", high.as_slice()?)], &read)?;
-    let (high, means_of) = (high.as_slice_mut()?, means_of.slice()?);
+    let (high, means_of) = (high.slice()?, means_of.slice()?);
     Ok(means
         .py()
         .detach(|| threads::install(|| rows::add_harmonics(&views, means_of, high, scale)))??)
@@ -317,17 +303,4 @@ fn rows_of<'py>(
 ) -> BindingResult<(Array<'py, i32>, Array<'py, f32>)> {
     let (values, m) = Array::<f32>::new(name, values)?.of_width(width)?;
     Ok((Array::<i32>::new("rows", rows)?.of_shape(&[m])?, values))
-}
-
-/// Borrow a C-contiguous array of `shape` to write to it.
-fn writable<'py, T: Element>(
-    name: &'static str,
-    shape: &[usize],
-    value: &Bound<'py, PyAny>,
-) -> BindingResult<PyReadwriteArrayDyn<'py, T>> {
-    Array::<T>::new(name, value)?.of_shape(shape)?;
-    let array = value.cast::<PyArrayDyn<T>>()?;
-    Ok(array
-        .try_readwrite()
-        .map_err(|e| PyValueError::new_err(format!("{name}: {e}")))?)
 }

@@ -59,9 +59,9 @@ impl<T: Real> Harmonics<'_, T> {
     /// Numbers per Gaussian in `coefficients` and in `rest`.
     pub fn rows(&self) -> (usize, usize) {
         if self.rest.is_some() {
-            (3, 3 * (self.stored - 1))
+            (3, 3 * self.stored.saturating_sub(1))
         } else {
-            (3 * self.stored, 0)
+            (self.stored.saturating_mul(3), 0)
         }
     }
 
@@ -85,9 +85,10 @@ impl<T: Real> Harmonics<'_, T> {
             ));
         }
         let (row, rest_row) = self.rows();
-        check_len("colors", self.coefficients, n * row)?;
-        self.rest
-            .map_or(Ok(()), |rest| check_len("colors", rest, n * rest_row))
+        check_len("colors", self.coefficients, n.saturating_mul(row))?;
+        self.rest.map_or(Ok(()), |rest| {
+            check_len("colors", rest, n.saturating_mul(rest_row))
+        })
     }
 }
 
@@ -118,5 +119,26 @@ impl<T: Real> Colors<'_, T> {
             Self::Harmonics(harmonics) => harmonics.check(n),
             Self::Channels(data, channels) => check_len("colors", data, n.saturating_mul(channels)),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_coefficients_that_cannot_be_are_refused() {
+        let mut harmonics = Harmonics {
+            coefficients: &[0.0f32; 6],
+            rest: Some(&[]),
+            stored: 0,
+            degree: 0,
+        };
+        assert_eq!(harmonics.rows(), (3, 0));
+        assert_eq!(harmonics.check(2).unwrap_err().name(), "colors");
+        // As many as wrap around to the two that there are.
+        harmonics.rest = None;
+        harmonics.stored = usize::MAX / 6 + 2;
+        assert_eq!(harmonics.check(2).unwrap_err().name(), "colors");
     }
 }

@@ -54,6 +54,18 @@ pub struct Picture<'a> {
     pub grey: &'a [f32],
 }
 
+impl Picture<'_> {
+    /// That it has as many pixels as its size says, and that they can be numbered.
+    fn check(&self, name: &str) -> Result<(), Error> {
+        let [height, width] = self.size;
+        if i32::try_from(height.max(1).saturating_mul(width.max(1))).is_err() {
+            let message = format!("has more than 2^31 pixels, {height} x {width}");
+            return Err(Error::new(name, message));
+        }
+        check_len(name, self.grey, height * width)
+    }
+}
+
 /// Another photo, and the matrix [3, 4] that takes a pixel of the first one (x, y, 1, 1 / depth) to where this one
 /// shows it, (x, y, 1) times some w > 0. Pixels' centres lie at halves.
 #[derive(Debug, Clone, Copy)]
@@ -73,7 +85,8 @@ pub struct Sweep {
 
 impl Sweep {
     /// For each of `pixels` (x, y) of `first`: the depth in its range at which the others agree best, and the mean
-    /// correlation of those `agreeing` that agree best; -1 where the patch is flat or too few photos show it.
+    /// correlation of those `agreeing` that agree best, in which each one that is missing counts as -1; -1 where the
+    /// patch is flat or no photo shows it.
     ///
     /// # Errors
     /// Names an array of another size, a range that is not 0 < nearest <= farthest, a value out of range, or what
@@ -100,13 +113,9 @@ impl Sweep {
             return Err(Error::new("agreeing", "must be at least 1"));
         }
         check_len("ranges", ranges, pixels.len())?;
-        check_len("first", first.grey, first.size[0] * first.size[1])?;
+        first.check("first")?;
         for other in others {
-            check_len(
-                "others",
-                other.picture.grey,
-                other.picture.size[0] * other.picture.size[1],
-            )?;
+            other.picture.check("others")?;
             if !other.map.iter().all(|x| x.is_finite()) {
                 return Err(Error::new("maps", "must be finite"));
             }
@@ -325,7 +334,11 @@ impl Place {
             let inverse = 1.0 / w;
             let x = (x * inverse - 0.5).clamp(0.0, most_x);
             let y = (y * inverse - 0.5).clamp(0.0, most_y);
-            let (column, row) = (x as i32, y as i32);
+            // From 2^15 px on, a float just below the last pixel rounds up to it.
+            let (column, row) = (
+                (x as i32).min(width as i32 - 2),
+                (y as i32).min(height as i32 - 2),
+            );
             at[k] = row * width as i32 + column;
             fx[k] = x - column as f32;
             fy[k] = y - row as f32;

@@ -164,3 +164,34 @@ fn each_level_and_number_of_threads_gives_the_same_bits() {
     }
     assert_eq!(run(simd::levels()[0], 3), all[0]);
 }
+
+#[test]
+fn a_patch_at_the_corner_of_a_wide_picture_stays_inside() {
+    // A float just below the last of so many pixels is that pixel.
+    for size in [[8, 33_000], [33_000, 8], [8, 70_001]] {
+        let grey: Vec<f32> = (0..size[0] * size[1])
+            .map(|k| texture(k as f64 * 0.013, k as f64 * 0.007))
+            .collect();
+        let picture = Picture { size, grey: &grey };
+        for k in 0..200 {
+            let [y, x] = size.map(|side| side as f64 - 3.45 - f64::from(k) * 0.002);
+            let base = [x as f32, y as f32, 1.0];
+            let place = Place {
+                base,
+                across: [STRIDE, 0.0, 0.0],
+                down: [0.0, STRIDE, 0.0],
+            };
+            if let Some(values) = place.sampled(picture) {
+                assert!(values.iter().all(|x| (0.0..=1.0).contains(x)));
+            }
+        }
+    }
+}
+
+#[test]
+fn more_pixels_than_can_be_numbered_are_refused() {
+    let size = [1 << 32, 1 << 32];
+    let picture = Picture { size, grey: &[] };
+    let found = Sweep { agreeing: 1 }.depths(picture, &[], &[], &[]);
+    assert_eq!(found.unwrap_err().name(), "first");
+}

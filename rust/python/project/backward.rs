@@ -1,6 +1,7 @@
 //! The binding of the projection's vector-Jacobian product.
 
 use super::{Arrays, Frame};
+use crate::threads;
 use crate::{
     arrays::{Array, CountsByName, Scalar, by_dtype, of_type, optional_of_shape},
     error::BindingResult,
@@ -9,7 +10,6 @@ use hqgs::internals::{
     Error,
     project::{self, GaussianGrads, ProjectCotangents, Shading},
     simd::Real,
-    threads,
 };
 use numpy::{Element, IntoPyArray};
 use pyo3::{IntoPyObjectExt, prelude::*};

@@ -1,6 +1,7 @@
 //! The binding of the projection, forward.
 
 use super::{Arrays, Frame, Projections, channels_of, of_camera};
+use crate::threads;
 use crate::{
     arrays::{Array, Optional, Scalar, by_dtype, join, optional},
     error::BindingResult,
@@ -11,7 +12,7 @@ use hqgs::internals::{
     counts::Counts,
     project::{self, ProjectOptions},
     scene::{Camera, Colors, Harmonics},
-    simd, threads,
+    simd,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};

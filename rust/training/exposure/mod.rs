@@ -32,6 +32,21 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// That it has pixels, and no more than can be counted. Returns the size of the render.
+    fn check(&self) -> Result<[usize; 2], Error> {
+        let side = |side: usize| side.checked_add(self.margin.checked_mul(2)?);
+        let sides = (side(self.size[0]), side(self.size[1]));
+        if let (false, (Some(height), Some(width))) = (self.size.contains(&0), sides)
+            && height
+                .checked_mul(width)
+                .is_some_and(|n| n.checked_mul(3).is_some())
+        {
+            return Ok([height, width]);
+        }
+        let got = format!("{:?} with a margin of {}", self.size, self.margin);
+        Err(Error::shape("size", "a photo with pixels", got))
+    }
+
     fn render_size(&self) -> [usize; 2] {
         self.size.map(|side| side + 2 * self.margin)
     }
@@ -97,11 +112,7 @@ impl<T: Light> Photograph<T> {
         warps: &[Warp],
         gains: [f64; 3],
     ) -> Result<Self, Error> {
-        let [height, width] = frame.render_size();
-        if frame.pixels() == 0 {
-            let got = format!("{:?}", frame.size);
-            return Err(Error::shape("size", "a photo with pixels", got));
-        }
+        let [height, width] = frame.check()?;
         check_len("image", image, height * width * 3)?;
         if !nearness.is_empty() {
             check_len("nearness", nearness, frame.pixels())?;
@@ -150,6 +161,11 @@ impl<T: Light> Photograph<T> {
         Ok(taken)
     }
 
+    /// Height and width of the photo.
+    pub fn size(&self) -> [usize; 2] {
+        self.frame.size
+    }
+
     /// Gradients for the cotangent `v_photo` [H, W, 3]. None flows to `nearness`.
     ///
     /// # Errors
@@ -162,25 +178,57 @@ impl<T: Light> Photograph<T> {
         check_len("v_photo", v_photo, self.photo.len())?;
         let ([height, width], across) = (self.frame.render_size(), self.frame.size[1]);
         let token = level.token;
-        let bands: Vec<Band<T>> = v_photo
-            .par_chunks(BAND * across * 3)
-            .enumerate()
-            .map(|(k, v)| dispatch!(token, simd => self.backward_band(simd, k * BAND, v)))
-            .collect::<Result<_, _>>()?;
         let mut image = memory::filled(T::ZERO, height * width * 3, "gradient")?;
+        let mut warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
+        let mut gains = [0.0; 3];
+        let across = BAND * across;
+        let bands: Vec<_> = v_photo.chunks(across * 3).enumerate().collect();
+        let reached =
+            |k: usize, v: &[T]| self.reached(k * BAND..k * BAND + v.len() * BAND / (across * 3));
+        let mut rest = &bands[..];
+        while !rest.is_empty() {
+            // Bands are held together as long as their rows of the render are no more than it has twice: one may
+            // reach all of them.
+            let mut rows = 0;
+            let held = rest.iter().take_while(|(k, v)| {
+                let first = rows == 0;
+                rows += reached(*k, v).len();
+                first || rows <= 2 * height
+            });
+            let (wave, others) = rest.split_at(held.count());
+            rest = others;
+            let wave: Vec<Band<T>> = wave
+                .par_iter()
+                .map(|&(k, v)| dispatch!(token, simd => self.backward_band(simd, k * BAND, v)))
+                .collect::<Result<_, _>>()?;
+            image
+                .par_chunks_mut(width * 3)
+                .enumerate()
+                .for_each(|(row, v)| {
+                    // Rows of the photo whose warps reach here, in their order.
+                    for band in wave.iter().filter(|band| band.rows.contains(&row)) {
+                        let from = &band.v_light[(row - band.rows.start) * width..][..width];
+                        for (v, from) in v.chunks_exact_mut(3).zip(from) {
+                            for c in 0..3 {
+                                v[c] += from[c];
+                            }
+                        }
+                    }
+                });
+            for band in &wave {
+                let parts = band.v_warps.iter().flatten();
+                for (sum, part) in warps.iter_mut().flatten().zip(parts) {
+                    *sum += part;
+                }
+                for (sum, part) in gains.iter_mut().zip(&band.v_gains) {
+                    *sum += part;
+                }
+            }
+        }
         image
             .par_chunks_mut(width * 3)
             .enumerate()
             .for_each(|(row, v)| {
-                // Rows of the photo whose warps reach here, in their order.
-                for band in bands.iter().filter(|band| band.rows.contains(&row)) {
-                    let from = &band.v_light[(row - band.rows.start) * width..][..width];
-                    for (v, from) in v.chunks_exact_mut(3).zip(from) {
-                        for c in 0..3 {
-                            v[c] += from[c];
-                        }
-                    }
-                }
                 let at = row * width;
                 let pixels = self.light[at..at + width].iter();
                 let values = self.image[at * 3..].chunks_exact(3);
@@ -190,20 +238,6 @@ impl<T: Light> Photograph<T> {
                     }
                 }
             });
-        let mut warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
-        let mut gains = [0.0; 3];
-        for band in &bands {
-            for (sum, part) in warps
-                .iter_mut()
-                .flatten()
-                .zip(band.v_warps.iter().flatten())
-            {
-                *sum += part;
-            }
-            for (sum, part) in gains.iter_mut().zip(&band.v_gains) {
-                *sum += part;
-            }
-        }
         Ok(PhotographGradients {
             image,
             warps,

@@ -233,3 +233,34 @@ fn wrong_arrays_are_named() {
     let taken = Photograph::take(FRAME, &case.image, &[], &[], GAINS).unwrap();
     assert_eq!(taken.backward(&case.v[1..]).unwrap_err().name(), "v_photo");
 }
+
+#[test]
+fn waves_of_bands_add_up_as_all_at_once() {
+    // The second warp folds the picture over: every band may reach every row, so that each is a wave of its own.
+    let frame = Frame {
+        size: [70, 9],
+        margin: 2,
+    };
+    let [h, w] = frame.render_size();
+    let image = numbers::<f64>(h * w * 3, 0.0, 0.0, 1.0);
+    let v = numbers::<f64>(frame.pixels() * 3, 2.0, -1.0, 1.0);
+    let mut folded = [0.0; 12];
+    folded[8] = -0.2;
+    for warps in [warps(), vec![warps()[0], folded]] {
+        let taken = Photograph::take(frame, &image, &[], &warps, GAINS).unwrap();
+        let all = taken.backward(&v).unwrap();
+        // By its definition: the sum over what each band alone gives.
+        let mut sum = vec![0.0; image.len()];
+        for band in 0..70usize.div_ceil(BAND) {
+            let rows = band * BAND * 9 * 3..v.len().min((band + 1) * BAND * 9 * 3);
+            let mut alone = vec![0.0; v.len()];
+            alone[rows.clone()].copy_from_slice(&v[rows]);
+            for (sum, part) in sum.iter_mut().zip(taken.backward(&alone).unwrap().image) {
+                *sum += part;
+            }
+        }
+        for (a, b) in all.image.iter().zip(&sum) {
+            assert!((a - b).abs() < 1e-12 * (1.0 + b.abs()), "{a} {b}");
+        }
+    }
+}

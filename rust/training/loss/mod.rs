@@ -247,7 +247,9 @@ fn ssim_at<T: Real, Y: Sample<T>>(
 
 impl<T, Y> Images<'_, T, Y> {
     fn check(&self, x: &str, y: &str) -> Result<(), Error> {
-        let n = self.height * self.width * self.channels;
+        let sides = [self.height, self.width, self.channels];
+        // No slice has so many elements; a product that wrapped around could fit one.
+        let n = sides.into_iter().fold(1, usize::saturating_mul);
         if n == 0 {
             let got = format!("[{}, {}, {}]", self.height, self.width, self.channels);
             return Err(Error::shape(x, "[H, W, C] with at least one pixel", got));

@@ -497,3 +497,14 @@ fn wrong_input_is_named() {
         assert_eq!(call(&[0; 12], None, 0.2, knee, [2, 2, 3]), "knee");
     }
 }
+
+#[test]
+fn sides_whose_product_wraps_around_are_refused() {
+    let mut scratch = LossScratch::<f32>::default();
+    let pixels = [0.5f32; 12];
+    let (height, width) = (1 << 63, 2); // 0 pixels, or 4 with one row more
+    for height in [height, height + 2] {
+        let found = ssim(&pixels, &pixels, None, height, width, 3, &mut scratch);
+        assert_eq!(found.unwrap_err().name(), "a");
+    }
+}

@@ -1,11 +1,13 @@
-//! The thread pool of the Python binding: as many threads as `RAYON_NUM_THREADS` or the machine says, until
+//! The thread pool: as many threads as `RAYON_NUM_THREADS` or the machine says, until
 //! [`set`] says otherwise. Results never depend on it.
 //!
 //! A process that forks leaves its child a pool without threads: work that it is given would wait for ever. The
 //! child therefore starts a pool of its own with as many threads, the first time that it needs one. All work goes
 //! through [`install`], since rayon's own global pool cannot be replaced.
 
-use crate::error::Error;
+use crate::error::BindingResult;
+use hqgs::Error;
+use pyo3::exceptions::PyRuntimeError;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use std::{
     fmt, process, ptr,
@@ -28,7 +30,7 @@ static POOL: AtomicPtr<Pool> = AtomicPtr::new(ptr::null_mut());
 
 impl Pool {
     /// One with `threads` threads, or with the default number for 0.
-    fn new(threads: usize) -> Result<Self, Error> {
+    fn new(threads: usize) -> BindingResult<Self> {
         let pool = start(threads)?;
         Ok(Self {
             process: process::id(),
@@ -39,13 +41,15 @@ impl Pool {
 
     #[allow(unsafe_code)]
     fn load() -> Option<&'static Self> {
-        // SAFETY: `POOL` is null or comes from `Box::into_raw` in `of_this_process`, and is never freed.
+        // SAFETY: `POOL` is null or holds what came from `Box::into_raw` in `of_this_process`: only the exchange there
+        // writes it, and Acquire here pairs with its release. What is put there is never freed, nor given away
+        // mutably: what loses the exchange was never there.
         unsafe { POOL.load(Ordering::Acquire).as_ref() }
     }
 
     /// The pool of this process; if there is none, one with `threads` threads, or with those of the process that
     /// this one was forked from.
-    fn of_this_process(threads: Option<usize>) -> Result<&'static Self, Error> {
+    fn of_this_process(threads: Option<usize>) -> BindingResult<&'static Self> {
         loop {
             let found = Self::load();
             if let Some(pool) = found.filter(|pool| pool.process == process::id()) {
@@ -65,27 +69,29 @@ impl Pool {
 
 #[allow(unsafe_code)]
 fn drop_unshared(pool: *mut Pool) {
-    // SAFETY: it comes from `Box::into_raw`, and was not put into `POOL`, so that nobody else knows it.
+    // SAFETY: it comes from `Box::into_raw`, and the exchange failed, so that it was never in `POOL`: nobody else has
+    // a pointer to it.
     drop(unsafe { Box::from_raw(pool) });
 }
 
-fn start(threads: usize) -> Result<ThreadPool, Error> {
+fn start(threads: usize) -> BindingResult<ThreadPool> {
     ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
-        .map_err(|e| Error::Threads {
-            message: match threads {
-                0 => format!("cannot start: {e}"),
-                _ => format!("cannot start {threads} threads: {e}"),
-            },
+        .map_err(|e| {
+            let message = match threads {
+                0 => format!("threads: cannot start: {e}"),
+                _ => format!("threads: cannot start {threads} threads: {e}"),
+            };
+            PyRuntimeError::new_err(message).into()
         })
 }
 
 /// The most threads that [`set`] takes: beyond it they only cost memory, and a mistyped number may stop the machine.
-pub const MAX_THREADS: usize = 1024;
+pub(crate) const MAX_THREADS: usize = 1024;
 
 /// The error for a number of threads that [`set`] does not take.
-pub fn out_of_range(threads: impl fmt::Display) -> Error {
+pub(crate) fn out_of_range(threads: impl fmt::Display) -> Error {
     let message = format!("must be 1 to {MAX_THREADS}, got {threads}");
     Error::new("threads", message)
 }
@@ -94,9 +100,9 @@ pub fn out_of_range(threads: impl fmt::Display) -> Error {
 ///
 /// # Errors
 /// When there are none or more than [`MAX_THREADS`], or the system refuses to start them.
-pub fn set(threads: usize) -> Result<(), Error> {
+pub(crate) fn set(threads: usize) -> BindingResult<()> {
     if !(1..=MAX_THREADS).contains(&threads) {
-        return Err(out_of_range(threads));
+        return Err(out_of_range(threads).into());
     }
     let pool = Pool::of_this_process(Some(threads))?;
     if pool.threads.load(Ordering::Relaxed) != threads {
@@ -111,7 +117,7 @@ pub fn set(threads: usize) -> Result<(), Error> {
 ///
 /// # Errors
 /// When the system refuses to start them.
-pub fn get() -> Result<usize, Error> {
+pub(crate) fn get() -> BindingResult<usize> {
     install(rayon::current_num_threads)
 }
 
@@ -119,7 +125,7 @@ pub fn get() -> Result<usize, Error> {
 ///
 /// # Errors
 /// When the system refuses to start its threads.
-pub fn install<R: Send>(f: impl FnOnce() -> R + Send) -> Result<R, Error> {
+pub(crate) fn install<R: Send>(f: impl FnOnce() -> R + Send) -> BindingResult<R> {
     let pool = Pool::of_this_process(None)?;
     let pool = Arc::clone(&pool.pool.read().unwrap_or_else(PoisonError::into_inner));
     Ok(pool.install(f))
@@ -129,7 +135,7 @@ pub fn install<R: Send>(f: impl FnOnce() -> R + Send) -> Result<R, Error> {
 ///
 /// # Errors
 /// As for [`install`].
-pub fn on_each(f: impl Fn() + Sync) -> Result<(), Error> {
+pub(crate) fn on_each(f: impl Fn() + Sync) -> BindingResult<()> {
     install(|| {
         rayon::broadcast(|_| f());
     })
