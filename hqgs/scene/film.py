@@ -18,6 +18,7 @@ from PIL import Image
 from hqgs.base.files import FRAMES, missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.photos.blocks import fine_detail
+from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
 LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
@@ -38,7 +39,7 @@ def film_frames(
         raise ValueError(f"frames is {count}, wanted at least 3")
     av = _pyav(path)
     state = path.stat()
-    name = f"3 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
+    name = f"4 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -56,10 +57,13 @@ def film_frames(
         finally:
             shutil.rmtree(new, ignore_errors=True)
             remove_empty(made)  # nothing is left of a film that cannot be read
-    return (
-        target,
-        f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval",
-    )
+    note = f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval"
+    if (curve := _transfer(av, path)) in HDR:
+        note += (
+            f"; its high dynamic range ({HDR[curve]}) is toned down to sRGB: light above {KNEE:g} of the "
+            "reference white of 203 cd/m2 is bent to end at white"
+        )
+    return target, note
 
 
 def write_details(folder: Path, details: dict[str, float]) -> None:
@@ -92,6 +96,7 @@ def _sharpest(
                 raise ValueError(f"{path} holds no pictures, only sound")
             stream = film.streams.video[0]
             stream.thread_type = "AUTO"
+            curve = transfer(stream.codec_context)
             seconds = _seconds(film, stream)
             wanted = count or int(np.clip(round(PER_SECOND * seconds), FEWEST, MOST))
             interval = seconds / wanted if seconds > 0 else 1 / PER_SECOND
@@ -108,7 +113,7 @@ def _sharpest(
                 if (sharpness := _sharpness(frame)) > best_sharpness:
                     best_sharpness = sharpness
                     turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
-                    best = number, np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))
+                    best = number, np.ascontiguousarray(np.rot90(as_photo(frame, curve), turns))
                 told(Stage("frames of the film looked at", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
         known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
@@ -117,6 +122,12 @@ def _sharpest(
     if best is None:
         raise ValueError(f"the film {path} holds no frame that can be read")
     yield best
+
+
+def _transfer(av: Any, path: Path) -> int:
+    """The number of the film's transfer function."""
+    with av.open(str(path)) as film:
+        return transfer(film.streams.video[0].codec_context)
 
 
 def _seconds(film: Any, stream: Any) -> float:
