@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,39 @@ def _optional(tensor: Tensor | None) -> np.ndarray[Any, Any] | None:
 
 def _tensor(array: np.ndarray[Any, Any] | None, *shape: int) -> Tensor | None:
     return None if array is None else torch.from_numpy(array).view(shape)
+
+
+class _First(torch.autograd.Function):
+    """Gradients as they are, which say where they are differentiated that there is no more to have.
+
+    Of `torch.autograd.function.once_differentiable` differs that it asks whether a graph is made: cotangents
+    that do not depend on anything (of a mean, say) would let a penalty on the gradient do nothing.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *grads):
+        return tuple(None if grad is None else grad.view_as(grad) for grad in grads)
+
+    @staticmethod
+    def backward(ctx: Any, *grads):
+        raise RuntimeError(
+            "hqgs.rasterization has first derivatives alone: its gradient (create_graph=True) cannot be "
+            "differentiated again"
+        )
+
+
+def _once(backward: Callable[..., tuple[Tensor | None, ...]]) -> Callable[..., tuple[Tensor | None, ...]]:
+    """A backward pass that is an error to differentiate."""
+
+    @wraps(backward)
+    def once(ctx: Any, *grads):
+        with torch.no_grad():
+            found = backward(ctx, *grads)
+        if not torch.is_grad_enabled():  # it is where create_graph is
+            return found
+        return _First.apply(*(None if grad is None else grad.requires_grad_() for grad in found))
+
+    return once
 
 
 class _Project(torch.autograd.Function):
@@ -64,6 +99,7 @@ class _Project(torch.autograd.Function):
         return frame, means2d, link, depths, conics, radii, alphas, sh_colors
 
     @staticmethod
+    @_once
     def backward(ctx: Any, *grads):
         _, v_means2d, v_link, v_depths, v_conics, _, v_alphas, v_colors = grads
         means, quats, scales, opacities = ctx.saved_tensors
@@ -115,6 +151,7 @@ class _Composite(torch.autograd.Function):
         return image, alphas, state.work
 
     @staticmethod
+    @_once
     def backward(ctx: Any, *grads):
         v_image, v_alphas, _ = grads
         means2d, colors, backgrounds = ctx.saved_tensors

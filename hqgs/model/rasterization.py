@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any, TypedDict, cast
 
 import numpy as np
 import torch
@@ -39,9 +39,21 @@ class RasterizationMeta(TypedDict):
     height: int
     tile_size: int
     n_cameras: int
-    camera_ids: None  # gsplat has them where it packs its arrays; nothing is packed here
+    camera_ids: None  # gsplat has them where it packs its arrays; nothing is packed here, see `rasterization`
     gaussian_ids: None
     work: tuple[int, int, int]  # pairs of Gaussian and tile, blocks evaluated, blocks with a change
+
+
+_TILE_LISTS = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets")
+
+
+class _Meta(dict[str, Any]):
+    """A dictionary that says of what gsplat has besides that it is not there."""
+
+    def __missing__(self, key: str) -> Any:
+        if key in _TILE_LISTS:
+            raise KeyError(f"{key}: hqgs hands out no tile lists")
+        raise KeyError(key)
 
 
 def rasterization(
@@ -101,6 +113,10 @@ def rasterization(
         covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then. As for
             gsplat, the entries on and above the diagonal count, those above it for two, and get the gradient.
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
+            Arrays are never packed, so that `meta` has no `gaussian_ids` and `camera_ids` (they are None) and
+            no tile lists (`tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`: a KeyError that says
+            so). A strategy of gsplat works with `packed=False`, its own default: `means2d`, `radii` and
+            `depths` have its shapes then.
 
     Any number of leading batch dimensions, the same for all tensors (but a `backgrounds` [D]), gives as many
     scenes, one after the other: outputs and the tensors of the meta data have them too.
@@ -111,6 +127,7 @@ def rasterization(
 
     Raises:
         ValueError: a wrong shape, dtype, device or value, with its name.
+        RuntimeError: a gradient that was taken with `create_graph=True` is differentiated again.
         NotImplementedError: an argument of gsplat that hqgs leaves out (other camera models, distortion,
             rolling shutter, distributed rendering, gradients of Ks, absgrad of a batch).
     """
@@ -178,7 +195,7 @@ def rasterization(
         "gaussian_ids": None,
         "work": (sum(w[0] for w in works), sum(w[1] for w in works), sum(w[2] for w in works)),
     }
-    return together(images), together(alphas), meta
+    return together(images), together(alphas), cast(RasterizationMeta, _Meta(meta))
 
 
 def _each_scene(tensors: dict[str, Tensor], dims: int) -> list[dict[str, Tensor]]:
