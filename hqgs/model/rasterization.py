@@ -114,9 +114,8 @@ def rasterization(
             gsplat, the entries on and above the diagonal count, those above it for two, and get the gradient.
         packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
             Arrays are never packed, so that `meta` has no `gaussian_ids` and `camera_ids` (they are None) and
-            no tile lists (`tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`: a KeyError
-            that says so). A strategy of gsplat works with `packed=False`, its own default: `means2d`, `radii` and
-            `depths` have its shapes then.
+            no tile lists (`tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`: a KeyError that
+            says so). A strategy of gsplat works with `packed=False`, its own default, which has these shapes.
 
     Any number of leading batch dimensions, the same for all tensors (but a `backgrounds` [D]), gives as many
     scenes, one after the other: outputs and the tensors of the meta data have them too.
