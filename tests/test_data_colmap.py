@@ -125,10 +125,20 @@ def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
     assert scene.notes == ["1 of 12 points are not finite and were dropped"]
 
 
-def test_missing_photo_names_the_camera(tmp_path: Path) -> None:
+def test_missing_photos_are_left_out_and_named(tmp_path: Path) -> None:
+    """The test views stay those of the whole model; a folder that lost most of it is refused."""
     write_colmap(make_truth(), tmp_path)
+    whole = load_scene(tmp_path)
     (tmp_path / "images/view_05.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"1 cameras have no photo in .*images: view_05\.png"):
+    (tmp_path / "images/view_08.png").unlink()
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.train] == [v.name for v in whole.train if v.name != "view_05.png"]
+    assert [v.name for v in scene.test] == ["view_00.png"]
+    wanted = "2 of 9 cameras have no photo any more and were left out: view_05.png, view_08.png"
+    assert wanted in scene.notes
+    for k in (1, 2, 3):
+        (tmp_path / f"images/view_{k:02d}.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"5 of 9 cameras have no photo in .*images: view_01\.png"):
         load_scene(tmp_path)
 
 
@@ -140,9 +150,12 @@ def test_duplicate_names(tmp_path: Path) -> None:
 
 
 def test_two_cameras_for_one_file(tmp_path: Path) -> None:
-    truth = replace(make_truth(3), names=["a.png", "b.jpg", "b.png"])
+    """Only b.tif is there for two cameras; a photo with a camera of its own is nobody else's."""
+    truth = replace(make_truth(4), names=["a.png", "b.jpg", "b.png", "c.png"])
     write_colmap(truth, tmp_path)
     (tmp_path / "images/b.jpg").unlink()
+    assert "left out: b.jpg" in load_scene(tmp_path).notes[-1]
+    (tmp_path / "images/b.png").replace(tmp_path / "images/b.tif")
     with pytest.raises(ValueError, match=r"the same photo: b\.jpg, b\.png"):
         load_scene(tmp_path)
 

@@ -272,9 +272,11 @@ def test_missing_files_and_duplicates(tmp_path: Path) -> None:
     write_transforms(truth, tmp_path, ply_file_path="none.ply")
     with pytest.raises(FileNotFoundError, match=r"ply_file_path 'none\.ply'"):
         load_scene(tmp_path)
+    write_transforms(truth, tmp_path)
     (tmp_path / "images/view_02.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"'images/view_02\.png' has no photo"):
-        load_scene(tmp_path)
+    scene = load_scene(tmp_path)
+    assert [v.name for v in scene.train + scene.test] == ["images/view_01.png", "images/view_00.png"]
+    assert "1 of 3 cameras have no photo any more and were left out: images/view_02.png" in scene.notes
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe{}", b"[" * 100_000, b'{"frames": 3}'])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +18,54 @@ DECODE_ERRORS = (
 )
 
 
+_HEAD = 64  # bytes that tell HEIC from other files
+_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")
+_registering = Lock()
+_LOSSY = ("JPEG", "MPO", "HEIF", "JPEG2000", "AVIF")  # formats that change values around an edge
+_HALF = 128  # of 8 bits: from here on a pixel of a lossy mask counts
+
+
 class UnreadableError(ValueError):
     """A photo or mask that cannot be decoded; the message names the file."""
 
 
 def open_photo(path: Path) -> Image.Image:
-    """Pillow's picture of the file, not decoded yet. One of DECODE_ERRORS where there is none."""
-    if path.suffix.lower() in HEIC_SUFFIXES:
-        try:
-            import pillow_heif  # here: only such photos need it
-        except ImportError as error:
-            raise OSError("HEIC photos need the extra 'heic': pip install 'hqgs[heic]'") from error
-        pillow_heif.register_heif_opener()
+    """Pillow's picture of the file, not decoded yet: by what it holds, whatever its suffix says.
+
+    One of DECODE_ERRORS where there is none.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    if is_heic(head) and not _register_heic():
+        raise OSError("HEIC photos need the extra 'heic': pip install 'hqgs[heic]'")
     return Image.open(path)
+
+
+def is_heic(head: bytes) -> bool:
+    """Whether a file that begins so holds an HEIC or HEIF picture: by the brands of its first box."""
+    avif = b"avif" in head[8:]  # which Pillow reads itself
+    return head[4:8] == b"ftyp" and not avif and any(brand in head[8:] for brand in _HEIC_BRANDS)
+
+
+def needs_heic(path: Path) -> bool:
+    """Whether a photo needs the extra that reads HEIC, and it is not there."""
+    try:
+        with path.open("rb") as file:
+            return is_heic(file.read(_HEAD)) and not _register_heic()
+    except OSError:
+        return False
+
+
+def _register_heic() -> bool:
+    """Teach Pillow HEIC, once for the process; whether that worked."""
+    try:
+        import pillow_heif  # here: only such photos need it
+    except ImportError:
+        return False
+    with _registering:
+        if "HEIF" not in Image.OPEN:
+            pillow_heif.register_heif_opener()
+    return True
 
 
 def check_whole(path: Path) -> tuple[int, int]:
@@ -56,6 +92,15 @@ def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
             return photo.size
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
+
+
+def stored_format(path: Path) -> str:
+    """Pillow's name of what the file holds, such as "JPEG"; empty where it is no picture."""
+    try:
+        with open_photo(path) as photo:
+            return photo.format or ""
+    except DECODE_ERRORS:
+        return ""
 
 
 def decode(
@@ -96,17 +141,32 @@ def shrunk(stored: int, decoded: int) -> int:
 
 
 def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
-    """The mask file as [height, width], True where it is not zero; the nearest pixel at another size."""
+    """The mask file as [height, width], True where it counts; the nearest pixel at another size.
+
+    What is not zero counts; in a lossy file, which blurs its edges, what is at least half of white. A file
+    whose colours are all one, but whose alpha is not, has its mask in alpha, from half on.
+    """
     w, h = stored_size(path, "mask")
     if abs(w * height - h * width) > width + height:
         raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
     try:
         with open_photo(path) as file:
+            lossy = file.format in _LOSSY or (file.format == "WEBP" and _is_lossy_webp(path))
             pixels = np.asarray(file.convert("RGB") if file.mode == "P" else file)
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the mask {path}: {e}") from e
+    alpha = pixels[..., -1] if pixels.ndim == 3 and pixels.shape[2] in (2, 4) else None
     if pixels.ndim == 3:
-        pixels = pixels[..., :3].max(-1)  # without alpha, which says nothing here
+        pixels = pixels[..., : 3 if pixels.shape[2] >= 3 else 1].max(-1)
+    if alpha is not None and pixels.min() == pixels.max() and alpha.min() < alpha.max():
+        pixels, lossy = alpha, True
+    counts = pixels >= _HALF if lossy else pixels != 0
     rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)
     columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64)
-    return pixels[rows][:, columns] != 0
+    return counts[rows][:, columns]
+
+
+def _is_lossy_webp(path: Path) -> bool:
+    """Whether a WebP file has no picture that is stored exactly."""
+    with path.open("rb") as file:
+        return b"VP8L" not in file.read(1 << 16)

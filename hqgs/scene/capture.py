@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.scene.photo_files import MASKS, Named, below
 from hqgs.scene.scene import SfmReport, Tracks
 
 MAX_SIDE = 65_535  # the largest side a JPEG can have; larger ones come from damaged files
@@ -89,10 +90,8 @@ def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: 
 
 
 def list_photos(folder: Path) -> list[str]:
-    """Photos below `folder` as relative POSIX paths, sorted; hidden files are left out."""
-    found = (p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
-    names = (p.relative_to(folder) for p in found)
-    return sorted(n.as_posix() for n in names if not any(part.startswith(".") for part in n.parts))
+    """Photos below `folder` as relative POSIX paths, sorted; nothing hidden, and nothing that a run wrote."""
+    return sorted(p.relative_to(folder).as_posix() for p in below(folder, PHOTO_SUFFIXES))
 
 
 def inside(root: Path, name: str, what: str) -> Path:
@@ -109,6 +108,24 @@ def inside(root: Path, name: str, what: str) -> Path:
     if not path.is_relative_to(root):
         raise ValueError(f"{what} {name!r} leaves the folder {root}")
     return path
+
+
+def found_inside(root: Path, name: str, what: str, files: Named) -> Path | None:
+    """The file inside `root` that a written name means, as `inside` has it, else by name (`Named.find`).
+
+    None where there is none. ValueError as `inside` raises it, where no file in `root` has such a name.
+    """
+    written = name.replace("\\", "/")
+    for option in (name, written):
+        try:
+            path = inside(root, option, what)
+        except ValueError:
+            continue
+        if os.path.lexists(path) and not path.is_dir():
+            return path
+    if (found := files.find(name)) is None:
+        inside(root, written, what)
+    return found
 
 
 def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] | None:
@@ -131,7 +148,11 @@ def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] 
 
 
 def find_mask(root: Path, name: str) -> Path | None:
-    """The mask of photo `name`: `masks/` with the same name, with `.png` added, or with `.png` instead."""
-    masks = root / "masks"
-    options = (masks / name, masks / f"{name}.png", (masks / name).with_suffix(".png"))
-    return next((p for p in options if p.is_file()), None)
+    """The mask of photo `name` in `masks/`: the same name, with a suffix added, or with another suffix."""
+    masks = root / MASKS
+    if not masks.is_dir():
+        return None
+    plain = (masks / name).with_suffix("")
+    suffixes = [suffix for own in PHOTO_SUFFIXES for suffix in (own, own.upper())]
+    added, instead = ([path.with_name(path.name + s) for s in suffixes] for path in (masks / name, plain))
+    return next((p for p in (masks / name, *added, *instead) if p.is_file()), None)

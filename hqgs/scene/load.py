@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +16,11 @@ from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
 from hqgs.scene.film import frame_details
-from hqgs.scene.formats.colmap import find_models, half_model, read_colmap
+from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
+from hqgs.scene.photo_files import is_run
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -84,6 +86,7 @@ def load_scene(
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
     notes = list(capture.notes)
     test_names = held_out_names(root, capture, test_every, notes, degraded)
+    capture = without_missing(root, capture, notes)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
     views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
@@ -149,9 +152,11 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
 
 
 def formats_of(root: Path, downscale: float) -> list[str]:
-    """Names of the formats that a folder is in."""
+    """Names of the formats that a folder is in. A model further down counts where there is nothing else."""
     has_model, has_photos = bool(find_models(root)), photo_folder(root, downscale) is not None
     others = [name for name in (SINGLE, TRAIN, POSES) if (root / name).is_file()]
+    if not others and not has_model and half_model(root) is None:
+        has_model = bool(find_models_below(root))
     return [COLMAP, *others] if has_model and (has_photos or not others) else others
 
 
@@ -189,6 +194,8 @@ def _broken(root: Path) -> str | None:
 
 def _nothing(root: Path) -> str:
     """What is wrong with a folder in which no format is recognised."""
+    if is_run(root):
+        return f"{root} is the folder of a run that hqgs wrote: give the folder with the photos"
     entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
     for suffixes, advice in (
         (ARCHIVE_SUFFIXES, "unpack it, and give the folder with the photos"),
@@ -225,6 +232,24 @@ def bounded(capture: Capture, longest: int) -> Capture:
             f"{MOST_BYTES / 1e9:g} GB of memory then"
         )
     return replace(capture, downscale=downscale, notes=[*capture.notes, note])
+
+
+def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
+    """The capture without cameras whose photo is not there; `notes` names them.
+
+    The places of the others in the split stay what they were. FileNotFoundError where more than half miss.
+    """
+    missing = [photo for photo in capture.photos if not os.path.lexists(photo.path)]
+    if not missing:
+        return capture
+    names, count = some([photo.name for photo in missing]), len(capture.photos)
+    if 2 * len(missing) > count:
+        raise FileNotFoundError(
+            f"{len(missing)} of {count} cameras have no photo in {capture.folder or root}: {names}"
+        )
+    notes.append(f"{len(missing)} of {count} cameras have no photo any more and were left out: {names}")
+    gone = {photo.name for photo in missing}
+    return replace(capture, photos=[photo for photo in capture.photos if photo.name not in gone])
 
 
 def _with_lows(

@@ -8,23 +8,27 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.base.files import KEPT
 from hqgs.base.text import some
 from hqgs.scene.capture import (
     Capture,
     Photo,
     find_mask,
-    inside,
     keep_finite,
     list_photos,
-    photo_folder,
     viewmat_from_pose,
 )
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model
+from hqgs.scene.formats.colmap_photos import photos_of, whole_names
 from hqgs.scene.geometry import project
+from hqgs.scene.named_split import held_out, listed_split, names_by_any
+from hqgs.scene.photo_files import is_run
 from hqgs.scene.scene import Camera, Tracks
 
 _FILES = ("cameras", "images", "points3D")
+CALLED = ("colmap", "distorted", "model", "reconstruction")  # folders of a model
+DEEP = 3  # folders below the one named in which a model is looked for
 
 
 def find_models(root: Path) -> list[Path]:
@@ -32,6 +36,28 @@ def find_models(root: Path) -> list[Path]:
     sparse = root / "sparse"
     fragments = sorted(p for p in sparse.iterdir() if _kind(p)) if sparse.is_dir() else []
     return fragments or [p for p in (sparse, root) if _kind(p)][:1]
+
+
+def find_models_below(root: Path) -> list[Path]:
+    """The same for the folders of `root`, and theirs: the first that has a model (`colmap/sparse/0`).
+
+    A model outside of any `sparse` counts beside photos, or in a folder that is called after one: what a run
+    keeps of COLMAP's work is none of the user's.
+    """
+    inner = [root]
+    for _ in range(DEEP):
+        inner = [p for folder in inner for p in _folders(folder)]
+        for folder in inner:
+            models = find_models(folder)
+            if models and (models != [folder] or folder.name.lower() in CALLED or list_photos(folder)):
+                return models
+    return []
+
+
+def _folders(folder: Path) -> list[Path]:
+    """Those in which a scene may lie."""
+    inner = (p for p in folder.iterdir() if p.is_dir() and p.name[0] != "." and p.name != KEPT)
+    return sorted(p for p in inner if not is_run(p))
 
 
 def half_model(root: Path) -> Path | None:
@@ -48,16 +74,17 @@ def half_model(root: Path) -> Path | None:
 def read_colmap(root: Path, downscale: float) -> Capture:
     """Read the largest COLMAP model of the scene in `root`.
 
-    COLMAP's camera frame and pixel centres (half-integers) are ours. Raises ValueError for a damaged model,
-    FileNotFoundError for a camera whose photo is missing.
+    COLMAP's camera frame and pixel centres (half-integers) are ours. A photo that is not there keeps its
+    path, for `load_scene` to name. Raises ValueError for a damaged model, FileNotFoundError where no camera
+    has a photo.
     """
-    found = photo_folder(root, downscale)
-    if found is None:
-        raise ValueError(f"{root} has a COLMAP model but no photos: looked for images, images_{downscale:g}")
-    folder, left, notes = found
-    models = {path: _read_model(path) for path in find_models(root)}
+    found = find_models(root) or find_models_below(root)
+    models = {path: _read_model(path) for path in found}
     path = max(models, key=lambda p: (len(_registered(models[p])), models[p].num_points3D()))
     model = models.pop(path)
+    notes = list[str]()
+    if path not in find_models(root):
+        notes.append(f"the COLMAP model is the one in {path.relative_to(root)}")
     if models:
         others = ", ".join(f"{p.name}: {len(_registered(m))}" for p, m in models.items())
         notes.append(
@@ -75,15 +102,19 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     if twice:
         raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
 
-    files = match_files(names, root, folder, notes)
+    folder, left, files = photos_of(names, root, path, downscale, notes)
     details = frame_details(folder)
     photos = []
     for name, image_id in by_name:
         image = model.images[image_id]
         camera = model.cameras[image.camera_id]
         viewmat = pose_viewmat(image.cam_from_world(), name)
-        film = details.get(files[name].relative_to(folder).as_posix())
-        photos.append(Photo(name, files[name], camera, viewmat, find_mask(root, name), film))
+        file = files.get(name)
+        film = None
+        if file is not None and file.is_relative_to(folder):
+            film = details.get(file.relative_to(folder).as_posix())
+        absent = folder / name if file is None else file
+        photos.append(Photo(name, absent, camera, viewmat, find_mask(root, name), film))
     used = set(files.values())
     if len(used) < len(files):
         shared = [n for n, p in files.items() if list(files.values()).count(p) > 1]
@@ -91,13 +122,26 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     unused = [n for n in list_photos(folder) if folder / n not in used]
     if unused:
         notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
+    test_names = None
+    if (split := listed_split([path, root], root)) is not None:
+        kept, test_names = held_out(split, names, names_by_any(names), notes)
+        photos = [photo for photo in photos if photo.name in kept | test_names]
     points, colors = keep_finite(*model_points(model), notes)
     tracks = _tracks(model, path)
     seen = None
     if tracks is not None and len(points) == model.num_points3D():  # else the rows would not be those
         seen = seen_points(model)
     return Capture(
-        "colmap", photos, left, points, colors, folder=folder, notes=notes, tracks=tracks, seen=seen
+        "colmap",
+        photos,
+        left,
+        points,
+        colors,
+        folder=folder,
+        test_names=test_names,
+        notes=notes,
+        tracks=tracks,
+        seen=seen,
     )
 
 
@@ -129,6 +173,9 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
             model.read_binary(folder)
         else:
             model.read_text(folder)
+            for image_id, name in whole_names(folder / "images.txt").items():
+                if image_id in model.images:
+                    model.images[image_id].name = name
     except (ValueError, IndexError, RuntimeError) as e:
         raise ValueError(f"{folder}: COLMAP cannot read its model there: {e}") from e
     if binary:
@@ -150,42 +197,6 @@ def pose_viewmat(pose: pycolmap.Rigid3d, name: str) -> NDArray[np.float64]:
     if abs(np.linalg.norm(quat) - 1) > 1e-2:  # the matrix does not show it: that of a zero quaternion is I
         raise ValueError(f"photo {name!r}: its quaternion (x, y, z, w) is not of length 1: {quat.tolist()}")
     return viewmat
-
-
-def match_files(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:
-    """The file of each photo: by name; by name up to the suffix; in `images_N` also by sorted position.
-
-    LLFF's scaled photos have names of their own (image000.png for IMG_4026.JPG) in the same order.
-    """
-    present = list_photos(folder)
-    by_stem: dict[str, list[str]] = {}
-    for n in present:
-        by_stem.setdefault(stem(n), []).append(n)
-    files: dict[str, Path] = {}
-    missing = []
-    for name in names:
-        exact = inside(folder, name, "the COLMAP model's photo")
-        similar = by_stem.get(stem(name), [])
-        if exact.is_file():
-            files[name] = exact
-        elif len(similar) == 1:
-            files[name] = folder / similar[0]
-        else:
-            missing.append(name)
-    if not missing:
-        return files
-    originals = root / "images"
-    originals_names = list_photos(originals) if originals.is_dir() else names
-    renamed = folder != originals and len(missing) == len(names) and len(originals_names) == len(present)
-    if renamed and set(names) <= set(originals_names):
-        notes.append(f"{folder.name} has other file names than the cameras: matched by sorted position")
-        return {n: folder / p for n, p in zip(originals_names, present, strict=True) if n in set(names)}
-    raise FileNotFoundError(f"{len(missing)} cameras have no photo in {folder}: {some(missing)}")
-
-
-def stem(name: str) -> str:
-    """The name without its suffix."""
-    return name.rsplit(".", 1)[0]
 
 
 def seen_points(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.intp]]:

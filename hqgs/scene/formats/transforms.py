@@ -1,9 +1,10 @@
-"""transforms.json (nerfstudio, instant-ngp) and transforms_train.json, transforms_test.json (Blender)."""
+"""transforms.json (nerfstudio, instant-ngp) and transforms_train, _test and _val.json (Blender)."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,18 @@ from hqgs.scene.capture import (
     Capture,
     Photo,
     find_mask,
+    found_inside,
     inside,
     keep_finite,
     no_points,
     viewmat_from_pose,
 )
 from hqgs.scene.formats.ply_points import read_ply_points
+from hqgs.scene.named_split import held_out, lists_in, names_by_any
+from hqgs.scene.photo_files import MASKS, Named, below
 
-SINGLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
+SINGLE = "transforms.json"
+TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_val.json"
 
 # Where only the photo tells the size and cannot be read: `load_views` meets the same error, and names it.
 UNKNOWN_CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0.5, 0.5])
@@ -35,33 +40,52 @@ _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # y up and z back become y down
 
 
 def read_transforms(root: Path, downscale: float) -> Capture:
-    """Read `transforms.json`, or the Blender pair, whose test file names the test views.
+    """Read `transforms.json`, or the Blender files, of which each names the views of a part of the split.
 
     Poses are camera to world in the OpenGL frame (x right, y up, z back). Intrinsics stand in the file or in
-    a frame, which wins. Distortion follows OpenCV: k1, k2, p1, p2, k3, or k1..k4 for a fisheye. Raises
-    ValueError, FileNotFoundError for a photo or PLY that is missing; both name the file.
+    a frame, which wins. Distortion follows OpenCV: k1, k2, p1, p2, k3, or k1..k4 for a fisheye. Photos are
+    found by what their paths say, whatever machine wrote them, but never outside of `root`; one that is not
+    there keeps its path, for `load_scene` to name. Test views are those of the test file, of the validation
+    file where there is none, or what the lists `train_filenames`, `test_filenames` and `val_filenames` say.
+
+    Raises ValueError, FileNotFoundError for a PLY or mask that is missing; both name the file.
     """
     notes: list[str] = []
-    if (root / SINGLE).is_file():
-        meta = _read_json(root / SINGLE)
-        photos, test_names = _read_frames(root, SINGLE, meta), None
-    else:
-        meta = _read_json(root / TRAIN)
-        photos, test_names = _read_frames(root, TRAIN, meta), None
-        if (root / TEST).is_file():
-            test = _read_frames(root, TEST, _read_json(root / TEST))
-            photos, test_names = photos + test, frozenset(p.name for p in test)
-            notes.append(f"the test views are the {len(test)} of {TEST}; test_every has no say")
+    files = Named(root)
+    present = [name for name in (TRAIN, TEST, VAL) if (root / name).is_file()]
+    main = SINGLE if (root / SINGLE).is_file() and (TRAIN not in present or len(present) < 2) else TRAIN
+    meta = _read_json(root / main)
+    photos, called = _read_frames(root, main, meta, files)
+    test_names = None
+    split_file = TEST if TEST in present else VAL if VAL in present else None
+    if split_file is not None:
+        test, _ = _read_frames(root, split_file, _read_json(root / split_file), files)
+        test_names = frozenset(p.name for p in test)
+        if main == SINGLE:
+            photos = [p for p in photos if p.name not in test_names]
+        photos = photos + test
+        notes.append(f"the test views are the {len(test)} of {split_file}; test_every has no say")
+        unread = [
+            name for name in (VAL, SINGLE) if (root / name).is_file() and name not in (main, split_file)
+        ]
+        if unread:
+            notes.append(f"not read, as {main} and {split_file} name the views: {', '.join(unread)}")
     names = [p.name for p in photos]
     if len(set(names)) < len(names):
         twice = next(n for n in names if names.count(n) > 1)
         raise ValueError(f"{root}: photo {twice!r} appears more than once in the transforms")
+    split = lists_in(meta, main, "_filenames") if split_file is None else None
+    if split is not None:
+        kept, test_names = held_out(split, names, names_by_any(names) | called, notes)
+        photos = [p for p in photos if p.name in kept | test_names]
     photos.sort(key=lambda p: p.name)
+    notes += files.note()
     points, colors = no_points()
     ply = meta.get("ply_file_path")
     if ply is not None:
-        path = inside(root, _text(ply, "ply_file_path", root), "ply_file_path")
-        if not path.is_file():
+        written = _text(ply, "ply_file_path", root)
+        path = found_inside(root, written, "ply_file_path", Named(root, (".ply",)))
+        if path is None or not path.is_file():
             raise FileNotFoundError(f"ply_file_path {ply!r} names no file in {root}")
         points, colors = keep_finite(*read_ply_points(path), notes)
     return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
@@ -77,14 +101,19 @@ def _read_json(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _read_frames(root: Path, file: str, meta: dict[str, Any]) -> list[Photo]:
-    photos = []
+def _read_frames(
+    root: Path, file: str, meta: dict[str, Any], files: Named
+) -> tuple[list[Photo], dict[str, str]]:
+    """The photos of a file, and their names by what the file calls them."""
+    photos, called = list[Photo](), dict[str, str]()
     for i, frame in enumerate(meta["frames"]):
         where = f"{root / file}, frame {i}"
         if not isinstance(frame, dict):
             raise ValueError(f"{where}: expected an object, got {frame!r:.80}")
-        path = _photo_path(root, _text(frame.get("file_path"), "file_path", where))
+        written = _text(frame.get("file_path"), "file_path", where)
+        path = _photo_path(root, written, files)
         name = path.relative_to(root).as_posix()
+        called[written] = name
         where = f"{where} ({name})"
         c2w = _matrix(frame.get("transform_matrix"), where)
         c2w[:, :3] *= _OPENGL_TO_OPENCV
@@ -92,24 +121,46 @@ def _read_frames(root: Path, file: str, meta: dict[str, Any]) -> list[Photo]:
         mask = frame.get("mask_path")
         mask_path = find_mask(root, name.removeprefix("images/"))
         if mask is not None:
-            mask_path = inside(root, _text(mask, "mask_path", where), "mask_path")
-            if not mask_path.is_file():
+            mask_path = _mask_path(root, _text(mask, "mask_path", where))
+            if mask_path is None:
                 raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
         try:
             camera = _camera({**meta, **frame}, path, where)
         except UnreadableError:
             camera = UNKNOWN_CAMERA
         photos.append(Photo(name, path, camera, viewmat, mask_path))
-    return photos
+    return photos, called
 
 
-def _photo_path(root: Path, file_path: str) -> Path:
-    """The photo of `file_path`, which may lack its suffix (Blender sets)."""
-    path = inside(root, file_path, "file_path")
-    for option in (path, *(path.with_name(path.name + s) for s in PHOTO_SUFFIXES)):
-        if option.is_file():
-            return option
-    raise FileNotFoundError(f"the camera of {file_path!r} has no photo in {root}")
+def _photo_path(root: Path, file_path: str, files: Named) -> Path:
+    """The photo of `file_path`, which may lack its suffix (Blender sets); its place, if it is gone."""
+    written = file_path.replace("\\", "/")
+    for name in dict.fromkeys((file_path, written)):
+        try:
+            path = inside(root, name, "file_path")
+        except ValueError:
+            continue
+        for option in (path, *(path.with_name(path.name + s) for s in PHOTO_SUFFIXES)):
+            if os.path.lexists(option) and not option.is_dir():
+                return option
+    return files.find(file_path) or inside(root, written, "file_path")
+
+
+def _mask_path(root: Path, written: str) -> Path | None:
+    """The mask of that name; by name alone where it is the only file in `root` that is called so."""
+    try:
+        path = inside(root, written.replace("\\", "/"), "mask_path")
+        if path.is_file():
+            return path
+    except ValueError:
+        path = None
+    last = written.replace("\\", "/").rsplit("/", 1)[-1]
+    same = [found for found in below(root / MASKS, PHOTO_SUFFIXES) if found.name == last]
+    if len(same) == 1:
+        return same[0]
+    if path is None:
+        inside(root, written.replace("\\", "/"), "mask_path")
+    return None
 
 
 def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
@@ -141,8 +192,13 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     pinhole = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
 
-    k1, k2, k3, k4 = (coefficient(k) for k in ("k1", "k2", "k3", "k4"))
-    p1, p2 = coefficient("p1"), coefficient("p2")
+    order = ("k1", "k2", "k3", "k4", "p1", "p2")  # of nerfstudio's list
+    listed = values.get("distortion_params")
+    if listed is not None:
+        if not isinstance(listed, list) or len(listed) > len(order):
+            raise ValueError(f"{where}: distortion_params must be k1 k2 k3 k4 p1 p2, got {listed!r:.80}")
+        values = {**values, **dict(zip(order, listed, strict=False))}
+    k1, k2, k3, k4, p1, p2 = (coefficient(k) for k in order)
     if model in _FISHEYE or values.get("is_fisheye"):
         if p1 or p2:
             raise ValueError(f"{where}: a fisheye with p1, p2 = {p1}, {p2} is no OpenCV fisheye")

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,19 @@ from hqgs.base.files import FRAMES
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
-from hqgs.photos.files import HEIC_SUFFIXES, PHOTO_SUFFIXES, UnreadableError, check_whole, decode
+from hqgs.photos.files import (
+    PHOTO_SUFFIXES,
+    UnreadableError,
+    check_whole,
+    decode,
+    needs_heic,
+    stored_format,
+)
 from hqgs.scene.capture import photo_folder
+from hqgs.scene.photo_files import MASKS, is_run
 from hqgs.scene.sfm.run import Guess
 
+COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
 QUALITY = 95  # of JPEG, of a converted photo
 WORKERS = 2
@@ -36,11 +45,13 @@ class BarePhotos:
     exif: list[Exif] = field(default_factory=list)  # of each
     unreadable: dict[str, str] = field(default_factory=dict)  # others, and why
     notes: list[str] = field(default_factory=list)
+    others: frozenset[str] = frozenset()  # whose files hold what COLMAP does not read, whatever their suffix
 
     @property
     def colmap_names(self) -> dict[str, str]:
         """Each photo's name by the one that COLMAP sees."""
-        return {n if n.lower().endswith(FOR_COLMAP) else f"{n}.jpg": n for n in self.names}
+        read = {n: n.lower().endswith(FOR_COLMAP) and n not in self.others for n in self.names}
+        return {n if read[n] else f"{n}.jpg": n for n in self.names}
 
     def contents(self) -> Iterator[bytes]:
         """The files' bytes."""
@@ -77,11 +88,13 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
 
     Those of `photo_folder`, or in `root` itself, or, where there are none, in the folders of `root`.
     """
+    if is_run(root):
+        return None
     folder, left, notes = photo_folder(root, downscale) or (root, downscale, [])
     names = _photos_in(folder)
     if not names:
-        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != "masks" and p.name[0] != ".")
-        found = {path.name: _photos_in(path) for path in below}
+        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != MASKS and p.name[0] != ".")
+        found = {path.name: _photos_in(path) for path in below if not is_run(path)}
         names = [f"{inner}/{name}" for inner, inside in found.items() for name in inside]
         inner = [name for name, inside in found.items() if inside]
         if len(inner) == 1:
@@ -96,15 +109,11 @@ def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
 
     ValueError where HEIC photos lack the extra that reads them, or less than half can be read.
     """
-    heic = [name for name in photos.names if name.lower().endswith(HEIC_SUFFIXES)]
-    if heic:
-        try:
-            import pillow_heif  # noqa: F401
-        except ImportError:
-            raise ValueError(
-                f"{photos.folder}: {len(heic)} of {len(photos.names)} photos are HEIC ({some(heic)}), which "
-                "needs the extra 'heic': pip install 'hqgs[heic]'"
-            ) from None
+    if heic := [name for name in photos.names if needs_heic(photos.folder / name)]:
+        raise ValueError(
+            f"{photos.folder}: {len(heic)} of {len(photos.names)} photos are HEIC ({some(heic)}), which "
+            "needs the extra 'heic': pip install 'hqgs[heic]'"
+        )
     sizes: dict[str, tuple[int, int]] = {}
     unreadable: dict[str, str] = {}
 
@@ -128,8 +137,9 @@ def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
         )
     names = list(sizes)
     exif = [read_exif(photos.folder / name) for name in names]
-    return BarePhotos(
-        photos.folder, photos.downscale, names, list(sizes.values()), exif, unreadable, photos.notes
+    others = frozenset(n for n in names if stored_format(photos.folder / n) not in COLMAP_FORMATS)
+    return replace(
+        photos, names=names, sizes=[*sizes.values()], exif=exif, unreadable=unreadable, others=others
     )
 
 

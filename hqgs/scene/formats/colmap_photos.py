@@ -1,0 +1,125 @@
+"""The photos of a COLMAP model: the folder that holds them, and the file of each name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from hqgs.base.text import some
+from hqgs.scene.capture import found_inside, inside, list_photos, photo_folder
+from hqgs.scene.photo_files import MASKS, Named, is_run
+
+INPUT = "input"  # 3DGS's convert.py: photos as they were before they were undistorted
+HEAD = 9  # id, rotation, translation and camera of a photo in images.txt, before its name
+
+
+def photos_of(
+    names: list[str], root: Path, model: Path, downscale: float, notes: list[str]
+) -> tuple[Path, float, dict[str, Path]]:
+    """The folder of photos, the downscale left to do, and the file of each name that has one.
+
+    The folder is that of `photo_folder`, where it has any of the photos; else the one that has most: those
+    beside the model, `images` or `input` beside it, the scene's folder, any folder in it.
+
+    Raises ValueError without photos, FileNotFoundError where none of the names has one.
+    """
+    found = photo_folder(root, downscale)
+    if found is not None:
+        folder, left, told = found
+        if files := match_some(names, root, folder, notes):
+            notes[:0] = told
+            return folder, left, files
+    base = model.parent.parent if model.parent.name == "sparse" else model.parent
+    beside = [place / name for place in (base, model, root) for name in (INPUT, "images")]
+    inner = [p for p in sorted(root.iterdir()) if p.is_dir() and p.name[0] != "." and not is_run(p)]
+    options = [*beside, model, base, root, *(p for p in inner if p.name != MASKS)]
+    options = [p for p in dict.fromkeys(options) if p.is_dir() and p.is_relative_to(root)]
+    counts = {folder: sum(_named(folder, name) for name in names) for folder in options}
+    best = max(options, key=lambda folder: counts[folder])
+    if not counts[best]:
+        best = root if found is None else found[0]
+    if not (list_photos(best) if best != root else list_photos(root)):
+        raise ValueError(
+            f"{root} has a COLMAP model but no photos: looked for images, images_{downscale:g}, and in "
+            f"{some([p.relative_to(root).as_posix() for p in options])}"
+        )
+    if files := match_some(names, root, best, notes):
+        if best != (root / "images"):
+            notes.append(f"the photos are those in {best.relative_to(root).as_posix()}")
+        return best, downscale, files
+    raise FileNotFoundError(f"{len(names)} cameras have no photo in {best}: {some(names)}")
+
+
+def _named(folder: Path, name: str) -> bool:
+    """Whether a folder has the photo of a name, by its name or up to the suffix."""
+    try:
+        path = inside(folder, name.replace("\\", "/"), "photo")
+    except ValueError:
+        return False
+    return path.is_file()
+
+
+def match_some(names: list[str], root: Path, folder: Path, notes: list[str]) -> dict[str, Path]:
+    """The files of the photos that have one: by name; by name up to the suffix; in `images_N` also by sorted
+    position; at last by what of the name other machines wrote otherwise (`Named`).
+
+    LLFF's scaled photos have names of their own (image000.png for IMG_4026.JPG) in the same order.
+    """
+    present = list_photos(folder)
+    by_stem: dict[str, list[str]] = {}
+    for n in present:
+        by_stem.setdefault(stem(n), []).append(n)
+    files: dict[str, Path] = {}
+    for name in names:
+        if "\0" in name:
+            inside(folder, name, "the COLMAP model's photo")
+        exact = Path(os.path.normpath(folder / name))
+        if exact.is_relative_to(folder) and os.path.lexists(exact) and not exact.is_dir():
+            files[name] = exact
+    exactly = set(files.values())
+    for name in names:
+        similar = [n for n in by_stem.get(stem(name), []) if folder / n not in exactly]
+        if name not in files and len(similar) == 1:
+            files[name] = folder / similar[0]
+    missing = [name for name in names if name not in files]
+    if not missing:
+        return files
+    originals = root / "images"
+    originals_names = list_photos(originals) if originals.is_dir() else names
+    renamed = folder != originals and len(missing) == len(names) and len(originals_names) == len(present)
+    scaled = folder.name.startswith("images_")
+    if renamed and scaled and set(names) <= set(originals_names):
+        notes.append(f"{folder.name} has other file names than the cameras: matched by sorted position")
+        return {n: folder / p for n, p in zip(originals_names, present, strict=True) if n in set(names)}
+    listed, used = Named(folder), set(files.values())
+    for name in missing:
+        found = listed.find(name, used.__contains__)
+        if found is None:
+            found_inside(folder, name, "the COLMAP model's photo", listed)  # else it leaves the folder
+        else:
+            files[name] = found
+    notes += listed.note()
+    return files
+
+
+def stem(name: str) -> str:
+    """The name without its suffix."""
+    return name.rsplit(".", 1)[0]
+
+
+def whole_names(path: Path) -> dict[int, str]:
+    """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces.
+
+    Every other line lists what a photo shows, and may be empty. ValueError for a line that is none.
+    """
+    names: dict[int, str] = {}
+    lines = iter(path.read_bytes().decode("utf-8", "surrogateescape").split("\n"))
+    for line in lines:
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        words = line.split(None, HEAD)
+        if len(words) > HEAD and words[0].isdigit():
+            names[int(words[0])] = words[HEAD]
+        next(lines, None)
+    return names

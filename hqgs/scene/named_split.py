@@ -1,0 +1,126 @@
+"""Splits that a scene's files name: which photos are trained on, and which are held out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from hqgs.base.text import some
+
+TRAIN, TEST, VAL = "train", "test", "val"
+LISTS = ("train_test_lists.json", "train_test_split.json", "split.json", "splits.json")
+MOST_BYTES = 1 << 24  # of a list of names
+_OTHER_NAMES = {"train": TRAIN, "test": TEST, "val": VAL, "valid": VAL, "validation": VAL, "eval": VAL}
+
+
+@dataclass(frozen=True)
+class Split:
+    """Names of photos as a file lists them; None: it has no such list."""
+
+    source: str  # the file, for people
+    train: Sequence[str] | None = None
+    test: Sequence[str] | None = None
+    val: Sequence[str] | None = None
+
+
+def listed_split(folders: Sequence[Path], root: Path) -> Split | None:
+    """The split that a file beside a COLMAP model names, in the first folder that has one; else None.
+
+    `test.txt` and `train.txt`, a name on each line, or a JSON file of LISTS with such lists. ValueError
+    where it is damaged.
+    """
+    for folder in dict.fromkeys(folders):
+        for name in LISTS:
+            if (path := folder / name).is_file():
+                return _from_json(path, path.relative_to(root).as_posix())
+        found = {key: folder / f"{key}.txt" for key in (TRAIN, TEST, VAL)}
+        lists = {key: _lines(path) for key, path in found.items() if path.is_file()}
+        if TEST in lists or VAL in lists:
+            files = " and ".join(found[key].relative_to(root).as_posix() for key in lists)
+            return Split(files, **lists)
+    return None
+
+
+def lists_in(meta: Mapping[str, Any], source: str, ending: str = "") -> Split | None:
+    """The lists of names in an object, under `train`, `test` and `val` with this ending; None without."""
+    lists: dict[str, list[str]] = {}
+    for key, kind in _OTHER_NAMES.items():
+        names = meta.get(key + ending)
+        if names is None:
+            continue
+        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise ValueError(f"{source}: {key + ending} must be a list of names, got {names!r:.80}")
+        lists[kind] = [*lists.get(kind, []), *names]
+    return Split(source, **lists) if lists else None
+
+
+def held_out(
+    split: Split, names: Sequence[str], known: Mapping[str, str], notes: list[str]
+) -> tuple[frozenset[str], frozenset[str]]:
+    """The photos to train on and those to hold out, of `names`; `notes` hears the rule.
+
+    Held out are those of `test`, or of `val` where there is no `test`, or else what is not in `train`. What
+    is in no list that counts is left out. `known`: names of photos by what files call them.
+
+    Raises ValueError where the lists leave no photo to train on, or one is in both.
+    """
+
+    def photo(name: str) -> str | None:
+        plain = unquote(name).replace("\\", "/").strip()
+        last = plain.rsplit("/", 1)[-1]
+        options = (name, plain, last, last.rsplit(".", 1)[0])
+        return next((known[option] for option in options if option in known), None)
+
+    def of(listed: Sequence[str] | None) -> set[str]:
+        return {found for name in listed or [] if (found := photo(name)) is not None}
+
+    train, test, val = of(split.train), of(split.test), of(split.val)
+    kind = TEST if split.test else VAL if split.val else TRAIN
+    held = test if kind == TEST else val if kind == VAL else set(names) - train
+    chosen = train if split.train else set(names) - held - val
+    if both := sorted(chosen & held):
+        raise ValueError(f"{split.source}: photos are to be trained on and held out: {some(both)}")
+    if not chosen:
+        raise ValueError(f"{split.source} names none of the photos to train on")
+    if not held and kind != TRAIN:
+        raise ValueError(f"{split.source} names none of the photos to hold out")
+    rest = sorted(set(names) - chosen - held)
+    rule = f"the split is that of {split.source}: {len(chosen)} photos to train on, {len(held)} held out"
+    notes.append(f"{rule}; test_every has no say")
+    if rest:
+        notes.append(f"{len(rest)} photos are in no list of {split.source} that counts: {some(rest)}")
+    listed = [*(split.train or []), *(split.test or []), *(split.val or [])]
+    if missing := [name for name in listed if name not in known]:
+        notes.append(f"{len(missing)} names in {split.source} are no photo of the scene: {some(missing)}")
+    return frozenset(chosen), frozenset(held)
+
+
+def names_by_any(names: Sequence[str]) -> dict[str, str]:
+    """Photos by their names, with or without suffix and folders, where that is only one."""
+    known: dict[str, str] = {}
+    doubtful = set[str]()
+    for name in names:
+        last = name.rsplit("/", 1)[-1]
+        for other in dict.fromkeys((name.rsplit(".", 1)[0], last, last.rsplit(".", 1)[0])):
+            doubtful |= {other} if known.setdefault(other, name) != name else set()
+    return {k: v for k, v in known.items() if k not in doubtful} | {name: name for name in names}
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        text = path.read_bytes()[:MOST_BYTES].decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no list of names: {error}") from error
+    return [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]
+
+
+def _from_json(path: Path, source: str) -> Split | None:
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    return lists_in(meta, source) if isinstance(meta, dict) else None

@@ -1,0 +1,122 @@
+"""Photos under the names that a file of another machine gives them.
+
+Files name photos as the machine that wrote them did: with backslashes, with a drive or a home that is not
+here, with escapes of a URL, in another case or Unicode form, with the suffix of the originals. What is opened
+lies in the scene's folder all the same: such names are looked up in a list of it, never followed out of it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from functools import cached_property
+from pathlib import Path
+from unicodedata import normalize
+from urllib.parse import unquote
+
+from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, LOCK, PLY
+from hqgs.base.text import some
+from hqgs.photos.files import PHOTO_SUFFIXES
+
+MASKS = "masks"
+_Key = tuple[str, ...]
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder is one that `hqgs train` writes or wrote: its pictures are no photos."""
+    wrote = (folder / CONFIG).is_file() and any((folder / name).exists() for name in (PLY, CHECKPOINT))
+    return wrote or (folder / LOCK).is_file()
+
+
+def below(folder: Path, suffixes: Iterable[str]) -> list[Path]:
+    """Files below a folder that end so, sorted; nothing hidden, and nothing of a run."""
+    found, wanted = list[Path](), tuple(suffixes)
+    for place, folders, files in os.walk(folder):
+        inner = (name for name in folders if name[0] != "." and name != KEPT)
+        folders[:] = [name for name in inner if not is_run(Path(place, name))]
+        found += [
+            path
+            for name in files
+            if name[0] != "." and name.lower().endswith(wanted) and (path := Path(place, name)).is_file()
+        ]
+    return sorted(found)
+
+
+class Named:
+    """The files below a folder, to be found by what other machines call them."""
+
+    def __init__(self, root: Path, suffixes: Iterable[str] = PHOTO_SUFFIXES) -> None:
+        self._root, self._suffixes = root, tuple(suffixes)
+        self.by_name: dict[str, Path] = {}  # what was found elsewhere than its name says
+
+    @cached_property
+    def _files(self) -> dict[str, list[tuple[_Key, Path]]]:
+        files: dict[str, list[tuple[_Key, Path]]] = {}
+        for path in below(self._root, self._suffixes):
+            key = _parts(path.relative_to(self._root).as_posix())
+            if MASKS not in key[:-1]:
+                files.setdefault(_bare(key[-1], self._suffixes), []).append((key, path))
+        return files
+
+    def find(self, written: str, taken: Callable[[Path], bool] = lambda _: False) -> Path | None:
+        """The one file that the name can mean and that is not taken; None where there is none, or several.
+
+        The more of the written folders a file's own agree with, from the last one up, the better it fits;
+        of those that fit alike the name with the same suffix is taken, and the one in `images`.
+        """
+        for name in dict.fromkeys((written, unquote(written))):
+            key = _parts(name)
+            if not key:
+                continue
+            fitting = [
+                (_fit(key, own), own, path)
+                for stem in dict.fromkeys((_bare(key[-1], self._suffixes), key[-1]))
+                for own, path in self._files.get(stem, [])
+                if not taken(path)
+            ]
+            if not fitting:
+                continue
+            best = max(fit for fit, _, _ in fitting)
+            paths = dict.fromkeys(path for fit, _, path in fitting if fit == best)
+            if len(paths) > 1:
+                exact = [path for path in paths if path.name == _posix(name).rsplit("/", 1)[-1]]
+                inside = [path for path in paths if path.parent == self._root / "images"]
+                paths = dict.fromkeys(exact if len(exact) == 1 else inside)
+            if len(paths) == 1:
+                found = next(iter(paths))
+                self.by_name[written] = found
+                return found
+        return None
+
+    def note(self, what: str = "photos") -> list[str]:
+        """That some were found by name, in words; nothing where none was."""
+        if not self.by_name:
+            return []
+        pairs = [
+            f"{file.relative_to(self._root).as_posix()} for {name}" for name, file in self.by_name.items()
+        ]
+        return [f"{len(pairs)} {what} were found by name, not at their written paths: {some(pairs)}"]
+
+
+def _posix(name: str) -> str:
+    return name.removeprefix("file://").replace("\\", "/")
+
+
+def _parts(name: str) -> _Key:
+    plain = normalize("NFC", _posix(name)).casefold()
+    return tuple(part.strip() for part in plain.split("/") if part not in ("", ".", ".."))
+
+
+def _bare(name: str, suffixes: tuple[str, ...]) -> str:
+    """The last part of a name without a suffix of those that count."""
+    return next((name[: -len(s)] for s in suffixes if name.endswith(s) and len(name) > len(s)), name)
+
+
+def _fit(wanted: _Key, own: _Key) -> tuple[int, bool]:
+    """How many folders agree, from the last one up, and whether the suffix does."""
+    folders = 0
+    for a, b in zip(reversed(wanted[:-1]), reversed(own[:-1]), strict=False):
+        if a != b:
+            break
+        folders += 1
+    return folders, wanted[-1] == own[-1]
