@@ -143,8 +143,7 @@ def torch_loss(
 class TorchAdam(torch.optim.Adam):
     """torch's own Adam behind the trainer's call."""
 
-    def step(self, closure: Any = None, visible: Tensor | None = None) -> Any:
-        assert visible is None  # it always updates every row
+    def step(self, closure: Any = None) -> Any:
         return super().step(closure)
 
 

@@ -85,7 +85,7 @@ def test_what_changes_no_bit_costs_nothing(quick: dict[str, Any]) -> None:
         assert rows[name]["refined_cost_db"] == 0, name
         psnr = [entry["psnr"] for entry in rows[name]["runs"][0]["history"]]
         assert psnr == [entry["psnr"] for entry in scene["default"][0]["history"]]
-    for name in ("rising SH degree", "selective Adam", "float32 rasterizer", "fused loss"):
+    for name in ("rising SH degree", "float32 rasterizer", "fused loss"):
         assert rows[name]["cost_db"] != 0, name  # the switch did something
         assert rows[name]["refined_cost_db"] != 0, name
     assert rows["rising SH degree"]["refined_cost_db"] is None  # trained harmonics have no start
@@ -122,16 +122,16 @@ def test_a_run_that_fails_leaves_its_scene_out(tmp_path: Path, monkeypatch: pyte
     real = features.train
 
     def failing(photos: Any, config: Any) -> Any:
-        if config.selective_adam:
+        if config.sh_interval == 1:
             raise ValueError("it cannot")
         return real(photos, config)
 
     monkeypatch.setattr(features, "train", failing)
     options = ("--quick", "--iterations", "3", "--downscale", "10", "--out", tmp_path)
-    assert call(*options, "--rows", "selective Adam") == 0
+    assert call(*options, "--rows", "rising SH degree") == 0
     written = json.loads((tmp_path / "features.json").read_text(encoding="utf-8"))
     assert written["results"]["scenes"] == []
-    assert written["left_out"] == [{"what": "run embedded, selective Adam, seed 0", "why": "it cannot"}]
+    assert written["left_out"] == [{"what": "run embedded, rising SH degree, seed 0", "why": "it cannot"}]
 
 
 @pytest.mark.parametrize(
@@ -237,20 +237,15 @@ def test_costs_and_verdicts_of_a_hand_made_case() -> None:
     runs[DEFAULT.label] = [run_of(30.0, 10.0), run_of(30.02, 10.0)]
     steps = {name: rounds(3.0) for name in runs} | {DEFAULT.label: rounds(1.0)}
     rows = {row["feature"]: row for row in compare(runs, steps)}
-    slower, selective = rows["fused loss"], rows["selective Adam"]
+    slower = rows["fused loss"]
     assert slower["costs_db"] == pytest.approx([0.06, 0.04])
     assert slower["cost_db"] == pytest.approx(0.05)
     assert (slower["speedup_run"], slower["speedup_step"]) == (2, 3)
-    assert selective["cost_db"] == pytest.approx(-0.05)  # on, it was better and slower
-    assert selective["speedup_run"] == pytest.approx(0.5)
     assert rows["rising SH degree"]["refined_costs_db"] == []
     runs["fused Adam"] = [run_of(30.2, 20.0), run_of(30.2, 20.0)]
-    runs["selective Adam"] = [run_of(29.0, 5.0), run_of(29.0, 5.0)]
     found = {row["feature"]: row for row in features.verdicts([{"features": compare(runs, steps)}] * 2)}
     assert found["fused Adam"]["cost_db"] == pytest.approx(0.19)
     assert not found["fused Adam"]["passed"]
-    assert found["selective Adam"]["cost_db"] == pytest.approx(1.01)
-    assert found["selective Adam"]["passed"]  # off by default, it may cost that
     spread = np.std([0.2, 0.18, 0.2, 0.18], ddof=1) / math.sqrt(4)
     assert found["fused Adam"]["standard_error_db"] == pytest.approx(spread)
 

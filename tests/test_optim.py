@@ -67,22 +67,6 @@ def test_parameters_without_a_gradient_are_left_alone() -> None:
     assert b not in optimizer.state
 
 
-def test_rows_that_are_not_visible_are_left_alone() -> None:
-    some, full = tensors(torch.float32)[:4], tensors(torch.float32)[:4]
-    visible = torch.from_numpy(np.random.default_rng(3).random(257) > 0.5)
-    optimizers = Adam(some, lr=0.1), Adam(full, lr=0.1)
-    set_grads(some, 0)
-    set_grads(full, 0)
-    optimizers[0].step(visible=visible)
-    optimizers[1].step()
-    for a, b, start in zip(some, full, tensors(torch.float32)[:4], strict=True):
-        assert torch.equal(a[visible], b[visible])
-        assert torch.equal(a[~visible], start[~visible])
-        moments = optimizers[0].state[a]["exp_avg"], optimizers[1].state[b]["exp_avg"]
-        assert torch.equal(moments[0][visible], moments[1][visible])
-        assert (moments[0][~visible] == 0).all()
-
-
 def test_state_dict_round_trip_and_torchs_own() -> None:
     straight, resumed, torchs = (tensors(torch.float32) for _ in range(3))
     first, second = Adam(straight), torch.optim.Adam(torchs)
@@ -153,10 +137,10 @@ def test_same_bits_for_any_number_of_threads() -> None:
 
 
 def test_bad_input_is_named() -> None:
-    def step(param: Tensor, visible: Tensor | None = None, **options: Any) -> None:
+    def step(param: Tensor, **options: Any) -> None:
         param.requires_grad_()
         param.grad = torch.ones_like(param)
-        Adam([param], **options).step(visible=visible)
+        Adam([param], **options).step()
 
     ones = torch.ones(4, 3)
     for name, call in {
@@ -164,8 +148,6 @@ def test_bad_input_is_named() -> None:
         "beta1": lambda: step(ones.clone(), betas=(1.0, 0.9)),
         "beta2": lambda: step(ones.clone(), betas=(0.9, math.nan)),
         "eps": lambda: step(ones.clone(), eps=-1e-8),
-        "visible: must be bool": lambda: step(ones.clone(), torch.ones(4)),
-        "visible: expected shape": lambda: step(ones.clone(), torch.ones(3, dtype=torch.bool)),
         "param: must be a contiguous": lambda: step(torch.ones(3, 4).t()),
         "param: expected an array of float32 or float64, got float16": lambda: step(ones.half()),
         "weight_decay": lambda: Adam([{"params": [ones.clone()], "weight_decay": 0.1}]).step(),

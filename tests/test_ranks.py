@@ -53,7 +53,7 @@ def state_of(path: Path) -> State:
 
 def config_of(case: str, batch: int = 4) -> TrainConfig:
     """Growth, a reset and all degrees within 40 views."""
-    return tiny_config(40, batch=batch, selective_adam=case == "tinted", **CASES[case])
+    return tiny_config(40, batch=batch, **CASES[case])
 
 
 def started(count: int, *arguments: object, env: dict[str, str] | None = None) -> list[subprocess.Popen[str]]:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.graph import increment_version
@@ -70,16 +69,12 @@ class Adam(torch.optim.Optimizer):
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's base says None)
         self,
         closure: Callable[[], Tensor] | None = None,
-        visible: Tensor | None = None,
         views: Mapping[Tensor, int] | None = None,
     ) -> Tensor | None:
         """Update every parameter that has a gradient.
 
         Args:
             closure: evaluated first, with gradients enabled; its value is returned.
-            visible: bool [N] for parameters [N, ...]: rows where it is False are left as they are, moments
-                included (the selective Adam of Taming 3DGS, Mallick et al. 2024). None: all rows. Groups with
-                `every_row` take no notice of it.
             views: of how many views a parameter's gradient is the mean, where not of one. With n the rate is
                 sqrt(n) times as high and the moments decay by betas^n, as in Grendel (arXiv 2406.18533).
         """
@@ -87,21 +82,15 @@ class Adam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if visible is not None and visible.dtype != torch.bool:
-            raise ValueError(f"visible: must be bool, got {visible.dtype}")
-        rows = None if visible is None else visible.contiguous().numpy().view(np.uint8)
         for group in self.param_groups:
             if asked := [name for name in UNSUPPORTED if group.get(name)]:
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
-            chosen = None if group.get("every_row") else rows
             for param in group["params"]:
                 if param.grad is not None or group.get("used") == 0:
-                    self._update(param, group, chosen, 1 if views is None else views.get(param, 1))
+                    self._update(param, group, 1 if views is None else views.get(param, 1))
         return loss
 
-    def _update(
-        self, param: Tensor, group: dict[str, Any], rows: np.ndarray[Any, Any] | None, views: int
-    ) -> None:
+    def _update(self, param: Tensor, group: dict[str, Any], views: int) -> None:
         state = self.state[param]
         if not state:
             state["step"] = torch.tensor(0.0)
@@ -109,12 +98,10 @@ class Adam(torch.optim.Optimizer):
             state["exp_avg_sq"] = torch.zeros_like(param)
         step = state["step"] + 1
         if group.get("used") != 0:
-            self._write(param, int(step), group, rows, views)
+            self._write(param, int(step), group, views)
         state["step"] = step  # a new tensor: a loaded state dict may share the old one
 
-    def _write(
-        self, param: Tensor, step: int, group: dict[str, Any], rows: np.ndarray[Any, Any] | None, views: int
-    ) -> None:
+    def _write(self, param: Tensor, step: int, group: dict[str, Any], views: int) -> None:
         grad = param.grad
         assert grad is not None
         if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
@@ -127,12 +114,11 @@ class Adam(torch.optim.Optimizer):
         beta1, beta2 = group["betas"]
         options = (float(group["lr"]) * math.sqrt(views), beta1**views, beta2**views, group["eps"])
         used = group.get("used")
-        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, rows, used)
+        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, None, used)
         for tensor in (param, *moments):
             increment_version(tensor)  # written behind torch's back
         if is_counting():
-            share = 1.0 if rows is None or not rows.size else float(rows.mean())
-            share *= 1.0 if used is None else used / param.shape[1]
+            share = 1.0 if used is None else used / param.shape[1]
             add_counts({"adam_numbers": round(param.numel() * share)})
 
 

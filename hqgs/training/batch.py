@@ -178,16 +178,14 @@ def descend(
     trained: Gaussians,
     modulated: Gaussians,
     optimizer: Adam,
-    selective: bool,
 ) -> list[Rest]:
     """A step of Adam along the mean of the gradients of the parts without a fault, added in their order.
 
     `others` waits for the rest of each part, which is returned; until then the harmonics are updated.
-    `selective`: only Gaussians that a view shows.
     """
     optimizer.zero_grad()
     sound = [part for part in parts if part.fault is None]
-    early = _follows(trained, modulated) and not selective and any(part.degree for part in sound)
+    early = _follows(trained, modulated) and any(part.degree for part in sound)
     if early:
         give_harmonics(sound, [None] * len(sound), trained, modulated)
         optimizer.step(views={trained.shN: len(sound)})
@@ -197,7 +195,7 @@ def descend(
     if not early:
         give_harmonics(sound, [rest.higher for rest in kept], trained, modulated)
     views_of = give_others(sound, kept, trained, optimizer)
-    optimizer.step(visible=_visible(sound, kept, len(trained)) if selective else None, views=views_of)
+    optimizer.step(views=views_of)
     return rests
 
 
@@ -253,17 +251,9 @@ def note_views(
             densifier.note(part.rows[rest.seen].long(), rest.values[rest.seen, OBSERVED])
 
 
-def _visible(parts: Sequence[Part], rests: Sequence[Rest], count: int) -> Tensor:
-    """Which of `count` Gaussians any of the views shows, bool."""
-    visible = torch.zeros(count, dtype=torch.bool)
-    for part, rest in zip(parts, rests, strict=True):
-        visible[part.rows[rest.seen].long()] = True
-    return visible
-
-
 def _own(optimizer: Adam) -> dict[str, Tensor]:
     """The method's trained tensors."""
-    groups = [group for group in optimizer.param_groups if group.get("every_row")]
+    groups = [group for group in optimizer.param_groups if group.get("own")]
     return {f"{group['name']}.{k}": param for group in groups for k, param in enumerate(group["params"])}
 
 

@@ -221,7 +221,6 @@ class TrainConfig:
     brisk: bool | None = None  # higher rates in short runs (`learning_rates`); None: if the method has them
     start_points: int = 100_000  # to start from at most, where photos agree on more than the scene has
     adam_eps: float = 1e-15
-    selective_adam: bool = False  # leave the Gaussians that a view does not show as they are (Taming 3DGS)
     leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays
     background: tuple[float, float, float] = BACKGROUND  # RGB
     eval_every: int = 3_000  # iterations between evaluations on the held-out views

@@ -77,7 +77,7 @@ def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -
     others = [
         (group["name"], param.grad)
         for group in optimizer.param_groups
-        if group.get("every_row")
+        if group.get("own")
         for param in group["params"]
         if param.grad is not None
     ]

@@ -214,8 +214,8 @@ class Trainer:
             {"name": name, "params": [tensor.requires_grad_()]}  # `_set_rates` has their rates
             for name, tensor in gaussians.named().items()
         ]
-        # Methods' own tensors have no row for each Gaussian: all of them are updated.
-        own = [group | {"every_row": True} for group in self.method.param_groups()]
+        # What the method trains beside the Gaussians has no row for each of them.
+        own = [group | {"own": True} for group in self.method.param_groups()]
         return Adam(groups + own, lr=0.0, eps=self.config.adam_eps)
 
     def _set_rates(self, plan: Plan) -> None:
@@ -241,8 +241,7 @@ class Trainer:
                 assert gradient is not None  # the backward pass was sound
                 camera = look.view.camera
                 state.densifier.observe(gradient[0], radii, camera.width, camera.height)
-            visible = (radii > 0).all(dim=1) if self.config.selective_adam else None
-            state.optimizer.step(visible=visible)
+            state.optimizer.step()
         return Step(loss, look.photo.detach(), look.view), [look.measured]
 
     def _together(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
@@ -264,8 +263,7 @@ class Trainer:
         if self._sound(views, [part.fault for part in parts], parts[-1].loss):
             with torch.no_grad():
                 modulated = self.method.modulate(state.gaussians)
-            selective = self.config.selective_adam
-            rests = descend(parts, others, state.gaussians, modulated, state.optimizer, selective)
+            rests = descend(parts, others, state.gaussians, modulated, state.optimizer)
             note_views(parts, rests, [plan.observes for plan in plans], state.densifier)
         step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
         return step, [part.measured for part in parts]
