@@ -13,10 +13,10 @@ import torch
 from scenes import GaussianScene, random_scene
 from tiny_scene import tiny_config, tiny_scene
 from torch import Tensor
+from work_counts import WorkCounts, work_counts
 
 import hqgs
 from hqgs import _rust
-from hqgs.model.work_counts import WorkCounts, work_counts
 from hqgs.training.adam import Adam
 from hqgs.training.config import DensifyConfig
 from hqgs.training.trainer import Trainer

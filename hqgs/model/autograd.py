@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from hqgs import _rust
-from hqgs.model.work_counts import add_counts, add_gradients, is_counting
 
 
 def _numpy(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -79,8 +78,6 @@ class _Project(torch.autograd.Function):
         )
         n, c = means.shape[0], viewmats.shape[0]
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)
-        if is_counting():
-            add_counts(frame.counts)
         ctx.frame, ctx.shapes, ctx.has_harmonics = frame, (n, c), sh_degree is not None
         ctx.sh_shapes = [() if t is None else tuple(t.shape) for t in (colors, rest)]
         ctx.save_for_backward(means, quats, scales, opacities)
@@ -107,7 +104,7 @@ class _Project(torch.autograd.Function):
         needs = list(ctx.needs_input_grad[:8])
         if not ctx.has_harmonics:
             v_colors = None
-        *v_inputs, counts = _rust.project_backward(
+        *v_inputs, _ = _rust.project_backward(
             ctx.frame,
             (_numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities)),
             (
@@ -120,8 +117,6 @@ class _Project(torch.autograd.Function):
             ),
             needs,
         )
-        if is_counting():
-            add_gradients(v_inputs, counts)
         if v_inputs[7] is not None:  # computed in f64; stay finite in the dtype of the inputs
             limit = torch.finfo(means.dtype).max
             v_inputs[7].clip(-limit, limit, out=v_inputs[7])
@@ -138,8 +133,6 @@ class _Composite(torch.autograd.Function):
         state, image, alphas = _rust.composite_forward(
             frame, _numpy(colors), _optional(backgrounds), channels
         )
-        if is_counting():
-            add_counts(state.counts)
         c = means2d.shape[0]
         width, height = frame.width, frame.height
         image = torch.from_numpy(image).view(c, height, width, channels)
@@ -162,11 +155,9 @@ class _Composite(torch.autograd.Function):
         c, n, channels = means2d.shape[0], means2d.shape[1], colors.shape[-1]
         v_image = means2d.new_zeros(ctx.image_shape) if v_image is None else v_image
         wanted = [geometry, ctx.absgrad, need_colors, need_backgrounds]
-        *v_inputs, counts = _rust.composite_backward(
+        *v_inputs, _ = _rust.composite_backward(
             ctx.state, _optional(backgrounds), _numpy(v_image), _optional(v_alphas), wanted
         )
-        if is_counting():
-            add_gradients(v_inputs, counts)
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
         if v_abs is not None:
             means2d.absgrad = _tensor(v_abs, c, n, 2)

@@ -15,7 +15,6 @@ from torch.optim.optimizer import ParamsT
 
 from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.work_counts import add_counts, is_counting
 
 UNSUPPORTED = (
     "weight_decay",
@@ -117,9 +116,6 @@ class Adam(torch.optim.Optimizer):
         _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, None, used)
         for tensor in (param, *moments):
             increment_version(tensor)  # written behind torch's back
-        if is_counting():
-            share = 1.0 if used is None else used / param.shape[1]
-            add_counts({"adam_numbers": round(param.numel() * share)})
 
 
 def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: int) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+import pytest
+
+from hqgs import _rust
 
 
 @dataclass(eq=False)
@@ -41,43 +43,59 @@ class WorkCounts:
     # Adam.
     adam_numbers: int = 0  # parameters updated
 
+    def add(self, more: dict[str, int]) -> None:
+        for name, value in more.items():
+            setattr(self, name, getattr(self, name) + value)
 
-_open: list[WorkCounts] = []
+
+def _of_forward(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
+    return found[0].counts
+
+
+def _of_backward(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
+    """What the crate counted, and the arrays that the backward pass made."""
+    *arrays, counts = found
+    made = [array.size for array in arrays if array is not None]
+    return {**counts, "gradient_arrays": len(made), "gradient_numbers": sum(made)}
+
+
+def _of_adam(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
+    param, used = arguments[0], arguments[7]
+    return {"adam_numbers": param.size if used is None else param.size // param.shape[1] * used}
+
+
+COUNTED: dict[str, Callable[[Any, tuple[Any, ...]], dict[str, int]]] = {
+    "project_forward": _of_forward,
+    "composite_forward": _of_forward,
+    "project_backward": _of_backward,
+    "composite_backward": _of_backward,
+    "adam_step": _of_adam,
+}
 
 
 @contextmanager
 def work_counts() -> Iterator[WorkCounts]:
-    """Count what `rasterization`, its backward pass and `hqgs.optim.Adam` do inside the `with` block.
+    """Count what the rasterizer, its backward pass and Adam do inside the `with` block.
 
         with work_counts() as counts:
             image, _, _ = rasterization(...)
             image.sum().backward()
         assert counts.backward_gaussians == ...
 
-    The crate counts in any case, a few additions for each tile and each group of Gaussians; outside of a
-    block nobody adds the counts up. Blocks may be nested: each counts everything inside it, from all threads.
+    The crate counts in any case; the block reads the counts from what its functions return. Blocks may be
+    nested: each counts everything inside it, from all threads.
     """
     counts = WorkCounts()
-    _open.append(counts)
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, counts_of in COUNTED.items():
+            patch.setattr(_rust, name, _counting(getattr(_rust, name), counts_of, counts))
         yield counts
-    finally:
-        _open.remove(counts)
 
 
-def is_counting() -> bool:
-    """Whether a block is open: otherwise there is no need to look at the counts."""
-    return bool(_open)
+def _counting(function: Any, counts_of: Any, counts: WorkCounts) -> Callable[..., Any]:
+    def counting(*arguments: Any) -> Any:
+        found = function(*arguments)
+        counts.add(counts_of(found, arguments))
+        return found
 
-
-def add_counts(more: Mapping[str, int]) -> None:
-    """Add to the open blocks."""
-    for counts in _open:
-        for name, value in more.items():
-            setattr(counts, name, getattr(counts, name) + value)
-
-
-def add_gradients(arrays: Iterable[np.ndarray[Any, Any] | None], more: Mapping[str, int]) -> None:
-    """Add the arrays that a backward pass made, and what the crate counted meanwhile."""
-    made = [array.size for array in arrays if array is not None]
-    add_counts({**more, "gradient_arrays": len(made), "gradient_numbers": sum(made)})
+    return counting
