@@ -9,6 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hqgs.base.files import is_room
 from hqgs.base.typed import build
 from hqgs.photos.formula import parse_degradation
@@ -83,6 +86,8 @@ class Protocol:
     embedded: tuple[int, int, int] = (504, 378, 24)  # width, height in px, views of the built-in scene
     config: dict[str, Any] = field(default_factory=dict)  # changes of every row's `TrainConfig`
     repeats: int = 1  # rounds of what is timed after the training
+    photos: int | None = None  # to train on, evenly spread over those that there are; None: all
+    longest: int | None = None  # px: sides of photos that are longer are scaled down
 
     @property
     def labels(self) -> list[str]:
@@ -152,19 +157,18 @@ def _distinct(name: str, values: Sequence[T]) -> tuple[T, ...]:
     return tuple(values)
 
 
-def load_scenes(
-    sources: Sequence[Path], downscale: float, embedded: tuple[int, int, int], cache: Path, validate: bool
-) -> list[Scene]:
-    """The clean scenes of these folders; `embedded` is the built-in ones' width, height and views.
+def load_scenes(sources: Sequence[Path], protocol: Protocol, cache: Path, validate: bool) -> list[Scene]:
+    """The clean scenes of these folders, of the size and with the number of photos that the protocol has.
 
-    With `validate` the held-out views are gone: see `validation_split`. The built-in scenes are kept in
-    `cache`. Raises FileNotFoundError for a missing folder, ValueError for a bad one, for two of one name, for
-    one that `hqgs degrade` wrote, and for degraded training photos where clean ones are to validate on.
+    With `validate` the held-out views are gone: see `validation_split`. The built-in scenes, and cameras that
+    were found for photos alone, are kept in `cache`. Raises FileNotFoundError for a missing folder,
+    ValueError for a bad one, for two of one name, for one that `hqgs degrade` wrote, and for degraded photos
+    where clean ones are to validate on.
     """
     names = [source.resolve().name for source in sources]
     if twice := [name for k, name in enumerate(names) if name in names[:k]]:
         raise ValueError(f"two scenes are called {twice[0]!r}; the tables could not tell them apart")
-    scenes = []
+    scenes, downscale, embedded = [], protocol.downscale, protocol.embedded
     for source in sources:
         if source in BUILT_IN:
             width, height = (round(size / downscale) for size in embedded[:2])
@@ -183,11 +187,48 @@ def load_scenes(
                 raise ValueError(
                     f"{source}: the training photos are degraded, so there is no clean one to validate on"
                 )
-            scene = load_scene(source, downscale=downscale)
+            kept = cache / f"{source.name}_sfm"
+            scene = load_scene(source, downscale=downscale, keep_sfm=kept, longest=protocol.longest)
         if not scene.test:
             raise ValueError(f"scene {scene.name!r} has no held-out view to judge by")
-        scenes.append(validation_split(scene) if validate else scene)
+        scene = validation_split(scene) if validate else scene
+        scenes.append(scene if protocol.photos is None else fewer_photos(scene, protocol.photos))
     return scenes
+
+
+def fewer_photos(scene: Scene, count: int) -> Scene:
+    """The scene with `count` of its training photos, and the points that two of them see.
+
+    The split of the few-photo papers (RegNeRF, Niemeyer et al. 2022): every 8th photo is held out, `count`
+    are spread evenly over the rest in the order of their names, and cameras are those of the whole capture.
+    ValueError where there are fewer.
+    """
+    if not 2 <= count <= len(scene.train):
+        raise ValueError(f"photos is {count}, wanted 2 to {len(scene.train)}, as {scene.name} has")
+    train = [scene.train[k] for k in np.linspace(0, len(scene.train) - 1, count).round().astype(int)]
+    name = f"{scene.name}-{count}"
+    if scene.seen is None:
+        return replace(scene, name=name, train=train)
+    rows, photos = np.unique(
+        np.concatenate([np.unique(scene.seen.get(view.name, no_rows())) for view in train]),
+        return_counts=True,
+    )
+    kept = rows[photos >= 2]
+    place = np.full(len(scene.points), -1)
+    place[kept] = np.arange(len(kept))
+    seen = {view.name: place[scene.seen.get(view.name, no_rows())] for view in train}
+    return replace(
+        scene,
+        name=name,
+        train=train,
+        points=scene.points[kept],
+        point_colors=scene.point_colors[kept],
+        seen={key: value[value >= 0] for key, value in seen.items()},
+    )
+
+
+def no_rows() -> NDArray[np.intp]:
+    return np.zeros(0, np.intp)
 
 
 def validation_split(scene: Scene) -> Scene:
@@ -234,6 +275,12 @@ def add_options(parser: argparse.ArgumentParser, protocol: Protocol) -> None:
     add("--seeds", nargs="+", type=int, metavar="S", help=f"({' '.join(map(str, protocol.seeds))})")
     add("--iterations", type=int, metavar="N", help=f"training steps of each run ({protocol.iterations})")
     add("--downscale", type=float, metavar="F", help=f"divide the photos' sides ({protocol.downscale:g})")
+    add(
+        "--photos",
+        type=int,
+        metavar="K",
+        help="train on K of the photos, by the split of the few-photo papers",
+    )
     add("--finished", action="store_true", help="train nothing: tables of the runs that are finished")
     add(
         "--known", nargs="+", type=Path, metavar="JSON",

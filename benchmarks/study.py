@@ -253,12 +253,12 @@ def begin(
 ) -> Study:
     """The study of one of the protocols, which the options of `add_options`, and then `changes`, narrow."""
     name = "quick" if args.quick else vars(args).get("protocol", "standard")
-    options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats")
+    options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats", "photos")
     given = {option: vars(args).get(option) for option in options} | changes
     protocol = narrowed(protocols[name], **given)
     sources = args.scenes[:1] if protocol.one_scene else args.scenes
     cache = args.out / "scenes"
-    scenes = load_scenes(sources, protocol.downscale, protocol.embedded, cache, args.validate)
+    scenes = load_scenes(sources, protocol, cache, args.validate)
     return Study(args, args.benchmark, protocol, scenes, labelled)
 
 

@@ -468,11 +468,12 @@ def test_bad_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str
     ):
         assert call(tmp_path / "out", *options) == 2
         assert message in capsys.readouterr().err
+    tiny = Protocol(rows=(), iterations=1, downscale=1.0, embedded=(48, 36, 10))
     with pytest.raises(ValueError, match="two scenes are called 'fern'"):
-        load_scenes([tmp_path / "a" / "fern", tmp_path / "b" / "fern"], 1.0, (48, 36, 10), tmp_path, False)
+        load_scenes([tmp_path / "a" / "fern", tmp_path / "b" / "fern"], tiny, tmp_path, False)
     (tmp_path / "degradation.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ValueError, match="holds degraded photos"):
-        load_scenes([tmp_path], 1.0, (48, 36, 10), tmp_path, False)
+        load_scenes([tmp_path], tiny, tmp_path, False)
 
 
 def test_regions_of_a_hand_made_view() -> None:

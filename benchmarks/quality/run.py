@@ -86,7 +86,7 @@ class Quality:
         parts = frame.groupby("scene", sort=False)
         for _, part in parts if len(parts) > 1 else ():
             report.tables.append(tables.metrics(part, self.what(part), ("psnr", "ssim")))
-        report.tables += [tables.training_times(frame), tables.courses(frame)]
+        report.tables += [tables.best_and_last(frame), tables.training_times(frame), tables.courses(frame)]
         report.tables += [tables.costs(frame, self.circumstances()), tables.regions(frame)]
         guessing = frame.loc[frame["formation"].notna(), "row"].unique()
         report.tables += [tables.formations(frame, label) for label in labels if label in guessing]

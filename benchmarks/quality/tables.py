@@ -124,6 +124,25 @@ def training_times(frame: DataFrame) -> str:
     )
 
 
+def best_and_last(frame: DataFrame) -> str:
+    """PSNR at the end, and how far below the best moment of the run that is, over moments that measured as
+    many views as the end did."""
+    frame = frame.assign(fall=[fall(history) for history in frame["history"]])
+    return crossed(
+        "PSNR at the end (below the best moment of the run), means",
+        frame,
+        lambda part: f"{number(part['psnr'].mean(), '.2f')} ({number(part['fall'].mean(), '.2f')})",
+        across="scene",
+    )
+
+
+def fall(history: Sequence[dict[str, Any]]) -> float:
+    """dB from the best moment to the last one."""
+    last = history[-1]
+    values = [entry["psnr"] for entry in history if entry.get("views") == last.get("views")]
+    return max(values) - last["psnr"]
+
+
 def courses(frame: DataFrame) -> str:
     """Held-out PSNR and seconds of training at the evaluations that all runs have, means over the runs."""
     histories = zip(frame["row"], frame["history"], strict=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hqgs.base.files import EMBEDDED, SPARSE
+from hqgs.base.files import BEYOND, EMBEDDED, SPARSE
+from hqgs.scene.builtin.beyond import PHOTOS, beyond_room
 from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.builtin.sparse import sparse_room
 from hqgs.scene.builtin.wild import parse_true_kind, wild_room
@@ -17,7 +18,8 @@ SIZE = (504, 378)  # px, of the photos where nothing else is said
 def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, seed: int = 0) -> Scene:
     """A built-in scene with photos of 504 x 378 px, divided by `downscale`.
 
-    "embedded": `embedded_scene`; "sparse": few photos from far apart (`sparse_room`); "true-shake[:PX]",
+    "embedded": `embedded_scene`; "sparse": few photos from far apart (`sparse_room`); "beyond[:N]": N
+    photos (12), judged between and beyond their cameras (`beyond_room`); "true-shake[:PX]",
     "true-defocus[:R]", "true-rolling[:PX]", "true-exposure[:EV]": training photos that a camera has truly
     taken so, held-out ones clean (`wild_room`, with `seed`). `cache` keeps what was made. ValueError for an
     unknown name or a value out of range.
@@ -28,5 +30,11 @@ def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, se
         return embedded_scene(cache, width, height)
     if text == SPARSE:
         return sparse_room(cache, width, height)
+    kind, _, value = text.partition(":")
+    if kind == BEYOND:
+        if value and not value.isdecimal():
+            raise ValueError(f"{text}: wanted {BEYOND}:N with the number of photos, got {value!r}")
+        scene = beyond_room(int(value or PHOTOS), cache, width, height)
+        return replace(scene, name=text.replace(":", "-"))
     parse_true_kind(text, width)  # its errors name the kinds and values there are
     return replace(wild_room(text, seed, cache, width, height).scene, name=text.replace(":", "-"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,15 +61,19 @@ def assemble(
     gloss: float | None,
     made: dict[str, Any],
     thin: Callable[[SparsePoints], SparsePoints] = lambda points: points,
+    held_out: Mapping[int, str] | None = None,
 ) -> Scene:
-    """A scene of clean photos of the room by these cameras, every 8th a test view; points from the others.
+    """A scene of clean photos of the room by these cameras; points from those that are trained on.
 
     The points pass through `thin`. `made` says what cameras and `thin` depend on beside the photos' size and
-    number, in JSON values, for the key of the cache.
+    number, in JSON values, for the key of the cache. `held_out`: numbers of the test views, and what they are
+    called; None: every 8th.
     """
+    if held_out is None:
+        held_out = dict.fromkeys(range(0, len(cameras), TEST_EVERY), "view")
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
-    names = [f"view_{k:02d}.png" for k in range(len(cameras))]
+    names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
     made = {
         "width": cameras[0].width,
         "height": cameras[0].height,
@@ -84,18 +88,18 @@ def assemble(
             for name, camera in zip(names, cameras, strict=True)
         }
         views = [View(name, camera, photos[name]) for name, camera in zip(names, cameras, strict=True)]
-        points = thin(sfm_points([v for k, v in enumerate(views) if k % TEST_EVERY], time_limit))
+        points = thin(sfm_points([v for k, v in enumerate(views) if k not in held_out], time_limit))
         if cache is not None:
             arrays = {key: value for key, value in points._asdict().items() if key != "note"}
             write_kept(cache, made, Kept(photos, arrays, points.note))
     else:
         views = [View(name, camera, kept.photos[name]) for name, camera in zip(names, cameras, strict=True)]
         points = SparsePoints(**kept.arrays, note=kept.note)
-    train = [v for k, v in enumerate(views) if k % TEST_EVERY]
+    train = [v for k, v in enumerate(views) if k not in held_out]
     return Scene(
         name=name,
         train=train,
-        test=views[::TEST_EVERY],
+        test=[views[k] for k in sorted(held_out)],
         points=points.points,
         point_colors=points.colors,
         source="embedded",

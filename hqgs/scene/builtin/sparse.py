@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hqgs.scene.builtin.points import TIME_LIMIT, SparsePoints
 from hqgs.scene.builtin.scene import FOCAL, HEIGHT, WIDTH, assemble, look_at
@@ -48,18 +49,33 @@ def sparse_room(
 def sparse_cameras(width: int = WIDTH, height: int = HEIGHT, num_views: int = 25) -> list[Camera]:
     """The cameras of the sparse room, from the left to the right."""
     rng = np.random.default_rng(2026)
+    angles = [ARC * ((2 * k + 1) / num_views - 1) for k in range(num_views)]
+    return [
+        camera_on_arc(angle, (HIGH, LOW)[k % 2], rng.uniform(-1, 1, 7), width, height)
+        for k, angle in enumerate(angles)
+    ]
+
+
+def camera_on_arc(
+    angle: float,
+    y: float,
+    jitter: NDArray[np.float64],
+    width: int,
+    height: int,
+    radius: float = RADIUS,
+) -> Camera:
+    """One that looks at the table from `radius` away.
+
+    `angle`: to the right of the front, radians; `y`: its height, downwards; `jitter` [7], -1 to 1: of its
+    angle, radius and height, of what it looks at, and of its roll.
+    """
     fx, fy = FOCAL * width / WIDTH, FOCAL * height / HEIGHT
     K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
-    cameras = []
-    for k in range(num_views):
-        jitter = rng.uniform(-1, 1, 7)
-        angle = ARC * ((2 * k + 1) / num_views - 1) + 0.03 * jitter[0]
-        radius = RADIUS + 0.15 * jitter[1]
-        x, z = TABLE[0] + radius * math.sin(angle), TABLE[2] - radius * math.cos(angle)
-        center = np.array([x, (LOW if k % 2 else HIGH) + 0.15 * jitter[2], z])
-        target = np.array(TABLE) + jitter[3:6] * [0.25, 0.12, 0.25]
-        cameras.append(Camera(width, height, K, look_at(center, target, math.radians(2 * jitter[6]))))
-    return cameras
+    angle, radius = angle + 0.03 * jitter[0], radius + 0.15 * jitter[1]
+    x, z = TABLE[0] + radius * math.sin(angle), TABLE[2] - radius * math.cos(angle)
+    center = np.array([x, y + 0.15 * jitter[2], z])
+    target = np.array(TABLE) + jitter[3:6] * [0.25, 0.12, 0.25]
+    return Camera(width, height, K, look_at(center, target, math.radians(2 * jitter[6])))
 
 
 def thinned(points: SparsePoints, count: int) -> SparsePoints:
