@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ from hqgs.training.config import AUTOMATIC
 EXAMPLES = Path(__file__).parent.parent / "examples"
 LONGEST = 80  # lines
 
+Run = Callable[..., str]
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
@@ -29,12 +33,18 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "desk"
 
 
-def run(name: str, cwd: Path, *arguments: str | Path) -> str:
-    """What the example says."""
-    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs an example in an empty folder; returns what it says."""
+
+    def run(name: str, *arguments: str | Path) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        capsys.readouterr()
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
 
 
 def test_examples_are_short() -> None:
@@ -45,8 +55,8 @@ def test_examples_are_short() -> None:
         assert f"def test_{file.stem}(" in Path(__file__).read_text(encoding="utf-8")
 
 
-def test_train_llff(folder: Path, tmp_path: Path) -> None:
-    told = run("train_llff.py", tmp_path, folder, "--iterations", "20")
+def test_train_llff(run: Run, folder: Path, tmp_path: Path) -> None:
+    told = run("train_llff.py", folder, "--iterations", "20")
     out = tmp_path / "outputs" / "desk"
     report = json.loads((out / "report.json").read_text())
     assert (report["method"], report["iterations"]) == ("3dgs", 20)
@@ -54,14 +64,12 @@ def test_train_llff(folder: Path, tmp_path: Path) -> None:
     assert f"{report['gaussians']} Gaussians after 20 iterations" in told
     assert f"psnr  {report['metrics']['mean']['psnr']:.4f}" in told
     assert len(list((out / "comparison").iterdir())) == 1
-    again = run("train_llff.py", tmp_path, folder, "--iterations", "10")
+    again = run("train_llff.py", folder, "--iterations", "10")
     assert "after 10 iterations" in again
 
 
-def test_bad_photos(folder: Path, tmp_path: Path) -> None:
-    told = run(
-        "bad_photos.py", tmp_path, folder, "--iterations", "50", "--downscale", "1", "--kind", "noise:40"
-    )
+def test_bad_photos(run: Run, folder: Path, tmp_path: Path) -> None:
+    told = run("bad_photos.py", folder, "--iterations", "50", "--downscale", "1", "--kind", "noise:40")
     assert "\ndesk: none\n" in told  # the diagnosis: photos of this size tell nothing
     (trained,) = re.findall(r"iteration 50 of 50: ([\d.]+) dB", told)
     out = tmp_path / "outputs" / "bad_photos"
@@ -73,16 +81,20 @@ def test_bad_photos(folder: Path, tmp_path: Path) -> None:
 
 
 def test_fit_picture(tmp_path: Path) -> None:
+    """As a program of its own."""
     options = ("--size", "32", "--gaussians", "200", "--iterations", "60", "--out", "a.png")
-    told = [float(value) for value in re.findall(r"([\d.]+) dB", run("fit_picture.py", tmp_path, *options))]
+    command = [sys.executable, str(EXAMPLES / "fit_picture.py"), *options]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    told = [float(value) for value in re.findall(r"([\d.]+) dB", done.stdout)]
     assert len(told) == 10
     assert told[-1] > told[0] + 3
     assert Image.open(tmp_path / "a.png").size == (64, 32)
 
 
-def test_look(tmp_path: Path) -> None:
+def test_look(run: Run, tmp_path: Path) -> None:
     hqgs.train(tiny_scene(), out=tmp_path / "run", config=tiny_config())
-    told = run("look.py", tmp_path, tmp_path / "run", "--frames", "5")
+    told = run("look.py", tmp_path / "run", "--frames", "5")
     assert "5 frames: outputs/look" in told
     names = {file.name for file in (tmp_path / "outputs" / "look").iterdir()}
     assert names == {"path.mp4", "orbit.gif", "wide.png"}

@@ -176,6 +176,7 @@ def test_few_photos_are_large_at_a_time(tmp_path: Path, monkeypatch: pytest.Monk
         np.testing.assert_array_equal(a.image, b.image)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not Path("/proc/self/statm").exists(), reason="the system does not tell the memory in use"
 )

@@ -92,7 +92,7 @@ def work(out: str, what: str) -> None:
         module.HEARTBEAT = 0.5
     with joined() as ranks:
         for case in names.split(","):
-            for threads in (1, 2):
+            for threads in (1, 2) if ranks.count == 1 else (2,):
                 hqgs.set_num_threads(threads)
 
                 def show(now: hqgs.Progress) -> None:
@@ -122,13 +122,13 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [3, pytest.param(2, marks=pytest.mark.slow)])
 def test_same_bits_for_any_number_of_processes_and_threads(count: int, alone: Path, tmp_path: Path) -> None:
     for code, said in ended(started(count, tmp_path, ",".join(CASES))):
         assert code == 0, said
     for case in CASES:
         expected = state_of(alone / case / "1" / CHECKPOINT)
-        for folder in (alone / case / "2", tmp_path / case / "1", tmp_path / case / "2"):
+        for folder in (alone / case / "2", tmp_path / case / "2"):
             assert_same(state_of(folder / CHECKPOINT), expected)
             assert (folder / PLY).read_bytes() == (alone / case / "1" / PLY).read_bytes()
 
@@ -140,11 +140,10 @@ def test_a_killed_rank_ends_the_others_and_another_number_goes_on(alone: Path, t
     assert first[0] == 1
     assert "RankError: rank 1 has gone: it was stopped, or its machine was cut off" in first[1]
     assert time.perf_counter() - began < 60
-    folder = tmp_path / "3dgs" / "1"
+    folder = tmp_path / "3dgs" / "2"
     assert not (folder / PLY).exists()
     assert 0 < state_of(folder / CHECKPOINT)[1]["iteration"] < 40  # type: ignore[operator]
-    for code, said in ended(started(3, tmp_path, "3dgs")):
-        assert code == 0, said
+    work(str(tmp_path), "3dgs")
     assert_same(state_of(folder / CHECKPOINT), state_of(alone / "3dgs" / "1" / CHECKPOINT))
     assert (folder / PLY).read_bytes() == (alone / "3dgs" / "1" / PLY).read_bytes()
 
@@ -158,7 +157,7 @@ def test_what_fails_on_one_rank_is_told_by_all(tmp_path: Path) -> None:
 
 def test_torchrun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The command as users give it; one process comes to the same scene, and a restart goes on."""
-    arguments = ["embedded", "--downscale", "8", "--iterations", "24", "--batch", "3", "--method", "3dgs"]
+    arguments = ["embedded", "--downscale", "16", "--iterations", "12", "--batch", "3", "--method", "3dgs"]
     train = ["-m", "hqgs", "train", *arguments, "--out", str(tmp_path / "two")]
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2"]
     done = subprocess.run([*torchrun, *train], capture_output=True, text=True, cwd=ROOT, check=False)
@@ -170,7 +169,7 @@ def test_torchrun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_restart_implies_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = ["train", "embedded", "--downscale", "8", "--iterations", "6", "--method", "3dgs"]
+    arguments = ["train", "embedded", "--downscale", "16", "--iterations", "6", "--method", "3dgs"]
     assert main([*arguments, "--out", str(tmp_path)]) == 0
     assert main([*arguments, "--out", str(tmp_path)]) == 2
     monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
