@@ -6,7 +6,6 @@ After each of them a run can be resumed or says in one line what is wrong, and n
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import resource
 import shutil
@@ -26,6 +25,7 @@ import numpy as np
 import pytest
 import torch
 from fixtures_scenes import make_truth, write_colmap
+from forks import forks
 from PIL import Image
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
@@ -86,13 +86,7 @@ def _command_in_child(arguments: list[str], stderr: Path, user: int | None) -> N
 
 @pytest.fixture(scope="module")
 def processes() -> ForkServerContext:
-    """Children that start from a process in which everything is imported already."""
-    context = multiprocessing.get_context("forkserver")
-    commands = [command.module for command in cli.COMMANDS.values()]
-    context.set_forkserver_preload(
-        [*commands, "hqgs.cli.main", "hqgs.pipeline", "hqgs.scene.source", "tiny_scene", "piq"]
-    )
-    return context
+    return forks()
 
 
 def start(processes: ForkServerContext, out: Path, config: TrainConfig) -> ForkServerProcess:

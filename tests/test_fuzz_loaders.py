@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import multiprocessing
 import os
 import pickle
 import struct
@@ -21,6 +20,7 @@ import plyfile
 import pytest
 import torch
 from fixtures_scenes import Truth, make_truth, subset, write_colmap, write_llff, write_transforms
+from forks import forks
 from fuzz import Target, judge, mutations, run_in_child
 from PIL import Image
 from safetensors.torch import save_file
@@ -187,11 +187,7 @@ def make(name: str, folder: Path) -> Target:
 
 @pytest.fixture(scope="module")
 def processes() -> ForkServerContext:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        ["hqgs.cli.main", "hqgs.training.trainer", "pytest"]
-    )  # not ours: its path is not set
-    return context
+    return forks()
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(1_000, marks=pytest.mark.slow)])

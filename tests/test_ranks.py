@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from example_method import Tinted, install
+from forks import forks
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
@@ -56,30 +58,34 @@ def config_of(case: str, batch: int = 4) -> TrainConfig:
     return tiny_config(40, batch=batch, **CASES[case])
 
 
-def started(count: int, *arguments: object, env: dict[str, str] | None = None) -> list[subprocess.Popen[str]]:
-    """This file as `count` processes."""
+def started(count: int, out: Path, what: str) -> list[tuple[ForkServerProcess, Path]]:
+    """`work` in `count` processes, and where each writes what it says."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     own = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(count)}
-    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    command = [sys.executable, __file__, *map(str, arguments)]
-    return [
-        subprocess.Popen(
-            command,
-            env={**os.environ, "PYTHONPATH": path, **own, "RANK": str(rank), **(env or {})},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for rank in range(count)
-    ]
+    processes = []
+    for rank in range(count):
+        told = out / f"rank {rank}.txt"
+        process = forks().Process(target=_work, args=({**own, "RANK": str(rank)}, told, str(out), what))
+        process.start()
+        processes.append((process, told))
+    return processes
 
 
-def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+def ended(processes: list[tuple[ForkServerProcess, Path]]) -> list[tuple[int | None, str]]:
     """Exit codes and what was said."""
-    said = [process.communicate(timeout=240) for process in processes]
-    return [(process.returncode, out + err) for process, (out, err) in zip(processes, said, strict=True)]
+    for process, _ in processes:
+        process.join(240)
+    return [(process.exitcode, told.read_text()) for process, told in processes]
+
+
+def _work(environment: dict[str, str], told: Path, out: str, what: str) -> None:
+    os.environ.update(environment)
+    with told.open("w") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    work(out, what)
 
 
 def work(out: str, what: str) -> None:
@@ -321,7 +327,3 @@ def test_one_process_is_a_rank_too() -> None:
     with joined() as ranks:
         assert ranks is ALONE
     assert issubclass(RankError, RuntimeError)
-
-
-if __name__ == "__main__":
-    work(*sys.argv[1:])
