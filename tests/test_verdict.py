@@ -1,0 +1,31 @@
+"""What a run is judged by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from hqgs.evaluation.verdict import judged_by, verdict
+
+
+def report(gains: list[list[float]], aligned: float | None) -> dict[str, Any]:
+    learned = [{"name": str(k), "gains": gain} for k, gain in enumerate(gains)]
+    return {"metrics": {"mean": {"psnr": 21.0, "psnr_aligned": aligned}}, "learned": learned}
+
+
+def test_brightness_is_set_aside_where_photos_were_exposed_each_in_its_own_way() -> None:
+    same, own = [[1.0, 1.0, 1.0]] * 2, [[1.0, 1.0, 1.0], [1.3, 1.0, 0.9]]
+    assert judged_by(report(same, 27.0)) == (21.0, "PSNR")
+    assert judged_by(report(own, 27.0))[0] == 27.0
+    assert "set aside" in judged_by(report(own, 27.0))[1]
+    assert judged_by(report(own, None)) == (21.0, "PSNR")
+    assert judged_by({"metrics": {"mean": {"psnr": None}}}) == (None, "PSNR")
+
+
+@pytest.mark.parametrize(
+    ("psnr", "word"),
+    [(19.99, "poor"), (20.0, "fair"), (25.0, "good"), (30.0, "very good"), (None, "not measured")],
+)
+def test_the_word_rises_with_the_psnr(psnr: float | None, word: str) -> None:
+    assert verdict(psnr)[0] == word
