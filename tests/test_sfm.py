@@ -146,6 +146,26 @@ def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene
         assert a.camera.viewmat.tobytes() == b.camera.viewmat.tobytes()
 
 
+def test_smoothed_photos_and_patches_place_noisy_ones_on_any_threads(cards: Scene) -> None:
+    """Without them 6 of the 7 or fewer have a place."""
+    noisy = degrade_scene(cards, parse_degradation("noise:50"), 0)
+    threads, stages, found = hqgs.get_num_threads(), set[str](), []
+    try:
+        for count in (1, 3):
+            hqgs.set_num_threads(count)
+            found.append(sfm_scene(noisy, told=lambda stage: stages.add(stage.what)))
+    finally:
+        hqgs.set_num_threads(threads)
+    assert any(what.endswith("with smoothed photos") for what in stages)
+    assert len(found[0].train) == 7
+    assert found[0].sfm is not None
+    assert found[0].sfm.rotation_error_deg is not None
+    assert found[0].sfm.rotation_error_deg["median"] < 0.3
+    assert found[0].points.tobytes() == found[1].points.tobytes()
+    for a, b in zip(found[0].train, found[1].train, strict=True):
+        assert a.camera.viewmat.tobytes() == b.camera.viewmat.tobytes()
+
+
 def test_a_reconstruction_that_is_kept_is_not_made_again(
     cards: Scene, found: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

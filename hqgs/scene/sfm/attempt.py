@@ -10,6 +10,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,14 @@ import pycolmap
 
 from hqgs.scene.sfm.database import known_cameras, new_cameras
 from hqgs.scene.sfm.likely import MANY, likely_pairs
+from hqgs.scene.sfm.sharpen import sharpened
+from hqgs.scene.sfm.tracks import usual
+from hqgs.scene.sfm.versions import SIGMAS, join, smoothed_copies
 
 LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
 PROBED, RICH = 8, 1000  # photos that tell whether coarse features are enough, and how many they need (median)
+ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
+UNSURE = 0.36  # px of what SIFT sees that sightings are usually off, from where on patches tell more
 SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
 COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
 BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
@@ -32,19 +38,33 @@ BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 
 
 class Attempt:
-    """A pass from photos to a model; the tolerant one takes weaker features, and fewer matches as enough."""
+    """A pass from photos to a model.
+
+    The tolerant one takes weaker features, and fewer matches as enough. `smoothed` 1 looks at smoothed
+    photos, 2 at all versions together, after 1 and the pass without, whose database is `plain`.
+    """
 
     def __init__(
-        self, directory: Path, given: dict[str, Any], threads: int, tolerant: bool, coarse: bool = False
+        self,
+        directory: Path,
+        given: dict[str, Any],
+        threads: int,
+        tolerant: bool = False,
+        coarse: bool = False,
+        smoothed: int = 0,
+        plain: Path | None = None,
     ) -> None:
         self.directory: Path = directory
         self.given: dict[str, Any] = given
         self.threads: int = threads
         self.tolerant: bool = tolerant
         self.coarse: bool = coarse
-        self.database: Path = directory / (
-            "tolerant.db" if tolerant else "coarse.db" if coarse else "colmap.db"
-        )
+        self.smoothed: int = smoothed
+        self.plain: Path = plain or directory / "colmap.db"
+        self.versions: list[Path] = [directory / f"smoothed_{sigma}.db" for sigma in SIGMAS]
+        names = {"tolerant.db": tolerant, "coarse.db": coarse, "joined.db": smoothed == len(SIGMAS)}
+        named = [directory / name for name, on in names.items() if on]
+        self.database: Path = [*named, self.versions[0] if smoothed else self.plain][0]
         self.names: list[str] = given["names"].tolist()
         self.model: pycolmap.Reconstruction | None = None
         self._tell("features", 0)
@@ -53,13 +73,24 @@ class Attempt:
     def registered(self) -> int:
         return 0 if self.model is None else self.model.num_reg_images()
 
+    @staticmethod
+    def _off(model: pycolmap.Reconstruction) -> float:
+        """What sightings are usually off, px of what SIFT sees."""
+        sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
+        return usual(model) * min(1, LARGEST / float(np.median(sides)))
+
+    def _begin(self, database: Path) -> None:
+        """A database of photos and cameras, if it is not there."""
+        if not database.exists():
+            new = database.with_suffix(".new")
+            new.unlink(missing_ok=True)
+            known_cameras(self.given, new) if "Ks" in self.given else new_cameras(self.given, new)
+            new.rename(database)
+
     def run(self) -> None:
         fixed = "Ks" in self.given
-        if not self.database.exists():
-            new = self.database.with_suffix(".new")
-            new.unlink(missing_ok=True)
-            known_cameras(self.given, new) if fixed else new_cameras(self.given, new)
-            new.rename(self.database)
+        if not self.smoothed:
+            self._begin(self.database)
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
         if self.tolerant:
@@ -67,8 +98,11 @@ class Attempt:
         photos = Path(str(self.given["photos"]))
         if self.coarse:
             self.coarse = self._probe(photos, extraction)
-        todo = self.directory, photos, self.names, extraction, self.threads, self.database
-        match(*todo, self._watched, self._pairs)
+        if self.smoothed:
+            self._look_smoothed(photos, extraction)
+        else:
+            todo = self.directory, photos, self.names, extraction, self.threads, self.database
+            match(*todo, self._watched, lambda: self._pairs(self.database))
         self._tell("verify", 0)
         verifier = pycolmap.GeometricVerifierOptions()
         verifier.num_threads = self.threads
@@ -85,6 +119,48 @@ class Attempt:
             best = max(sorted(models), key=lambda k: (models[k].num_reg_images(), models[k].num_points3D()))
             self.model = models[best]
             self._settle(self.model, fixed)
+
+    def sharpen(self) -> None:
+        """Move the sightings to where the photos agree, and adjust again, where that is more precise."""
+        if self.model is None or self._off(self.model) <= UNSURE:
+            return
+        self._tell("sharpen", 0)
+        mapping = self._mapping("Ks" in self.given)
+
+        def adjust(model: pycolmap.Reconstruction, scale: float, move: bool) -> None:
+            options = mapping.get_global_bundle_adjustment()
+            options.refine_rig_from_world = move
+            if not move:
+                options.refine_focal_length = options.refine_extra_params = False
+            options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+            options.ceres.loss_function_scale = scale
+            pycolmap.bundle_adjustment(model, options)
+
+        self.model = sharpened(self.model, Path(str(self.given["photos"])), adjust)
+
+    def _look_smoothed(self, photos: Path, extraction: pycolmap.FeatureExtractionOptions) -> None:
+        """Features and matches of the smoothed photos; of all versions, they are joined."""
+        if self.database in self.versions:
+            done, todo = [], self.versions[:1]
+        elif self.database.exists():
+            return
+        else:
+            done, todo = [self.plain, self.versions[0]], self.versions[1:]
+        for sigma, version in zip(SIGMAS, self.versions, strict=True):
+            if version not in todo:
+                continue
+            self._begin(version)
+            copies = self.directory / f"photos_{sigma}"
+            if not copies.is_dir():
+                smoothed_copies(photos, copies, self.names, sigma, LARGEST)
+            given = self.directory, copies, self.names, extraction, self.threads, version
+            match(*given, self._watched, partial(self._pairs, version))
+        if done:
+            new = self.directory / "joining.db"
+            new.unlink(missing_ok=True)
+            self._begin(new)
+            join([*done, *todo], new, len(self.names))
+            new.rename(self.database)
 
     def _probe(self, photos: Path, extraction: pycolmap.FeatureExtractionOptions) -> bool:
         """Whether a few photos show enough where they are not enlarged; if so, `extraction` is to do without.
@@ -108,8 +184,8 @@ class Attempt:
         extraction.sift.first_octave, extraction.sift.max_num_features = fine
         return False
 
-    def _pairs(self) -> Any:
-        """Pairs [P, 2] of photos that are to be matched; None: all."""
+    def _pairs(self, database: Path) -> Any:
+        """Pairs [P, 2] of photos that are to be matched by their features in `database`; None: all."""
         if self.tolerant:
             return None
         if "pairs" in self.given:
@@ -117,7 +193,7 @@ class Attempt:
         if len(self.names) <= MANY:
             return None
         self._tell("matches", 0)
-        with pycolmap.Database.open(self.database) as db:
+        with pycolmap.Database.open(database) as db:
             return likely_pairs(db, len(self.names))
 
     def facts(self) -> dict[str, Any]:
@@ -207,7 +283,13 @@ class Attempt:
 
     def _tell(self, stage: str, done: int, total: int = 0) -> None:
         """What is being done, for whoever waits."""
-        now = {"tolerant": self.tolerant, "stage": stage, "done": done, "total": total}
+        now = {
+            "tolerant": self.tolerant,
+            "smoothed": self.smoothed,
+            "stage": stage,
+            "done": done,
+            "total": total,
+        }
         new = self.directory / "stage.new"
         new.write_text(json.dumps(now), encoding="utf-8")
         new.replace(self.directory / "stage.json")

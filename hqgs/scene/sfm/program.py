@@ -13,8 +13,9 @@ no model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADI
 [C, 2], focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera,
 camera_of [V]. The first pass matches the pairs [P, 2], numbers of photos, where it has some; else all, or of
 many photos those that are alike. Where it has `coarse`, photos rich in detail are looked at coarsely, and
-again finely where too few find a place. Where the first pass registers few photos, a second, more tolerant
-one follows, with every pair; the better of the two counts.
+again finely where too few find a place. Where too few do then, smoothed versions of the photos are looked at,
+first one and then all together. Where few photos have a place yet, another, more tolerant pass follows, with
+every pair; the better of the two counts. In the end sightings are moved to where the photos agree.
 `facts.json` says what both came to, `stage.json` what is being done now, which is read from COLMAP's log: the
 caller sends the output to `log.txt`. A second call in the same DIRECTORY goes on with the features and
 matches that the first one left. The program ends when its standard input does.
@@ -32,13 +33,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.attempt import Attempt, match, pipeline_options
+from hqgs.scene.sfm.attempt import ALMOST, Attempt, match, pipeline_options
 from hqgs.scene.sfm.database import known_cameras
 
 MAX_FEATURES = 2048  # per photo, of known cameras
 MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many pixels on average
 ENOUGH = 0.7  # of the photos: with fewer, the second pass follows
-ALMOST = 0.95  # of the photos: with fewer, those that were looked at coarsely are looked at again
 
 
 def triangulate(directory: Path) -> None:
@@ -76,16 +76,25 @@ def reconstruct(directory: Path, threads: int) -> None:
     the order of numbers. Mapping has one thread and the seed 0.
     """
     given = _given(directory)
-    passes = [Attempt(directory, given, threads, tolerant=False, coarse="coarse" in given)]
+    passes = [Attempt(directory, given, threads, coarse="coarse" in given)]
     passes[0].run()
+    plain = passes[0].database
     if passes[0].coarse and passes[0].registered < ALMOST * len(given["names"]):
-        fine = Attempt(directory, given, threads, tolerant=False)
+        fine = Attempt(directory, given, threads)
         fine.run()
+        plain = fine.database
         passes = [max(fine, passes[0], key=lambda one: one.registered)]
+    for smoothed in (1, 2):
+        if passes[0].registered >= ALMOST * len(given["names"]):
+            break
+        again = Attempt(directory, given, threads, smoothed=smoothed, plain=plain)
+        again.run()
+        passes = [max(passes[0], again, key=lambda one: one.registered)]
     if passes[0].registered < ENOUGH * len(given["names"]):
         passes.append(Attempt(directory, given, threads, tolerant=True))
         passes[1].run()
     best = max(passes, key=lambda one: (one.registered, -one.tolerant))
+    best.sharpen()
     facts = json.dumps({"passes": [one.facts() for one in passes]})
     (directory / "facts.json").write_text(facts, encoding="utf-8")
     if best.model is not None:

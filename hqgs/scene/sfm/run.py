@@ -28,7 +28,10 @@ from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
-PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in ("attempt", "database", "likely"))]
+PARTS = [
+    PROGRAM,
+    *(PROGRAM.with_name(f"{name}.py") for name in ("attempt", "database", "likely", "sharpen", "versions")),
+]
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
@@ -40,6 +43,7 @@ STAGES = {
     "matches": "COLMAP: pairs of photos matched",
     "verify": "COLMAP: matches checked",
     "place": "COLMAP: photos placed",
+    "sharpen": "COLMAP: places made precise",
 }
 
 
@@ -254,6 +258,7 @@ def _tell(file: Path, told: OnStage) -> None:
     except FileNotFoundError:  # it has only begun
         return
     again = ", second and more tolerant pass" if now["tolerant"] else ""
+    again = ", with smoothed photos" if now["smoothed"] else again
     told(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
 
 
