@@ -38,8 +38,8 @@ from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
-from hqgs.training.fitting import fitted
 from hqgs.training.notes import learned_record, run_notes
+from hqgs.training.pace import fit_to_seconds
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values
 from hqgs.training.trainer import Trainer
@@ -105,10 +105,10 @@ def train(
         iterations: training views to see; None: as many as pay (docs/start.md), at most 30,000.
         batch: of them in a step: one after the other in one process, shared out by several.
         seconds: of training, in place of `iterations`: as many as fit in and pay, by the steps of this
-            machine before the run and once more after growth. `iterations` and `turn` of the configuration
-            in the report, and plan.json, tell what that came to: a run with these makes the same bits again.
-        method: "auto" (hqgs with what the diagnosis asks for, 3dgs where it asks for nothing), "3dgs",
-            "srgs" or "hqgs".
+            machine before the run and once more after growth. The rows of its plan, in the report and in
+            plan.json, tell what that came to: a run with that plan makes the same bits again.
+        method: "auto" or "hqgs" (the photos' degradation in the loss, none where they show none), "3dgs" or
+            "srgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
             photos, growth, weight, resolution, iterations, with commas.
         seed: of everything random.
@@ -183,8 +183,9 @@ def open_run(
                 remove_leftovers(folder / file)
         going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
         inspector = Inspector(told)
-        config = config if going_on else fitted(scene, config, inspector, ranks)
         trainer = Trainer(scene, config, inspector, ranks)
+        if not going_on:
+            fit_to_seconds(trainer)
         del inspector  # it holds what it has seen of the photos
         give_back_memory()  # of the start
         if going_on:
@@ -194,7 +195,7 @@ def open_run(
             checkpoint.unlink(missing_ok=True)
         if ranks.count > 1:
             ranks.agree(scene_fingerprint(trainer.scene), "the scene")
-            ranks.agree(trainer.config, "the configuration")
+            ranks.agree(trainer.plan, "the plan")
         _check_agreement(trainer)
         if folder is not None:
             asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
@@ -301,6 +302,7 @@ def _report(
 ) -> Report:
     """The report, written into `out`, if there is one; what made it is in `trainer`."""
     scene, culled = trainer.scene, views.culled()
+    rows = [row.known() for row in trainer.rows]
     result = RunResult(
         scene=scene.name,
         source=scene.source,
@@ -317,6 +319,7 @@ def _report(
         decision_seconds=trainer.frugality.memory.seconds,
         scene_bytes=None if out is None else (out / PLY).stat().st_size,
         config=asdict(config),
+        plan=rows,
         sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
         guard=trainer.guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
@@ -330,8 +333,8 @@ def _report(
         learned = learned_picture([view.image for view in scene.train], result.learned)
         with atomic_path(out / LEARNED) as tmp:
             learned.save(tmp)
-    if out is not None and config.seconds is not None:
-        write_json(out / PLAN, plan_values(config))
+    if out is not None:
+        write_json(out / PLAN, plan_values(config, rows))
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
         write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, learned))

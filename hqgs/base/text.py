@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import textwrap
 from collections.abc import Sequence
 
 
@@ -17,6 +19,19 @@ def markdown_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]
 
     rule = [("-" * w) if k == 0 else "-" * (w - 1) + ":" for k, w in enumerate(widths)]
     return "\n".join([f"**{title}**", "", line(head), line(rule), *map(line, rows)])
+
+
+def aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> str:
+    """Columns one beside the other; the last one is wrapped to `width` (None: the terminal's)."""
+    width = shutil.get_terminal_size((110, 24)).columns if width is None else width
+    before = [max(map(len, column)) for column in list(zip(*rows, strict=True))[:-1]]
+    indent = sum(before) + 2 * len(before)
+    lines = []
+    for *cells, last in rows:
+        first = "".join(f"{cell:{size}}  " for cell, size in zip(cells, before, strict=True))
+        wrapped = textwrap.wrap(last, max(width - indent, 40)) or [""]
+        lines += [(first + wrapped[0]).rstrip(), *(" " * indent + more for more in wrapped[1:])]
+    return "\n".join(lines)
 
 
 def some(names: list[str]) -> str:

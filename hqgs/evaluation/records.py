@@ -137,6 +137,20 @@ class RankRecord(TypedDict):
     sent_bytes: int
 
 
+class _Decided(TypedDict):
+    what: str
+    value: str
+    why: str
+
+
+class PlanRowRecord(_Decided, total=False):
+    """One decision of a run; what is not there does not apply."""
+
+    evidence: str  # what was measured
+    rule: str  # the rule's name and its source
+    iteration: int  # after which it was decided; none: before the first step
+
+
 class RunRecord(TypedDict):
     """A run without its metrics."""
 
@@ -160,7 +174,8 @@ class RunRecord(TypedDict):
     photos: list[PhotoRecord]  # those that were looked at; empty where the method does not ask for it
     ranks: list[RankRecord]  # empty where one process did all
     learned: list[LearnedRecord]  # of the photos' cameras; empty where nothing of them is learned
-    config: dict[str, Json]  # `TrainConfig`, as the method has fitted it to the scene
+    config: dict[str, Json]  # `TrainConfig`, as the plan has it
+    plan: list[PlanRowRecord]  # what was decided, before the first step and since
 
 
 class Report(RunRecord):

@@ -28,6 +28,7 @@ from hqgs.evaluation.records import (
     MetricsRecord,
     MetricValues,
     PhotoRecord,
+    PlanRowRecord,
     RankRecord,
     Report,
     RunRecord,
@@ -73,6 +74,7 @@ class RunResult:
     guard: GuardRecord
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
     views: Sequence[RenderedView] = field(repr=False)
+    plan: list[PlanRowRecord] = field(default_factory=list)
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
     photos: list[PhotoRecord] = field(default_factory=list)

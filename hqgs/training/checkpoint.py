@@ -19,7 +19,7 @@ from torch import Tensor
 from hqgs.base.files import atomic_path
 from hqgs.scene.scene import Scene
 
-FORMAT = 4  # raised when a newer reader could not use an older file
+FORMAT = 5  # raised when a newer reader could not use an older file
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
 # In a longer run too.
 LENGTH_FIELDS = ("iterations", "sh_interval", "start", "stop", "every", "leave_out", "seconds", "turn")
@@ -105,13 +105,19 @@ def check_same(
             )
 
 
+def other_length(saved: dict[str, Any], here: dict[str, Any]) -> bool:
+    """Whether another length is asked for."""
+    return any(saved.get(name) != here.get(name) for name in ("iterations", "leave_out", "seconds"))
+
+
 def check_scene(path: str | Path, saved: object, scene: Scene) -> None:
     """ValueError, in the words of the options, where a fingerprint is not that of the scene."""
     if not isinstance(saved, dict):
         raise ValueError(f"{path} is damaged: scene is {saved!r:.80}")
-    for name, digest in scene_fingerprint(scene).items():
-        if saved.get(name) != digest:
-            why = OTHER[name]
+    here = scene_fingerprint(scene)
+    for name in here | saved:
+        if saved.get(name) != here.get(name):
+            why = OTHER.get(name, f"it had {name}")
             raise ValueError(f"{path} is of another scene: {why}; ask for the same, or for another folder")
 
 
@@ -157,16 +163,3 @@ def _crc32(text: str, tensors: dict[str, Tensor]) -> int:
         crc = zlib.crc32(f"{name} {tensor.dtype} {list(tensor.shape)}".encode(), crc)
         crc = zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, crc)
     return crc
-
-
-def lengthened(meta: dict[str, Any], total: int) -> int | None:
-    """The iteration at which a run had come to its end that is now to have `total` iterations, and its
-    decisions in `meta` changed to that; None: it goes on as it was."""
-    done, decisions = meta["iteration"], meta["decisions"]
-    if not done == decisions["length"] < total != meta["config"]["iterations"]:
-        return None
-    meta["decisions"] = decisions | {
-        "length": total,
-        "released": decisions["released"] or done,  # what was held back has come back
-    }
-    return done

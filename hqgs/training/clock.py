@@ -1,28 +1,27 @@
-"""The length of a run that has so many seconds, by the clock; fitting.py tells it before the run."""
+"""The length of a run that has so many seconds, by the clock; pace.py tells it before the run."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from hqgs.training.config import TrainConfig
 from hqgs.training.schedule import Decisions, Schedule
 from hqgs.training.state import TrainState
 
 SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
 
 
-def turned(config: TrainConfig, schedule: Schedule, state: TrainState, step: float) -> Decisions:
+def turned(schedule: Schedule, state: TrainState, step: float) -> Decisions:
     """The decisions after a step: at `Schedule.turn_at` the rest gets the length that the clock allows.
 
-    `step`: seconds of a step now. A configuration with a `turn` follows that in place of the clock.
+    `step`: seconds of a step now. Settings with a `turn` follow that in place of the clock.
     """
-    decisions, iteration = state.decisions, state.iteration
+    config, decisions, iteration = schedule.config, state.decisions, state.iteration
     if decisions.turned:
         return decisions
     at = schedule.turn_at(decisions)
     if config.turn is not None:
         length = config.turn[1]
-    elif config.seconds is not None:
+    elif schedule.run.follows_clock and config.seconds is not None:
         rest = config.iterations - at
         left = (config.seconds - state.seconds) / step if step > 0 else rest
         length = at + round(min(max(left, SHORTEST * rest), LONGEST * rest))

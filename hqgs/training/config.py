@@ -14,7 +14,7 @@ METHODS = {
     "3dgs": "3D Gaussian Splatting",
     "srgs": "renders are judged at the size of low-resolution photos as well",
     "hqgs": "renders are degraded as the photos were before they are compared",
-    AUTO: "hqgs with what the diagnosis asks for, 3dgs where it asks for nothing",
+    AUTO: "hqgs",
 }
 ITEMS = {
     "photos": "training photos that repeat others or show nothing",
@@ -181,6 +181,7 @@ class HQGSConfig:
     jpeg_pixels: float = 0.2  # weight of the pixel loss beside the loss of the JPEG cells
     smallest: float = 0.5  # standard deviation of the smallest Gaussian, in photo pixels
     gaussians_per_pixel: float = 1 / 3  # for each pixel's worth of degraded photos: the most that may grow
+    held_pixels: bool = True  # under noise: hold some back, which tell when it is learned (`HeldPixels`)
     first_points: float = 1.0  # share of that number to start from, filled up along edges; 0: no filling up
 
     def __post_init__(self) -> None:

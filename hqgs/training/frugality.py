@@ -20,6 +20,7 @@ from torch import Tensor
 from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
+from hqgs.training.plan import PlanRow
 from hqgs.training.schedule import (
     CHECKS,
     COARSE_FACTOR,
@@ -67,7 +68,7 @@ class Memory:
     best: float = -1e3  # dB, on the held-back photos
     best_at: int = 0
     seconds: float = 0.0  # that the trials took
-    records: list[dict[str, Any]] = field(default_factory=list)  # of `LeftOut`
+    records: list[dict[str, Any]] = field(default_factory=list)  # of `LeftOut`, each with its `item`
 
 
 class Frugality:
@@ -119,10 +120,8 @@ class Frugality:
 
     def left_out(self) -> list[LeftOut]:
         """What was left out, in the order of the decisions."""
-        found = [LeftOut(**record) for record in self.memory.records]
-        if end := self.schedule.coarse_end:
-            what = f"full resolution in the first {end} iterations"
-            found.insert(0, LeftOut(what, f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"))
+        records = self.memory.records
+        found = [LeftOut(**{k: v for k, v in record.items() if k != "item"}) for record in records]
         if self.memory.refused:
             why = f"they were no wider than {FINEST:g} pixels of the sharpest photo, so no photo shows more"
             found.insert(0, LeftOut(f"{self.memory.refused} splits of small Gaussians", why))
@@ -137,8 +136,7 @@ class Frugality:
 
     def forget_end(self) -> None:
         """The run goes on after its end: no iterations are left out."""
-        records = self.memory.records
-        self.memory.records = [one for one in records if not one["what"].startswith("iterations ")]
+        self.memory.records = [one for one in self.memory.records if one["item"] != "iterations"]
 
     def _of_held_photos(self, state: TrainState) -> Verdict:
         """What the held-back photos say, and whether they come back."""
@@ -148,6 +146,10 @@ class Frugality:
             decisions = replace(decisions, length=length, released=iteration)
         if iteration == schedule.config.densify.stop:
             decisions = replace(decisions, released=iteration)
+        if decisions.released:
+            why = "early enough that the scene can grow where only they look"
+            row = PlanRow("photos held back", "back", why, "", "held_photos", iteration)
+            state.rows.append(row)
         return Verdict(decisions)
 
     def _length(self, state: TrainState, shown: Gaussians) -> int | None:
@@ -165,7 +167,7 @@ class Frugality:
             f"best {memory.best:.2f} dB at iteration {memory.best_at}, {now:.2f} dB at {iteration}",
             seconds=self.step_seconds * (total - length),
         )
-        self._note(left, state)
+        self._note("iterations", "length", f"{length:,} iterations", left, state)
         return length
 
     def _faint(self, state: TrainState) -> Tensor | None:
@@ -184,12 +186,15 @@ class Frugality:
             bytes=4 * row * count,
             cost_db=fewer.cost,
         )
-        self._note(left, state)
+        self._note("weight", "Gaussians", f"{total - count:,} are left", left, state)
         return fewer.faint
 
-    def _note(self, item: LeftOut, state: TrainState) -> None:
-        self.memory.records.append(asdict(item))
-        if len(self._seconds) == WINDOW and item.seconds is None:
+    def _note(self, item: str, what: str, value: str, left: LeftOut, state: TrainState) -> None:
+        """Keep what is left out by this item, and the row that tells it."""
+        self.memory.records.append(asdict(left) | {"item": item})
+        row = PlanRow(what, value, left.why, left.evidence or "", item, state.iteration)
+        state.rows.append(row)
+        if len(self._seconds) == WINDOW and left.seconds is None:
             opened = len(self.memory.records) - 1, state.iteration, self.step_seconds
             self._open.append(opened)
 

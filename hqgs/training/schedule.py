@@ -1,4 +1,4 @@
-"""What a step does: a pure function of the configuration, of the decisions so far, and of the iteration."""
+"""What a step does: a pure function of the run's plan, of the decisions so far, and of the iteration."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from hqgs._rust import EPS2D
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
+from hqgs.training.plan import RunPlan
 
 T = TypeVar("T")
 
@@ -57,23 +58,23 @@ class Plan:
 class Schedule:
     """The plan of every step of a run."""
 
-    config: TrainConfig
-    items: frozenset[str]  # of `config.leave_out`: what this run may do without
+    run: RunPlan
     num_views: int  # for training
     held: tuple[int, ...]  # numbers of those that are held back at first
 
     @classmethod
-    def of(cls, config: TrainConfig, views: Sequence[View], as_photographed: bool) -> Schedule:
-        """`views`: those for training; `as_photographed`: whether the method takes them as they are."""
-        items = set(config.leave_out)
-        if not as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
-            items &= {"photos", "iterations"}
-        if min(min(v.camera.width, v.camera.height) for v in views) < COARSE_FACTOR * SMALLEST_SIDE:
-            items -= {"resolution"}
-        count = 0
-        if "iterations" in items and len(views) >= FEWEST_VIEWS:
-            count = min(MOST_HELD, max(1, round(HELD_SHARE * len(views))))
-        return cls(config, frozenset(items), len(views), tuple(spread(range(len(views)), count)))
+    def of(cls, run: RunPlan, num_views: int) -> Schedule:
+        """Of a run on so many training views."""
+        return cls(run, num_views, tuple(spread(range(num_views), run.held_photos)))
+
+    @property
+    def config(self) -> TrainConfig:
+        return self.run.settings
+
+    @property
+    def items(self) -> frozenset[str]:
+        """Of `ITEMS`: what this run does without."""
+        return frozenset(self.config.leave_out)
 
     def start(self) -> Decisions:
         """Before the first step."""
@@ -165,11 +166,15 @@ class Schedule:
     @property
     def coarse_end(self) -> int:
         """The last iteration at the smaller size; 0: there is none."""
-        end = min(round(COARSE_PART * self.config.iterations), COARSE_MOST)
-        return end if "resolution" in self.items else 0
+        return self.run.half_size_until
 
     def is_coarse(self, iteration: int) -> bool:
         return iteration <= self.coarse_end
+
+
+def half_size_end(iterations: int) -> int:
+    """The last iteration at half size, where a run of so many starts with it."""
+    return min(round(COARSE_PART * iterations), COARSE_MOST)
 
 
 def learning_rates(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -80,9 +81,10 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
     )
 
 
-def plan_values(config: TrainConfig) -> dict[str, Any]:
-    """How long the run of a configuration was, as JSON values; `with_plan` reads it."""
-    return {"iterations": config.iterations, "turn": None if config.turn is None else list(config.turn)}
+def plan_values(config: TrainConfig, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How long the run of these settings was, as JSON values, which `with_plan` reads; and its rows."""
+    turn = None if config.turn is None else list(config.turn)
+    return {"iterations": config.iterations, "turn": turn, "seconds": config.seconds, "rows": list(rows)}
 
 
 def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
@@ -94,6 +96,8 @@ def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
     try:
         plan = json.loads(path.read_text(encoding="utf-8"))
         iterations, turn = plan["iterations"], plan["turn"]
+        if plan.get("seconds", 0) is None:
+            raise ValueError("its run had no number of seconds; --config with config.json repeats it")
         turn = None if turn is None else (int(turn[0]), int(turn[1]))
         return replace(with_iterations(config, int(iterations)), seconds=None, turn=turn)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:

@@ -16,6 +16,7 @@ from hqgs.training.adam import Adam
 from hqgs.training.checkpoint import part
 from hqgs.training.densify import Densifier
 from hqgs.training.guard import Guard
+from hqgs.training.plan import PlanRow
 from hqgs.training.schedule import Decisions
 
 
@@ -31,6 +32,7 @@ class TrainState:
     seconds: float = 0.0  # spent in steps
     guard: Guard = field(default_factory=Guard)
     history: list[HistoryEntry] = field(default_factory=list)  # of the held-out means
+    rows: list[PlanRow] = field(default_factory=list)  # what was decided after the plan was made
 
     def none_left(self) -> str:
         """What is wrong where no Gaussian is left."""
@@ -57,6 +59,7 @@ class TrainState:
             "history": self.history,
             "guard": asdict(self.guard),
             "decisions": asdict(self.decisions),
+            "rows": [asdict(row) for row in self.rows],
         }
 
     def restored(
@@ -102,6 +105,7 @@ class TrainState:
             values["seconds"],
             Guard(**values["guard"]),
             values["history"],
+            [PlanRow(**row) for row in values["rows"]],
         )
 
 

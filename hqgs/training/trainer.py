@@ -14,7 +14,6 @@ from torch import Tensor
 from hqgs.base.left_out import LeftOut
 from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
-from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import HeldOutViews, history_entry
 from hqgs.evaluation.records import HistoryEntry
@@ -29,10 +28,12 @@ from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
 from hqgs.training.frugality import Frugality
 from hqgs.training.guard import Fault, Guard, parameter_fault
-from hqgs.training.looks import Looks
-from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
+from hqgs.training.plan import PlanRow, RunPlan, left_out_of
+from hqgs.training.plan_rules import plan_run
+from hqgs.training.prepare import Prepared
 from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
+from hqgs.training.settings import config_values
 from hqgs.training.state import TrainState
 
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
@@ -60,31 +61,39 @@ class Trainer:
     ) -> None:
         """`inspector`: what looks at the photos before the first step; `ranks`: the processes that train
         together. ValueError if scene or configuration cannot be trained."""
-        scene.check_trainable()
-        inspector = inspector or Inspector()
         self.ranks = ranks
-        self.photos_left_out: list[LeftOut] = []
-        if "photos" in config.leave_out:
-            scene, self.photos_left_out = choose_photos(scene, inspector)
-        self.scene = scene
-        self.method: Method[Any] = make_method(scene, config, inspector)
-        self.diagnosis: Diagnosis | None = inspector.last  # None: the method asks for none
-        self._looks = Looks(scene.train, self.method, config.background)
-        with one_torch_thread():
-            start = self.method.start(scene, self._looks.targets, config)
+        self.prepared: Prepared = Prepared(scene, config, inspector)
+        self.asked: TrainConfig = config
+        self.scene: Scene = self.prepared.scene
+        self.method: Method[Any] = self.prepared.method
+        self.diagnosis: Diagnosis | None = self.prepared.shown_diagnosis  # None: the method asks for none
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
-        self.config: TrainConfig = start.config
-        self.method_left_out: list[LeftOut] = start.left_out
-        self.first_points: int = len(start.gaussians)
-        plain = self.method.as_photographed
-        self.schedule: Schedule = Schedule.of(self.config, scene.train, plain)
-        self.frugality: Frugality = Frugality(self.schedule, scene.train, self.shown, self._psnr)
-        self.state: TrainState = TrainState(
-            start.gaussians,
-            self._optimizer(start.gaussians),
-            Densifier(self.config.densify, scene.extent, scene.reach, self.config.seed, self.first_points),
-            self.schedule.start(),
-        )
+        self.begin(plan_run(self.prepared.facts, self.prepared.diagnosis, config))
+
+    def begin(self, plan: RunPlan) -> None:
+        """Stand before the first step of a run of this plan."""
+        self.plan: RunPlan = plan
+        self.schedule: Schedule = Schedule.of(plan, len(self.scene.train))
+        self.frugality: Frugality = Frugality(self.schedule, self.scene.train, self.shown, self._psnr)
+        gaussians = self.prepared.first_gaussians(plan)
+        self.first_points: int = len(gaussians)
+        scene, settings = self.scene, plan.settings
+        densifier = Densifier(settings.densify, scene.extent, scene.reach, settings.seed, len(gaussians))
+        state = TrainState(gaussians, self._optimizer(gaussians), densifier, self.schedule.start())
+        self.state: TrainState = state
+        if plan.first_points > len(scene.points):
+            why = "so many agree between photos, the reconstruction's own among them"
+            state.rows.append(PlanRow("first points found", f"{len(gaussians):,}", why, "", "first_points"))
+
+    @property
+    def config(self) -> TrainConfig:
+        """The settings that the plan has come to."""
+        return self.plan.settings
+
+    @property
+    def rows(self) -> list[PlanRow]:
+        """What was decided, before the first step and since."""
+        return [*self.plan.rows, *self.state.rows]
 
     @property
     def gaussians(self) -> Gaussians:
@@ -136,7 +145,7 @@ class Trainer:
                 raise TrainingError(state.none_left())
             for plan, noted in zip(plans, seen, strict=True):
                 state.iteration = plan.iteration
-                method.after_step(state, self._looks.target(plan.view, plan.coarse)[0], noted)
+                method.after_step(state, self.prepared.looks.target(plan.view, plan.coarse)[0], noted)
             self._leave_out(growth, (time.perf_counter() - started) / len(plans))
 
         state.seconds += time.perf_counter() - started
@@ -150,7 +159,7 @@ class Trainer:
 
     def left_out(self) -> list[LeftOut]:
         """What the run did without so far."""
-        return [*self.photos_left_out, *self.frugality.left_out(), *self.method_left_out]
+        return [*left_out_of(self.plan.rows), *self.frugality.left_out()]
 
     def held_out(self, numbers: Sequence[int] | None = None) -> HeldOutViews:
         """The held-out views of these numbers (None: all), for use before the next step."""
@@ -179,7 +188,8 @@ class Trainer:
         of_method = {f"method.{name}": tensor for name, tensor in self.method.state_dict().items()}
         meta = self.state.values() | {
             "frugality": self.frugality.state_dict(),
-            "config": asdict(self.config),
+            "asked": config_values(self.asked),
+            "plan": self.plan.values(),
             "scene": checkpoint.scene_fingerprint(self.scene),
         }
         checkpoint.save_checkpoint(path, self.state.tensors() | of_method, meta)
@@ -192,17 +202,25 @@ class Trainer:
         for a damaged checkpoint, or one of another run; it names the field in which that differs.
         """
         tensors, meta = checkpoint.load_checkpoint(path)
-        lists = {k: list(v) for k, v in vars(self.config).items() if isinstance(v, tuple)}  # as JSON has them
         try:
-            # The scene first: methods fit the configuration to it.
-            checkpoint.check_scene(path, meta["scene"], self.scene)
-            self.lengthened = checkpoint.lengthened(meta, self.config.iterations)
-            longer = self.lengthened is not None
-            checkpoint.check_same(path, "", meta["config"], asdict(self.config) | lists, longer)
+            checkpoint.check_scene(path, meta["scene"], self.scene)  # first: methods go by the scene
+            saved, asked = RunPlan.of_values(meta["plan"], f"{path}: plan"), config_values(self.asked)
+            done, decisions = meta["iteration"], meta["decisions"]
+            ended = done == decisions["length"] and self.asked.seconds is None
+            more = self.plan.settings.iterations
+            longer = ended and checkpoint.other_length(meta["asked"], asked) and more > done
+            checkpoint.check_same(path, "", meta["asked"], asked, longer)
+            if longer:
+                meta["decisions"] = decisions | {"length": more, "released": decisions["released"] or done}
+            else:
+                self.begin(saved)
             state = self.state.restored(path, tensors, meta, self._optimizer)
             self.frugality.load_state_dict(meta["frugality"])
             if longer:
+                self.lengthened = done
                 self.frugality.forget_end()
+                why = "a longer run was asked for after its end"
+                state.rows.append(PlanRow("length", f"{more:,} iterations", why, "", "restore", done))
             self.method.load_state_dict(checkpoint.part("method.", tensors))
         except (KeyError, TypeError, AttributeError, RuntimeError) as error:
             raise ValueError(f"{path} is no whole checkpoint of a run: {error!r}") from error
@@ -232,7 +250,7 @@ class Trainer:
     def _one(self, plan: Plan) -> tuple[Step, list[Tensor]]:
         """Train on one view."""
         state = self.state
-        look = self._looks.at(plan, self.method.modulate(state.gaussians))
+        look = self.prepared.looks.at(plan, self.method.modulate(state.gaussians))
         state.optimizer.zero_grad()
         fault, loss = look.backward(state.gaussians, state.optimizer), float(look.loss.detach())
         if self._sound([look.view], [fault], loss):
@@ -246,7 +264,7 @@ class Trainer:
 
     def _together(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
         """Train on several views, of which each rank renders its share; all add up what all have found."""
-        state, looks = self.state, self._looks
+        state, looks = self.state, self.prepared.looks
         step: Step | None = None
 
         def make(k: int) -> tuple[Part, Callable[[], Rest]]:
@@ -293,17 +311,25 @@ class Trainer:
 
     def _turned(self) -> Decisions:
         """The decisions after a step, by the clock of the first rank."""
-        state = self.state
-        decisions = turned(self.config, self.schedule, state, self.frugality.step_seconds)
-        if self.config.seconds is None or self.ranks.count == 1:
-            return decisions
-        return Decisions(**self.ranks.tell(asdict(decisions))[0])
+        state, before = self.state, self.state.decisions
+        step = self.frugality.step_seconds
+        decisions = turned(self.schedule, state, step)
+        if self.plan.follows_clock and self.ranks.count > 1:
+            decisions = Decisions(**self.ranks.tell(asdict(decisions))[0])
+        if decisions != before:
+            why = "as recorded" if self.config.turn else f"what fits into {self.config.seconds:g} s"
+            evidence = f"{state.seconds:.1f} s so far, {1e3 * step:.1f} ms a step"
+            length = f"{decisions.length:,} iterations"
+            state.rows.append(PlanRow("length", length, why, evidence, "clock", state.iteration))
+        return decisions
 
     def _psnr(self, gaussians: Gaussians, numbers: Sequence[int]) -> float:
         """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize."""
         iteration = self.state.iteration
         degree = self.schedule.degree(iteration)
-        return self._looks.psnr(gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks)
+        return self.prepared.looks.psnr(
+            gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks
+        )
 
     def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], loss: float) -> bool:
         """Whether the step has gradients to go by, of one view at least; the guard notes its faults.

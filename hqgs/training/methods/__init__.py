@@ -7,7 +7,7 @@ from typing import Any
 
 from hqgs.diagnosis.scene import Inspector
 from hqgs.scene.scene import Scene
-from hqgs.training.config import AUTO, PAPER, TrainConfig
+from hqgs.training.config import PAPER, TrainConfig
 from hqgs.training.methods.base import Method, ThreeDGS
 from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.methods.paper import PaperHQGS
@@ -26,7 +26,6 @@ MAKERS: dict[str, Callable[[Scene, TrainConfig, Inspector], Method[Any]]] = {
     "3dgs": lambda scene, config, inspector: ThreeDGS(),
     "srgs": lambda scene, config, inspector: SRGS(config.srgs),
     "hqgs": make_hqgs,
-    AUTO: make_hqgs,  # named after what it comes to
 }
 
 

@@ -8,7 +8,7 @@ nothing), give it a name and a line of text in `METHODS` (config.py), and its ma
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -16,12 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
-from hqgs.scene.scene import Scene, View
-from hqgs.training.config import AUTO, TrainConfig
+from hqgs.scene.scene import View
 from hqgs.training.methods.cameras import Found, Shot, no_shot
 from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
 
 
@@ -33,24 +32,16 @@ class Target:
     mask: Tensor | None  # [h, w] bool, True where the photo counts; None: everywhere
 
 
-@dataclass(frozen=True)
-class Start:
-    """What a method decides before the first step."""
-
-    config: TrainConfig  # the given one, fitted to the scene
-    gaussians: Gaussians
-    left_out: list[LeftOut] = field(default_factory=list)  # parts of the method that the scene does not need
-
-
 T = TypeVar("T", bound=Target)
 
 
 class Method(Protocol[T]):
     """The replaceable part of a training step.
 
-    The trainer calls `prepare` for each training view and then `start`, once. A step is, for each of its
-    views, `modulate`, `shot`, rasterization, the shot's `develop`, `compare`, `loss` and `measured`, which
-    change nothing; then Adam, `rows_changed` where Gaussians came or went, and `after_step`.
+    The trainer calls `prepare` for each training view, `facts` once, and `start` for the first Gaussians. A
+    step is, for each of its views, `modulate`, `shot`, rasterization, the shot's `develop`, `compare`, `loss`
+    and `measured`, which change nothing; then Adam, `rows_changed` where Gaussians came or went, and
+    `after_step`.
     """
 
     @property
@@ -72,8 +63,12 @@ class Method(Protocol[T]):
         """What renders of a training view are compared with. ValueError, which names it, for a bad one."""
         ...
 
-    def start(self, scene: Scene, targets: Sequence[T], config: TrainConfig) -> Start:
-        """What to start from; `targets` are those of `scene.train`."""
+    def facts(self, facts: Facts, targets: Sequence[T]) -> Facts:
+        """`facts` with what the method's part of the plan goes by; `targets`: of all training views."""
+        ...
+
+    def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
+        """Those that are trained for so many iterations, of the first ones as the plan has them."""
         ...
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
@@ -145,13 +140,11 @@ class Plain:
     def prepare(self, view: View) -> Target:
         return Target(*photo_tensors(view))
 
-    def start(self, scene: Scene, targets: Sequence[Any], config: TrainConfig) -> Start:
-        gaussians = Gaussians.from_points(scene.points, scene.point_colors, config.sh_degree)
-        return Start(self.named(config), gaussians)
+    def facts(self, facts: Facts, targets: Sequence[Any]) -> Facts:
+        return replace(facts, as_photographed=self.as_photographed)
 
-    def named(self, config: TrainConfig) -> TrainConfig:
-        """`config` with the name of what "auto" comes to."""
-        return replace(config, method=self.name) if config.method == AUTO else config
+    def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
+        return gaussians
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         return gaussians

@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hqgs.base.left_out import LeftOut
-from hqgs.base.text import some
 from hqgs.diagnosis.resolution import undo_enlargement
 from hqgs.diagnosis.scene import Inspector
 from hqgs.photos.formation import Operator, formation
@@ -45,31 +43,26 @@ class Formation:
     """How a scene's photos were made."""
 
     def __init__(
-        self,
-        degradation: Degradation,
-        directions: Mapping[str, float],
-        noises: Mapping[str, float],
-        white: bool = True,
+        self, degradation: Degradation, directions: Mapping[str, float], noises: Mapping[str, float]
     ) -> None:
         """`directions`: of each photo's motion, radians from x towards y (down), where it is known.
 
-        `noises`: of the photos that have noise of their own, where 1 is white. `white`: whether the noise in
-        a pixel tells nothing of that beside it.
+        `noises`: of the photos that have noise of their own, where 1 is white.
         """
         self.degradation = degradation
-        self.white = white
         kinds = {step.kind: step.value for step in degradation.steps}
         self.kinds: frozenset[str] = frozenset(kinds)
         self.noise: float = float(kinds.get("noise") or 0.0) / 255  # standard deviation, where 1 is white
         self.factor: int = int(kinds.get("lowres") or 1)  # by which the photos were enlarged
         self._quality = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
-        self._directions, self._noises = directions, noises
+        self.directions: Mapping[str, float] = directions
+        self.noises: Mapping[str, float] = noises
         self._operators: dict[tuple[int, int, float | None], Operator | None] = {}
         self._cells: dict[tuple[int, int], JpegCells] = {}
 
     def target(self, view: View) -> FormedTarget:
         """Of a training view. ValueError, which names it, where the photo does not fit the formation."""
-        size, direction = (view.camera.height, view.camera.width), self._directions.get(view.name)
+        size, direction = (view.camera.height, view.camera.width), self.directions.get(view.name)
         key = (*size, direction)
         if key not in self._operators:
             self._operators[key] = formation(self.degradation, *size, direction)
@@ -96,41 +89,17 @@ class Formation:
             operator,
             cells,
             centres,
-            noise=self._noises.get(view.name, self.noise),
+            noise=self.noises.get(view.name, self.noise),
         )
 
 
-def find_formation(scene: Scene, text: str, inspector: Inspector) -> tuple[Formation, list[LeftOut]]:
-    """The formation that `text` names, with "auto" the diagnosed one; and what the loss leaves out."""
-    left_out: list[LeftOut] = []
-    white = True
-    if text == AUTO:
-        diagnosis = inspector.diagnose(scene)
-        text = diagnosis.formation
-        needs = diagnosis.needs()
-        left_out += diagnosis.passed_over
-        left_out += [
-            LeftOut(f"a correction for {part}", f"not needed: {why}")
-            for part, needed, why in needs
-            if not needed
-        ]
-        if diagnosis.together is not None and any(name == "noise" and needed for name, needed, _ in needs):
-            white = False
-            why = f"the noise of neighbouring pixels goes together by {diagnosis.together:.2f} at least"
-            left_out.append(LeftOut("pixels held back to tell when noise is learned", why))
-    degradation = parse_formation(text)
-    directions: dict[str, float] = {}
-    if any(step.kind == "motion" for step in degradation.steps):
-        directions = _motion_directions(scene, inspector)
-        if unknown := [view.name for view in scene.train if view.name not in directions]:
-            what = f"motion in the loss of {len(unknown)} of {len(scene.train)} photos"
-            left_out.append(LeftOut(what, f"no direction is told from {some(unknown)}"))
-    noises: dict[str, float] = {}
-    if any(step.kind == "grain" for step in degradation.steps):
-        noises = _noises(scene, inspector)
-        what = f"D-SSIM in the loss of {len(noises)} of {len(scene.train)} photos"
-        left_out.append(LeftOut(what, "it asks for the noise that they have"))
-    return Formation(degradation, directions, noises, white), left_out
+def find_formation(scene: Scene, text: str, inspector: Inspector) -> Formation:
+    """The formation that `text` names, with "auto" the diagnosed one."""
+    degradation = parse_formation(inspector.diagnose(scene).formation if text == AUTO else text)
+    kinds = {step.kind for step in degradation.steps}
+    directions = _motion_directions(scene, inspector) if "motion" in kinds else {}
+    noises = _noises(scene, inspector) if "grain" in kinds else {}
+    return Formation(degradation, directions, noises)
 
 
 def _motion_directions(scene: Scene, inspector: Inspector) -> dict[str, float]:

@@ -10,9 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hqgs.base.left_out import LeftOut
 from hqgs.diagnosis.scene import Inspector
-from hqgs.model.discs import as_discs
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.smoothing import enlarge
 from hqgs.photos.formula import LEARNED, OWN
@@ -20,23 +18,18 @@ from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
-from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, HQGSConfig, TrainConfig
-from hqgs.training.methods.base import Plain, Start
-from hqgs.training.methods.budget import first_points, start_points, with_budget
+from hqgs.training.config import HQGSConfig
+from hqgs.training.methods.base import Plain
 from hqgs.training.methods.cameras import Found, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
-from hqgs.training.methods.held_pixels import SHARE, HeldPixels, Plateau
+from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
-from hqgs.training.settings import with_iterations
+from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
 
 LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
-# Where no number of iterations is given, and cameras are learned or photos are as photographed: so many are
-# enough; of the latter also so many for each photo. More would learn what no other photo shows.
-ENOUGH, LOOKS = 7_000, 150
-GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
@@ -58,7 +51,7 @@ class HQGS(Plain):
     - A film's codec (video): 3DGS's loss and rates.
     - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG or video alone.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
-    - Growth has a budget, and no resets (`with_budget`).
+    - Growth has a budget, and no resets (plan_budget.py).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
       Gaussians are discs and needles then, as their neighbours lie (`as_discs`); but not under noise, blur,
@@ -75,10 +68,7 @@ class HQGS(Plain):
         """`inspector`: what diagnoses the scene's photos where the formation is not given."""
         self.config = config
         inspector = inspector or Inspector()
-        self._told = inspector.told
-        self.formation: Formation
-        self._left_out: list[LeftOut]
-        self.formation, self._left_out = find_formation(scene, config.formation, inspector)
+        self.formation: Formation = find_formation(scene, config.formation, inspector)
         kinds = self.formation.kinds
         self.as_photographed: bool = not kinds
         self.noise: float = self.formation.noise
@@ -91,7 +81,7 @@ class HQGS(Plain):
                 gains = inspector.log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
             self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
-        holds = self.noise and self.formation.white and "jpeg" not in kinds
+        holds = self.noise and config.held_pixels and "jpeg" not in kinds
         self._plateau = Plateau(len(scene.train)) if holds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
         self._since = 0  # the iteration after which they were computed
@@ -107,45 +97,25 @@ class HQGS(Plain):
         held, mask = HeldPixels.draw(self._numbers[view.name], target.photo, target.mask)
         return replace(target, mask=mask, held=held)
 
-    def start(self, scene: Scene, targets: Sequence[FormedTarget], config: TrainConfig) -> Start:
-        """With the formation that was found, and a budget of Gaussians that the photos can determine."""
-        degradation, left_out = self.formation.degradation, list(self._left_out)
-        if self._plateau is not None:
-            what = f"1/{1 / SHARE:.0f} of each photo's pixels in the loss"
-            left_out.append(LeftOut(what, "they tell when the scene would start to learn the noise"))
-        known = replace(config.hqgs, formation=str(degradation))
-        # What a codec leaves open is learned sooner at higher rates, and nothing holds it back.
-        coded = self.formation.kinds in ({"jpeg"}, {"video"})
-        brisk = not coded if config.brisk is None else config.brisk
-        config = replace(config, hqgs=known, brisk=brisk)
+    def facts(self, facts: Facts, targets: Sequence[FormedTarget]) -> Facts:
+        formation, kinds = self.formation, self.formation.kinds
+        undirected = [view.name for view in self._views if view.name not in formation.directions]
+        height_width = [tuple(target.photo.shape[:2]) for target in targets]
+        return replace(
+            facts,
+            as_photographed=self.as_photographed,
+            sizes=tuple((int(height), int(width)) for height, width in height_width),
+            kept=sum(target.kept for target in targets) if "jpeg" in kinds else None,
+            noisy=len(formation.noises),
+            undirected=tuple(undirected) if "motion" in kinds else (),
+        )
+
+    def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
         if self._cameras is not None:
-            config, why = _without_held_photos(config)
-            left_out += why
-            self._cameras.schedule(config.iterations)
-        if self.formation.kinds <= set(OWN):
-            plain = self.as_photographed and config.method == AUTO
-            wanted = start_points(scene, min(config.start_points, config.densify.max_gaussians))
-            points, colors, _ = first_points(scene, wanted, config.seed, self._told)
-            gaussians = Gaussians.from_points(points, colors, config.sh_degree)
-            if len(points) > len(scene.points):
-                gaussians = as_discs(gaussians)
-                config, why = _growing_later(config)
-                left_out += why
-                config = _coarse_first(config) if self.as_photographed else config
-            if self.as_photographed:
-                config, why = _long_enough(config, len(scene.train))
-                left_out += why
-            config = replace(config, method="3dgs") if plain else self.named(config)
-            return Start(config, gaussians, left_out)
-        least, densify = len(scene.points), config.densify
-        budget = with_budget(densify, self.formation, targets, self.config.gaussians_per_pixel, least)
-        if densify.reset_every < densify.stop:
-            left_out.append(LeftOut("resets of the opacities", "a budget of Gaussians bears none"))
-        wanted = int(self.config.first_points * budget.max_gaussians)
-        points, colors, why = first_points(scene, wanted, config.seed, self._told)
-        gaussians = Gaussians.from_points(points, colors, config.sh_degree)
-        self._measure(gaussians, 0)
-        return Start(self.named(replace(config, densify=budget)), gaussians, left_out + why)
+            self._cameras.schedule(iterations)
+        if not self.formation.kinds <= set(OWN):
+            self._measure(gaussians, 0)
+        return gaussians
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         return gaussians if self._smallest is None else enlarge(gaussians, self._smallest)
@@ -216,42 +186,3 @@ class HQGS(Plain):
         if self.config.smallest:
             pixels = photo_pixels(gaussians.means, self._views) * self.formation.factor
             self._smallest, self._since = (self.config.smallest * pixels).float(), iteration
-
-
-def _without_held_photos(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
-    """The same where no photo can be held back: what its camera did would not be learned."""
-    why = "no photo can be held back to tell when to end: its camera would not be learned"
-    config, left_out = _no_longer(config, ENOUGH, why)
-    return replace(config, leave_out=tuple(item for item in config.leave_out if item == "photos")), left_out
-
-
-def _long_enough(config: TrainConfig, photos: int) -> tuple[TrainConfig, list[LeftOut]]:
-    """As many looks at each of the photos as pay; in a long run held-back photos tell whether fewer do."""
-    most = max(ENOUGH, LOOKS * photos)
-    shorter, left_out = _no_longer(config, most, "more looks at the same photos do not pay")
-    return (shorter if most == ENOUGH else replace(shorter, leave_out=config.leave_out)), left_out
-
-
-def _no_longer(config: TrainConfig, most: int, why: str) -> tuple[TrainConfig, list[LeftOut]]:
-    """With at most so many iterations, if no number is given."""
-    if "iterations" not in config.leave_out or config.iterations <= most:
-        return config, []
-    return with_iterations(config, most), [LeftOut(f"iterations {most + 1} to {config.iterations}", why)]
-
-
-def _growing_later(config: TrainConfig) -> tuple[TrainConfig, list[LeftOut]]:
-    """For a short run that starts from points all over the photos."""
-    if config.densify.start >= GROWS_FROM:
-        return config, []
-    what = f"growth in the first {GROWS_FROM} iterations"
-    why = "until sizes and colours are about right, gradients do not tell where something is missing"
-    return replace(config, densify=replace(config.densify, start=GROWS_FROM)), [LeftOut(what, why)]
-
-
-def _coarse_first(config: TrainConfig) -> TrainConfig:
-    """For a run that starts from points all over the photos: at the smaller size it loses nothing then."""
-    if not set(AUTOMATIC) <= set(config.leave_out):
-        return config
-    return replace(
-        config, leave_out=tuple(item for item in ITEMS if item in {*config.leave_out, "resolution"})
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +13,8 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.photos.edges import edge_magnitude
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
-from hqgs.training.config import ESFGConfig, PaperConfig, TrainConfig
-from hqgs.training.methods.base import Plain, Start, Target, ThreeDGS, photo_tensors
+from hqgs.training.config import ESFGConfig, PaperConfig
+from hqgs.training.methods.base import Plain, Target, ThreeDGS, photo_tensors
 from hqgs.training.methods.esfg import ESFG
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.methods.scs import ScsWeights, weighted_scs_loss
@@ -72,14 +71,12 @@ class PaperHQGS(Plain):
         self._room -= size
         return ScsTarget(photo, mask, _scs_weights(photo, mask))
 
-    def start(self, scene: Scene, targets: Sequence[ScsTarget], config: TrainConfig) -> Start:
-        start = super().start(scene, targets, config)
+    def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
         if self.esfg is None:
-            return start
-        gaussians = start.gaussians
+            return gaussians
         self.rows = torch.arange(len(gaussians)) % self.esfg.config.feature_size
         means = self.esfg.unmodulate(gaussians.means, self.rows)
-        return replace(start, gaussians=replace(gaussians, means=means))
+        return replace(gaussians, means=means)
 
     def modulate(self, gaussians: Gaussians) -> Gaussians:
         if self.esfg is None:

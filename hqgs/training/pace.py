@@ -1,0 +1,39 @@
+"""How fast this machine trains a scene, from steps timed before a run that has so many seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hqgs.training.plan import StepSeconds
+from hqgs.training.plan_rules import plan_run
+from hqgs.training.trainer import Trainer
+
+WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
+
+
+def fit_to_seconds(trainer: Trainer) -> None:
+    """Plan a run that has so many seconds anew, by the time that its first steps take, and let it begin.
+
+    Does nothing to a run without a number of seconds, or whose length is recorded. The trainer is a fresh
+    one; the steps leave nothing behind.
+    """
+    asked, prepared = trainer.asked, trainer.prepared
+    if asked.seconds is None or asked.turn is not None:
+        return
+    kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
+    half, full = trainer.ranks.tell([timed(trainer, True), timed(trainer, False)])[0]
+    trainer.method.load_state_dict(kept)
+    facts = replace(prepared.facts, seconds=StepSeconds(full, half))
+    trainer.begin(plan_run(facts, prepared.diagnosis, asked))
+
+
+def timed(trainer: Trainer, half_size: bool) -> float:
+    """Mean seconds of a step's view at half or at full size."""
+    if half_size and not trainer.plan.half_size_until:
+        return 0.0
+    for _ in range(WARM):
+        trainer.step(half_size)
+    started, before = trainer.seconds, trainer.iteration
+    for _ in range(TIMED):
+        trainer.step(half_size)
+    return (trainer.seconds - started) / (trainer.iteration - before)

@@ -1,0 +1,198 @@
+"""What a run is, decided once: what its plan holds, and how rules come to it. plan_rules.py has the rules.
+
+The plan is all that a run reads, and nothing changes it. What is decided later, by the clock or by photos
+that are held back, is added to the run's rows with the iteration after which it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, cast
+
+from hqgs.base.left_out import LeftOut
+from hqgs.base.text import aligned
+from hqgs.base.typed import build
+from hqgs.diagnosis.scene import Diagnosis
+from hqgs.evaluation.records import PlanRowRecord
+from hqgs.photos.formula import NONE, OWN, Degradation, parse_formation
+from hqgs.training.config import AUTO, FORMATION, TrainConfig
+
+
+@dataclass(frozen=True)
+class StepSeconds:
+    """Of one view of a step at the start of a run, on this machine."""
+
+    full: float
+    half: float  # at half the sides; 0: there are no such steps
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a run's decisions go by, beside the diagnosis of its photos."""
+
+    photos: int  # for training
+    pixels: int  # of their cameras, in all
+    shortest_side: int  # px, of all photos
+    points: int  # of the reconstruction
+    linked: bool  # whether it tells which photos see which of its points (`Scene.seen`)
+    unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
+    # What the method tells of the photos (`Method.facts`):
+    as_photographed: bool = False  # renders are compared with photos as they are, of any size
+    sizes: tuple[tuple[int, int], ...] = ()  # height and width of each photo as it was taken
+    kept: int | None = None  # luma coefficients that the photos' codec did not round to zero; None: no JPEG
+    noisy: int = 0  # photos that have noise of their own
+    undirected: tuple[str, ...] = ()  # names of photos blurred by a motion of unknown direction
+    # Of the machine:
+    seconds: StepSeconds | None = None  # None: no step was timed
+
+
+@dataclass(frozen=True)
+class PlanRow:
+    """One decision."""
+
+    what: str
+    value: str
+    why: str  # one sentence
+    evidence: str = ""  # what was measured
+    rule: str = ""  # the rule's name and its source
+    iteration: int = 0  # after which it was decided; 0: before the first step
+    left_out: str | None = None  # what the run does without by it; None: nothing
+
+    def known(self) -> PlanRowRecord:
+        """As the report has it."""
+        values = {"evidence": self.evidence, "rule": self.rule, "iteration": self.iteration}
+        known = {name: value for name, value in values.items() if value}
+        row = {"what": self.what, "value": self.value, "why": self.why, **known}
+        return cast(PlanRowRecord, row)
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """Everything that a run reads of what was decided before its first step."""
+
+    settings: TrainConfig  # the one asked for, with what the rules decided
+    first_points: (
+        int  # Gaussians to start from, as far as photos agree on so many; at least the scene's points
+    )
+    discs: bool  # the first ones are flat, as their neighbours lie; else round
+    held_photos: int  # training photos that are held back at first
+    half_size_until: int  # the last iteration at half the photos' sides; 0: there is none
+    follows_clock: bool  # the clock gives the run another length after growth
+    rows: tuple[PlanRow, ...] = field(default=(), repr=False)
+
+    def values(self) -> dict[str, Any]:
+        """As JSON values; `of_values` reads them."""
+        return asdict(self)
+
+    @staticmethod
+    def of_values(values: Any, where: str) -> RunPlan:
+        """The plan of JSON values, of `where`. ValueError names the field."""
+        return build(RunPlan, values, where)
+
+    def __str__(self) -> str:
+        return plan_table(self.rows)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A plan on its way through the rules."""
+
+    facts: Facts
+    diagnosis: Diagnosis | None
+    asked: TrainConfig
+    plan: RunPlan
+
+    @property
+    def settings(self) -> TrainConfig:
+        return self.plan.settings
+
+    @property
+    def formed(self) -> bool:
+        """Whether the loss knows how the photos were made."""
+        return self.settings.method == "hqgs" and self.settings.hqgs.guidance == FORMATION
+
+    @property
+    def degradation(self) -> Degradation:
+        """What has happened to the photos, as far as the loss knows of it."""
+        known = self.formed and self.settings.hqgs.formation != AUTO
+        return parse_formation(self.settings.hqgs.formation if known else NONE)
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """Of its steps."""
+        return frozenset(step.kind for step in self.degradation.steps)
+
+    @property
+    def undegraded(self) -> bool:
+        """Photos as photographed, or each with what its own camera did: they bear 3DGS's growth."""
+        return self.formed and self.kinds <= set(OWN)
+
+    @property
+    def dense(self) -> bool:
+        """Whether the run starts from more points than the reconstruction has."""
+        return self.plan.first_points > self.facts.points
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a rule decides; `row` tells it, and the plan has `changes` from then on."""
+
+    value: str
+    why: str
+    evidence: str = ""
+    left_out: str | None = None
+    what: str | None = None  # None: as the rule is called
+    changes: Mapping[str, Any] = field(default_factory=dict)  # by names of RunPlan's and TrainConfig's fields
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How one thing is decided."""
+
+    what: str  # it decides
+    decide: Callable[[Draft], Sequence[Choice]]  # nothing where it does not apply
+    source: str  # paper and equation, or where the measurement is that chose it
+
+
+def plan_by(rules: Sequence[Rule], facts: Facts, diagnosis: Diagnosis | None, asked: TrainConfig) -> RunPlan:
+    """What the rules make of a run, one after the other: each sees what those before it have decided."""
+    plan = RunPlan(asked, facts.points, False, 0, 0, False)
+    for rule in rules:
+        name = f"{rule.decide.__name__}: {rule.source}"
+        for choice in rule.decide(Draft(facts, diagnosis, asked, plan)):
+            row = PlanRow(
+                choice.what or rule.what, choice.value, choice.why, choice.evidence, name, 0, choice.left_out
+            )
+            plan = replace(_changed(plan, choice.changes), rows=(*plan.rows, row))
+    return plan
+
+
+def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
+    """What a run does without by these rows."""
+    return [LeftOut(row.left_out, row.why, row.evidence or None) for row in rows if row.left_out is not None]
+
+
+def plan_table(rows: Sequence[PlanRow]) -> str:
+    """The rows as lines that a person reads."""
+    return aligned([(row.what, row.value, _reason(row)) for row in rows])
+
+
+def _reason(row: PlanRow) -> str:
+    when = f"after iteration {row.iteration}: " if row.iteration else ""
+    return f"{when}{row.why}" + (f" ({row.evidence})" if row.evidence else "")
+
+
+def _changed(plan: RunPlan, changes: Mapping[str, Any]) -> RunPlan:
+    """The plan with other values of fields; those of the settings are named after them, `densify.stop`."""
+    for path, value in changes.items():
+        *within, name = path.split(".")
+        if within == [] and name in vars(plan):
+            plan = replace(plan, **{name: value})
+        elif within == []:
+            plan = replace(plan, settings=replace(plan.settings, **{name: value}))
+        else:
+            (part,) = within
+            inner = replace(getattr(plan.settings, part), **{name: value})
+            plan = replace(plan, settings=replace(plan.settings, **{part: inner}))
+    return plan

@@ -1,0 +1,343 @@
+"""The rules by which a run is planned, in their order: one entry of `RULES` for each thing that is decided.
+
+To add one: write a function of a `Draft` that gives a `Choice`, or none where it does not apply, and its
+entry. What it goes by beside the diagnosis is a fact (`Facts`), so that a plan follows from facts alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from hqgs.base.text import some
+from hqgs.diagnosis.scene import Diagnosis
+from hqgs.photos.formula import LEARNED, parse_formation
+from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, TrainConfig
+from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
+from hqgs.training.plan_budget import first_points_wanted, gaussians_determined, kept_gradient, sharp_pixels
+from hqgs.training.plan_length import ENOUGH, fitting, most_that_pays
+from hqgs.training.schedule import (
+    COARSE_FACTOR,
+    FEWEST_VIEWS,
+    FINEST,
+    HELD_SHARE,
+    MOST_HELD,
+    SMALLEST_SIDE,
+    half_size_end,
+)
+from hqgs.training.settings import with_iterations
+
+GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
+HELD_PIXELS = 50  # one of so many is held back under noise
+LINEAR = ("blur", "defocus", "motion", "lowres")
+CHOSEN = "measured on held-back photos of fern, fox and horns at half size"
+
+
+def photos(draft: Draft) -> Sequence[Choice]:
+    return [
+        Choice("left out", item.why, item.evidence or "", item.what, item.what) for item in draft.facts.unused
+    ]
+
+
+def method(draft: Draft) -> Sequence[Choice]:
+    if draft.asked.method == AUTO:
+        why = "it takes photos for what they are; nothing else was asked for"
+        return [Choice("hqgs", why, changes={"method": "hqgs"})]
+    return [Choice(draft.asked.method, "asked for")]
+
+
+def formation(draft: Draft) -> Sequence[Choice]:
+    if not draft.formed:
+        return []
+    asked, diagnosis = draft.asked.hqgs.formation, draft.diagnosis
+    if asked != AUTO:
+        text = str(parse_formation(asked))
+        return [Choice(text, "asked for", changes={"hqgs.formation": text})]
+    if diagnosis is None:
+        raise ValueError("the formation is auto, and nobody has looked at the photos")
+    text = str(parse_formation(diagnosis.formation))
+    found = [f"{name}: {why}" for name, needed, why in diagnosis.needs() if needed]
+    why = "what the photos show" if found else "the photos show nothing that must be undone"
+    rows = [Choice(text, why, "; ".join(found), changes={"hqgs.formation": text})]
+    rows += [
+        Choice("left out", item.why, what=item.what, left_out=item.what) for item in diagnosis.passed_over
+    ]
+    for name, needed, why in diagnosis.needs():
+        if not needed:
+            what = f"a correction for {name}"
+            rows.append(Choice("none", f"not needed: {why}", what=what, left_out=what))
+    return rows
+
+
+def noise_rates(draft: Draft) -> Sequence[Choice]:
+    if "noise" not in draft.kinds or "jpeg" in draft.kinds or not draft.settings.hqgs.held_pixels:
+        return []
+    together = None if draft.diagnosis is None else draft.diagnosis.together
+    if draft.asked.hqgs.formation == AUTO and together is not None:
+        why = f"the noise of neighbouring pixels goes together by {together:.2f} at least"
+        what = "pixels held back to tell when noise is learned"
+        return [Choice("as planned", why, left_out=what, changes={"hqgs.held_pixels": False})]
+    share = f"1/{HELD_PIXELS} of each photo's pixels"
+    why = "they tell when the scene would start to learn the noise"
+    return [Choice(f"fall where {share} gain nothing", why, left_out=f"{share} in the loss")]
+
+
+def loss(draft: Draft) -> Sequence[Choice]:
+    facts, has = draft.facts, draft.kinds
+    of = f"of {facts.photos} photos"
+    if draft.settings.method == "srgs":
+        return [
+            Choice("0.6 at the photos' own resolution, 0.4 at full size", "SRGS: each view ties finer pixels")
+        ]
+    if draft.settings.method == "hqgs" and not draft.formed:
+        return [
+            Choice(
+                f"{draft.settings.hqgs.paper.loss} of modulated Gaussians", "the published form was asked for"
+            )
+        ]
+    if "jpeg" in has:
+        why = "a file says no more of a coefficient than the cell that it lies in"
+        rows = [Choice(f"distance to the JPEG's cells + {draft.settings.hqgs.jpeg_pixels:g} L1", why)]
+    elif "noise" in has:
+        why = "the photos' mean is nearer to the truth than their median, and D-SSIM asks for the noise"
+        rows = [Choice("squares up to 2 sigma of the noise, then L1", why)]
+    else:
+        rows = [Choice("0.8 L1 + 0.2 D-SSIM", "as 3DGS has it")]
+    if "grain" in has:
+        what = f"D-SSIM in the loss of {facts.noisy} {of}"
+        rows.append(
+            Choice("as under noise", "it asks for the noise that they have", what=what, left_out=what)
+        )
+    if operators := [step for step in draft.degradation.steps if step.kind in LINEAR]:
+        why = "a photo is compared with what it would show of the scene"
+        rows.append(Choice("+".join(map(str, operators)), why, what="renders go through"))
+    if facts.undirected:
+        what = f"motion in the loss of {len(facts.undirected)} {of}"
+        why = f"no direction is told from {some(list(facts.undirected))}"
+        rows.append(Choice("none", why, what=what, left_out=what))
+    return rows
+
+
+def cameras(draft: Draft) -> Sequence[Choice]:
+    own = [kind for kind in LEARNED if kind in draft.kinds]
+    return [Choice(", ".join(own), "each photo has its own: it is learned with the scene")] if own else []
+
+
+def rates(draft: Draft) -> Sequence[Choice]:
+    asked, has = draft.asked.brisk, draft.kinds
+    if asked is not None or not draft.formed:
+        return [
+            Choice(
+                "higher in short runs" if asked else "those of 3DGS",
+                "asked for" if asked is not None else "as published",
+            )
+        ]
+    if has in ({"jpeg"}, {"video"}):
+        why = "what a codec leaves open is learned sooner at higher rates, and nothing holds it back"
+        return [Choice("those of 3DGS", why, changes={"brisk": False})]
+    why = "those of 3DGS suit its 30,000 iterations"
+    return [Choice("higher in short runs", why, changes={"brisk": True})]
+
+
+def first_points(draft: Draft) -> Sequence[Choice]:
+    facts, settings, what = draft.facts, draft.settings, "first points along edges"
+    if not draft.formed:
+        return [Choice(f"the reconstruction's {facts.points:,}", "as published")]
+    if draft.undegraded:
+        most = min(settings.start_points, settings.densify.max_gaussians)
+        wanted, what = first_points_wanted(facts, most), None
+        why = "points lie at corners alone, and a run from points all over the photos costs less"
+    else:
+        wanted = int(settings.hqgs.first_points * settings.densify.max_gaussians)
+        why = "bad photos give few points, and under a budget little grows"
+    own = f"the reconstruction's {facts.points:,}"
+    if not wanted:
+        return [Choice(own, "more were not asked for")]
+    if not facts.linked:
+        return [Choice(own, "the scene does not tell which photos see which of its points", left_out=what)]
+    if facts.points >= wanted:
+        why = f"it has {facts.points} points for {wanted} that are called for"
+        return [Choice(own, why, left_out=what)]
+    evidence = f"{facts.points:,} points of the reconstruction, {facts.pixels / 1e6:.1f} megapixels"
+    return [Choice(f"{wanted:,}, along the photos' edges", why, evidence, changes={"first_points": wanted})]
+
+
+def shapes(draft: Draft) -> Sequence[Choice]:
+    if draft.undegraded and draft.dense:
+        return [Choice("discs", "as their neighbours lie; depths are exact enough", changes={"discs": True})]
+    return []
+
+
+def smallest(draft: Draft) -> Sequence[Choice]:
+    size = draft.settings.hqgs.smallest
+    if not draft.formed or draft.undegraded or not size:
+        return []
+    return [Choice(f"{size:g} px of a photo", "what is finer, no photo has seen")]
+
+
+def half_size(draft: Draft) -> Sequence[Choice]:
+    items, facts = set(draft.settings.leave_out), draft.facts
+    if draft.formed and facts.as_photographed and draft.dense and set(AUTOMATIC) <= items:
+        items.add("resolution")
+    if not facts.as_photographed or facts.shortest_side < COARSE_FACTOR * SMALLEST_SIDE:
+        items.discard("resolution")
+    left = tuple(item for item in ITEMS if item in items)
+    if "resolution" not in items:
+        why = "none was asked for, or a run from few points or of small or degraded photos loses by it"
+        return [Choice("full from the start", why, changes={"leave_out": left})]
+    why = f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"
+    return [Choice(f"1/{COARSE_FACTOR} of the sides at first", why, changes={"leave_out": left})]
+
+
+def length(draft: Draft) -> Sequence[Choice]:
+    settings, facts, has, most = draft.settings, draft.facts, draft.kinds, None
+    open_ended, why = "iterations" in settings.leave_out, ""
+    if has & set(LEARNED):
+        most, why = ENOUGH, "no photo can be held back to tell when to end: its camera would not be learned"
+    elif draft.formed and not has:
+        most, why = most_that_pays(facts.photos), "more looks at the same photos do not pay"
+    if not open_ended or (most is not None and settings.iterations <= most):
+        most = None
+    if facts.seconds is not None and settings.seconds is not None:
+        return [_timed(draft, facts.seconds, settings.seconds, None if has else most)]
+    if most is not None:
+        new = with_iterations(settings, most)
+        if not has and most > ENOUGH:  # held-back photos tell whether fewer do
+            new = replace(new, leave_out=settings.leave_out)
+        left = f"iterations {most + 1} to {settings.iterations}"
+        return [
+            Choice(f"{most:,} iterations", why, f"{facts.photos} photos", left, changes={"settings": new})
+        ]
+    why = "at most: held-back photos tell when they no longer pay" if open_ended else "asked for"
+    return [Choice(f"{settings.iterations:,} iterations", why)]
+
+
+def _timed(draft: Draft, step: StepSeconds, seconds: float, most: int | None) -> Choice:
+    """As many iterations as fit into the seconds, by the steps that were timed."""
+    first = draft.plan.first_points / max(draft.facts.points, 1)
+    halves = "resolution" in draft.settings.leave_out
+    planned = fitting(seconds, step, first, lambda n: half_size_end(n) if halves else 0, most)
+    pays = planned != most
+    why = f"as many as fit into {seconds:g} s" if pays else "more looks at the same photos do not pay"
+    half = f", {1e3 * step.half:.1f} ms at half size" if halves else ""
+    return Choice(
+        f"{planned:,} iterations",
+        why + ("; the clock corrects that after growth" if pays else ""),
+        f"{1e3 * step.full:.1f} ms a step{half} at the start",
+        changes={"settings": with_iterations(draft.settings, planned), "follows_clock": pays},
+    )
+
+
+def half_size_until(draft: Draft) -> Sequence[Choice]:
+    if "resolution" not in draft.settings.leave_out:
+        return []
+    end = half_size_end(draft.settings.iterations)
+    why = f"a scene takes shape at 1/{COARSE_FACTOR} of the sides"
+    left = f"full resolution in the first {end} iterations"
+    return [Choice(f"until iteration {end:,}", why, left_out=left, changes={"half_size_until": end})]
+
+
+def budget(draft: Draft) -> Sequence[Choice]:
+    facts, settings = draft.facts, draft.settings
+    growth = settings.densify
+    if not draft.formed or draft.undegraded or not facts.sizes:
+        return [Choice(f"{growth.max_gaussians:,} Gaussians at most", "it bounds the memory")]
+    degradation = draft.degradation
+    wanted = max(gaussians_determined(facts, degradation, settings.hqgs.gaussians_per_pixel), facts.points)
+    most = min(growth.max_gaussians, wanted)
+    told = f"{facts.photos} photos tell as much as {sharp_pixels(facts, degradation):,.0f} sharp pixels"
+    rows = [
+        Choice(
+            f"{most:,} Gaussians at most",
+            "more than the photos determine paint noise and ringing",
+            told + (f"; the codec kept {facts.kept:,} coefficients" if facts.kept is not None else ""),
+            changes={"densify.max_gaussians": most},
+        )
+    ]
+    threshold = kept_gradient(facts, degradation, growth.grad_threshold)
+    if threshold != growth.grad_threshold:
+        rows.append(
+            Choice(
+                f"{threshold:.2g} of gradient",
+                "within the JPEG's cells there is none, so growth asks for less",
+                what="growth from",
+                changes={"densify.grad_threshold": threshold},
+            )
+        )
+    return rows
+
+
+def resets(draft: Draft) -> Sequence[Choice]:
+    densify = draft.settings.densify
+    if draft.formed and not draft.undegraded and densify.reset_every < densify.stop:
+        what, why = "resets of the opacities", "a budget of Gaussians bears none"
+        return [Choice("none", why, left_out=what, changes={"densify.reset_every": densify.stop})]
+    return []
+
+
+def growth(draft: Draft) -> Sequence[Choice]:
+    densify = draft.settings.densify
+    if draft.undegraded and draft.dense and densify.start < GROWS_FROM:
+        why = "until sizes and colours are about right, gradients do not tell where something is missing"
+        left = f"growth in the first {GROWS_FROM} iterations"
+        value = _growth(GROWS_FROM, densify.stop, densify.every)
+        return [Choice(value, why, "", left, changes={"densify.start": GROWS_FROM})]
+    value = _growth(densify.start, densify.stop, densify.every)
+    return [Choice(value, "3DGS's schedule, fitted to the length of the run")]
+
+
+def _growth(start: int, stop: int, every: int) -> str:
+    return f"every {every} iterations from {start:,} to {stop:,}"
+
+
+def needless(draft: Draft) -> Sequence[Choice]:
+    items, facts, has = set(draft.settings.leave_out), draft.facts, draft.kinds
+    rows: list[Choice] = []
+    if has & set(LEARNED):
+        items &= {"photos"}
+    elif not facts.as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
+        items &= {"photos", "iterations"}
+    left = tuple(item for item in ITEMS if item in items)
+    if "growth" in items:
+        why = "no photo shows more than that"
+        rows.append(Choice(f"not of Gaussians below {FINEST:g} px", why, what="growth of fine ones"))
+    names = ", ".join(left) or "nothing"
+    why = "asked for, as far as these photos and this length bear it"
+    return [*rows, Choice(names, why, changes={"leave_out": left})]
+
+
+def held_photos(draft: Draft) -> Sequence[Choice]:
+    count = 0
+    if "iterations" in draft.settings.leave_out and draft.facts.photos >= FEWEST_VIEWS:
+        count = min(MOST_HELD, max(1, round(HELD_SHARE * draft.facts.photos)))
+    if not count:
+        return []
+    why = "they tell when more iterations no longer pay, and then come back"
+    return [Choice(f"{count} of {draft.facts.photos} at first", why, changes={"held_photos": count})]
+
+
+RULES = (
+    Rule("a photo", photos, "what a broken or an empty photo teaches is wrong"),
+    Rule("method", method, "the default of hqgs train"),
+    Rule("formation", formation, "hqgs/diagnosis/, thresholds beside each measurement"),
+    Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN),
+    Rule("cameras", cameras, "shake, focus and exposure as the diagnosis tells them"),
+    Rule("budget", budget, "Candes and Donoho 2004 under noise; " + CHOSEN),
+    Rule("first points", first_points, f"one for each 100 pixels, or the budget: {CHOSEN}"),
+    Rule("first shapes", shapes, "0.1 to 0.8 dB at 30 s on fern, fox and horns"),
+    Rule("smallest Gaussian", smallest, "the 3D smoothing of Mip-Splatting, Yu et al. 2024"),
+    Rule("photos' size", half_size, CHOSEN),
+    Rule("length", length, "7,000, or 150 for each photo: " + CHOSEN),
+    Rule("half size", half_size_until, "60 % of the run, 1,500 iterations at most: " + CHOSEN),
+    Rule("growth", growth, "Kerbl et al. 2023, section 5.2; from 140 on: " + CHOSEN),
+    Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
+    Rule("learning rates", rates, "learning_rates in schedule.py; " + CHOSEN),
+    Rule("rates under noise", noise_rates, f"white noise of a pixel tells nothing of the next; {CHOSEN}"),
+    Rule("left out where needless", needless, "half the time and a third of the bytes on four scenes"),
+    Rule("photos held back", held_photos, "one of 20, 4 at most"),
+)
+
+
+def plan_run(facts: Facts, diagnosis: Diagnosis | None, asked: TrainConfig) -> RunPlan:
+    """The plan of a run. `diagnosis`: None where nobody has looked at the photos."""
+    return plan_by(RULES, facts, diagnosis, asked)

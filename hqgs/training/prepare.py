@@ -1,0 +1,90 @@
+"""What a run is planned from, found once: facts, diagnosis, and what renders are compared with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hqgs.base.left_out import LeftOut
+from hqgs.base.threads import one_torch_thread
+from hqgs.diagnosis.choice import choose_photos
+from hqgs.diagnosis.scene import Diagnosis, Inspector
+from hqgs.model.consistency import Agreement
+from hqgs.model.discs import as_discs
+from hqgs.model.first_points import Colors, Points, points_along_edges
+from hqgs.model.gaussians import Gaussians
+from hqgs.scene.scene import Scene
+from hqgs.training.config import AUTO, FORMATION, TrainConfig
+from hqgs.training.looks import Looks
+from hqgs.training.methods import make_method
+from hqgs.training.methods.base import Method
+from hqgs.training.plan import Facts, RunPlan
+from hqgs.training.plan_rules import plan_run
+
+
+class Prepared:
+    """A scene on which a run was asked for, looked at; plans are made from its facts."""
+
+    def __init__(self, scene: Scene, asked: TrainConfig, inspector: Inspector | None = None) -> None:
+        """`inspector`: what looks at the photos. ValueError if the scene cannot be trained."""
+        scene.check_trainable()
+        inspector = inspector or Inspector()
+        unused = list[LeftOut]()
+        if "photos" in asked.leave_out:
+            scene, unused = choose_photos(scene, inspector)
+        self.scene: Scene = scene
+        self.asked: TrainConfig = asked
+        facts = facts_of(scene, unused)
+        self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
+        settings = plan_run(facts, self.diagnosis, asked).settings
+        self.method: Method[Any] = make_method(scene, settings, inspector)
+        self.looks: Looks = Looks(scene.train, self.method, asked.background)
+        self.facts: Facts = self.method.facts(facts, self.looks.targets)
+        self.shown_diagnosis: Diagnosis | None = (
+            inspector.last
+        )  # of more photos, where the method asks for it
+        self._told = inspector.told
+        self._points: dict[int, tuple[Points, Colors]] = {}
+
+    def first_gaussians(self, plan: RunPlan) -> Gaussians:
+        """Those that a run of this plan trains."""
+        settings = plan.settings
+        with one_torch_thread():
+            points, colors = self._first_points(plan.first_points)
+            gaussians = Gaussians.from_points(points, colors, settings.sh_degree)
+            if plan.discs and len(points) > len(self.scene.points):
+                gaussians = as_discs(gaussians)
+            return self.method.start(gaussians, settings.iterations)
+
+    def _first_points(self, wanted: int) -> tuple[Points, Colors]:
+        """The scene's points and more along the photos' edges that other photos agree with, at most `wanted`
+        in all."""
+        scene, (points, colors) = self.scene, (self.scene.points, self.scene.point_colors)
+        if scene.seen is None or wanted <= len(points):
+            return points, colors
+        if wanted not in self._points:
+            agreement = Agreement(scene.train, scene.seen)
+            count, seed = wanted - len(points), self.asked.seed
+            more = points_along_edges(scene.train, points, scene.seen, count, seed, agreement, self._told)
+            self._points[wanted] = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
+        return self._points[wanted]
+
+
+def facts_of(scene: Scene, unused: list[LeftOut] | None = None) -> Facts:
+    """What a scene tells before a method has looked at its photos; `unused`: photos it does without."""
+    cameras = [view.camera for view in scene.train]
+    return Facts(
+        photos=len(cameras),
+        pixels=sum(camera.width * camera.height for camera in cameras),
+        shortest_side=min(min(camera.width, camera.height) for camera in cameras),
+        points=len(scene.points),
+        linked=scene.seen is not None,
+        unused=tuple(unused or ()),
+    )
+
+
+def asks_for_diagnosis(asked: TrainConfig) -> bool:
+    """Whether somebody must look at the photos before the run is planned."""
+    formed = asked.method in (AUTO, "hqgs") and asked.hqgs.guidance == FORMATION
+    return formed and asked.hqgs.formation == AUTO
