@@ -32,7 +32,7 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
         path = Path(folder) / PLY
         trainer.shown().save(path)
         size = path.stat().st_size
-    left_out = [*trainer.photos_left_out, *trainer.frugality.left_out()]
+    left_out = trainer.left_out()
     return done.judged() | {
         "cpu_seconds": done.setup_cpu_seconds + done.cpu_seconds,  # with the choice of photos
         "decision_seconds": trainer.frugality.memory.seconds,

@@ -12,6 +12,7 @@ from hqgs.base.machine import peak_rss_mb, reset_peak_rss
 from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
+from hqgs.training.pace import fit_to_seconds
 from hqgs.training.trainer import Step, Trainer
 
 Run = dict[str, Any]  # plain JSON values
@@ -76,6 +77,7 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
     """
     done = Training(photos, config)
     trainer = done.trainer
+    fit_to_seconds(trainer)
 
     def after(_: Step) -> None:
         if evaluate and trainer.iteration % trainer.config.eval_every == 0:

@@ -146,6 +146,8 @@ def key_of(cell: Cell, fingerprint: dict[str, str]) -> str:
     paper = row.method == "hqgs" and cell.config.hqgs.guidance == PAPER
     if config["brisk"] is None and (paper or row.method in ("3dgs", "srgs")):
         del config["brisk"]  # so are those of methods without higher rates
+    if config.get("hqgs", {}).get("held_pixels"):
+        del config["hqgs"]["held_pixels"]  # so are those from before they could be switched off
     if paper:
         del config["hqgs"]["first_points"]  # and the paper's, which has no use for it
     facts = {"format": FORMAT, "version": hqgs.__version__, "config": config, "degradation": cell.degradation}

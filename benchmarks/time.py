@@ -20,7 +20,6 @@ from hqgs.evaluation.held_out import held_out_means
 from hqgs.evaluation.metrics import haarpsi
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
-from hqgs.training.fitting import fitted
 from hqgs.training.settings import with_iterations
 
 FILE = Path(__file__).with_suffix(".toml")
@@ -37,7 +36,7 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
     config = cell.config
     if config.seconds is not None:  # as without a number of iterations: no more than pay
         config = with_iterations(config, TrainConfig.iterations)
-        config = fitted(photos, replace(config, leave_out=(*config.leave_out, "iterations")))
+        config = replace(config, leave_out=(*config.leave_out, "iterations"))
     done = train(photos, config, evaluate=config.seconds is None)
     views = done.held_out()
     (mean,) = held_out_means([haarpsi], views)

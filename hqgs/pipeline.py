@@ -333,7 +333,7 @@ def _report(
         learned = learned_picture([view.image for view in scene.train], result.learned)
         with atomic_path(out / LEARNED) as tmp:
             learned.save(tmp)
-    if out is not None:
+    if out is not None and config.seconds is not None:
         write_json(out / PLAN, plan_values(config, rows))
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:

@@ -86,7 +86,8 @@ def asked(
     """The run of these options of `hqgs.train`; `changes` are made to the configuration."""
 
     def make() -> tuple[Scene, TrainConfig]:
-        config = run_config(**({"iterations": STEPS} | options))
+        given: dict[str, Any] = {"iterations": STEPS} | options
+        config = run_config(**given)
         config = replace(config, densify=replace(config.densify, grad_threshold=5e-5))
         return scene(), replace(config, **(changes or {}))
 
@@ -157,12 +158,14 @@ def hashed(trainer: Trainer) -> str:
 def trained(case: Case, stop: int | None = None) -> str:
     """The hash at the end; with `stop` the run is stopped after that step, and resumed."""
     scene, config = case.make()
+    trainer: Trainer | None = None
     with TemporaryDirectory() as name:
         for end in (stop, None) if stop else (None,):
             with open_run(scene, config, name, resume=True) as trainer:
                 while trainer.iteration < min(trainer.length, end or case.steps):
                     trainer.step()
                 trainer.save(Path(name) / CHECKPOINT)
+    assert trainer is not None
     return hashed(trainer)
 
 

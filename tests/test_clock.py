@@ -9,6 +9,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from planned import planned
+from run_state import assert_same, whole_state
 from test_diagnose import inspected
 from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
@@ -18,14 +20,15 @@ from hqgs.base.files import CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
-from hqgs.training import clock, fitting
+from hqgs.training import clock, plan_length
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config
-from hqgs.training.fitting import fitted
-from hqgs.training.methods.budget import PIXELS
-from hqgs.training.methods.hqgs import ENOUGH, GROWS_FROM, LOOKS
 from hqgs.training.notes import run_notes
+from hqgs.training.pace import fit_to_seconds
+from hqgs.training.plan import StepSeconds
+from hqgs.training.plan_budget import PIXELS
+from hqgs.training.plan_rules import ENOUGH, FOR_EACH_PHOTO, GROWS_FROM
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import with_iterations, with_plan
+from hqgs.training.settings import plan_values, with_iterations, with_plan
 from hqgs.training.trainer import Trainer
 
 N, STOP = 300, 200
@@ -34,12 +37,13 @@ N, STOP = 300, 200
 def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
     """When a run of N steps gets another length, and which; each step takes `step` s."""
     config = tiny_config(N, densify=DensifyConfig(stop=STOP), seconds=seconds, **changes)
-    schedule = Schedule.of(config, tiny_scene().train, as_photographed=True)
+    views = tiny_scene().train
+    schedule = Schedule.of(replace(planned(config, views), follows_clock=True), len(views))
     state = SimpleNamespace(decisions=schedule.start(), iteration=0, seconds=0.0)
     while state.iteration < state.decisions.length:
         state.iteration += 1
         state.seconds += step
-        state.decisions = clock.turned(config, schedule, state, step)  # type: ignore[arg-type]
+        state.decisions = clock.turned(schedule, state, step)  # type: ignore[arg-type]
     assert schedule.part(state.iteration, state.decisions) == pytest.approx(1.0)
     assert schedule.growth_end(state.decisions) == STOP
     return state.decisions.turned, state.iteration
@@ -56,30 +60,38 @@ def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
 
 
 def test_as_many_iterations_as_fit() -> None:
-    """A full step takes 0.1 s, one at the smaller size 0.02 s, before the scene grows."""
-    config = run_config(leave_out="photos,growth,resolution")
-    large = [replace(view, camera=replace(view.camera, width=64, height=64)) for view in tiny_scene().train]
+    """A full step takes 0.1 s, one at half size 0.02 s, before the scene grows."""
+    steps = StepSeconds(full=0.1, half=0.02)
 
-    class Fake:
-        seconds, iteration, first_points, scene = 0.0, 0, 2, SimpleNamespace(points=[0, 0])
-        schedule = Schedule.of(config, large, as_photographed=True)
+    def half_until(iterations: int) -> int:
+        return round(0.6 * iterations)
 
-        def __init__(self, config: TrainConfig) -> None:
-            self.config = config
+    fits = plan_length.fitting(60.0, steps, 1.0, half_until)
+    assert (0.6 * 0.02 + 0.4 * 0.1) * plan_length.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
+    dense = plan_length.fitting(60.0, steps, 3.0, half_until)
+    assert dense == pytest.approx(fits * plan_length.GROWTH / plan_length.GROWTH_DENSE, abs=2)
+    assert plan_length.fitting(60.0, steps, 1.0, half_until, most=100) == 100
+    assert plan_length.fitting(1e-3, steps, 1.0, half_until) == plan_length.FEWEST
+    assert plan_length.fitting(1e9, steps, 1.0, half_until) == pytest.approx(plan_length.MOST, abs=1)
 
-        def step(self, coarse: bool) -> None:
-            self.iteration += 1
-            self.seconds += 0.02 if coarse else 0.1
 
-    fits = fitting.fitting(Fake(config), 60.0)  # type: ignore[arg-type]
-    assert (0.6 * 0.02 + 0.4 * 0.1) * fitting.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
-    assert fitting.fitting(Fake(config), 1e-3) == fitting.FEWEST  # type: ignore[arg-type]
-    assert fitting.fitting(Fake(config), 1e9) == pytest.approx(fitting.MOST, abs=1)  # type: ignore[arg-type]
+@pytest.mark.parametrize("formation", ["none", "exposure", "noise:12"])
+def test_steps_that_are_timed_leave_nothing_behind(formation: str, tmp_path: Path) -> None:
+    config = run_config(method="hqgs", formation=formation)
+    trainer = Trainer(tiny_scene(12), replace(config, seconds=1e-3))
+    fit_to_seconds(trainer)
+    (tmp_path / PLAN).write_text(json.dumps(plan_values(trainer.config, [])))
+    again = Trainer(tiny_scene(12), with_plan(config, tmp_path))
+    for _ in range(6):
+        trainer.step()
+        again.step()
+    first, second = whole_state(trainer, tmp_path / "a"), whole_state(again, tmp_path / "b")
+    assert_same((first[0], {}), (second[0], {}))
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "FEWEST", 30)
-    monkeypatch.setattr(fitting, "MOST", 31)
+    monkeypatch.setattr(plan_length, "FEWEST", 30)
+    monkeypatch.setattr(plan_length, "MOST", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
     run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
     plan = json.loads((tmp_path / "a" / PLAN).read_text())
@@ -94,14 +106,14 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
     other = hqgs.train(scene, config=with_iterations(config, 30))
     assert (other.iterations == run.iterations) == (length == 30)
     kept = json.loads((tmp_path / "a" / CONFIG).read_text())["train"]
-    assert (kept["iterations"], kept["seconds"]) == (30, 0.5)  # a resumed run is not planned anew
+    assert (kept["iterations"], kept["seconds"]) == (500, 0.5)  # as it was asked for
 
 
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although it is prepared twice: to be timed, and to be trained."""
     seen = inspected(monkeypatch)
-    monkeypatch.setattr(fitting, "FEWEST", 5)
-    monkeypatch.setattr(fitting, "MOST", 6)
+    monkeypatch.setattr(plan_length, "FEWEST", 5)
+    monkeypatch.setattr(plan_length, "MOST", 6)
     scene = tiny_scene()
     hqgs.train(scene, seconds=0.1)
     assert sorted(seen) == sorted(view.name for view in scene.train)
@@ -178,25 +190,26 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     assert trainer(iterations=9_000).config.iterations == 9_000
     assert trainer(leave_out="none").config.iterations == 30_000
     assert trainer(method="3dgs").config.iterations == 30_000
-    monkeypatch.setattr("hqgs.training.methods.hqgs.ENOUGH", 700)
+    monkeypatch.setattr("hqgs.training.plan_rules.ENOUGH", 700)
     many = trainer()
-    assert many.config.iterations == LOOKS * len(scene.train) == 1_050
+    assert many.config.iterations == FOR_EACH_PHOTO * len(scene.train) == 1_050
     assert "iterations" in many.schedule.items
 
-    asked = replace(run_config(formation="none"), seconds=1e6)
-    config = fitted(scene, asked)
-    assert (config.iterations, config.turn) == (1_050, (1_049, 1_050))
-    assert fitted(scene, config) == config
-    assert any(
-        "more looks at the same photos do not pay" in note for note in run_notes(Trainer(scene, config))
-    )
-    short_of = fitted(scene, replace(asked, seconds=1e-3))
-    assert (short_of.iterations, short_of.turn) == (fitting.FEWEST, None)
+    def timed(seconds: float) -> Trainer:
+        trainer = Trainer(scene, replace(run_config(formation="none"), seconds=seconds))
+        fit_to_seconds(trainer)
+        return trainer
+
+    long = timed(1e6)
+    assert (long.config.iterations, long.plan.follows_clock) == (1_050, False)
+    assert any("more looks at the same photos do not pay" in note for note in run_notes(long))
+    short_of = timed(1e-3)
+    assert (short_of.config.iterations, short_of.plan.follows_clock) == (plan_length.FEWEST, True)
 
 
 def test_a_run_without_a_number_can_be_made_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.training.methods.hqgs.ENOUGH", 20)
-    monkeypatch.setattr("hqgs.training.methods.hqgs.LOOKS", 1)
+    monkeypatch.setattr("hqgs.training.plan_rules.ENOUGH", 20)
+    monkeypatch.setattr("hqgs.training.plan_rules.FOR_EACH_PHOTO", 1)
     scene, out = tmp_path / "desk", tmp_path / "run"
     write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)
     argv = ["train", str(scene), "--out", str(out), "--formation", "none"]

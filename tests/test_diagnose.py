@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_filter, uniform_filter1d
+from tiny_scene import tiny_config
 
 import hqgs.diagnosis.scene as module
 from hqgs.diagnosis import Diagnosis, diagnose_photo, diagnose_scene
@@ -29,9 +30,10 @@ from hqgs.photos.formula import parse_degradation, parse_formation
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.config import HQGSConfig
+from hqgs.training.config import TrainConfig
 from hqgs.training.methods.formed import find_formation
-from hqgs.training.methods.hqgs import HQGS
+from hqgs.training.plan import left_out_of
+from hqgs.training.prepare import Prepared
 
 WIDTH, HEIGHT, PHOTOS = 272, 208, 3  # px; multiples of 8 and 16
 
@@ -263,13 +265,13 @@ def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None
     inspector = Inspector()
     find_formation(scene, "auto", inspector)
     assert sorted(seen) == [view.name for view in scene.train]
-    again, _ = find_formation(scene, "motion:9", inspector)
+    again = find_formation(scene, "motion:9", inspector)
     assert inspector.inspect(scene.train[2]).diagnosis.name == "2.png"
     assert len(seen) == 4
     twin = replace(scene.train[2])  # another photo that is equal
     assert inspector.inspect(twin) is not inspector.inspect(scene.train[2])
     assert len(seen) == 5
-    alone, _ = find_formation(scene, "motion:9", Inspector())
+    alone = find_formation(scene, "motion:9", Inspector())
     targets = [formation.target(scene.train[0]).operator for formation in (again, alone)]
     image = torch.rand(208, 272, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(*(operator(image) for operator in targets if operator is not None))
@@ -315,23 +317,17 @@ def blurred_noise(sigma: float, level: float) -> Scene:
 def test_noise_whose_neighbours_go_together_is_not_white() -> None:
     """Then no pixels tell when the noise is learned. A Gaussian of 0.6 px is 1 to 0.25 to 0.004 in pixels."""
     white, soft = degraded_scene("noise:25"), blurred_noise(0.6, 40)
-    inspectors = Inspector(), Inspector()
-    (first, said), (second, left) = (
-        find_formation(scene, "auto", inspector)
-        for scene, inspector in zip((white, soft), inspectors, strict=True)
-    )
-    found = inspectors[1].last
+    config = tiny_config(method="hqgs", hqgs=TrainConfig().hqgs)
+    runs = [Prepared(scene, config) for scene in (white, soft)]
+    found = runs[1].diagnosis
     assert found is not None
     assert found.together == pytest.approx(2 * 0.249 / (1 + 2 * 0.249**2), abs=0.08)
-    assert (first.white, second.white) == (True, False)
-    assert first.noise
-    assert second.noise
+    assert all(run.method.noise for run in runs)
     what = "pixels held back to tell when noise is learned"
-    assert [what in {item.what for item in items} for items in (said, left)] == [False, True]
+    assert [what in {item.what for item in left_out_of(run.plan().rows)} for run in runs] == [False, True]
     assert "at least: not white" in str(found)
-    for scene, inspector, told in zip((white, soft), inspectors, (True, False), strict=True):
-        method = HQGS(scene, HQGSConfig(), inspector)
-        assert (method.prepare(scene.train[0]).held is not None) == told
+    for run, told in zip(runs, (True, False), strict=True):
+        assert (run.method.prepare(run.scene.train[0]).held is not None) == told
 
 
 def test_photos_that_were_not_looked_at_are_told() -> None:
@@ -341,7 +337,7 @@ def test_photos_that_were_not_looked_at_are_told() -> None:
     (spared,) = found.passed_over
     assert spared.what == "a diagnosis of 2 of 5 training photos"
     assert f"left out: {spared.what}: the 3 that were looked at are spread over the scene" in str(found)
-    said = find_formation(scene, "auto", inspector)[1]
+    said = left_out_of(Prepared(scene, tiny_config(method="hqgs")).plan().rows)
     (taken,) = inspector.diagnose(scene).passed_over
     assert taken.what == "the search for an enlargement in 1 of 5 photos"
     assert taken in said

@@ -298,7 +298,7 @@ def test_f_is_replicated_over_the_first_gaussians() -> None:
     for points, expected in ((18, [0, 1, 2, 3, 4, 5, 6] * 2 + [0, 1, 2, 3]), (4, [0, 1, 2, 3])):
         scene, config = tiny_scene(num_points=points), ESFGConfig(feature_size=7, concat=False)
         method = PaperHQGS(scene, 0, PaperConfig(config))
-        method.start(scene, [], tiny_config())
+        method.start(Gaussians.from_points(scene.points, scene.point_colors, 3), 30)
         assert method.rows.tolist() == expected
 
 

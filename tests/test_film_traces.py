@@ -15,7 +15,7 @@ from hqgs.diagnosis.scene import diagnose_scene
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import area_downscale
-from hqgs.training.methods.hqgs import HQGS
+from hqgs.training.trainer import Trainer
 from tests.tiny_scene import tiny_config, tiny_scene
 
 Levels = NDArray[np.float64]
@@ -70,20 +70,16 @@ def test_a_coarse_film_has_the_rates_of_3dgs() -> None:
     """Alone; what else happened to the photos asks for the higher ones."""
     scene, brisk = tiny_scene(), {}
     for kind in ("none", "video", "jpeg:30", "video+exposure", "noise:10"):
-        method = HQGS(scene, fixed(kind))
-        targets = [method.prepare(view) for view in scene.train]
-        brisk[kind] = method.start(scene, targets, tiny_config()).config.brisk
+        brisk[kind] = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed(kind))).config.brisk
     assert brisk == {"none": True, "video": False, "jpeg:30": False, "video+exposure": True, "noise:10": True}
 
 
 def test_a_shaken_film_trains_as_shaken_photos() -> None:
-    starts = []
-    for kind in ("shake", "shake+video"):
-        scene = tiny_scene()
-        method = HQGS(scene, fixed(kind))
-        starts.append(method.start(scene, [method.prepare(view) for view in scene.train], tiny_config()))
-    shaken, both = starts
+    shaken, both = (
+        Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=fixed(kind)))
+        for kind in ("shake", "shake+video")
+    )
     assert both.config.hqgs.formation == "shake+video"
     assert replace(both.config, hqgs=shaken.config.hqgs) == shaken.config
     assert (both.gaussians.means == shaken.gaussians.means).all()
-    assert both.left_out == shaken.left_out
+    assert both.left_out() == shaken.left_out()

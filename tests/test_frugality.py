@@ -12,10 +12,10 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 import hqgs.training.frugality as module
-import hqgs.training.schedule as schedule
 from hqgs.base.left_out import LeftOut, format_left_out
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
+from hqgs.training import plan_rules
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig, parse_leave_out
 from hqgs.training.schedule import COARSE_PART, smaller
 from hqgs.training.trainer import Trainer
@@ -120,7 +120,7 @@ def test_what_no_photo_shows_goes_when_growth_ends() -> None:
 
 
 def test_the_first_part_is_trained_at_half_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule, "SMALLEST_SIDE", 8)
+    monkeypatch.setattr(plan_rules, "SMALLEST_SIDE", 8)
     trainer = Trainer(tiny_scene(), tiny_config(20, leave_out=("resolution",)))
     shapes = [tuple(trainer.step().render.shape) for _ in range(20)]
     end = round(COARSE_PART * 20)
@@ -162,7 +162,7 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule, "SMALLEST_SIDE", 8)
+    monkeypatch.setattr(plan_rules, "SMALLEST_SIDE", 8)
     items = ("growth", "weight", "resolution")
     scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
     whole = Trainer(scene, config)

@@ -19,6 +19,7 @@ import pytest
 import torch
 from example_method import Tinted, install
 from forks import forks
+from planned import schedule_of
 from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
@@ -33,7 +34,6 @@ from hqgs.training.config import TrainConfig
 from hqgs.training.guard import Fault
 from hqgs.training.looks import Looks
 from hqgs.training.methods.base import ThreeDGS
-from hqgs.training.schedule import Schedule
 from hqgs.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
@@ -259,7 +259,7 @@ def test_a_part_comes_back_with_the_same_bits() -> None:
 def test_steps_take_each_view_of_the_schedule_once() -> None:
     config = replace(config_of("3dgs", batch=3), leave_out=())
     views = tiny_scene(9).train
-    schedule = Schedule.of(config, views, as_photographed=True)
+    schedule = schedule_of(config, views)
     decisions, steps, done = schedule.start(), [], 0
     while done < config.iterations:
         plans = schedule.batch(done + 1, decisions)
@@ -273,7 +273,7 @@ def test_steps_take_each_view_of_the_schedule_once() -> None:
     sizes = [len(plans) for plans in steps]
     assert max(sizes) == 3
     assert np.mean(sizes) > 2.2
-    one = Schedule.of(replace(config, batch=1), views, as_photographed=True)
+    one = schedule_of(replace(config, batch=1), views)
     alone = [one.batch(k, decisions) for k in range(1, 41)]
     assert [plans[0] for plans in alone] == [plan for plans in steps for plan in plans]
     assert {len(plans) for plans in alone} == {1}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from example_method import Tinted, install, loss_of
+from planned import schedule_of
 from run_state import assert_same, whole_state
 from tiny_scene import tiny_config, tiny_scene
 
@@ -29,7 +30,7 @@ def views(count: int) -> list[View]:
 
 
 def schedule(config: TrainConfig, count: int = 5) -> Schedule:
-    return Schedule.of(config, views(count), as_photographed=True)
+    return schedule_of(config, views(count))
 
 
 def plans(schedule: Schedule, decisions: Decisions | None = None, count: int = 99) -> list[Plan]:
@@ -71,12 +72,12 @@ def test_a_coarse_beginning_has_coarser_limits() -> None:
     view = views(1)[0]
     large = replace(view, camera=replace(view.camera, width=64, height=64))
     config = tiny_config(100, leave_out=("growth", "resolution"))
-    timetable = Schedule.of(config, [large] * 3, as_photographed=True)
+    timetable = schedule_of(config, [large] * 3)
     made = plans(timetable)
     assert [plan.coarse for plan in made] == [True] * 60 + [False] * 39
     assert [made[k].finest for k in (0, 59, 60)] == [2 * FINEST, 2 * FINEST, FINEST]
-    assert Schedule.of(replace(config, iterations=9_000), [large] * 3, True).coarse_end == 1_500
-    degraded = Schedule.of(config, [large] * 3, as_photographed=False)
+    assert schedule_of(replace(config, iterations=9_000), [large] * 3).coarse_end == 1_500
+    degraded = schedule_of(config, [large] * 3, as_photographed=False)
     assert degraded.items == frozenset()
     assert not any(plan.coarse or plan.finest for plan in plans(degraded))
 

@@ -33,6 +33,7 @@ from hqgs.scene.geometry import project
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import AUTO
 from hqgs.training.methods.base import photo_tensors
+from hqgs.training.plan import left_out_of
 from hqgs.training.trainer import Trainer
 
 EDGE_SHARE = 0.2  # of the pixels of a photo, those with the largest gradient, are its edges
@@ -117,7 +118,7 @@ def _facts(trainer: Trainer, cell: Cell) -> dict[str, Any]:
         "render_ms": _render_ms(trainer),
         "regions": count_regions(trainer.shown().means.detach().numpy(), cell.scene.train),
         "formation": None if formation == AUTO else formation,  # what the loss assumes of the photos
-        "left_out": [item.known() for item in trainer.method_left_out],
+        "left_out": [item.known() for item in left_out_of(trainer.plan.rows)],
     }
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from hqgs.training.plan import StepSeconds
-from hqgs.training.plan_rules import plan_run
 from hqgs.training.trainer import Trainer
 
 WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
@@ -17,14 +14,12 @@ def fit_to_seconds(trainer: Trainer) -> None:
     Does nothing to a run without a number of seconds, or whose length is recorded. The trainer is a fresh
     one; the steps leave nothing behind.
     """
-    asked, prepared = trainer.asked, trainer.prepared
-    if asked.seconds is None or asked.turn is not None:
+    if trainer.asked.seconds is None or trainer.asked.turn is not None:
         return
     kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
     half, full = trainer.ranks.tell([timed(trainer, True), timed(trainer, False)])[0]
     trainer.method.load_state_dict(kept)
-    facts = replace(prepared.facts, seconds=StepSeconds(full, half))
-    trainer.begin(plan_run(facts, prepared.diagnosis, asked))
+    trainer.begin(trainer.prepared.plan(StepSeconds(full, half)))
 
 
 def timed(trainer: Trainer, half_size: bool) -> float:

@@ -6,19 +6,11 @@ from collections.abc import Callable
 
 from hqgs.training.plan import StepSeconds
 
-# So many are enough where cameras are learned or photos are as photographed; of the latter also so many for
-# each photo. More would learn what no other photo shows: fox at stored size loses 0.5 dB in 2,250 more.
-ENOUGH, FOR_EACH_PHOTO = 7_000, 150
 # A mean step of a run over one at its start. One that starts from points all over the photos grows little,
 # and its Gaussians hide more of each other as they become opaque.
 GROWTH, GROWTH_DENSE = 2.0, 1.0
 DENSE = 2  # times the scene's own points
 FEWEST, MOST = 50, 30_000  # iterations of a run that has a number of seconds
-
-
-def most_that_pays(photos: int) -> int:
-    """Iterations on so many photos that are as photographed."""
-    return max(ENOUGH, FOR_EACH_PHOTO * photos)
 
 
 def fitting(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from hqgs.training.config import AUTO, FORMATION, TrainConfig
 from hqgs.training.looks import Looks
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
-from hqgs.training.plan import Facts, RunPlan
+from hqgs.training.plan import Facts, RunPlan, StepSeconds
 from hqgs.training.plan_rules import plan_run
 
 
@@ -46,6 +47,10 @@ class Prepared:
         )  # of more photos, where the method asks for it
         self._told = inspector.told
         self._points: dict[int, tuple[Points, Colors]] = {}
+
+    def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
+        """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""
+        return plan_run(replace(self.facts, seconds=seconds), self.diagnosis, self.asked)
 
     def first_gaussians(self, plan: RunPlan) -> Gaussians:
         """Those that a run of this plan trains."""

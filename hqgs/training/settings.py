@@ -84,7 +84,7 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
 def plan_values(config: TrainConfig, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """How long the run of these settings was, as JSON values, which `with_plan` reads; and its rows."""
     turn = None if config.turn is None else list(config.turn)
-    return {"iterations": config.iterations, "turn": turn, "seconds": config.seconds, "rows": list(rows)}
+    return {"iterations": config.iterations, "turn": turn, "rows": list(rows)}
 
 
 def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
@@ -96,8 +96,6 @@ def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
     try:
         plan = json.loads(path.read_text(encoding="utf-8"))
         iterations, turn = plan["iterations"], plan["turn"]
-        if plan.get("seconds", 0) is None:
-            raise ValueError("its run had no number of seconds; --config with config.json repeats it")
         turn = None if turn is None else (int(turn[0]), int(turn[1]))
         return replace(with_iterations(config, int(iterations)), seconds=None, turn=turn)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:

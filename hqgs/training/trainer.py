@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,14 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
-from hqgs.training.batch import Part, Rest, descend, exchanged, note_views, part_of, to_rasterize
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
 from hqgs.training.frugality import Frugality
+from hqgs.training.gradients import gradients_of
 from hqgs.training.guard import Fault, Guard, parameter_fault
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import PlanRow, RunPlan, left_out_of
-from hqgs.training.plan_rules import plan_run
 from hqgs.training.prepare import Prepared
 from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
 from hqgs.training.settings import config_values
@@ -68,7 +67,7 @@ class Trainer:
         self.method: Method[Any] = self.prepared.method
         self.diagnosis: Diagnosis | None = self.prepared.shown_diagnosis  # None: the method asks for none
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
-        self.begin(plan_run(self.prepared.facts, self.prepared.diagnosis, config))
+        self.begin(self.prepared.plan())
 
     def begin(self, plan: RunPlan) -> None:
         """Stand before the first step of a run of this plan."""
@@ -138,7 +137,7 @@ class Trainer:
         self._set_rates(last)
 
         with one_torch_thread():
-            step, seen = self._one(last) if self.config.batch == 1 else self._together(plans)
+            step, seen = self._train_on(plans)
             growth = self._grow(last) if last.grows else Growth()
             self._cull(step.view, parameter_fault(state.gaussians, growth.parents is not None))
             if not len(state.gaussians):
@@ -247,44 +246,14 @@ class Trainer:
             groups[name]["lr"] = rate
         groups["shN"]["used"] = (plan.degree + 1) ** 2 - 1
 
-    def _one(self, plan: Plan) -> tuple[Step, list[Tensor]]:
-        """Train on one view."""
-        state = self.state
-        look = self.prepared.looks.at(plan, self.method.modulate(state.gaussians))
-        state.optimizer.zero_grad()
-        fault, loss = look.backward(state.gaussians, state.optimizer), float(look.loss.detach())
-        if self._sound([look.view], [fault], loss):
-            radii, gradient = look.meta["radii"][0], look.meta["means2d"].grad
-            if plan.observes:
-                assert gradient is not None  # the backward pass was sound
-                camera = look.view.camera
-                state.densifier.observe(gradient[0], radii, camera.width, camera.height)
-            state.optimizer.step()
-        return Step(loss, look.photo.detach(), look.view), [look.measured]
-
-    def _together(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
-        """Train on several views, of which each rank renders its share; all add up what all have found."""
+    def _train_on(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
+        """Train on these views together; what the method goes by after the step, of each."""
         state, looks = self.state, self.prepared.looks
-        step: Step | None = None
-
-        def make(k: int) -> tuple[Part, Callable[[], Rest]]:
-            nonlocal step
-            modulated = self.method.modulate(state.gaussians)
-            look = looks.at(plans[k], to_rasterize(state.gaussians, modulated))
-            state.optimizer.zero_grad()
-            fault = look.backward(state.gaussians, state.optimizer)
-            step = step or Step(float(look.loss.detach()), look.photo.detach(), look.view)
-            return part_of(look, fault, state.gaussians, state.optimizer)
-
-        parts, others = exchanged(self.ranks, len(plans), make)
-        views = [looks.views[plan.view] for plan in plans]
-        if self._sound(views, [part.fault for part in parts], parts[-1].loss):
-            with torch.no_grad():
-                modulated = self.method.modulate(state.gaussians)
-            rests = descend(parts, others, state.gaussians, modulated, state.optimizer)
-            note_views(parts, rests, [plan.observes for plan in plans], state.densifier)
-        step = step or Step(parts[0].loss, torch.zeros(0, 0, 3), views[0])
-        return step, [part.measured for part in parts]
+        found = gradients_of(plans, looks, state, self.ranks, alone=self.config.batch == 1)
+        step = Step(found.loss, found.photo, found.view)
+        if self._sound([looks.views[plan.view] for plan in plans], found.faults, step):
+            found.apply(state)
+        return step, found.measured
 
     def _grow(self, plan: Plan) -> Growth:
         """Add and remove Gaussians."""
@@ -331,7 +300,7 @@ class Trainer:
             gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks
         )
 
-    def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], loss: float) -> bool:
+    def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], step: Step) -> bool:
         """Whether the step has gradients to go by, of one view at least; the guard notes its faults.
 
         Gaussians whose gradient is not finite are removed, and then no row is where the others' gradients
@@ -352,7 +321,7 @@ class Trainer:
         if guard.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
                 f"the loss or a gradient was not finite in {guard.skipped_in_a_row} steps in a row, up to "
-                f"iteration {state.iteration}; the last loss is {loss}, of view {views[-1].name!r}"
+                f"iteration {state.iteration}; the last loss is {step.loss}, of view {step.view.name!r}"
             )
         return skipped < len(views)
 
