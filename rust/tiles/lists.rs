@@ -47,6 +47,8 @@ fn fetch<T: Copy>(data: &[T]) {
 pub(super) struct Scratch<T> {
     /// (bits of the depth as f32, place by index).
     keys: Vec<u64>,
+    /// For their sort.
+    sorted: Vec<u64>,
     /// Records and colours by index.
     records: Vec<Record<T>>,
     colors: Vec<T>,
@@ -58,6 +60,7 @@ impl<T> Default for Scratch<T> {
     fn default() -> Self {
         Self {
             keys: Vec::new(),
+            sorted: Vec::new(),
             records: Vec::new(),
             colors: Vec::new(),
             shapes: Shapes::default(),
@@ -78,6 +81,7 @@ pub(super) fn list<S: Simd, T: Real>(
 ) -> Result<List<T>, Error> {
     let Scratch {
         keys,
+        sorted,
         records,
         colors,
         shapes,
@@ -114,7 +118,7 @@ pub(super) fn list<S: Simd, T: Real>(
     if n == 0 {
         return Ok(list);
     }
-    keys.sort_unstable();
+    sort(keys, sorted)?;
     for key in keys.iter() {
         list.places.push(*key as u32);
     }
@@ -143,6 +147,45 @@ pub(super) fn list<S: Simd, T: Real>(
     Ok(list)
 }
 
+/// Keys below which a comparing sort is faster.
+const FEW: usize = 96;
+/// Values of a digit of the depth.
+const DIGITS: usize = 256;
+
+/// Sort keys by their upper halves; those with the same one stay in their order. `other` is a buffer.
+///
+/// Digit by digit from the lowest, each pass stable; a digit that all share, as the exponent mostly is, needs none.
+fn sort(keys: &mut Vec<u64>, other: &mut Vec<u64>) -> Result<(), Error> {
+    if keys.len() < FEW {
+        keys.sort_unstable(); // their lower halves ascend
+        return Ok(());
+    }
+    memory::resize(other, keys.len(), 0, NAME)?;
+    let digit = |key: u64, pass: usize| (key >> (32 + 8 * pass)) as usize % DIGITS;
+    let mut counts = [[0u32; DIGITS]; 4];
+    for &key in keys.iter() {
+        for (pass, counts) in counts.iter_mut().enumerate() {
+            counts[digit(key, pass)] += 1;
+        }
+    }
+    for (pass, counts) in counts.iter_mut().enumerate() {
+        if counts[digit(keys[0], pass)] as usize == keys.len() {
+            continue;
+        }
+        let mut sum = 0;
+        for count in counts.iter_mut() {
+            sum += std::mem::replace(count, sum);
+        }
+        for &key in keys.iter() {
+            let place = &mut counts[digit(key, pass)];
+            other[*place as usize] = key;
+            *place += 1;
+        }
+        std::mem::swap(keys, other);
+    }
+    Ok(())
+}
+
 /// Depths that are equal as f32 are ordered by their exact values; the sort is stable, so that exactly
 /// equal ones stay in the order of their indices.
 fn order_ties<T>(projection: &Projection, keys: &[u64], records: &[Record<T>], order: &mut [u32]) {
@@ -153,5 +196,28 @@ fn order_ties<T>(projection: &Projection, keys: &[u64], records: &[Record<T>], o
             order[begin..begin + run.len()].sort_by(|a, b| depth(a).total_cmp(&depth(b)));
         }
         begin += run.len();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_sorted_by_depth_and_then_by_index() {
+        let mut other = Vec::new();
+        for n in [0, 1, FEW - 1, FEW, FEW + 1, 3000] {
+            // All bits of the depth, one exponent, the lowest digit alone, the same depth for all.
+            for mask in [0x7fff_ffff, 0x40ff_ffff, 0x4000_00ff, 0x4000_0000_u32] {
+                let depth = |k: u64| (k as u32).wrapping_mul(0x9e37_79b9) & mask;
+                let mut keys: Vec<_> = (0..n as u64)
+                    .map(|k| u64::from(depth(k)) << 32 | k)
+                    .collect();
+                let mut expected = keys.clone();
+                expected.sort();
+                sort(&mut keys, &mut other).unwrap();
+                assert_eq!(keys, expected, "{n} keys, {mask:x}");
+            }
+        }
     }
 }
