@@ -123,7 +123,7 @@ pub fn backward<T: Real>(
 #[derive(Default)]
 struct Scratch<T: Real> {
     adjoint: Adjoint<T>,
-    /// What `kernel::unblend` stores.
+    /// What `kernel::replay` stores.
     layers: Vec<T>,
 }
 
@@ -161,8 +161,8 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     }
     counts.backward_tiles = 1;
     list.fetch();
-    let begins = unblend_blocks::<S, T, D, E>(simd, input, grid, tile, &depths, adjoint, layers)?;
-    let out = for_parts!(S, T, P => sum_layers::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
+    let begins = replay_blocks::<S, T, E>(simd, input, grid, tile, &depths, adjoint, layers)?;
+    let out = for_parts!(S, T, P => unblend::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
     Ok((out, counts))
 }
 
@@ -206,10 +206,10 @@ fn read_cotangents<T: Real, const D: usize>(
     wanted
 }
 
-/// Block by block what each of its first `depths` layers contributes, one after the other in `layers`. Returns
-/// the begin of each block there, and the end.
+/// Block by block its first `depths` layers once more, one after the other in `layers`. Returns the begin of each
+/// block there, and the end.
 #[inline(always)]
-fn unblend_blocks<S: Simd, T: Real, const D: usize, const E: usize>(
+fn replay_blocks<S: Simd, T: Real, const E: usize>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
@@ -230,42 +230,56 @@ fn unblend_blocks<S: Simd, T: Real, const D: usize, const E: usize>(
         let mut seen = input.layers(tile, block);
         seen.list = &seen.list[..depth];
         let out = &mut layers[begin * LAYER..end * LAYER];
-        for_vectors!(S, T, V => kernel::unblend::<S, T, D, E, V>(simd, grid, block, seen, adjoint, out));
+        for_vectors!(S, T, V => kernel::replay::<S, T, E, V>(simd, grid, block, seen, adjoint, out));
         begins[block + 1] = end;
     }
     Ok(begins)
 }
 
-/// Gaussian by Gaussian the sums over its blocks.
+/// Gaussian by Gaussian, back to front, the sums over its blocks.
 #[inline(always)]
-fn sum_layers<S: Simd, T: Real, const D: usize, const P: usize>(
+fn unblend<S: Simd, T: Real, const D: usize, const P: usize>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
     tile: usize,
     begins: &[usize; TILE_BLOCKS + 1],
     layout: PairLayout,
-    adjoint: &Adjoint<T>,
+    adjoint: &mut Adjoint<T>,
     layers: &[T],
 ) -> Result<Vec<T>, Error> {
     let list = &input.tiles.lists[tile];
-    let mut next = [0; TILE_BLOCKS];
-    next.copy_from_slice(&begins[..TILE_BLOCKS]);
+    let channels = if D > 0 { D } else { layout.channels };
+    // Of each block the layers in front, of which the last ones may not have been reached.
+    let mut left = [0; TILE_BLOCKS];
+    for (left, ends) in left.iter_mut().zip(list.begins.windows(2)) {
+        *left = (ends[1] - ends[0]) as usize;
+    }
     let row = layout.row();
     let mut out = memory::filled(T::ZERO, list.records.len() * row, NAME)?;
-    for ((record, &mask), &place) in list.records.iter().zip(&list.masks).zip(&list.places) {
-        let mut sums = Sums::<S, T, P>::new(simd, record);
+    let pairs = list.records.iter().zip(&list.masks).zip(&list.places);
+    for (k, ((record, &mask), &place)) in pairs.enumerate().rev() {
+        let color = &list.colors[k * channels..(k + 1) * channels];
+        let mut sums = Sums::<S, T, P>::new(simd, record, color);
         let out = &mut out[place as usize * row..(place as usize + 1) * row];
         let mut rest = mask;
         while rest != 0 {
             let block = rest.trailing_zeros() as usize % TILE_BLOCKS;
             rest &= rest - 1;
-            let k = next[block];
+            left[block] -= 1;
+            let k = begins[block] + left[block];
             if k < begins[block + 1] {
-                next[block] = k + 1;
                 let layer = &layers[k * LAYER..(k + 1) * LAYER];
-                let v_colors = &adjoint.v_colors;
-                sums.add::<D>(simd, grid, block, layer, v_colors, layout.absolute, out);
+                sums.add::<D>(
+                    simd,
+                    grid,
+                    block,
+                    layer,
+                    color,
+                    adjoint,
+                    layout.absolute,
+                    out,
+                );
             }
         }
         sums.finish::<D>(layout.absolute, out);

@@ -8,7 +8,7 @@ mod blend;
 mod unblend;
 
 pub(super) use blend::blend;
-pub(super) use unblend::{ABSOLUTE, Adjoint, LAYER, MOMENTS, Sums, unblend};
+pub(super) use unblend::{ABSOLUTE, Adjoint, LAYER, MOMENTS, Sums, replay};
 
 use crate::{
     constants::{ALPHA_MAX, BLOCK, BLOCK_PIXELS, BLOCKS_PER_SIDE, TILE, TILE_PIXELS},

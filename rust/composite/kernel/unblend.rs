@@ -17,14 +17,15 @@ pub const MOMENTS: usize = 6;
 /// |d loss / d mean2d| summed pixel by pixel, x and y, where asked for.
 pub const ABSOLUTE: usize = 2;
 
-/// Numbers that `unblend` stores per layer of a block.
+/// Numbers that `replay` stores per layer of a block.
 pub const LAYER: usize = 2 * BLOCK_PIXELS;
 
 /// One tile in the backward pass.
 pub struct Adjoint<T> {
     /// 1 inside the image, 0 outside.
     pub transmittance: Pixels<T>,
-    /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance.
+    /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance; then behind
+    /// each layer, back to front.
     pub behind: Pixels<T>,
     /// Cotangent of each channel.
     pub v_colors: Vec<Pixels<T>>,
@@ -60,14 +61,10 @@ impl<T: Real> Adjoint<T> {
     }
 }
 
-/// Gradients of the layers of one block (V vectors). For each layer `out` receives w, the gradient with
-/// respect to sigma, and the weight of its colour.
-///
-/// Front to back once more for transmittance and alpha of each layer, then back to front. There `behind` is
-/// a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however deep
-/// the layer.
+/// The layers of one block (V vectors), front to back once more: for each layer `out` receives the transmittance in
+/// front of it and its alpha, 0 where it is not blended.
 #[inline(always)]
-pub fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
+pub fn replay<S: Simd, T: Real, const E: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -75,13 +72,10 @@ pub fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>
     adjoint: &Adjoint<T>,
     out: &mut [T],
 ) {
-    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
-    let channels = if D > 0 { D } else { layers.channels };
-    let at = block * BLOCK_PIXELS;
     let [x, y] = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
-    let (cap, zero) = (splat(T::from_f64(ALPHA_MAX)), splat(T::ZERO));
-    let mut open = load::<S, T, V>(simd, &adjoint.transmittance[at..]);
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+    let mut open = load::<S, T, V>(simd, &adjoint.transmittance[block * BLOCK_PIXELS..]);
     for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)) {
         let record = RecordLanes::<S, T>::new(simd, &layers.records[k as usize]);
         let (mut before, mut alphas) = (open, [zero; V]);
@@ -95,57 +89,39 @@ pub fn unblend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>
         store::<S, T, V>(out, before);
         store::<S, T, V>(&mut out[BLOCK_PIXELS..], alphas);
     }
-    let mut behind = load::<S, T, V>(simd, &adjoint.behind[at..]);
-    let mut v_colors = [[zero; V]; D];
-    for (v, color) in v_colors.iter_mut().zip(&adjoint.v_colors) {
-        *v = load::<S, T, V>(simd, &color[at..]);
-    }
-    for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)).rev() {
-        let k = k as usize;
-        let rgb = &layers.colors[k * channels..(k + 1) * channels];
-        let before = load::<S, T, V>(simd, out);
-        let alpha = load::<S, T, V>(simd, &out[BLOCK_PIXELS..]);
-        let (mut ws, mut weights) = ([zero; V], [zero; V]);
-        for j in 0..V {
-            let weight = before[j] * alpha[j];
-            let mut q = zero;
-            for (c, color) in rgb.iter().enumerate() {
-                let v = if D > 0 {
-                    v_colors[c][j]
-                } else {
-                    let v = &adjoint.v_colors[c][at + j * width::<S, T>()..];
-                    Lanes::<T, S>::from_slice(simd, &v[..width::<S, T>()])
-                };
-                q = v.mul_add(splat(*color), q);
-            }
-            let difference = q - behind[j];
-            // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
-            ws[j] = alpha[j].simd_lt(cap).select(weight * (behind[j] - q), zero);
-            behind[j] = alpha[j].mul_add(difference, behind[j]);
-            weights[j] = weight;
-        }
-        store::<S, T, V>(out, ws);
-        store::<S, T, V>(&mut out[BLOCK_PIXELS..], weights);
-    }
 }
 
 /// Running sums of one Gaussian over its blocks, in P vectors each (`sums::parts`).
 pub struct Sums<S: Simd, T: Real, const P: usize> {
     record: RecordLanes<S, T>,
+    /// Of at most 4 channels.
+    color: [Lanes<T, S>; 4],
+    cap: Lanes<T, S>,
     /// The moments, the colours (at most 4 channels), the absolute gradients.
     lanes: [[Lanes<T, S>; P]; MOMENTS + 4 + ABSOLUTE],
 }
 
 impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
     #[inline(always)]
-    pub fn new(simd: S, g: &Record<T>) -> Self {
+    pub fn new(simd: S, g: &Record<T>, color: &[T]) -> Self {
+        let splat = |x: T| Lanes::<T, S>::splat(simd, x);
+        let mut wide = [splat(T::ZERO); 4];
+        for (wide, color) in wide.iter_mut().zip(color) {
+            *wide = splat(*color);
+        }
         Self {
             record: RecordLanes::new(simd, g),
-            lanes: [[Lanes::<T, S>::splat(simd, T::ZERO); P]; MOMENTS + 4 + ABSOLUTE],
+            color: wide,
+            cap: splat(T::from_f64(ALPHA_MAX)),
+            lanes: [[splat(T::ZERO); P]; MOMENTS + 4 + ABSOLUTE],
         }
     }
 
-    /// Add one block of what `unblend` stored. With D = 0 the gradient of the colour goes straight to `out`.
+    /// Step in front of the Gaussian in one block, of which `replay` stored `layer`, and add its gradients there.
+    /// With D = 0 that of the colour goes straight to `out`.
+    ///
+    /// `behind` is a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however
+    /// deep the layer.
     #[inline(always)]
     pub fn add<const D: usize>(
         &mut self,
@@ -153,29 +129,49 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         grid: &Grid<T>,
         block: usize,
         layer: &[T],
-        v_colors: &[Pixels<T>],
+        color: &[T],
+        adjoint: &mut Adjoint<T>,
         absolute: bool,
         out: &mut [T],
     ) {
-        let (ws, weights) = layer.split_at(BLOCK_PIXELS);
-        for i in (0..BLOCK_PIXELS).step_by(width::<S, T>()) {
-            let at = block * BLOCK_PIXELS + i..block * BLOCK_PIXELS + i + width::<S, T>();
-            let w = Lanes::<T, S>::from_slice(simd, &ws[i..i + width::<S, T>()]);
-            let weight = Lanes::<T, S>::from_slice(simd, &weights[i..i + width::<S, T>()]);
-            let x = Lanes::<T, S>::from_slice(simd, &grid.x[at.clone()]);
-            let y = Lanes::<T, S>::from_slice(simd, &grid.y[at.clone()]);
+        let n = width::<S, T>();
+        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+        let (before, alphas) = layer.split_at(BLOCK_PIXELS);
+        let mut weights = [T::ZERO; BLOCK_PIXELS];
+        for i in (0..BLOCK_PIXELS).step_by(n) {
+            let at = block * BLOCK_PIXELS + i..block * BLOCK_PIXELS + i + n;
+            let load = |from: &[T]| Lanes::<T, S>::from_slice(simd, from);
+            let (alpha, behind) = (load(&alphas[i..i + n]), load(&adjoint.behind[at.clone()]));
+            let weight = load(&before[i..i + n]) * alpha;
+            let (mut q, mut v_colors) = (zero, [zero; D]);
+            if D > 0 {
+                for (c, v_color) in v_colors.iter_mut().enumerate() {
+                    *v_color = load(&adjoint.v_colors[c][at.clone()]);
+                    q = v_color.mul_add(self.color[c], q);
+                }
+            } else {
+                for (v, color) in adjoint.v_colors.iter().zip(color) {
+                    q = load(&v[at.clone()]).mul_add(Lanes::<T, S>::splat(simd, *color), q);
+                }
+                weight.store_slice(&mut weights[i..i + n]);
+            }
+            // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
+            let w = alpha.simd_lt(self.cap).select(weight * (behind - q), zero);
+            alpha
+                .mul_add(q - behind, behind)
+                .store_slice(&mut adjoint.behind[at.clone()]);
+            let (x, y) = (load(&grid.x[at.clone()]), load(&grid.y[at]));
             let (u, v) = self.record.position(x, y);
             let (wu, wv) = (w * u, w * v);
-            let (lanes, p) = (&mut self.lanes, i / width::<S, T>() % P);
+            let (lanes, p) = (&mut self.lanes, i / n % P);
             lanes[0][p] += w;
             lanes[1][p] += wu;
             lanes[2][p] += wv;
             lanes[3][p] = wu.mul_add(u, lanes[3][p]);
             lanes[4][p] = wu.mul_add(v, lanes[4][p]);
             lanes[5][p] = wv.mul_add(v, lanes[5][p]);
-            for (c, v) in v_colors[..D].iter().enumerate() {
-                let v = Lanes::<T, S>::from_slice(simd, &v[at.clone()]);
-                lanes[MOMENTS + c][p] = weight.mul_add(v, lanes[MOMENTS + c][p]);
+            for (c, v_color) in v_colors.iter().enumerate() {
+                lanes[MOMENTS + c][p] = weight.mul_add(*v_color, lanes[MOMENTS + c][p]);
             }
             if absolute {
                 lanes[MOMENTS + D][p] += wu.abs();
@@ -185,8 +181,8 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         }
         if D == 0 {
             let at = block * BLOCK_PIXELS;
-            for (out, v) in out[MOMENTS..].iter_mut().zip(v_colors) {
-                add_products::<S, T, P>(simd, weights, &v[at..at + BLOCK_PIXELS], out);
+            for (out, v) in out[MOMENTS..].iter_mut().zip(&adjoint.v_colors) {
+                add_products::<S, T, P>(simd, &weights, &v[at..at + BLOCK_PIXELS], out);
             }
         }
     }
