@@ -75,9 +75,8 @@ class Knobs:
     dtype: str = "float32"
     alpha_min: float = ALPHA_MIN  # smallest alpha that is blended
     transmittance_min: float = TRANSMITTANCE_MIN  # compositing stops there
-    spans: str = "ellipse"  # the tiles of a Gaussian: of its support, its "box", or a 3-sigma "square"
+    spans: str = "ellipse"  # the tiles of a Gaussian: of its support, or of its "box"
     skip_blocks: bool = True  # leave out the 4 x 4 blocks that a Gaussian does not reach
-    exp2_degree: int = 6  # of the polynomial in float32
 
 
 @contextmanager

@@ -14,9 +14,6 @@ pub enum Spans {
     Ellipse,
     /// Those of the support's bounding box.
     Box,
-    /// Those of a square of three standard deviations along the longer axis, as in the original 3DGS. It cuts
-    /// off what an opaque Gaussian has beyond them.
-    Square,
 }
 
 /// The knobs.
@@ -30,12 +27,7 @@ pub struct AccuracyKnobs {
     pub spans: Spans,
     /// Leave out the blocks of a tile that a Gaussian does not reach.
     pub skip_blocks: bool,
-    /// Degree of the polynomial of 2^x, 3 to 6; used for three channels in f32 alone.
-    pub exp2_degree: usize,
 }
-
-/// Degree of the polynomial of 2^x in f32: the first whose error is far below a rounding of f32.
-pub const EXP2_DEGREE: usize = 6;
 
 impl Default for AccuracyKnobs {
     fn default() -> Self {
@@ -44,7 +36,6 @@ impl Default for AccuracyKnobs {
             transmittance_min: TRANSMITTANCE_MIN,
             spans: Spans::default(),
             skip_blocks: true,
-            exp2_degree: EXP2_DEGREE,
         }
     }
 }
@@ -64,11 +55,6 @@ impl AccuracyKnobs {
         if !(0.0..1.0).contains(&transmittance_min) {
             let got = format!("must be in [0, 1), got {transmittance_min}");
             return Err(Error::new("transmittance_min", got));
-        }
-        let degree = self.exp2_degree;
-        if !(3..=EXP2_DEGREE).contains(&degree) {
-            let got = format!("must be 3 to {EXP2_DEGREE}, got {degree}");
-            return Err(Error::new("exp2_degree", got));
         }
         Ok(())
     }

@@ -1,12 +1,11 @@
 //! Vector-Jacobian product of compositing.
 
 use super::{
-    CompositeInput, Composited, for_alpha, for_parts, for_vectors,
+    CompositeInput, Composited, for_channels, for_parts, for_vectors,
     gather::{PairLayout, gather},
     kernel::{self, Adjoint, Grid, LAYER, Sums},
 };
 use crate::{
-    accuracy_knobs::EXP2_DEGREE,
     constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::{Error, check_len},
@@ -95,7 +94,6 @@ pub fn backward<T: Real>(
     }
     let grid = Grid::new();
     let level = input.projection.level.token;
-    let degree = input.projection.knobs.exp2_degree;
     let count = tiles.lists.len();
     let mut pair_grads = memory::filled(Vec::new(), count, NAME)?;
     let mut counts = memory::filled(Counts::default(), count, NAME)?;
@@ -106,8 +104,8 @@ pub fn backward<T: Real>(
         .try_for_each_init(
             Scratch::default,
             |scratch, (tile, (grads, counts))| -> Result<(), Error> {
-                (*grads, *counts) = dispatch!(level, simd => for_alpha!(
-                    channels, degree, backward_tile, simd, T, (input, composited, v, &grid, tile, layout, scratch)
+                (*grads, *counts) = dispatch!(level, simd => for_channels!(
+                    channels, backward_tile, simd, T, (input, composited, v, &grid, tile, layout, scratch)
                 ))?;
                 Ok(())
             },
@@ -129,7 +127,7 @@ struct Scratch<T: Real> {
 
 /// Gradients of a tile's pairs, by index, and the work that they took; empty if all are zero.
 #[inline(always)]
-fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
+fn backward_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
     input: &CompositeInput<T>,
     composited: &Composited<T>,
@@ -161,7 +159,7 @@ fn backward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     }
     counts.backward_tiles = 1;
     list.fetch();
-    let begins = replay_blocks::<S, T, E>(simd, input, grid, tile, &depths, adjoint, layers)?;
+    let begins = replay_blocks::<S, T>(simd, input, grid, tile, &depths, adjoint, layers)?;
     let out = for_parts!(S, T, P => unblend::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
     Ok((out, counts))
 }
@@ -209,7 +207,7 @@ fn read_cotangents<T: Real, const D: usize>(
 /// Block by block its first `depths` layers once more, one after the other in `layers`. Returns the begin of each
 /// block there, and the end.
 #[inline(always)]
-fn replay_blocks<S: Simd, T: Real, const E: usize>(
+fn replay_blocks<S: Simd, T: Real>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
@@ -230,7 +228,7 @@ fn replay_blocks<S: Simd, T: Real, const E: usize>(
         let mut seen = input.layers(tile, block);
         seen.list = &seen.list[..depth];
         let out = &mut layers[begin * LAYER..end * LAYER];
-        for_vectors!(S, T, V => kernel::replay::<S, T, E, V>(simd, grid, block, seen, adjoint, out));
+        for_vectors!(S, T, V => kernel::replay::<S, T, V>(simd, grid, block, seen, adjoint, out));
         begins[block + 1] = end;
     }
     Ok(begins)

@@ -1,11 +1,10 @@
 //! Compositing, forward.
 
 use super::{
-    CompositeInput, Composited, for_alpha, for_vectors,
+    CompositeInput, Composited, for_channels, for_vectors,
     kernel::{self, Grid, Pixels},
 };
 use crate::{
-    accuracy_knobs::EXP2_DEGREE,
     constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::Error,
@@ -43,7 +42,6 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
     let mut colors = UninitVec::new(count * channels, "image")?;
     let grid = Grid::new();
     let level = input.projection.level.token;
-    let degree = input.projection.knobs.exp2_degree;
     let counts = depths
         .par_iter_mut()
         .zip(transmittance.cut(repeat_n(TILE_PIXELS, count)))
@@ -52,8 +50,8 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
         .map(|(tile, ((depths, transmittance), colors))| {
             let transmittance = transmittance.fill(T::ZERO);
             let colors = colors.fill([T::ZERO; TILE_PIXELS]);
-            dispatch!(level, simd => for_alpha!(
-                channels, degree, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
+            dispatch!(level, simd => for_channels!(
+                channels, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
             ))
         })
         .reduce(Counts::default, Counts::plus);
@@ -114,7 +112,7 @@ fn image_from_tiles<T: Real>(
 
 /// Composite one tile.
 #[inline(always)]
-fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
+fn forward_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
@@ -136,7 +134,7 @@ fn forward_tile<S: Simd, T: Real, const D: usize, const E: usize>(
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
         let layers = input.layers(tile, block);
-        let blended = for_vectors!(S, T, V => kernel::blend::<S, T, D, E, V>(simd, grid, block, layers, pixels, colors));
+        let blended = for_vectors!(S, T, V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
         counts.blocks += blended.layers as u64;
         counts.changed_blocks += blended.changed;

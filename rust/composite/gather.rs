@@ -1,7 +1,7 @@
 //! The gradients of each Gaussian from those of its pairs.
 
 use super::{
-    CompositeGrads, CompositeInput, Wanted,
+    CompositeGrads, CompositeInput, Wanted, for_channels,
     kernel::{ABSOLUTE, MOMENTS},
 };
 use crate::{
@@ -18,17 +18,6 @@ use std::hint::black_box;
 
 /// What an error calls the buffers of this file.
 const NAME: &str = "gradients";
-
-/// Call a function for the number of channels: the common ones are compiled for it.
-macro_rules! for_channels {
-    ($channels:expr, $function:ident, $simd:expr, $types:ty, ($($argument:expr),*)) => {
-        match $channels {
-            3 => $function::<_, $types, 3>($simd, $($argument),*),
-            4 => $function::<_, $types, 4>($simd, $($argument),*),
-            _ => $function::<_, $types, 0>($simd, $($argument),*),
-        }
-    };
-}
 
 /// Layout of one pair's gradients: moments, colours, absolute gradients.
 #[derive(Debug, Clone, Copy)]

@@ -8,7 +8,6 @@ use super::{
     kernel::{Decision, Grid, Layers, RecordLanes, STRIDE, load, width},
 };
 use crate::{
-    accuracy_knobs::EXP2_DEGREE,
     constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
     error::{Error, check_len},
     memory,
@@ -21,7 +20,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// The largest weight of each Gaussian over the pixels of an image, `[N]`; 0 for one that no pixel blends.
 ///
 /// `mask` [H, W] is not 0 in the pixels that count; None: all of them. The tile lists need no channels, and the
-/// background plays no part. The power of 2 is always that of the default knobs. A maximum is the same in any
+/// background plays no part. A maximum is the same in any
 /// order, so that the bits depend on no number of threads.
 ///
 /// # Errors
@@ -124,7 +123,7 @@ fn weigh<S: Simd, T: Real, const V: usize>(
             let out = &mut largest[k * width::<S, T>()..(k + 1) * width::<S, T>()];
             let mut most = Lanes::<T, S>::from_slice(simd, out);
             for j in 0..V {
-                let alpha = record.alpha::<EXP2_DEGREE>(simd, x[j], y[j]);
+                let alpha = record.alpha(simd, x[j], y[j]);
                 let met = decision.meet(alpha, open[j]);
                 most = most.max(met.blended.select(open[j] * alpha, zero));
                 open[j] = met.open;

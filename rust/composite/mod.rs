@@ -100,33 +100,21 @@ pub struct Composited<T> {
     transmittance: Vec<T>,
 }
 
-/// Call a function for the number of channels, of which the common ones are compiled, and with three channels in
-/// f32 also for the degree of 2^x.
-///
-/// Here and below the type decides in a constant of its own, so that the compiler never sees what no call reaches:
-/// each kernel costs it seconds.
-macro_rules! for_alpha {
-    ($channels:expr, $degree:expr, $function:ident, $simd:expr, $T:ty, ($($argument:expr),*)) => {
-        if const { <$T>::SINGLE } {
-            match ($channels, $degree) {
-                (3, 3) => $function::<_, $T, 3, 3>($simd, $($argument),*),
-                (3, 4) => $function::<_, $T, 3, 4>($simd, $($argument),*),
-                (3, 5) => $function::<_, $T, 3, 5>($simd, $($argument),*),
-                (3, _) => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
-                (4, _) => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
-                _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
-            }
-        } else {
-            match $channels {
-                3 => $function::<_, $T, 3, EXP2_DEGREE>($simd, $($argument),*),
-                4 => $function::<_, $T, 4, EXP2_DEGREE>($simd, $($argument),*),
-                _ => $function::<_, $T, 0, EXP2_DEGREE>($simd, $($argument),*),
-            }
+/// Call a function for the number of channels, of which the common ones are compiled.
+macro_rules! for_channels {
+    ($channels:expr, $function:ident, $simd:expr, $T:ty, ($($argument:expr),*)) => {
+        match $channels {
+            3 => $function::<_, $T, 3>($simd, $($argument),*),
+            4 => $function::<_, $T, 4>($simd, $($argument),*),
+            _ => $function::<_, $T, 0>($simd, $($argument),*),
         }
     };
 }
 
 /// Call a kernel with the constant V: the number of vectors that a block has on this machine.
+///
+/// Here and below the types decide in a constant of its own, so that the compiler never sees what no call reaches: each
+/// kernel costs it seconds.
 macro_rules! for_vectors {
     ($S:ty, $T:ty, $V:ident => $call:expr) => {
         match const { BLOCK_PIXELS / crate::composite::kernel::width::<$S, $T>() } {
@@ -159,7 +147,7 @@ macro_rules! for_parts {
     }};
 }
 
-use {for_alpha, for_parts, for_vectors};
+use {for_channels, for_parts, for_vectors};
 
 #[cfg(test)]
 mod tests {

@@ -231,13 +231,6 @@ impl<S: Simd> Geometry<S> {
         [self.a.sqrt(), self.c * self.factors[2]]
     }
 
-    /// Standard deviation along the longer axis, pixels.
-    #[inline(always)]
-    pub fn largest_sigma(&self) -> Wide<S> {
-        let (middle, half) = ((self.a + self.c) * 0.5, (self.a - self.c) * 0.5);
-        (middle + (half * half + self.b * self.b).sqrt()).sqrt()
-    }
-
     /// `sqrt(det(cov2d - eps I) / det(cov2d))`: keeps a Gaussian's total energy under the low-pass
     /// (Mip-Splatting, eq. 9).
     #[inline(always)]

@@ -5,7 +5,6 @@ use super::{
     geometry::Geometry,
 };
 use crate::{
-    accuracy_knobs::Spans,
     constants::{FACTOR_MAX, SUPPORT_SLACK, TILE},
     scene::Camera,
     simd::{
@@ -110,10 +109,7 @@ impl SplatGroup {
                 & (mean[k] - radii).simd_lt(splat_lanes(simd, size[k]));
             largest = largest.max(radii);
             // Tiles whose pixel centres lie within `mean +- extent`, clipped to the image.
-            let extent = match o.knobs.spans {
-                Spans::Square => g.largest_sigma() * 3.0,
-                Spans::Ellipse | Spans::Box => reach * sigma[k],
-            };
+            let extent = reach * sigma[k];
             let first = (mean[k] - extent - 0.5).ceil().max(zero);
             let last = (mean[k] + extent - 0.5)
                 .floor()

@@ -192,15 +192,8 @@ fn check_knobs(level: Level) {
             ..exact
         })
     };
-    let degree = |exp2_degree| {
-        error(AccuracyKnobs {
-            exp2_degree,
-            ..exact
-        })
-    };
     assert!(0.0 < floor(1e-4) && floor(1e-4) < floor(4e-3) && floor(4e-3) < floor(0.03));
     assert!(0.0 < stop(1e-4) && stop(1e-4) < stop(1e-3) && stop(1e-3) < stop(1e-2));
-    assert!(0.0 < degree(5) && degree(5) < degree(4) && degree(4) < degree(3));
 }
 
 #[test]
@@ -226,13 +219,6 @@ fn knobs_out_of_range_are_named() {
             "transmittance_min",
             AccuracyKnobs {
                 transmittance_min: 1.0,
-                ..d
-            },
-        ),
-        (
-            "exp2_degree",
-            AccuracyKnobs {
-                exp2_degree: 7,
                 ..d
             },
         ),

@@ -14,24 +14,6 @@ const EXP2_F32: [f32; 7] = [
     0.000_153_458_12,
 ];
 
-/// The same with fewer terms, to measure what they are worth: 7.5e-8, 2.6e-6 and 7.5e-5.
-const EXP2_F32_5: [f32; 6] = [
-    1.000_000_1,
-    0.693_146_94,
-    0.240_221_2,
-    0.055_507_13,
-    0.009_675_541,
-    0.001_327_647_2,
-];
-const EXP2_F32_4: [f32; 5] = [
-    0.999_999_3,
-    0.693_121_8,
-    0.240_247_44,
-    0.055_917_86,
-    0.009_570_102,
-];
-const EXP2_F32_3: [f32; 4] = [0.999_928_06, 0.693_260_97, 0.242_611_13, 0.055_171_67];
-
 /// Coefficients of `2^f` on [-0.5, 0.5]: Taylor series, `ln(2)^k / k!`, truncation error below 1e-17.
 const EXP2_F64: [f64; 14] = {
     let mut c = [1.0; 14];
@@ -63,13 +45,8 @@ macro_rules! exp2 {
 
 /// [`Real::exp2`](super::Real::exp2) in f32.
 #[inline(always)]
-pub(super) fn exp2_f32<S: Simd, const DEGREE: usize>(simd: S, x: Lanes<f32, S>) -> Lanes<f32, S> {
-    match DEGREE {
-        3 => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32_3),
-        4 => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32_4),
-        5 => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32_5),
-        _ => exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32),
-    }
+pub(super) fn exp2_f32<S: Simd>(simd: S, x: Lanes<f32, S>) -> Lanes<f32, S> {
+    exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32)
 }
 
 /// [`Real::exp2`](super::Real::exp2) in f64.
@@ -122,41 +99,24 @@ mod tests {
     use crate::simd::{Level, Real, at_each_level};
     use fearless_simd::dispatch;
 
-    fn worst_error<T: Real, const DEGREE: usize>(level: Level) -> f64 {
-        fn run<S: Simd, T: Real, const DEGREE: usize>(simd: S) -> f64 {
+    fn worst_error<T: Real>(level: Level) -> f64 {
+        fn run<S: Simd, T: Real>(simd: S) -> f64 {
             (0..20_000)
                 .map(|i| {
                     let x = T::from_f64(-f64::from(i) * 0.0037);
-                    let y = T::exp2::<S, DEGREE>(simd, Lanes::<T, S>::splat(simd, x))[0].to_f64();
+                    let y = T::exp2(simd, Lanes::<T, S>::splat(simd, x))[0].to_f64();
                     (y / x.to_f64().exp2() - 1.0).abs()
                 })
                 .fold(0.0, f64::max)
         }
-        dispatch!(level.token, simd => run::<_, T, DEGREE>(simd))
+        dispatch!(level.token, simd => run::<_, T>(simd))
     }
 
     #[test]
     fn exp2_is_as_accurate_as_stated() {
         at_each_level(|level| {
-            let errors = [worst_error::<f32, 6>(level), worst_error::<f64, 6>(level)];
+            let errors = [worst_error::<f32>(level), worst_error::<f64>(level)];
             assert!(errors[0] < 1.2e-7 && errors[1] < 3e-16, "{errors:?}");
-        });
-    }
-
-    #[test]
-    fn fewer_terms_have_the_error_of_their_polynomial() {
-        // The relative errors of the polynomials, with the roundings for the first.
-        at_each_level(|level| {
-            for (error, expected) in [
-                (worst_error::<f32, 5>(level), 2.1e-7),
-                (worst_error::<f32, 4>(level), 2.7e-6),
-                (worst_error::<f32, 3>(level), 7.5e-5),
-            ] {
-                assert!(
-                    (error / expected - 1.0).abs() < 0.1,
-                    "{error:e}, not {expected:e}"
-                );
-            }
         });
     }
 

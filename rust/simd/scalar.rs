@@ -28,10 +28,9 @@ pub trait Real: sealed::Sealed + SimdFloatElement + Send + Sync + 'static {
     /// The value as f64, exactly.
     fn to_f64(self) -> f64;
     /// `2^x` for `x <= 0`, lane by lane. Relative error at most 1.2e-7 (f32), 3e-16 (f64) down to the
-    /// smallest normal number; below it the result is that number, which every caller cuts off. `DEGREE` is
-    /// that of the polynomial; all but 3, 4 and 5, which f32 alone has, mean the one of this accuracy.
+    /// smallest normal number; below it the result is that number, which every caller cuts off.
     #[doc(hidden)]
-    fn exp2<S: Simd, const DEGREE: usize>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S>;
+    fn exp2<S: Simd>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S>;
 }
 
 impl Real for f32 {
@@ -55,8 +54,8 @@ impl Real for f32 {
     }
 
     #[inline(always)]
-    fn exp2<S: Simd, const DEGREE: usize>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S> {
-        exp2_f32::<S, DEGREE>(simd, x)
+    fn exp2<S: Simd>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S> {
+        exp2_f32(simd, x)
     }
 }
 
@@ -81,7 +80,7 @@ impl Real for f64 {
     }
 
     #[inline(always)]
-    fn exp2<S: Simd, const DEGREE: usize>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S> {
+    fn exp2<S: Simd>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S> {
         exp2_f64(simd, x)
     }
 }

@@ -21,7 +21,7 @@ pub struct Blended {
 /// Blend the layers over one block (V vectors). `transmittance` is 1 inside the image and 0 outside before,
 /// and what the last layer leaves after. The colours go to `colors[channel]`, block by block.
 #[inline(always)]
-pub fn blend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
+pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -47,7 +47,7 @@ pub fn blend<S: Simd, T: Real, const D: usize, const E: usize, const V: usize>(
             let rgb = &layers.colors[k * channels..(k + 1) * channels];
             let mut changed = 0;
             for j in 0..V {
-                let alpha = record.alpha::<E>(simd, x[j], y[j]);
+                let alpha = record.alpha(simd, x[j], y[j]);
                 let met = decision.meet(alpha, open[j]);
                 let weight = met.blended.select(open[j] * alpha, zero);
                 for (c, color) in rgb.iter().enumerate() {

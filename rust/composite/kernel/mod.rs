@@ -93,13 +93,12 @@ impl<S: Simd, T: Real> RecordLanes<S, T> {
         )
     }
 
-    /// alpha at the pixels (x, y): the one function that both passes use. E: degree of the power of 2.
+    /// alpha at the pixels (x, y): the one function that both passes use.
     #[inline(always)]
-    pub fn alpha<const E: usize>(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
+    pub fn alpha(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
         let (u, v) = self.position(x, y);
         let power = u.mul_add(u, v * v);
-        let alpha =
-            self.opacity * T::exp2::<S, E>(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
+        let alpha = self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
         alpha.min(Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX)))
     }
 }

@@ -64,7 +64,7 @@ impl<T: Real> Adjoint<T> {
 /// The layers of one block (V vectors), front to back once more: for each layer `out` receives the transmittance in
 /// front of it and its alpha, 0 where it is not blended.
 #[inline(always)]
-pub fn replay<S: Simd, T: Real, const E: usize, const V: usize>(
+pub fn replay<S: Simd, T: Real, const V: usize>(
     simd: S,
     grid: &Grid<T>,
     block: usize,
@@ -80,7 +80,7 @@ pub fn replay<S: Simd, T: Real, const E: usize, const V: usize>(
         let record = RecordLanes::<S, T>::new(simd, &layers.records[k as usize]);
         let (mut before, mut alphas) = (open, [zero; V]);
         for j in 0..V {
-            let alpha = record.alpha::<E>(simd, x[j], y[j]);
+            let alpha = record.alpha(simd, x[j], y[j]);
             let met = decision.meet(alpha, open[j]);
             before[j] = open[j];
             alphas[j] = met.blended.select(alpha, zero);

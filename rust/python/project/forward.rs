@@ -37,19 +37,18 @@ fn cameras(
         .collect::<Result<_, _>>()?)
 }
 
-/// alpha_min, transmittance_min, spans, skip_blocks, exp2_degree
-type Knobs<'a> = (f64, f64, &'a str, bool, usize);
+/// alpha_min, transmittance_min, spans, skip_blocks
+type Knobs<'a> = (f64, f64, &'a str, bool);
 
 fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
-    let Some((alpha_min, transmittance_min, spans, skip_blocks, exp2_degree)) = knobs else {
+    let Some((alpha_min, transmittance_min, spans, skip_blocks)) = knobs else {
         return Ok(AccuracyKnobs::default());
     };
     let spans = match spans {
         "ellipse" => Spans::Ellipse,
         "box" => Spans::Box,
-        "square" => Spans::Square,
         _ => {
-            let message = format!("must be ellipse, box or square, got {spans}");
+            let message = format!("must be ellipse or box, got {spans}");
             return Err(Error::new("spans", message));
         }
     };
@@ -58,7 +57,6 @@ fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
         transmittance_min,
         spans,
         skip_blocks,
-        exp2_degree,
     };
     knobs.check()?;
     Ok(knobs)
