@@ -9,6 +9,7 @@ use hqgs::internals::{
     tiles,
     training::adam::{self, AdamArrays, AdamOptions, Selection},
 };
+use std::time::Duration;
 
 const SIZES: [usize; 3] = [10_000, 100_000, 500_000];
 const WIDTH: usize = 504;
@@ -167,5 +168,11 @@ fn optimizer(c: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, cloud, room, optimizer);
+criterion_group! {
+    name = benches;
+    config = Criterion::default()
+        .warm_up_time(Duration::from_secs(1))
+        .measurement_time(Duration::from_secs(3));
+    targets = cloud, room, optimizer
+}
 criterion_main!(benches);

@@ -1,0 +1,207 @@
+//! `cargo bench --bench training`: the parts of a step beside the rasterizer, 504 x 378, f32, all threads: the loss, an
+//! exposure, the operators, cells of JPEG, a sweep of depths and the sum of several views.
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use hqgs::internals::{
+    stereo::{Other, Picture, Sweep},
+    training::{
+        exposure::{Frame, Photograph, Warp},
+        jpeg_cells,
+        loss::{self, LossScratch},
+        rows::{self, ViewColors, ViewRows},
+        separable::{Dense, Separable},
+    },
+};
+use std::time::Duration;
+
+const WIDTH: usize = 504;
+const HEIGHT: usize = 378;
+const PIXELS: usize = WIDTH * HEIGHT;
+const MARGIN: usize = 8;
+
+/// Numbers between 0 and 1.
+fn wave(n: usize, step: f32) -> Vec<f32> {
+    (0..n)
+        .map(|i| 0.5 + 0.5 * (i as f32 * step).sin())
+        .collect()
+}
+
+fn losses(c: &mut Criterion) {
+    let (render, floats) = (wave(3 * PIXELS, 0.37), wave(3 * PIXELS, 0.11));
+    let bytes: Vec<u8> = floats.iter().map(|x| (255.0 * x) as u8).collect();
+    let (mut grad, mut scratch) = (vec![0.0; 3 * PIXELS], LossScratch::default());
+    let mut group = c.benchmark_group("loss");
+    for (name, lambda) in [("L1", 0.0), ("L1 and D-SSIM", 0.2)] {
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                let out = Some(&mut grad[..]);
+                loss::photometric(
+                    &render,
+                    &bytes,
+                    None,
+                    HEIGHT,
+                    WIDTH,
+                    3,
+                    lambda,
+                    0.0,
+                    out,
+                    &mut scratch,
+                )
+                .expect("right lengths")
+            });
+        });
+    }
+    group.finish();
+}
+
+/// Five samples of a hand that shakes.
+fn exposures(c: &mut Criterion) {
+    let frame = Frame {
+        size: [HEIGHT, WIDTH],
+        margin: MARGIN,
+    };
+    let image = wave(3 * (HEIGHT + 2 * MARGIN) * (WIDTH + 2 * MARGIN), 0.01);
+    let near = wave(PIXELS, 0.001);
+    let warps: Vec<Warp> = (0..5)
+        .map(|k| {
+            let mut warp = [0.0; 12];
+            (warp[2], warp[6], warp[3]) = (f64::from(k) * 0.8 - 1.6, f64::from(k) * 0.3, 0.5);
+            warp
+        })
+        .collect();
+    let take = || Photograph::take(frame, &image, &near, &warps, [1.0; 3]).expect("right lengths");
+    let mut group = c.benchmark_group("exposure");
+    group.bench_function("forward", |b| b.iter(take));
+    let (taken, v_photo) = (take(), wave(3 * PIXELS, 0.23));
+    group.bench_function("backward", |b| {
+        b.iter(|| taken.backward(&v_photo).expect("right lengths"));
+    });
+    group.finish();
+}
+
+/// A band of weights around the diagonal, for the middle of `scale` pixels.
+fn blur(from: usize, scale: usize, reach: usize) -> Vec<f64> {
+    let to = from / scale;
+    let mut weights = vec![0.0; to * from];
+    for row in 0..to {
+        let middle = row * scale + scale / 2;
+        for column in middle.saturating_sub(reach)..from.min(middle + reach + 1) {
+            weights[row * from + column] = 1.0 / (2 * reach + 1) as f64;
+        }
+    }
+    weights
+}
+
+fn operators(c: &mut Criterion) {
+    let image = wave(3 * PIXELS, 0.37);
+    let mut group = c.benchmark_group("operators");
+    for (name, scale, reach) in [("blur of 13 px", 1, 6), ("half the size", 2, 3)] {
+        let (rows, columns) = (blur(HEIGHT, scale, reach), blur(WIDTH, scale, reach));
+        let dense = |weights, width: usize| Dense {
+            weights,
+            height: width / scale,
+            width,
+        };
+        let (there, back) =
+            Separable::<f32>::pair(dense(&rows, HEIGHT), dense(&columns, WIDTH), None)
+                .expect("matrices");
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                there
+                    .apply(&image, &[HEIGHT, WIDTH, 3])
+                    .expect("right shape")
+            });
+        });
+        let small = wave(3 * (HEIGHT / scale) * (WIDTH / scale), 0.7);
+        group.bench_function(format!("{name}, transposed"), |b| {
+            let shape = [HEIGHT / scale, WIDTH / scale, 3];
+            b.iter(|| back.apply(&small, &shape).expect("right shape"));
+        });
+    }
+    let (x, centres, widths) = (image.clone(), wave(3 * PIXELS, 0.2), vec![0.1; 3 * PIXELS]);
+    let mut grad = vec![0.0; x.len()];
+    group.bench_function("cells of JPEG", |b| {
+        b.iter(|| {
+            jpeg_cells::distance(&x, &centres, &widths, 1.0, Some(&mut grad))
+                .expect("right lengths")
+        });
+    });
+    group.finish();
+}
+
+/// 2,000 pixels of one photo in four others.
+fn depths(c: &mut Criterion) {
+    let grey = wave(PIXELS, 0.05);
+    let picture = Picture {
+        size: [HEIGHT, WIDTH],
+        grey: &grey,
+    };
+    let others: Vec<_> = (0..4)
+        .map(|k| {
+            let mut map = [1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0.];
+            map[3] = f64::from(k) * 12.0 - 18.0;
+            Other { picture, map }
+        })
+        .collect();
+    let pixels: Vec<_> = (0..2000)
+        .map(|k| {
+            [
+                50.5 + f64::from(k % 50) * 8.0,
+                40.5 + f64::from(k / 50) * 7.0,
+            ]
+        })
+        .collect();
+    let ranges = vec![[0.5, 4.0]; pixels.len()];
+    c.bench_function("depths", |b| {
+        let sweep = Sweep { agreeing: 2 };
+        b.iter(|| {
+            sweep
+                .depths(picture, &others, &pixels, &ranges)
+                .expect("right lengths")
+        });
+    });
+}
+
+/// Four views of 100,000 Gaussians, of which each shows half.
+fn views(c: &mut Criterion) {
+    const N: usize = 100_000;
+    let (means, colors) = (wave(3 * N, 0.3), wave(3 * N / 2, 0.7));
+    let shown: Vec<Vec<i32>> = (0..4)
+        .map(|k| (0..N as i32 / 2).map(|i| 2 * i + k % 2).collect())
+        .collect();
+    let low = wave(12 * N / 2, 0.9);
+    let (mut high, mut sums) = (vec![0.0; 45 * N], vec![0.0; 12 * N]);
+    let mut group = c.benchmark_group("views");
+    group.bench_function("rows", |b| {
+        let views: Vec<_> = shown
+            .iter()
+            .map(|rows| ViewRows { rows, values: &low })
+            .collect();
+        b.iter(|| rows::add(&views, &mut sums, 12, 0.25).expect("right lengths"));
+    });
+    group.bench_function("harmonics", |b| {
+        let views: Vec<_> = shown
+            .iter()
+            .map(|rows| ViewColors {
+                colors: ViewRows {
+                    rows,
+                    values: &colors,
+                },
+                center: [0.0, 0.0, -3.0],
+                degree: 3,
+            })
+            .collect();
+        b.iter(|| rows::add_harmonics(&views, &means, &mut high, 0.25).expect("right lengths"));
+    });
+    group.finish();
+}
+
+criterion_group! {
+    name = benches;
+    config = Criterion::default()
+        .sample_size(20)
+        .warm_up_time(Duration::from_secs(1))
+        .measurement_time(Duration::from_secs(3));
+    targets = losses, exposures, operators, depths, views
+}
+criterion_main!(benches);
