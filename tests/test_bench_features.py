@@ -127,7 +127,7 @@ def test_a_run_that_fails_leaves_its_scene_out(tmp_path: Path, monkeypatch: pyte
         return real(photos, config)
 
     monkeypatch.setattr(features, "train", failing)
-    options = ("--quick", "--iterations", "3", "--downscale", "10", "--out", tmp_path)
+    options = ("--quick", "--iterations", "14", "--downscale", "10", "--out", tmp_path)
     assert call(*options, "--rows", "rising SH degree") == 0
     written = json.loads((tmp_path / "features.json").read_text(encoding="utf-8"))
     assert written["results"]["scenes"] == []

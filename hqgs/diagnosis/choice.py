@@ -1,4 +1,4 @@
-"""The training photos that a scene does without: broken, empty, far too blurred, or taken twice."""
+"""The training photos that a scene does without: broken, empty or far too blurred."""
 
 from __future__ import annotations
 
@@ -10,19 +10,41 @@ from numpy.typing import NDArray
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.text import some
-from hqgs.diagnosis.copies import find_copies, note_of_unlike
-from hqgs.diagnosis.coverage import Sight
-from hqgs.diagnosis.scene import Inspector
 from hqgs.diagnosis.sharpness import Look, Sharpness, look_at_photos
+from hqgs.scene.geometry import in_frame
 from hqgs.scene.scene import Scene, View
 
 LEAST_KEPT = 3  # photos, and at least half
 OTHERS = 3  # photos that must see a point for it to be well seen
 WELL_SEEN = 0.98  # of the points of a blurred photo, without it
+LEAST_POINTS, MOST_POINTS = 100, 600  # of the scene's, evenly spread, that are looked for in the photos
+CHECKS = 30_000_000  # of a point in two views; more views look at fewer points
+MOST_TURNED = np.cos(np.deg2rad(45))  # between two rays to a point; beyond, it may be another side of a thing
 SHARED = 0.5  # of a photo's points that another must see to be compared with it
 BLACK, WHITE = 16.0, 239.0  # levels: what is called so
 LEAST_BLUR = 2.0  # px, sigma of a Gaussian
 UNUSUAL = 4.0  # robust standard deviations of sigma^2 over the scene
+
+
+class Sight:
+    """Which views have which points in their picture, from which side. What hides a point is not known."""
+
+    def __init__(self, views: Sequence[View], points: NDArray[np.float32]) -> None:
+        """`points` [*, 3], world."""
+        count = min(max(CHECKS // len(views) ** 2, LEAST_POINTS), MOST_POINTS, len(points))
+        world = points[np.linspace(0, len(points) - 1, count).astype(np.int64)].astype(np.float64)
+        self._inside = np.stack([in_frame(view.camera, world) for view in views])  # [N, P]
+        rays = world - np.stack([view.camera.center for view in views])[:, None]
+        lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
+        self._rays = rays / np.where(lengths > 0, lengths, 1)  # [N, P, 3]
+
+    def covered(self, view: int) -> NDArray[np.bool_]:
+        """[N, p]: which views see each of the p points that `view` sees, from the same side; itself: none."""
+        seen = self._inside[view]
+        turned = np.einsum("npk,pk->np", self._rays[:, seen], self._rays[view, seen])
+        covered = self._inside[:, seen] & (turned >= MOST_TURNED)
+        covered[view] = False
+        return covered
 
 
 @dataclass(frozen=True)
@@ -34,7 +56,7 @@ class _Drop:
     evidence: str
 
 
-def choose_photos(scene: Scene, inspector: Inspector | None = None) -> tuple[Scene, list[LeftOut]]:
+def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     """The scene without training photos that teach nothing or do harm, and what was left out.
 
     - Broken: with values that are not finite.
@@ -42,12 +64,8 @@ def choose_photos(scene: Scene, inspector: Inspector | None = None) -> tuple[Sce
       photo with a mask is not asked for its colours.
     - Blurred: by a Gaussian of 2 px and more against the median of the photos that see at least half of its
       points, and far from the scene's spread; and three sharper photos see (nearly) each of its points.
-    - Copies: the same picture as a sharper photo from the same place (less than half a pixel of parallax at
-      the scene's points). What the parallax changes is excused, unless the photos show noise or JPEG: then
-      each of them averages some of it away.
-
     At least three photos and half of them stay. `Scene.notes` says which photos nearly went and why they
-    stay. Held-out views are neither looked at nor changed. `inspector`: the one of the run.
+    stay. Held-out views are neither looked at nor changed.
     """
     most = len(scene.train) - max(LEAST_KEPT, (len(scene.train) + 1) // 2)
     if most <= 0:
@@ -61,7 +79,7 @@ def choose_photos(scene: Scene, inspector: Inspector | None = None) -> tuple[Sce
     notes: list[str] = []
     sound = [view for view, count in zip(scene.train, bad, strict=True) if not count]
     if sound:
-        drops += _needless(sound, scene.points, notes, inspector or Inspector())
+        drops += _needless(sound, scene.points, notes)
     if len(drops) > most:
         names = some([drop.view.name for drop in drops[most:]])
         notes.append(f"training photos kept so that at least half of them stay: {names}")
@@ -81,34 +99,17 @@ def _bad_values(view: View) -> int:
     return sum(int((~np.isfinite(p)).sum()) for p in photos if p is not None and p.dtype != np.uint8)
 
 
-def _needless(
-    views: list[View], points: NDArray[np.float32], notes: list[str], inspector: Inspector
-) -> list[_Drop]:
+def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[_Drop]:
     """The worst first. What was nearly left out is told in `notes`."""
     looks = look_at_photos(views)
     sight = Sight(views, points)
     peers = [_peers(sight, k) for k in range(len(views))]
     empty = _empty(views, looks, peers)
     gone = set(empty)
-    spectra = [look.rings for look in looks if look.rings is not None]
-    sharpness = Sharpness(spectra) if spectra else None
-    rank = np.zeros(len(views)) if sharpness is None else sharpness.fine()
-    copies, unlike, averaged = find_copies(views, looks, sight, rank, gone, inspector)
-    gone |= {twin.index for twin in copies}
     gone |= {k for k, look in enumerate(looks) if look.colour is not None}  # there is nothing to be sharp
-    blurred = {} if sharpness is None else _blurred(views, sharpness, sight, peers, gone, notes)
-    if kept := [twin for twin in unlike if twin.index not in blurred and twin.sharper not in blurred]:
-        notes.append(note_of_unlike(views, kept, averaged))
-    repeats = [
-        _Drop(
-            views[twin.index],
-            f"it repeats {views[twin.sharper].name}, which is no less sharp",
-            f"the scene's points lie within {twin.moved:.2f} px of each other in both photos, whose pixels "
-            f"differ by {twin.off:.1f} levels (root mean square)",
-        )
-        for twin in copies
-    ]
-    return [*empty.values(), *blurred.values(), *repeats]
+    spectra = [look.rings for look in looks if look.rings is not None]
+    blurred = _blurred(views, Sharpness(spectra), sight, peers, gone, notes) if spectra else {}
+    return [*empty.values(), *blurred.values()]
 
 
 def _peers(sight: Sight, view: int) -> NDArray[np.int64]:

@@ -22,7 +22,6 @@ BLOCK = 8  # px: the mean over a block hides noise
 FLAT_LEVELS = 3.0  # that a block may be off the colour of an empty photo
 FLAT_SHARE = 0.99  # of the blocks of an empty photo
 FLAT_NOISE = 8.0  # levels: standard deviation of an empty photo's luma
-SAMPLES = 4096  # pixels of each photo, by which pictures are compared
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,6 @@ class Look:
 
     colour: Floats | None  # [3] levels, where it shows one colour and, at most, noise
     spread: float  # of the luma, levels: standard deviation
-    size: tuple[int, int]  # px
-    samples: NDArray[np.float32]  # of the luma, levels
-    gradient: float  # of the luma, levels per px, root mean square
     rings: Rings | None  # of its spectrum; None: a photo of the scene is too small for one
 
 
@@ -57,14 +53,9 @@ def _look(photo: NDArray[Any], name: str, tile: int | None) -> Look:
     levels = to_levels(photo, f"photo {name!r}")
     grey = luma(levels)
     spread = float(grey.std())
-    steps = [np.square(np.diff(grey, axis=axis)).mean() for axis in (0, 1)]
-    places = np.linspace(0, grey.size - 1, min(SAMPLES, grey.size)).astype(np.int64)
     return Look(
         colour=_flat_colour(levels) if spread <= FLAT_NOISE else None,
         spread=spread,
-        size=(grey.shape[1], grey.shape[0]),
-        samples=grey.ravel()[places].astype(np.float32),
-        gradient=float(np.sqrt(sum(steps))),
         rings=None if tile is None else rings(power_spectrum(grey, tile)),
     )
 
@@ -88,10 +79,6 @@ class Sharpness:
         self._frequency, _, number = spectra[0]
         self._log_power = np.stack([log_power for _, log_power, _ in spectra])  # [N, rings]
         self._weights = np.minimum(number / RING_SAMPLES, 1) / (2 * RING_ERROR**2)
-
-    def fine(self) -> NDArray[np.float64]:
-        """[N]: the log power of the finer half of the details."""
-        return np.asarray(self._log_power[:, self._log_power.shape[1] // 2 :].mean(1))
 
     def quarters(self) -> NDArray[np.float64]:
         """[4, N]: the log power of a quarter of the details each, from the coarsest to the finest."""

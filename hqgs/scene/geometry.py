@@ -39,6 +39,12 @@ def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.flo
         return np.stack([x * K[0, 0] / depths + K[0, 2], y * K[1, 1] / depths + K[1, 2]], axis=1), depths
 
 
+def in_frame(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[M]: which of `points` [M, 3], world, lie before the camera and project into its picture."""
+    pixels, depths = project(camera, points)
+    return (depths > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
+
+
 def most_shown(
     points: int, seen: Mapping[str, NDArray[np.intp]], views: Sequence[View], count: int
 ) -> NDArray[np.intp]:

@@ -17,7 +17,7 @@ METHODS = {
     AUTO: "hqgs",
 }
 ITEMS = {
-    "photos": "training photos that repeat others or show nothing",
+    "photos": "training photos that are broken, empty or far too blurred",
     "growth": "Gaussians finer than the photos' pixels",
     "weight": "Gaussians that no photo shows",
     "resolution": "full resolution in the first part of the run",

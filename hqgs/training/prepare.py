@@ -33,7 +33,7 @@ class Prepared:
         inspector = inspector or Inspector()
         unused = list[LeftOut]()
         if "photos" in asked.leave_out:
-            scene, unused = choose_photos(scene, inspector)
+            scene, unused = choose_photos(scene)
         self.scene: Scene = scene
         self.asked: TrainConfig = asked
         facts = facts_of(scene, unused)
