@@ -1,12 +1,14 @@
 """Points into a camera and back."""
 
+import tracemalloc
 import warnings
 
 import numpy as np
 import pytest
+from tiny_scene import tiny_scene
 
 from hqgs.scene.geometry import project, unproject
-from hqgs.scene.scene import Camera
+from hqgs.scene.scene import Camera, Scene
 
 # The camera stands at (1, 2, 3) and looks along world x: its right is -y, its down is -z.
 LOOKS_ALONG_X = np.array([[0, -1, 0, 2], [0, 0, -1, 3], [1, 0, 0, -1], [0, 0, 0, 1]], dtype=np.float64)
@@ -38,3 +40,16 @@ def test_points_beside_and_behind_are_told_by_their_depths(camera):
     np.testing.assert_array_equal(depths, [0, -1])
     assert not np.isfinite(pixels[0]).any()
     assert project(camera, np.zeros((0, 3)))[0].shape == (0, 2)
+
+
+def test_the_reach_of_a_large_scene_takes_little_memory() -> None:
+    view, rng = tiny_scene().train[0], np.random.default_rng(0)
+    points = rng.normal([0, 0, 5], 1, (400_000, 3)).astype(np.float32)
+    scene = Scene("many", [view] * 60, [], points, np.zeros((400_000, 3), np.uint8), "test")
+    tracemalloc.start()
+    reach = scene.reach
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6  # 672 MB if each view kept the depths of all points
+    depths = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]
+    assert reach == pytest.approx(np.median(depths[depths > 0]), rel=0.01)

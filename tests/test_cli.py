@@ -359,6 +359,15 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     told = capsys.readouterr().out
     assert "view0.png" in told
     assert "fitted" not in told
+    report = json.loads((tmp_path / "report.json").read_text())
+    report["learned"] = [
+        {"name": "view1.png", "gains": [1.2, 1.0, 1.0]}
+    ]
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    assert call("eval", tmp_path) == 0
+    aligned = report["metrics"]["mean"]["psnr_aligned"]
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert told.endswith(f"{aligned:.2f} dB PSNR with each photo's brightness and tint set aside")
     assert call("eval", tmp_path, "--fit-cameras", "--out", tmp_path / "eval.json") == 0
     assert "cameras moved by" in capsys.readouterr().out
     numbers = json.loads((tmp_path / "eval.json").read_text())

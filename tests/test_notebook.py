@@ -45,6 +45,14 @@ def test_a_bare_scene_shows_itself_whole(tmp_path: Path) -> None:
     assert random_gaussians(0, 0)._repr_png_() is None
 
 
+def test_a_scene_beside_damaged_cameras_loads_and_shows_itself_whole(tmp_path: Path) -> None:
+    random_gaussians(20, 0).save(tmp_path / "scene.ply")
+    (tmp_path / "cameras.json").write_text("{")
+    model = hqgs.Gaussians.load(tmp_path / "scene.ply")
+    assert (len(model), model.look) == (20, None)
+    assert shown(model).shape == (378, 504, 3)
+
+
 def test_pictures() -> None:
     image = torch.tensor([[[-1.0, 0.5, 2.0]]])
     assert hqgs.picture(image).getpixel((0, 0)) == (0, 128, 255)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, ready
-from hqgs.evaluation.verdict import verdict
+from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import scene_file
 
 if TYPE_CHECKING:
@@ -104,9 +105,16 @@ def run(options: Evaluate) -> int:
         rows = [*zip(views.names, again, strict=True), ("mean", mean_metrics(again))]
         print(f"\n{_table(f'{title}, each camera fitted to the scene', rows)}")
         print(f"\ncameras moved by {pixels[len(pixels) // 2]:.2f} px (median), at most {pixels[-1]:.2f} px")
-    word, why = verdict(mean.psnr)
-    print(f"\nquality: {word} ({why})")
+    psnr, name = judged_by({**_report(options.source), "metrics": {"mean": asdict(mean)}})
+    word, why = verdict(psnr)
+    print(f"\nquality: {word} ({why})" + ("" if psnr == mean.psnr else f"; {psnr:.2f} dB {name}"))
     return 0
+
+
+def _report(source: Path) -> dict[str, Any]:
+    """The report of the run in a folder; empty for a file, or where there is none."""
+    path = source / "report.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _table(title: str, rows: Sequence[tuple[str, ViewMetrics]]) -> str:

@@ -21,7 +21,7 @@ from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.files import READERS, WRITERS, format_of, scene_file
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
-from hqgs.scene.camera_files import CAMERAS, load_cameras
+from hqgs.scene.camera_files import first_camera
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 
@@ -202,10 +202,6 @@ class Gaussians:
         """
         file = scene_file(path)
         arrays = READERS[format_of(file, format)](file)
-        look = None
-        if file.name == PLY and (file.parent / CAMERAS).is_file():
-            known = load_cameras(file.parent)
-            look = next(iter([*known.test, *known.train]), None)
         made = cls(
             means=torch.from_numpy(arrays["means"]),
             scales=torch.from_numpy(arrays["scales"]),
@@ -214,7 +210,7 @@ class Gaussians:
             sh0=torch.from_numpy(arrays["sh0"]),
             shN=torch.from_numpy(arrays["shN"]),
         )
-        made.look = look
+        made.look = first_camera(file.parent) if file.name == PLY else None
         return made
 
     @classmethod

@@ -107,6 +107,18 @@ def load_cameras(folder: str | Path) -> RunCameras:
     return RunCameras(up / np.linalg.norm(up), views)
 
 
+def first_camera(folder: Path) -> Camera | None:
+    """The first camera of the run in a folder, a held-out one where there is one.
+
+    None where none is kept, or where its file is damaged: it is for pictures that can do without.
+    """
+    try:
+        known = load_cameras(folder)
+    except (OSError, ValueError):
+        return None
+    return next(iter([*known.test, *known.train]), None)
+
+
 def _known(path: Path, folder: Path, entry: Any) -> KnownCamera:
     name, photo = entry["name"], entry["photo"]
     if not isinstance(name, str):
