@@ -360,9 +360,7 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert "view0.png" in told
     assert "fitted" not in told
     report = json.loads((tmp_path / "report.json").read_text())
-    report["learned"] = [
-        {"name": "view1.png", "gains": [1.2, 1.0, 1.0]}
-    ]
+    report["learned"] = [{"name": "view1.png", "gains": [1.2, 1.0, 1.0]}]
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert call("eval", tmp_path) == 0
     aligned = report["metrics"]["mean"]["psnr_aligned"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.model.consistency import Look
+from hqgs.model.consistency import SmallPhoto
 from hqgs.model.first_points import points_along_edges
 from hqgs.pipeline import run_to_end
 from hqgs.scene.scene import Camera, Scene, View
@@ -45,7 +45,7 @@ class Plane:
     """What photos of the plane agree on: every pixel, at its depth."""
 
     def __init__(self, views: list[View]) -> None:
-        self.views, self.looks = views, [Look.of(view) for view in views]
+        self.views, self.looks = views, [SmallPhoto.of(view) for view in views]
         self.ranges = [np.zeros((0, 2))]
 
     def depths(self, number: int, pixels: np.ndarray, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from hqgs.diagnosis.choice import Sight, choose_photos
-from hqgs.diagnosis.sharpness import Sharpness, look_at_photos
+from hqgs.diagnosis.sharpness import Sharpness, summarised
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import Camera, Scene, View
@@ -240,7 +240,7 @@ def test_small_photos_without_points() -> None:
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 2.0, 3.0])
 def test_relative_blur_is_measured(sigma: float) -> None:
     views = [blurred(sigma)(view) if k == 3 else view for k, view in enumerate(clean_scene().train)]
-    sharpness = Sharpness([look.rings for look in look_at_photos(views) if look.rings is not None])
+    sharpness = Sharpness([look.rings for look in summarised(views) if look.rings is not None])
     others = np.array([k for k in range(PHOTOS) if k != 3])
     assert sharpness.extra_blur(3, others) == pytest.approx(sigma, abs=0.5)
 

@@ -28,7 +28,7 @@ Open = Annotated[bool, tyro.conf.arg(help_behavior_hint="", help="Open the page 
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class ViewOptions:
     """Options of `hqgs view`."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -37,10 +37,10 @@ class View:
     open: Open = False
 
 
-OPTIONS = View
+OPTIONS = ViewOptions
 
 
-def run(options: View, seconds: float | None = None) -> int:
+def run(options: ViewOptions, seconds: float | None = None) -> int:
     """Show a scene until Ctrl-C, or for some seconds; return the exit code (0 done, 2 bad input)."""
     try:
         file = scene_file(options.source)

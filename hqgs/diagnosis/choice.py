@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.text import some
-from hqgs.diagnosis.sharpness import Look, Sharpness, look_at_photos
+from hqgs.diagnosis.sharpness import PhotoSummary, Sharpness, summarised
 from hqgs.scene.geometry import in_frame
 from hqgs.scene.scene import Scene, View
 
@@ -101,7 +101,7 @@ def _bad_values(view: View) -> int:
 
 def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) -> list[_Drop]:
     """The worst first. What was nearly left out is told in `notes`."""
-    looks = look_at_photos(views)
+    looks = summarised(views)
     sight = Sight(views, points)
     peers = [_peers(sight, k) for k in range(len(views))]
     empty = _empty(views, looks, peers)
@@ -119,7 +119,7 @@ def _peers(sight: Sight, view: int) -> NDArray[np.int64]:
 
 
 def _empty(
-    views: Sequence[View], looks: Sequence[Look], peers: Sequence[NDArray[np.int64]]
+    views: Sequence[View], looks: Sequence[PhotoSummary], peers: Sequence[NDArray[np.int64]]
 ) -> dict[int, _Drop]:
     """Photos with nothing on them, although others of the same points show something."""
     drops = {}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.sharpness import Sharpness, look_at_photos
+from hqgs.diagnosis.sharpness import Sharpness, summarised
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.scene.scene import Scene
 
@@ -38,7 +38,7 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     """
     if len(scene.train) < FEWEST:
         return None
-    looks = [look.rings for look in look_at_photos(scene.train)]
+    looks = [look.rings for look in summarised(scene.train)]
     rings = [found for found in looks if found is not None]
     if len(rings) < len(looks):
         return None

@@ -29,7 +29,7 @@ COARSE_FILM = 0.24
 
 
 @dataclass(frozen=True)
-class Part:
+class Finding:
     """One step of how the photos were made, and whether the method must undo it."""
 
     name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise", "jpeg" or "video"
@@ -46,7 +46,7 @@ class Diagnosis:
 
     scene: str
     formation: str  # the degradation that best explains the photos, as `parse_formation` reads it
-    parts: tuple[Part, ...]  # in the order of the formation
+    parts: tuple[Finding, ...]  # in the order of the formation
     photos: tuple[PhotoDiagnosis, ...]  # those looked at
     passed_over: tuple[LeftOut, ...]  # looks that photos were spared, since others stand for them
 
@@ -87,7 +87,7 @@ class Inspector:
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
-        self._differences: dict[tuple[int, ...], tuple[Part, Part, Part]] = {}
+        self._differences: dict[tuple[int, ...], tuple[Finding, Finding, Finding]] = {}
         self._gains: dict[tuple[int, ...], NDArray[np.float64] | None] = {}
         self.last: Diagnosis | None = None  # that was made
 
@@ -173,38 +173,38 @@ def _passed_over(total: int, looked_at: int, taken: int) -> tuple[LeftOut, ...]:
     return tuple(looks)
 
 
-def _exposure(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Part:
+def _exposure(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Finding:
     """`log_gains` [N, 3], as `hqgs.diagnosis.gains` tells them."""
     if log_gains is None:
-        return Part("exposure", False, None, None, None, "the photos share too few points to tell")
+        return Finding("exposure", False, None, None, None, "the photos share too few points to tell")
     spread = float(np.std(log_gains, axis=0).max())
     reason = f"gains differ by {spread:.1%} from photo to photo"
     # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
     noises = [noise for photo in photos if (noise := photo.told_noise) is not None]
     least = UNLIKE_GAINS + (0.5 * max(noises) / 255 if noises else 0.0)
     if spread < least:
-        return Part("exposure", False, spread, None, None, f"{reason} (needed from {least:.0%})")
-    return Part("exposure", True, spread, None, "exposure", reason)
+        return Finding("exposure", False, spread, None, None, f"{reason} (needed from {least:.0%})")
+    return Finding("exposure", True, spread, None, "exposure", reason)
 
 
-def _shake(scene: Scene) -> Part:
+def _shake(scene: Scene) -> Finding:
     unlike = unlike_sharpness(scene)
     if unlike is None:
-        return Part("shake", False, None, None, None, "the photos are too few or too small to tell")
+        return Finding("shake", False, None, None, None, "the photos are too few or too small to tell")
     reason = (
         f"photos differ in sharpness by {unlike.sharpness:.2f}, in its direction by {unlike.direction:.2f}"
     )
     if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
         reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
-        return Part("shake", False, unlike.sharpness, None, None, reason)
-    return Part("shake", True, unlike.sharpness, None, "shake", reason)
+        return Finding("shake", False, unlike.sharpness, None, None, reason)
+    return Finding("shake", True, unlike.sharpness, None, "shake", reason)
 
 
-def _focus(scene: Scene, shaken: bool) -> Part:
+def _focus(scene: Scene, shaken: bool) -> Finding:
     """`shaken`: photos then differ in sharpness as a whole, whatever their focus."""
     signs = focus_signs(scene)
     if signs is None:
-        return Part("focus", False, None, None, None, "the photos share too few points to tell")
+        return Finding("focus", False, None, None, None, "the photos share too few points to tell")
     needed = signs.with_depth >= GOES_WITH_DEPTH or (signs.in_all >= DIFFERS and not shaken)
     reason = (
         f"points are sharper or softer from photo to photo by {signs.with_depth:.2f} with their distance and "
@@ -212,61 +212,61 @@ def _focus(scene: Scene, shaken: bool) -> Part:
     )
     if not needed:
         reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g} in the logarithm of contrast)"
-    return Part("focus", needed, signs.with_depth, None, "focus" if needed else None, reason)
+    return Finding("focus", needed, signs.with_depth, None, "focus" if needed else None, reason)
 
 
-def _lowres(photos: Sequence[PhotoDiagnosis]) -> Part:
+def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:
     factors = [photo.enlargement.factor for photo in photos]
     factor, count = Counter(factors).most_common(1)[0]
     known = all(photo.enlargement.evidence is None for photo in photos)
     of = f"{count} of {len(photos)} photos"
     if factor == 1 or 2 * count <= len(photos):
         reason = f"{len(photos) - factors.count(1)} of {len(photos)} photos show the grid of an enlargement"
-        return Part("lowres", False, 1.0, _spread_of(factors), None, reason)
+        return Finding("lowres", False, 1.0, _spread_of(factors), None, reason)
     size = f"{photos[0].enlargement.width} x {photos[0].enlargement.height}"
     how = (
         f"the small photos of about {size} px are at hand"
         if known
         else f"{of} show the grid of smaller pixels"
     )
-    return Part(
+    return Finding(
         "lowres", True, float(factor), _spread_of(factors), f"lowres:{factor}", f"enlarged by {factor}: {how}"
     )
 
 
-def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Part:
+def _jpeg(photos: Sequence[PhotoDiagnosis]) -> Finding:
     qualities = [photo.jpeg.quality for photo in photos if photo.jpeg.quality is not None]
     of = f"{len(qualities)} of {len(photos)} photos show quantised coefficients"
     if 2 * len(qualities) <= len(photos):
-        return Part("jpeg", False, None, None, None, of)
+        return Finding("jpeg", False, None, None, None, of)
     quality = float(np.median(qualities))
     spread = _spread_of(qualities)
     if quality >= VISIBLE_QUALITY:
         reason = f"quality {quality:.0f} is too good to matter (needed below {VISIBLE_QUALITY})"
-        return Part("jpeg", False, quality, spread, None, reason)
+        return Finding("jpeg", False, quality, spread, None, reason)
     (row, column), _ = Counter(photo.jpeg.phase for photo in photos if photo.jpeg.quality).most_common(1)[0]
     if (row, column) != (0, 0):
         reason = f"{of}, but from row {row} and column {column} on: cropped since, which no step can say"
-        return Part("jpeg", False, quality, spread, None, reason)
-    return Part("jpeg", True, quality, spread, f"jpeg:{quality:.0f}", f"{of} of quality {quality:.0f}")
+        return Finding("jpeg", False, quality, spread, None, reason)
+    return Finding("jpeg", True, quality, spread, f"jpeg:{quality:.0f}", f"{of} of quality {quality:.0f}")
 
 
-def _video(photos: Sequence[PhotoDiagnosis]) -> Part:
+def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
     details = [photo.film for photo in photos if photo.film is not None]
     reason = f"{len(details)} of {len(photos)} photos are told to be frames of a film"
     if 2 * len(details) <= len(photos):
-        return Part("video", False, None, None, None, reason)
+        return Finding("video", False, None, None, None, reason)
     detail, spread = float(np.median(details)), _spread_of(details)
     reason += f"; as decoded, the finest details are {detail:.2f} times as strong as coarser ones"
     if detail >= COARSE_FILM:
-        return Part("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
-    return Part("video", True, detail, spread, "video", reason)
+        return Finding("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
+    return Finding("video", True, detail, spread, "video", reason)
 
 
-def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
+def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     told = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
     if not told:
-        return Part("noise", False, None, None, None, "the photos are too small or too clipped to tell")
+        return Finding("noise", False, None, None, None, "the photos are too small or too clipped to tell")
     level, limit = (float(value) for value in np.median(told, axis=0))
     spread = None if _pooled(photos) else _spread_of([noise for noise, _ in told])
     noisy = sum(photo.told_noise is not None for photo in photos)
@@ -278,20 +278,20 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Part:
         more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
     if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:
         reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
-        return Part("noise", True, level, spread, "grain", reason)
+        return Finding("noise", True, level, spread, "grain", reason)
     if level >= limit:
-        return Part("noise", True, level, spread, f"noise:{level:.0f}", f"{kind} {level:.1f} levels{more}")
+        return Finding("noise", True, level, spread, f"noise:{level:.0f}", f"{kind} {level:.1f} levels{more}")
     if spread is None:
         reason = f"below {limit:.0f} levels the JPEG hides it, and no more than that is seen"
     else:
         reason = f"{level:.1f} levels could be fine texture (needed from {limit:g})"
-    return Part("noise", False, level, spread, None, reason)
+    return Finding("noise", False, level, spread, None, reason)
 
 
-def _blur(photos: Sequence[PhotoDiagnosis]) -> Part:
+def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
     blurs = [photo.blur for photo in photos if photo.blur is not None]
     if not blurs:
-        return Part("blur", False, None, None, None, "the photos are too small to tell")
+        return Finding("blur", False, None, None, None, "the photos are too small to tell")
     sigma = float(np.median([blur.sigma for blur in blurs]))
     least = float(np.median([photo.blur_limit for photo in photos]))
     kind, count = Counter(blur.kind for blur in blurs).most_common(1)[0]
@@ -303,14 +303,14 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Part:
         blurred = sum(blur.sigma >= least for blur in blurs)
         reason = f"sigma {sigma:.1f} px is within what sharp photos show (needed from {least:.1f} px)"
         reason += f"; {blurred} of {len(blurs)} photos are blurred" if blurred else ""
-        return Part("blur", False, sigma, spread, None, reason)
+        return Finding("blur", False, sigma, spread, None, reason)
     name, unit = {
         "gaussian": ("blur", "sigma"),
         "defocus": ("defocus", "radius"),
         "motion": ("motion", "length"),
     }[kind]
     step = f"{name}:{round(amount, 1):g}"
-    return Part(
+    return Finding(
         "blur", True, amount, spread, step, f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
     )
 

@@ -25,7 +25,7 @@ FLAT_NOISE = 8.0  # levels: standard deviation of an empty photo's luma
 
 
 @dataclass(frozen=True)
-class Look:
+class PhotoSummary:
     """A photo in numbers."""
 
     colour: Floats | None  # [3] levels, where it shows one colour and, at most, noise
@@ -33,7 +33,7 @@ class Look:
     rings: Rings | None  # of its spectrum; None: a photo of the scene is too small for one
 
 
-def look_at_photos(views: Sequence[View]) -> list[Look]:
+def summarised(views: Sequence[View]) -> list[PhotoSummary]:
     """One for each view; of the small photos, where all views have them: enlargement adds nothing.
 
     ValueError for values that are not finite; it names the photo.
@@ -46,14 +46,14 @@ def look_at_photos(views: Sequence[View]) -> list[Look]:
     known = [tile for tile in tiles if tile is not None]
     # One size for all, so that their frequencies are the same.
     tile = min(known) if len(known) == len(views) > 0 else None
-    return [_look(photo, view.name, tile) for photo, view in zip(photos, views, strict=True)]
+    return [_summary(photo, view.name, tile) for photo, view in zip(photos, views, strict=True)]
 
 
-def _look(photo: NDArray[Any], name: str, tile: int | None) -> Look:
+def _summary(photo: NDArray[Any], name: str, tile: int | None) -> PhotoSummary:
     levels = to_levels(photo, f"photo {name!r}")
     grey = luma(levels)
     spread = float(grey.std())
-    return Look(
+    return PhotoSummary(
         colour=_flat_colour(levels) if spread <= FLAT_NOISE else None,
         spread=spread,
         rings=None if tile is None else rings(power_spectrum(grey, tile)),

@@ -24,7 +24,7 @@ AGREED = 0.6  # correlation of the patches
 
 
 @dataclass(frozen=True)
-class Look:
+class SmallPhoto:
     """A photo as it is looked at: small, in one channel, smoothed."""
 
     camera: Camera  # of this size
@@ -33,7 +33,7 @@ class Look:
     scale: Floats  # [2]: what takes a pixel (x, y) of the view to one of this photo
 
     @classmethod
-    def of(cls, view: View) -> Look:
+    def of(cls, view: View) -> SmallPhoto:
         whole = view.camera
         if (factor := max(whole.width, whole.height) / LONGEST) > 1:
             view = resized(view, *(max(1, round(side / factor)) for side in (whole.width, whole.height)))
@@ -48,7 +48,7 @@ class Agreement:
 
     def __init__(self, views: Sequence[View], seen: Mapping[str, NDArray[np.intp]]) -> None:
         """`seen`: by the view's name, which points it sees. Views that share most are asked first."""
-        self.looks: list[Look] = [Look.of(view) for view in views]
+        self.looks: list[SmallPhoto] = [SmallPhoto.of(view) for view in views]
         rows = [np.unique(seen.get(view.name, np.zeros(0, np.intp))) for view in views]
         ends = np.cumsum([0, *map(len, rows)])
         points = 1 + max((int(some[-1]) for some in rows if len(some)), default=0)

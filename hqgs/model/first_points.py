@@ -10,7 +10,7 @@ from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
 from hqgs.base.stages import OnStage, Stage, untold
-from hqgs.model.consistency import Agreement, Look
+from hqgs.model.consistency import Agreement, SmallPhoto
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import View
@@ -67,7 +67,7 @@ def points_along_edges(
     return np.concatenate(found), np.concatenate(colors)
 
 
-def _drawn(look: Look, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _drawn(look: SmallPhoto, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Centres [M, 2] of pixels of the view as x, y; M is `count`, or fewer where so many do not count."""
     grey = look.grey
     mask = np.ones(grey.shape, bool) if look.mask is None else look.mask

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.threads import one_torch_thread
 from hqgs.photos.camera import draw_gains, expose
-from hqgs.photos.formula import VIDEOS, Degradation, Step, small_side
+from hqgs.photos.formula import VIDEOS, Degradation, DegradationStep, small_side
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.kernels import REACH, disc_kernel, motion_kernel
 from hqgs.photos.light import to_linear, to_srgb
@@ -115,7 +115,7 @@ class _Photo:
         self.records: list[Record] = []
         self._rng = rng
 
-    def apply(self, step: Step) -> None:
+    def apply(self, step: DegradationStep) -> None:
         """One step that has a value and concerns this photo alone."""
         value, self.jpeg = step.value or 0.0, None
         own: Record = {}

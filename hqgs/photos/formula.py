@@ -49,7 +49,7 @@ NOT_MADE = {
 
 
 @dataclass(frozen=True)
-class Step:
+class DegradationStep:
     """One step. ValueError for an unknown kind, or a value outside the kind's range."""
 
     kind: str
@@ -73,11 +73,11 @@ class Step:
         elif not kind.lowest <= self.value <= kind.highest or (kind.integer and self.value % 1):
             raise ValueError(f"{self.kind} is {self.value:g}, wanted {wanted}")
 
-    def scaled(self, factor: float) -> Step:
+    def scaled(self, factor: float) -> DegradationStep:
         """The step with `factor` times its value, which it has, within the kind's range; for all photos."""
         if self.value is None:
             raise ValueError(f"{self} has no value that could be scaled")
-        return Step(self.kind, _within(KINDS[self.kind], self.value * factor))
+        return DegradationStep(self.kind, _within(KINDS[self.kind], self.value * factor))
 
     def __str__(self) -> str:
         name = f"{SOME}:{self.kind}" if self.some else self.kind
@@ -88,7 +88,7 @@ class Step:
 class Degradation:
     """Steps in the order in which they happen; none for a clean photo. `str()` is what the parser reads."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[DegradationStep, ...]
 
     def for_width(self, width: int, height: int | None = None) -> Degradation:
         """The same with a value in every step, for photos `width` px wide and `height` px high.
@@ -121,7 +121,12 @@ class Degradation:
         return "+".join(str(step) for step in self.steps) or NONE
 
 
-MIXED_STEPS = (Step("blur"), Step("lowres", 2), Step("noise", 10), Step("jpeg", 20))
+MIXED_STEPS = (
+    DegradationStep("blur"),
+    DegradationStep("lowres", 2),
+    DegradationStep("noise", 10),
+    DegradationStep("jpeg", 20),
+)
 
 
 def parse_degradation(text: str) -> Degradation:
@@ -176,7 +181,7 @@ def check_formation(degradation: Degradation) -> Degradation:
 def _parsed(text: str) -> Degradation:
     if text == NONE:
         return Degradation(())
-    steps: list[Step] = []
+    steps: list[DegradationStep] = []
     for part in text.split("+"):
         if part == MIXED:
             steps.extend(MIXED_STEPS)
@@ -185,7 +190,7 @@ def _parsed(text: str) -> Degradation:
         else:
             some = part.partition(":")[0] == SOME
             kind, colon, value = (part.partition(":")[2] if some else part).partition(":")
-            steps.append(Step(kind, _number(value, part) if colon else None, some))
+            steps.append(DegradationStep(kind, _number(value, part) if colon else None, some))
     return Degradation(tuple(steps))
 
 

@@ -67,7 +67,7 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
 
 
 @dataclass(frozen=True)
-class Step:
+class Reduction:
     """A part that was left out, and the Gaussians after that."""
 
     gaussians: Gaussians
@@ -76,9 +76,9 @@ class Step:
     evidence: str | None = None
 
 
-def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]:
+def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduction]:
     """What is left out in turn; nothing: an empty list. The Gaussians given stay what they are."""
-    steps: list[Step] = []
+    steps: list[Reduction] = []
     g = gaussians.detached()
     n = len(g)
     finite = torch.stack(
@@ -90,7 +90,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]
         (finite & visible, int(finite.sum()), "no pixel can show them: opacity below 1/255 or no rotation"),
     ):
         if (gone := others - int(keep.sum())) > 0:
-            steps.append(Step(gaussians.detached().rows(keep), f"{gone:,} Gaussians", why))
+            steps.append(Reduction(gaussians.detached().rows(keep), f"{gone:,} Gaussians", why))
     g = steps[-1].gaussians if steps else g
 
     degrees = needed_degrees(g, options.band_tolerance)
@@ -111,12 +111,12 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Step]
             f"degree {degree + 1}" if degree + 1 == g.sh_degree else f"degrees {degree + 1} to {g.sh_degree}"
         )
         g = _cut(g, degree)
-        steps.append(Step(g, f"harmonics of {bands}", why, evidence))
+        steps.append(Reduction(g, f"harmonics of {bands}", why, evidence))
     if options.format == "spz":  # zeros save nothing in a PLY file
         fewer = _without_bands(g, degrees)
         if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
             why = f"they change a colour by at most {options.band_tolerance:g}"
-            steps.append(Step(fewer, f"the highest harmonics of {changed:,} Gaussians", why))
+            steps.append(Reduction(fewer, f"the highest harmonics of {changed:,} Gaussians", why))
     return steps
 
 

@@ -23,7 +23,7 @@ LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on non
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundCameras:
     """What COLMAP found in photos alone, upright."""
 
     photos: BarePhotos  # those that can be read
@@ -33,7 +33,7 @@ class Found:
 
 def find_cameras(
     root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold, coarse: bool = False
-) -> Found:
+) -> FoundCameras:
     """Cameras and points of photos alone, by COLMAP, as `read_photos` has them."""
     photos = readable(photos, told)
     names = photos.colmap_names
@@ -64,7 +64,7 @@ def find_cameras(
         first_pass=ran.first_pass,
         advice=ran.advice(),
     )
-    return Found(photos, model, report)
+    return FoundCameras(photos, model, report)
 
 
 def read_photos(
