@@ -14,7 +14,8 @@ from test_learned_cameras import textured_scene, trained
 
 import hqgs
 from hqgs.diagnosis import focus
-from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, focus_signs
+from hqgs.diagnosis.constants import DIFFERS, GOES_WITH_DEPTH
+from hqgs.diagnosis.focus import focus_signs
 from hqgs.photos.exposure import take_photo
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.builtin import wild_room
@@ -111,7 +112,7 @@ def test_what_photos_tell_of_their_focus() -> None:
 def test_large_photos_are_looked_at_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = at_two_depths(textured_scene())
     scene = softer(scene, [(0.0, 3.0) if k % 2 else (3.0, 0.0) for k in range(len(scene.train))])
-    monkeypatch.setattr(focus, "LARGEST", 48)
+    monkeypatch.setattr(focus, "FOCUS_LARGEST", 48)
     found = focus_signs(scene)
     assert found is not None
     assert found.with_depth > GOES_WITH_DEPTH

@@ -10,10 +10,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1
 
-from hqgs.diagnosis.spectrum import (
+from hqgs.diagnosis.constants import (
+    ANGLES,
+    BLUR_LENGTHS,
+    BLUR_SIGMAS,
+    CLEARLY,
+    FAINTEST,
+    FINE_LENGTHS,
     FLOOR,
     HIGHEST,
-    SLOPE,
+    MIN_RINGS,
+    NEIGHBOURS,
+    PLANE_POINTS,
+    POINT_ERROR,
+    RADII,
+    RING_ERROR,
+    RING_SAMPLES,
+    SHARP,
+    SHORTEST,
+    SPECTRUM_SLOPE,
+    UNKNOWN_FLOORS,
+)
+from hqgs.diagnosis.spectrum import (
     Fit,
     Spectrum,
     fit_blurs,
@@ -25,22 +43,7 @@ from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 Kind = Literal["gaussian", "defocus", "motion"]
 
-SHARP = 0.3  # px: the sigma that the spectra of sharp photos fit; taken off in squares
-SIGMAS = np.concatenate([np.arange(0, 4, 0.05), 4 * 1.02 ** np.arange(70)])  # px, up to 16
-RADII = np.concatenate([np.arange(1, 8, 0.1), 8 * 1.02 ** np.arange(57)])  # px of the disc, up to 24
-ROUND: tuple[tuple[Kind, Floats], ...] = (("gaussian", SIGMAS), ("defocus", RADII))
-LENGTHS = 3 * 1.25 ** np.arange(13)  # px, of the motion
-FINE_LENGTHS = 3 * 1.04 ** np.arange(69)
-ANGLES = np.arange(18) * np.pi / 18
-CLEARLY = 0.7  # a kind other than Gaussian must have less than this share of the Gaussian's misfit
-SHORTEST = 3.0  # px of motion; a shorter one is not told from the scene's own direction
-RING_ERROR, POINT_ERROR = 0.2, 0.3  # of the log power: how far sharp photos are off the power law
-UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)  # levels^2: what JPEG of a quality too good to be found may have added
-MIN_RINGS = 3  # that must rise above the noise
-PLANE_POINTS = 1_000  # frequencies at which motion is looked for
-RING_SAMPLES = 40.0  # a ring with more counts no more: its error is the law's
-NEIGHBOURS = 8.0  # frequencies that err together
-FAINTEST = 1e-7  # power response; no zero is exact
+ROUND: tuple[tuple[Kind, Floats], ...] = (("gaussian", BLUR_SIGMAS), ("defocus", RADII))
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
         for floor in known + np.array(UNKNOWN_FLOORS)
     ]
     gaussian, defocus, floor = min(fits, key=lambda fit: min(fit[0].cost, fit[1].cost))
-    sigma, radius = float(SIGMAS[gaussian.best]), float(RADII[defocus.best])
+    sigma, radius = float(BLUR_SIGMAS[gaussian.best]), float(RADII[defocus.best])
     motion = _motion(spectrum, floor, sigma, radius)
     if motion is not None:
         return motion
@@ -110,7 +113,7 @@ def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Bl
     coarse = fit(_coarse_motions(spectrum.tile))
     if coarse.cost >= still:
         return None
-    angle = float(np.repeat(ANGLES, len(LENGTHS))[coarse.best])
+    angle = float(np.repeat(ANGLES, len(BLUR_LENGTHS))[coarse.best])
     lengths, angles = (a.ravel() for a in np.meshgrid(FINE_LENGTHS, angle + np.deg2rad([-4.0, 0.0, 4.0])))
     moved = fit(_motions(lengths, angles, at, spectrum.step))
     length = float(lengths[moved.best])
@@ -125,9 +128,9 @@ def _round_blurs(kind: Kind, sizes: Floats, frequency: Floats, step: float) -> F
 
     def power(at: Floats) -> Floats:
         if kind == "gaussian":
-            return np.exp(-np.square(sizes[:, None] * at)) * at**-SLOPE
+            return np.exp(-np.square(sizes[:, None] * at)) * at**-SPECTRUM_SLOPE
         x = sizes[:, None] * at
-        return np.square(2 * j1(x) / x) * at**-SLOPE
+        return np.square(2 * j1(x) / x) * at**-SPECTRUM_SLOPE
 
     below = np.maximum(frequency - step, step / 4)
     return _leaked(power(frequency), power(below), power(frequency + step), frequency)
@@ -141,19 +144,19 @@ def _motions(lengths: Floats, angles: Floats, at: tuple[Floats, Floats], step: f
         vertical, horizontal = at[0] + shift * rows, at[1] + shift * columns
         turns = (vertical * rows + horizontal * columns) * lengths[:, None] / (2 * np.pi)
         distance = np.maximum(np.hypot(vertical, horizontal), step / 4)
-        return np.square(np.sinc(turns)) * distance**-SLOPE
+        return np.square(np.sinc(turns)) * distance**-SPECTRUM_SLOPE
 
     return _leaked(power(0), power(-step), power(step), np.hypot(*at))
 
 
 def _leaked(here: Floats, below: Floats, above: Floats, frequency: Floats) -> Floats:
     """Log of what a Hann window shows of a response: power from the neighbours, by the photos' law."""
-    return np.log((here * 2 / 3 + (below + above) / 6) * frequency**SLOPE + FAINTEST)
+    return np.log((here * 2 / 3 + (below + above) / 6) * frequency**SPECTRUM_SLOPE + FAINTEST)
 
 
 @lru_cache(maxsize=4)
 def _coarse_motions(tile: int) -> Floats:
-    angles, lengths = (a.ravel() for a in np.meshgrid(ANGLES, LENGTHS, indexing="ij"))
+    angles, lengths = (a.ravel() for a in np.meshgrid(ANGLES, BLUR_LENGTHS, indexing="ij"))
     return _motions(lengths, angles, _half_plane(tile)[0], 2 * np.pi / tile)
 
 

@@ -10,20 +10,23 @@ from numpy.typing import NDArray
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.text import some
+from hqgs.diagnosis.constants import (
+    BLACK,
+    CHECKS,
+    CHOICE_LEAST_BLUR,
+    CHOICE_MOST_POINTS,
+    CHOICE_SHARED,
+    CHOICE_WHITE,
+    LEAST_KEPT,
+    LEAST_POINTS,
+    MOST_TURNED,
+    OTHERS,
+    UNUSUAL,
+    WELL_SEEN,
+)
 from hqgs.diagnosis.sharpness import PhotoSummary, Sharpness, summarised
 from hqgs.scene.geometry import in_frame
 from hqgs.scene.scene import Scene, View
-
-LEAST_KEPT = 3  # photos, and at least half
-OTHERS = 3  # photos that must see a point for it to be well seen
-WELL_SEEN = 0.98  # of the points of a blurred photo, without it
-LEAST_POINTS, MOST_POINTS = 100, 600  # of the scene's, evenly spread, that are looked for in the photos
-CHECKS = 30_000_000  # of a point in two views; more views look at fewer points
-MOST_TURNED = np.cos(np.deg2rad(45))  # between two rays to a point; beyond, it may be another side of a thing
-SHARED = 0.5  # of a photo's points that another must see to be compared with it
-BLACK, WHITE = 16.0, 239.0  # levels: what is called so
-LEAST_BLUR = 2.0  # px, sigma of a Gaussian
-UNUSUAL = 4.0  # robust standard deviations of sigma^2 over the scene
 
 
 class Sight:
@@ -31,7 +34,7 @@ class Sight:
 
     def __init__(self, views: Sequence[View], points: NDArray[np.float32]) -> None:
         """`points` [*, 3], world."""
-        count = min(max(CHECKS // len(views) ** 2, LEAST_POINTS), MOST_POINTS, len(points))
+        count = min(max(CHECKS // len(views) ** 2, LEAST_POINTS), CHOICE_MOST_POINTS, len(points))
         world = points[np.linspace(0, len(points) - 1, count).astype(np.int64)].astype(np.float64)
         self._inside = np.stack([in_frame(view.camera, world) for view in views])  # [N, P]
         rays = world - np.stack([view.camera.center for view in views])[:, None]
@@ -115,7 +118,7 @@ def _needless(views: list[View], points: NDArray[np.float32], notes: list[str]) 
 def _peers(sight: Sight, view: int) -> NDArray[np.int64]:
     """The views that see at least half of what `view` sees."""
     covered = sight.covered(view)
-    return np.flatnonzero(covered.sum(1) >= max(SHARED * covered.shape[1], 1))
+    return np.flatnonzero(covered.sum(1) >= max(CHOICE_SHARED * covered.shape[1], 1))
 
 
 def _empty(
@@ -133,7 +136,11 @@ def _empty(
         if look.colour is None or others < OTHERS or 2 * others <= len(peers[k]):
             continue
         name = (
-            "black" if look.colour.max() < BLACK else "white" if look.colour.min() > WHITE else "one colour"
+            "black"
+            if look.colour.max() < BLACK
+            else "white"
+            if look.colour.min() > CHOICE_WHITE
+            else "one colour"
         )
         evidence = (
             f"its colour is {', '.join(f'{c:.0f}' for c in look.colour)} with a standard deviation of "
@@ -161,7 +168,7 @@ def _blurred(
         return {}
     squares = np.array([sigma * abs(sigma) for sigma in sigmas.values()])
     spread = 1.4826 * float(np.median(np.abs(squares - np.median(squares))))
-    least = max(LEAST_BLUR, float(np.sqrt(UNUSUAL * spread)))
+    least = max(CHOICE_LEAST_BLUR, float(np.sqrt(UNUSUAL * spread)))
     found = sorted((k for k, sigma in sigmas.items() if sigma >= least), key=lambda k: -sigmas[k])
     sharp = np.array([k not in gone and k not in found for k in range(len(views))])
     drops, needed = {}, []

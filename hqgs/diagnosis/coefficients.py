@@ -14,19 +14,21 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.special import ndtr
 
+from hqgs.diagnosis.constants import (
+    DCT_LEAST,
+    DCT_MAX_BLOCKS,
+    DCT_SLOPE,
+    DCT_SLOPE_SPREAD,
+    EM_STEPS,
+    LEAST_SIGMA,
+    LIKELIHOOD_GAIN,
+    MAGNITUDES,
+    MIN_BLOCKS,
+    SHOWS,
+    VARIANCES,
+)
 from hqgs.photos.blocks import block_coefficients
 from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
-
-SLOPE, SLOPE_SPREAD = 2.55, 2.0  # of the power over frequency; the spread is that of one block
-VARIANCES = 13 * 6.0 ** np.arange(-1, 8)  # levels^2: of the lowest coefficient, one per class of blocks
-MAGNITUDES = np.array([1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56, 80, 112, 160, 226, 320, 452])  # in steps
-MAX_BLOCKS = 4_000
-MIN_BLOCKS = 60
-EM_STEPS = 12
-LIKELIHOOD_GAIN = 8.0  # nats that noise must bring, or there is none
-SHOWS = 0.32  # times the mean of the three finest steps: the least noise that is told from fine texture
-LEAST = 6.0  # levels; below it fine texture is taken for noise at any table
-LEAST_SIGMA = 0.7  # px; coarse tables (quality 10 and below) make sharp photos look 0.8 px soft
 
 _GRID = (np.arange(-32, 32) + 0.5) * np.pi / 32  # rad/px
 _BASIS = np.cos(np.pi * np.arange(8)[:, None] * (2 * np.arange(8) + 1) / 16)
@@ -61,7 +63,7 @@ def quantised(
     levels: Floats, table: NDArray[np.int64], corner: tuple[int, int] = (0, 0)
 ) -> NDArray[np.int64]:
     """Coefficients [blocks, 63] of a decoded photo's luma in steps of its `table` [8, 8], means left out."""
-    blocks = block_coefficients(luma(levels)[corner[0] :, corner[1] :], MAX_BLOCKS)
+    blocks = block_coefficients(luma(levels)[corner[0] :, corner[1] :], DCT_MAX_BLOCKS)
     return np.rint(blocks / table).astype(np.int64).reshape(-1, 64)[:, 1:]
 
 
@@ -77,10 +79,10 @@ def estimate_hidden(steps: NDArray[np.int64], table: NDArray[np.int64]) -> Hidde
     if len(steps) < MIN_BLOCKS or not steps.any():
         return None
     model = _Model(steps, table)
-    clean = min((model.minimise([SLOPE, sigma]) for sigma in (0.5, 2.0)), key=lambda result: result[1])
+    clean = min((model.minimise([DCT_SLOPE, sigma]) for sigma in (0.5, 2.0)), key=lambda result: result[1])
     noisy = model.minimise([*clean[0], 3.8])
     finest = np.sort(table.ravel()[1:])[:3].mean()
-    limit = max(LEAST, SHOWS * float(finest))
+    limit = max(DCT_LEAST, SHOWS * float(finest))
     sigma_limit = LEAST_SIGMA + 0.2 * float(np.clip((finest - 30) / 30, 0, 1))
     noise = float(np.exp(noisy[0][2] / 2)) / LUMA_NOISE
     if noise >= limit and clean[1] - noisy[1] >= LIKELIHOOD_GAIN:
@@ -134,5 +136,8 @@ class _Model:
         self.shares = shares
         total = ((np.log(likelihoods @ shares) + highest[:, 0]) * self.counts).sum()
         # The law errs alike in all blocks, so its prior counts per block: more blocks must not outvote it.
-        unusual = 0.5 * self.counts.sum() * ((slope - SLOPE) / SLOPE_SPREAD) ** 2 + 1e3 * min(sigma, 0.0) ** 2
+        unusual = (
+            0.5 * self.counts.sum() * ((slope - DCT_SLOPE) / DCT_SLOPE_SPREAD) ** 2
+            + 1e3 * min(sigma, 0.0) ** 2
+        )
         return float(unusual - total)

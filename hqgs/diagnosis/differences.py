@@ -8,16 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.diagnosis.constants import SECTORS, UNLIKE_COARSE, UNLIKE_FEWEST, UNLIKE_FINE, UNLIKE_LARGEST
 from hqgs.diagnosis.sharpness import Sharpness, summarised
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.scene.scene import Scene
-
-UNLIKE, TURNED = 0.18, 0.45  # from these values of `Unlike` on, photos were shaken
-UNLIKE_GAINS = 0.05  # of the log gains
-FEWEST = 5  # photos
-SECTORS = 8  # directions of frequencies
-COARSE, FINE = (0.03, 0.1), (0.15, 0.4)  # frequencies, cycles per px
-LARGEST = 1024  # px: of the middle of a photo that is looked at
 
 
 @dataclass(frozen=True)
@@ -36,7 +30,7 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     details of one direction, so that the direction differs by 0.5 and more; where photos are out of focus by
     different amounts it does not.
     """
-    if len(scene.train) < FEWEST:
+    if len(scene.train) < UNLIKE_FEWEST:
         return None
     looks = [look.rings for look in summarised(scene.train)]
     rings = [found for found in looks if found is not None]
@@ -51,8 +45,8 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
 
 def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
     """Log ratio of the power of fine to coarse details for each direction, [8]."""
-    top, left = (max(side - LARGEST, 0) // 2 for side in photo.shape[:2])
-    grey = luma(as_floats(photo[top : top + LARGEST, left : left + LARGEST])).astype(np.float64)
+    top, left = (max(side - UNLIKE_LARGEST, 0) // 2 for side in photo.shape[:2])
+    grey = luma(as_floats(photo[top : top + UNLIKE_LARGEST, left : left + UNLIKE_LARGEST])).astype(np.float64)
     window = np.hanning(grey.shape[0])[:, None] * np.hanning(grey.shape[1])
     power = np.abs(np.fft.fft2((grey - grey.mean()) * window)) ** 2
     rows, columns = np.fft.fftfreq(grey.shape[0])[:, None], np.fft.fftfreq(grey.shape[1])
@@ -64,4 +58,4 @@ def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
         sums = np.bincount(sector[chosen], power[chosen], SECTORS)
         return np.log(sums / np.bincount(sector[chosen], minlength=SECTORS).clip(1) + 1e-12)
 
-    return logs(FINE) - logs(COARSE)
+    return logs(UNLIKE_FINE) - logs(UNLIKE_COARSE)

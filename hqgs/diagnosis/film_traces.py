@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hqgs.diagnosis.constants import DECODED, FEWEST_LEVELS, FEWEST_PIXELS, LUMA_709, STEP
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.pixels import LUMA, Floats
-
-LUMA_709 = np.array([0.2126, 0.7152, 0.0722])  # of films in HD (ITU-R BT.709); LUMA is that of the others
-STEP = 255 / 219  # levels: of the luma of 8 bits from 16 (black) to 235 (white), which films store
-DECODED = 0.35  # decoded frames have 0.48 and more, frames made smaller since 0.15 at most, photos 0.02
-FEWEST_PIXELS, FEWEST_LEVELS = 10, 48  # of each level of the luma that counts, and of these
 
 
 def film_detail(levels: Floats) -> float | None:

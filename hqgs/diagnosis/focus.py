@@ -9,24 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
+from hqgs.diagnosis.constants import (
+    BORDER,
+    FEWEST_PHOTOS,
+    FEWEST_POINTS,
+    FOCUS_COARSE,
+    FOCUS_DARK,
+    FOCUS_FINE,
+    FOCUS_LARGEST,
+    FOCUS_LEAST,
+    FOCUS_MOST_POINTS,
+    FOCUS_ROUNDS,
+    FOCUS_SHARED,
+    FOCUS_WINDOW,
+    MOST_PHOTOS,
+    NEARNESS,
+)
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.photos.resize import area_downscale
 from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
-
-GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `FocusSigns` on, photos differ in focus
-MOST_PHOTOS, MOST_POINTS = 60, 4000  # that are looked at
-FEWEST_PHOTOS, FEWEST_POINTS = 5, 40  # in all, and of each photo on average
-SHARED = 3  # photos that show a point, at least
-FINE, COARSE, WINDOW = 0.8, 2.4, 9  # px: sigmas between which details lie, and the window around a point
-LARGEST = 2000  # px: the longest side of what is looked at of a photo
-BORDER = 4  # px: points so near to the border do not count
-DARK = 0.5 / 255  # contrast below which there is nothing to be sharp
-NEARNESS = (0.2, 3.0)  # that count; the photo's median depth has 1
-LEAST = 0.25  # added to the sum of squares of a photo's nearness: few points tell no slope
-ROUNDS = 12
 
 
 @dataclass(frozen=True)
@@ -52,13 +56,13 @@ def focus_signs(scene: Scene) -> FocusSigns | None:
         return None
     chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
     views = [scene.train[k] for k in chosen]
-    points = most_shown(len(scene.points), scene.seen, views, MOST_POINTS)
+    points = most_shown(len(scene.points), scene.seen, views, FOCUS_MOST_POINTS)
     sharp, depths = (np.full((len(views), len(points)), np.nan) for _ in range(2))
     for k, view in enumerate(views):
         rows = np.flatnonzero(np.isin(points, scene.seen.get(view.name, [])))
         _look(view, scene.points[points[rows]].astype(np.float64), rows, sharp[k], depths[k])
     told = np.isfinite(sharp)
-    keep = told.sum(0) >= SHARED
+    keep = told.sum(0) >= FOCUS_SHARED
     if told[:, keep].sum() < FEWEST_POINTS * len(views):
         return None
     sharp, depths = sharp[:, keep], np.where(told, depths, np.nan)[:, keep]
@@ -75,17 +79,17 @@ def _look(view: View, points: Floats, rows: NDArray[np.intp], sharp: Floats, dep
     inside = (depth > 0) & (where > BORDER).all(1) & (where < [width - BORDER, height - BORDER]).all(1)
     rows, places = rows[inside], (where[inside] - 0.5).T[::-1]
     grey = luma(as_floats(view.image)).astype(np.float32)
-    if (factor := max(height, width) / LARGEST) > 1:
+    if (factor := max(height, width) / FOCUS_LARGEST) > 1:
         small = round(width / factor), round(height / factor)
         grey = area_downscale(np.ascontiguousarray(grey[..., None]), None, *small)[0][..., 0]
         scale = np.array([small[1] / height, small[0] / width])[:, None]
         places = (places + 0.5) * scale - 0.5
-    fine, coarse = gaussian_filter(grey, FINE), gaussian_filter(grey, COARSE)
+    fine, coarse = gaussian_filter(grey, FOCUS_FINE), gaussian_filter(grey, FOCUS_COARSE)
     power = [
-        map_coordinates(uniform_filter(np.square(part), WINDOW), places, order=1, mode="nearest")
+        map_coordinates(uniform_filter(np.square(part), FOCUS_WINDOW), places, order=1, mode="nearest")
         for part in (grey - fine, fine - coarse)
     ]
-    ratio = (power[0].astype(np.float64) + DARK**2) / (power[1] + DARK**2)
+    ratio = (power[0].astype(np.float64) + FOCUS_DARK**2) / (power[1] + FOCUS_DARK**2)
     sharp[rows], depths[rows] = 0.5 * np.log(ratio), np.log(depth[inside])
 
 
@@ -99,13 +103,13 @@ def _of_photos(sharp: Floats, depths: Floats) -> tuple[Floats, Floats]:
         squares = np.nansum(near**2, axis=1)
         slope, rest = np.zeros(len(sharp)), np.zeros(len(sharp))
         with_distance = 0.0
-        for _ in range(ROUNDS):
+        for _ in range(FOCUS_ROUNDS):
             told = sharp - with_distance * farther
             own = np.nanmedian(told - rest[:, None] - slope[:, None] * near, axis=0)
             left = told - own
             rest = np.nan_to_num(np.nanmedian(left - slope[:, None] * near, axis=1))
             off = (left - rest[:, None]).clip(-1, 1)
-            slope = np.nansum(near * off, axis=1) / (squares + LEAST)
+            slope = np.nansum(near * off, axis=1) / (squares + FOCUS_LEAST)
             slope, rest = slope - np.median(slope), rest - np.median(rest)
             off = sharp - own - rest[:, None] - slope[:, None] * near
             with_distance = float(np.nansum(off * farther) / max(np.nansum(farther**2), 1e-9))

@@ -11,22 +11,24 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 from scipy.special import logsumexp
 
+from hqgs.diagnosis.constants import (
+    BRIGHT,
+    GAINS_DARK,
+    GAINS_DOUBT,
+    GAINS_FEWEST,
+    GAINS_LENGTHS,
+    GAINS_ROUNDS,
+    GAINS_WINDOW,
+    MOST_VALUES,
+    OPPONENTS,
+    SHARES,
+)
 from hqgs.photos.light import to_linear
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 
 Floats = NDArray[np.float64]
-
-WINDOW = 5  # px around a point, whose mean is its colour there
-DARK, BRIGHT = 0.02, 0.9  # of white in linear light: beyond them noise and the sensor's white tell nothing
-FEWEST = 20  # points that a photo must share with others
-MOST_VALUES = 8_000_000  # photos times points that are looked at: 200 MB a table
-ROUNDS = 30
-LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
-SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
-DOUBT = 3.0  # of the log-likelihood: less does not tell neighbours that go together from chance
-OPPONENTS = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # of red, green and blue
 
 
 def log_gains(scene: Scene) -> Floats | None:
@@ -48,13 +50,13 @@ def log_gains(scene: Scene) -> Floats | None:
             _note_colors(view, scene.points[chosen[rows]].astype(np.float64), rows, colors[k])
     told = np.isfinite(colors).all(2)
     told &= told.sum(0) >= 2
-    if told.sum(1).min() < FEWEST:
+    if told.sum(1).min() < GAINS_FEWEST:
         return None
     logs = np.log(np.where(told[..., None], colors, np.nan))
     gains: Floats = np.zeros((len(scene.train), 3))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of points that no photo tells
-        for _ in range(ROUNDS):
+        for _ in range(GAINS_ROUNDS):
             own = np.nanmean(logs - gains[:, None], axis=0)
             gains = np.nanmedian(logs - own, axis=1)
             gains -= gains.mean(0)
@@ -76,13 +78,13 @@ def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Flo
     else:
         light = to_linear(np.clip(view.image, 0, 1).astype(np.float64))
     for c in range(3):
-        smooth = uniform_filter(light[..., c], WINDOW, mode="nearest")
+        smooth = uniform_filter(light[..., c], GAINS_WINDOW, mode="nearest")
         found = map_coordinates(smooth, (where - 0.5).T[::-1], order=1, mode="nearest")
-        colors[rows, c] = np.where((found > DARK) & (found < BRIGHT), found, np.nan)
+        colors[rows, c] = np.where((found > GAINS_DARK) & (found < BRIGHT), found, np.nan)
 
 
 def _apart(views: Sequence[View], gains: Floats) -> Floats:
-    """`gains` [N, 3] of mean 0 without what neighbours share: its expectation over `LENGTHS` and `SHARES`.
+    """`gains` [N, 3] of mean 0 without what neighbours share: its mean over GAINS_LENGTHS and SHARES.
 
     Brightness and the two differences of colour are looked at apart, since a tint may drift where the
     exposure does not; the length is one for all three.
@@ -94,8 +96,8 @@ def _apart(views: Sequence[View], gains: Floats) -> Floats:
     squares += np.square(ahead[:, None] - ahead).sum(-1)
     parts = gains @ OPPONENTS.T
     apart = -0.5 * len(views) * np.log(np.square(parts).mean(0) + 1e-12)
-    evidence, shared = [apart.sum() + DOUBT], [np.zeros_like(gains)]
-    for length in LENGTHS:
+    evidence, shared = [apart.sum() + GAINS_DOUBT], [np.zeros_like(gains)]
+    for length in GAINS_LENGTHS:
         together = np.exp(-squares / (2 * length**2))
         likely, means = [apart], [np.zeros_like(gains)]
         for share in SHARES:
@@ -106,7 +108,7 @@ def _apart(views: Sequence[View], gains: Floats) -> Floats:
             likely.append(-0.5 * (len(views) * np.log(energy.mean(0) + 1e-12) + np.log(values).sum()))
             means.append(share * together @ (vectors @ (seen / values[:, None])))
         total = np.asarray(logsumexp(likely, axis=0))
-        evidence.append(total.sum() - 3 * math.log(len(likely)) - math.log(len(LENGTHS)))
+        evidence.append(total.sum() - 3 * math.log(len(likely)) - math.log(len(GAINS_LENGTHS)))
         shared.append((np.exp(likely - total)[:, None] * means).sum(0))
     weights = np.exp(np.array(evidence) - logsumexp(evidence))
     rest = gains - np.tensordot(weights, shared, 1) @ OPPONENTS

@@ -8,23 +8,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.diagnosis.constants import (
+    BLOCKING_SEEN,
+    COMB_MAX_BLOCKS,
+    COMB_MIN_EVIDENCE,
+    COMB_SMALLEST,
+    MIN_COEFFICIENTS,
+    MIN_FREQUENCIES,
+    OUTLIERS,
+    SPREAD,
+    STEPS,
+)
 from hqgs.photos.blocks import block_coefficients
 from hqgs.photos.jpeg import read_table, standard_tables
 from hqgs.photos.pixels import Floats, luma
 
-MAX_BLOCKS = 200  # looked at; they are spread over the photo
-MIN_COEFFICIENTS = 40  # fewer that are not zero prove nothing
-MIN_FREQUENCIES = 4  # in which coefficients must show: few repeat in a drawing
-MIN_EVIDENCE = 0.5  # nats per coefficient; photos that were never JPEG have -0.25, quality 90 has 0.8
-SPREAD = 0.4  # levels: standard deviation of a decoded coefficient, as pixels were rounded twice
-OUTLIERS = 0.02  # share of coefficients off the comb, in blocks that were clipped
-BLOCKING_SEEN = 0.15  # above this a grid that does not begin at the corner is looked at too
-SMALLEST = 24  # px a side
 _ROWS, _COLUMNS = np.mgrid[:6, :6]
 _WAVES = _ROWS + _COLUMNS
 # Rows and columns of the 20 low frequencies. Not the mean: in a flat photo it is the same in all blocks.
 LOW = (_ROWS[(_WAVES > 0) & (_WAVES < 6)], _COLUMNS[(_WAVES > 0) & (_WAVES < 6)])
-STEPS = 255  # the largest step of an 8-bit JPEG
 Index = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
@@ -51,13 +53,13 @@ def find_jpeg(levels: Floats, path: Path | None = None) -> Jpeg:
     """
     grey = luma(levels)
     blocking, phase = measure_blocking(grey)
-    if min(grey.shape) < SMALLEST:
+    if min(grey.shape) < COMB_SMALLEST:
         return Jpeg(None, 0.0, blocking, phase, None)
     filed = read_table(path) if path is not None else None
     in_range = np.all((levels > 0) & (levels < 255), axis=2)
     unproven = []
     for row, column in dict.fromkeys([(0, 0), phase] if blocking > BLOCKING_SEEN else [(0, 0)]):
-        coefficients = block_coefficients(grey[row:, column:], MAX_BLOCKS, in_range[row:, column:])
+        coefficients = block_coefficients(grey[row:, column:], COMB_MAX_BLOCKS, in_range[row:, column:])
         quality, evidence, table = _best_table(coefficients, filed)
         if quality is not None:
             steps = tuple(tuple(int(step) for step in line) for line in table)
@@ -110,7 +112,7 @@ def _best_table(
     quality, table, total = max(candidates, key=lambda candidate: candidate[2])  # the first of equals
     evidence = float(total / max(count, 1))
     many = count >= MIN_COEFFICIENTS and (scores != 0).any(axis=1).sum() >= MIN_FREQUENCIES
-    proven = many and evidence >= MIN_EVIDENCE
+    proven = many and evidence >= COMB_MIN_EVIDENCE
     return (quality if proven else None), evidence, table
 
 

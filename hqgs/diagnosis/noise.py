@@ -6,16 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hqgs.diagnosis.constants import (
+    FEW_PATCHES,
+    HALF_TILE,
+    LARGE_PATCH,
+    LIMIT,
+    MAX_PATCHES,
+    MIN_PATCHES,
+    NOISE_BLOCK,
+    NOISE_FEW_BLOCKS,
+    NOISIEST,
+    SMALL_LIMIT,
+    SMALL_PATCH,
+)
 from hqgs.photos.pixels import Floats, luma
-
-LARGE_PATCH, SMALL_PATCH = 5, 3  # px
-FEW_PATCHES = 4_000  # below this the large patch has too many directions for the photo
-MIN_PATCHES = 200  # below this no estimate
-LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise reach 1.9, small ones 3.2
-MAX_PATCHES = 12_000
-HALF_TILE = 24  # px: the photo is cut into a chessboard of tiles of this size
-BLOCK, FEW_BLOCKS = 16, 40  # px a side, and how many must be without clipped values, to tell of neighbours
-NOISIEST = 0.05  # share of the blocks that show noise and little else
 
 
 @dataclass(frozen=True)
@@ -67,16 +71,16 @@ def neighbour_correlation(levels: Floats) -> float | None:
     noise strong enough to be told comes to 0.12 at most, a phone's, denoised and as JPEG, to 0.24 to 0.5.
     """
     grey = luma(levels)
-    height, width = (side // BLOCK * BLOCK for side in grey.shape)
-    shape = height // BLOCK, BLOCK, width // BLOCK, BLOCK
-    blocks = grey[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
+    height, width = (side // NOISE_BLOCK * NOISE_BLOCK for side in grey.shape)
+    shape = height // NOISE_BLOCK, NOISE_BLOCK, width // NOISE_BLOCK, NOISE_BLOCK
+    blocks = grey[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, NOISE_BLOCK, NOISE_BLOCK)
     blocks = blocks[((blocks > 0) & (blocks < 255)).all((1, 2))]
     one, two = (
         np.square(blocks[:, n:] - blocks[:, :-n]).mean((1, 2))
         + np.square(blocks[..., n:] - blocks[..., :-n]).mean((1, 2))
         for n in (1, 2)
     )
-    if (two > 0).sum() < FEW_BLOCKS:
+    if (two > 0).sum() < NOISE_FEW_BLOCKS:
         return None
     together = 1 - one[two > 0] / two[two > 0]
     return float(max(np.quantile(together, NOISIEST), 0.0))

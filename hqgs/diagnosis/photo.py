@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.diagnosis.blur import Blur, estimate_blur, extra_sigma
-from hqgs.diagnosis.coefficients import MAX_BLOCKS, Hidden, estimate_hidden, quantised
+from hqgs.diagnosis.coefficients import Hidden, estimate_hidden, quantised
+from hqgs.diagnosis.constants import (
+    DCT_MAX_BLOCKS,
+    HIDING_QUALITY,
+    LUMA_TELLS,
+    PHOTO_FEW_BLOCKS,
+    PHOTO_LARGEST,
+    PHOTO_LEAST_BLUR,
+    SHARPER,
+)
 from hqgs.diagnosis.film_traces import film_detail
 from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
 from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
@@ -20,12 +29,6 @@ from hqgs.photos.pixels import Floats, to_levels
 Table = tuple[tuple[int, ...], ...]
 Photo = NDArray[np.uint8] | NDArray[np.float32]
 
-LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6
-SHARPER = 0.2  # px of the small photo: shrinking halves a camera's own softness or more, to 0.45 at most
-HIDING_QUALITY = 92  # from this quality on, JPEG leaves the luma's noise and spectrum as they were
-LARGEST = 1024  # px a side: more of a photo is not looked at, but for its enlargement
-FEW_BLOCKS = 1_000  # of all photos together, to look for noise in the luma alone
-LUMA_TELLS = 100  # px a side; the coefficients of smaller photos have the fine texture of large ones
 ROUNDING_ONLY: Table = ((1,) * 8,) * 8
 
 
@@ -110,7 +113,7 @@ def inspect_photo(
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     levels = _middle(levels)
     jpeg = find_jpeg(levels, path)
-    limit = _least_blur(LEAST_BLUR, enlargement) * width / enlargement.width
+    limit = _least_blur(PHOTO_LEAST_BLUR, enlargement) * width / enlargement.width
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
     film = film_detail(levels) if film is None else film
     found = replace(found, film=film, correlation=neighbour_correlation(levels))
@@ -135,7 +138,7 @@ def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
         large = min(min(photos[k].kept.shape[:2]) for k in members) >= LUMA_TELLS
         hidden = None
         if hiding or (large and shown and np.median(shown) < 0):
-            share = -(-(MAX_BLOCKS if hiding else FEW_BLOCKS) // len(members))
+            share = -(-(DCT_MAX_BLOCKS if hiding else PHOTO_FEW_BLOCKS) // len(members))
             steps = np.array(table)
             corners = [diagnoses[k].jpeg.phase if hiding else (0, 0) for k in members]
             blocks = [
@@ -185,9 +188,9 @@ def _enlarged(blur: Blur, scale: float) -> Blur:
 
 
 def _middle(levels: Floats) -> Floats:
-    """At most `LARGEST` px a side, cut so that blocks of 8 x 8 pixels stay whole."""
-    top, left = (max(0, side - LARGEST) // 16 * 8 for side in levels.shape[:2])
-    return levels[top : top + LARGEST, left : left + LARGEST]
+    """At most `PHOTO_LARGEST` px a side, cut so that blocks of 8 x 8 pixels stay whole."""
+    top, left = (max(0, side - PHOTO_LARGEST) // 16 * 8 for side in levels.shape[:2])
+    return levels[top : top + PHOTO_LARGEST, left : left + PHOTO_LARGEST]
 
 
 def _kept(levels: Floats) -> NDArray[np.uint8] | Floats:

@@ -9,15 +9,9 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from hqgs.diagnosis.constants import FACTORS, GRID_MIN_EVIDENCE, GRID_SMALLEST, LINE_STEP, LONGEST, ROUNDING
 from hqgs.photos.pixels import Floats, luma
 from hqgs.photos.resize import resize_matrix
-
-FACTORS = (2, 3, 4, 6, 8)
-MIN_EVIDENCE = 2.1  # JPEG blocks reach 1.8 at factor 2; bicubic enlargement kept in 8 bits starts at 4.5
-LINE_STEP = 4  # every 4th row and column is looked at
-LONGEST = 768  # px of a line that are looked at
-SMALLEST = 8  # px, of the small photo
-ROUNDING = 0.05  # levels; a residual below this counts as this
 
 
 @dataclass(frozen=True)
@@ -47,7 +41,7 @@ def find_enlargement(levels: Floats) -> Enlargement:
         columns = _best_size(grey.T[:, ::LINE_STEP], factor)
         candidates.append((min(rows[0], columns[0]), factor, rows[1], columns[1]))
     evidence, factor, small_height, small_width = max(candidates)
-    if evidence < MIN_EVIDENCE:
+    if evidence < GRID_MIN_EVIDENCE:
         return Enlargement(1, evidence, height, width)
     return Enlargement(factor, evidence, small_height, small_width)
 
@@ -66,7 +60,7 @@ def _best_size(lines: Floats, factor: int) -> tuple[float, int]:
 
 
 def _evidence(lines: Floats, small: int, factor: int) -> float:
-    if small < SMALLEST:
+    if small < GRID_SMALLEST:
         return 0.0
     basis = _basis(small, len(lines))
     lines = lines[: len(basis)]

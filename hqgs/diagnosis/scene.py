@@ -11,8 +11,21 @@ from numpy.typing import NDArray
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, untold
-from hqgs.diagnosis.differences import TURNED, UNLIKE, UNLIKE_GAINS, unlike_sharpness
-from hqgs.diagnosis.focus import DIFFERS, GOES_WITH_DEPTH, MOST_PHOTOS, focus_signs
+from hqgs.diagnosis.constants import (
+    COARSE_FILM,
+    DIFFERS,
+    GOES_WITH_DEPTH,
+    MOST_PHOTOS,
+    PROBES,
+    SCENE_WHITE,
+    TURNED,
+    UNLIKE,
+    UNLIKE_GAINS,
+    UNLIKE_NOISE,
+    VISIBLE_QUALITY,
+)
+from hqgs.diagnosis.differences import unlike_sharpness
+from hqgs.diagnosis.focus import focus_signs
 from hqgs.diagnosis.gains import log_gains
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
@@ -20,12 +33,6 @@ from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
-PROBES = 4  # photos searched for enlargement; if they agree, the others are taken to be like them
-UNLIKE_NOISE = 2.5  # times the noise of the quieter photos in the noisier ones: each has its own
-WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
-VISIBLE_QUALITY = 85  # from this quality of JPEG on, nothing can be won back
-# Of `fine_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
-COARSE_FILM = 0.24
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,7 @@ class Diagnosis:
     def together(self) -> float | None:
         """How far neighbours go together in the photos' noise; None where it is white, or not told."""
         together = _correlation(self.photos)
-        return together if together > WHITE else None
+        return together if together > SCENE_WHITE else None
 
     def needs(self) -> list[tuple[str, bool, str]]:
         """Per part: its name, whether the method needs it, and why, in one sentence."""
@@ -191,9 +198,7 @@ def _shake(scene: Scene) -> Finding:
     unlike = unlike_sharpness(scene)
     if unlike is None:
         return Finding("shake", False, None, None, None, "the photos are too few or too small to tell")
-    reason = (
-        f"photos differ in sharpness by {unlike.sharpness:.2f}, in its direction by {unlike.direction:.2f}"
-    )
+    reason = f"photos differ by {unlike.sharpness:.2f} in sharpness, by {unlike.direction:.2f} in direction"
     if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
         reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
         return Finding("shake", False, unlike.sharpness, None, None, reason)
@@ -224,11 +229,8 @@ def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:
         reason = f"{len(photos) - factors.count(1)} of {len(photos)} photos show the grid of an enlargement"
         return Finding("lowres", False, 1.0, _spread_of(factors), None, reason)
     size = f"{photos[0].enlargement.width} x {photos[0].enlargement.height}"
-    how = (
-        f"the small photos of about {size} px are at hand"
-        if known
-        else f"{of} show the grid of smaller pixels"
-    )
+    at_hand = f"the small photos of about {size} px are at hand"
+    how = at_hand if known else f"{of} show the grid of smaller pixels"
     return Finding(
         "lowres", True, float(factor), _spread_of(factors), f"lowres:{factor}", f"enlarged by {factor}: {how}"
     )
@@ -273,7 +275,7 @@ def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
     quiet, loud = np.quantile([max(noise, 0.5 * least) for noise, least in told], [0.1, 0.9])
     together = _correlation(photos)
     kind, more = "white noise of", ""
-    if together > WHITE:
+    if together > SCENE_WHITE:
         kind = "noise of at least"
         more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
     if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:

@@ -9,19 +9,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.blur import RING_ERROR, RING_SAMPLES
-from hqgs.diagnosis.spectrum import SLOPE, fit_blurs, power_spectrum, rings, tile_size
+from hqgs.diagnosis.constants import (
+    CHOICE_BLOCK,
+    CHOICE_DOUBT,
+    CHOICE_SIGMAS,
+    FLAT_LEVELS,
+    FLAT_NOISE,
+    FLAT_SHARE,
+    LEAST_SIGNAL,
+    RING_ERROR,
+    RING_SAMPLES,
+    SPECTRUM_SLOPE,
+)
+from hqgs.diagnosis.spectrum import fit_blurs, power_spectrum, rings, tile_size
 from hqgs.photos.pixels import Floats, luma, to_levels
 from hqgs.scene.scene import View
 
 Rings = tuple[Floats, Floats, Floats]  # as `rings` returns them
-SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the others
-DOUBT = 2.0  # of the log-likelihood: two standard deviations
-LEAST_SIGNAL = 1e-3  # of the power of details that may be noise alone
-BLOCK = 8  # px: the mean over a block hides noise
-FLAT_LEVELS = 3.0  # that a block may be off the colour of an empty photo
-FLAT_SHARE = 0.99  # of the blocks of an empty photo
-FLAT_NOISE = 8.0  # levels: standard deviation of an empty photo's luma
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,14 @@ def _summary(photo: NDArray[Any], name: str, tile: int | None) -> PhotoSummary:
 
 def _flat_colour(levels: Floats) -> Floats | None:
     """The colour [3] of (nearly) all blocks of a photo [H, W, 3]; None where they differ."""
-    rows, columns = (side // BLOCK for side in levels.shape[:2])
+    rows, columns = (side // CHOICE_BLOCK for side in levels.shape[:2])
     if not rows or not columns:
         return None
-    blocks = levels[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK, 3).mean((1, 3))
+    blocks = (
+        levels[: rows * CHOICE_BLOCK, : columns * CHOICE_BLOCK]
+        .reshape(rows, CHOICE_BLOCK, columns, CHOICE_BLOCK, 3)
+        .mean((1, 3))
+    )
     colour = np.median(blocks, axis=(0, 1))
     off = np.abs(blocks - colour).max(-1)
     return colour if (off <= FLAT_LEVELS).mean() >= FLAT_SHARE else None
@@ -95,9 +103,9 @@ class Sharpness:
         noise = np.exp(mine.min())
         usual = np.exp(np.median(self._log_power[others], axis=0))
         usual = np.log(np.maximum(usual - noise, LEAST_SIGNAL * usual))
-        squares = (SIGMAS * np.abs(SIGMAS))[:, None]
+        squares = (CHOICE_SIGMAS * np.abs(CHOICE_SIGMAS))[:, None]
         # `fit_blurs` expects a power law: the usual spectrum, as a blur of that law, takes its place.
-        blurred = usual + SLOPE * np.log(self._frequency) - squares * self._frequency**2
+        blurred = usual + SPECTRUM_SLOPE * np.log(self._frequency) - squares * self._frequency**2
         fit = fit_blurs(self._frequency, mine, self._weights, blurred, float(noise))
-        likely = SIGMAS[fit.costs <= fit.cost + DOUBT]
+        likely = CHOICE_SIGMAS[fit.costs <= fit.cost + CHOICE_DOUBT]
         return float(likely[np.abs(likely).argmin()])

@@ -8,15 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft2
 
+from hqgs.diagnosis.constants import (
+    FLOOR,
+    HIGHEST,
+    LARGEST_TILE,
+    MOST_TILES,
+    NEWTON_STEPS,
+    SHARED_TILES,
+    SMALLEST_TILE,
+    SPECTRUM_SLOPE,
+    SPECTRUM_SLOPE_SPREAD,
+)
 from hqgs.photos.pixels import Floats
-
-FLOOR = 0.03  # levels^2: what rounding to 8 bits leaves in the luma; nothing below it is believed
-SLOPE, SLOPE_SPREAD = 2.4, 0.35  # of the power, over photos that count as sharp
-MOST_TILES = 12  # along a side of a large photo
-SHARED_TILES = 3  # tiles along the shorter side, before their overlap
-SMALLEST_TILE, LARGEST_TILE = 32, 128  # px
-HIGHEST = 2.7  # rad/px; above it cameras and resizing leave their own mark
-NEWTON_STEPS = 8
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,12 @@ def fit_blurs(
     """Fit `log(exp(c) frequency^-a blur + noise)` to `log_power` for each blur; [points], blurs [B, points].
 
     `log_blurs` are log power responses, `noise` the power of what was not blurred. Amplitude c is free, slope
-    a is held near its usual value (`SLOPE`): only so can a blur be told from a soft scene. Gauss-Newton.
+    a is held near its usual value (SPECTRUM_SLOPE): so a blur is told from a soft scene. Gauss-Newton.
     """
     log_frequency, log_noise = np.log(frequency), np.log(noise)
-    slope = np.full(len(log_blurs), SLOPE)
-    height = np.full(len(log_blurs), np.median(log_power[:3] + SLOPE * log_frequency[:3]))
-    stiffness = 1 / SLOPE_SPREAD**2
+    slope = np.full(len(log_blurs), SPECTRUM_SLOPE)
+    height = np.full(len(log_blurs), np.median(log_power[:3] + SPECTRUM_SLOPE * log_frequency[:3]))
+    stiffness = 1 / SPECTRUM_SLOPE_SPREAD**2
 
     def predict() -> tuple[Floats, Floats]:
         signal = height[:, None] - slope[:, None] * log_frequency + log_blurs
@@ -120,12 +123,12 @@ def fit_blurs(
         h11, h12 = w.sum(1), -(w * log_frequency).sum(1)
         h22 = (w * log_frequency**2).sum(1) + stiffness
         g1 = (weights * share * misfit).sum(1)
-        g2 = -(weights * share * misfit * log_frequency).sum(1) + stiffness * (SLOPE - slope)
+        g2 = -(weights * share * misfit * log_frequency).sum(1) + stiffness * (SPECTRUM_SLOPE - slope)
         determinant = h11 * h22 - h12**2
         height += ((h22 * g1 - h12 * g2) / determinant).clip(-3, 3)
         slope += ((h11 * g2 - h12 * g1) / determinant).clip(-0.7, 0.7)
     misfit = log_power - predict()[1]
-    return Fit((weights * misfit**2).sum(1) + stiffness * (slope - SLOPE) ** 2)
+    return Fit((weights * misfit**2).sum(1) + stiffness * (slope - SPECTRUM_SLOPE) ** 2)
 
 
 def _starts(size: int, tile: int) -> NDArray[np.int64]:
