@@ -8,24 +8,23 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from torch import Tensor
 
+from benchmarks.command import TIMED, Benchmark, sizes_of
 from benchmarks.measure import Training
-from benchmarks.output import LEGEND, TIMED, Benchmark, Report, color, panels, sizes_of, table, unbeaten
+from benchmarks.pages.figures import listed
+from benchmarks.pages.rasterizing import unbeaten_default
 from benchmarks.patches import Knobs, tuned
 from benchmarks.protocol import Row, read_toml
+from benchmarks.rows import Table, facts
 from benchmarks.speed.inputs import LEAVES, RasterInputs, make_inputs
 from benchmarks.speed.rasterizer import RasterPass
-from benchmarks.speed.timing import interleaved, quartiles, whole
+from benchmarks.speed.timing import interleaved, quartiles
 from hqgs.base.threads import one_torch_thread
 from hqgs.base.typed import build
 from hqgs.model.render import render_view
@@ -37,9 +36,17 @@ from hqgs.training.methods.photometric import photometric_loss
 FILE = Path(__file__).with_suffix(".toml")
 DATA = read_toml(FILE)
 Errors = dict[str, Any]  # of a row against an oracle
-ERRORS: dict[str, Callable[[Errors], float]] = {  # what the panels show
-    "image RMS error": lambda errors: errors["image"]["rms"],
-    "relative error of the gradients": lambda errors: errors["gradients"]["all"]["relative"],
+SHOWN = {
+    "inputs": ("inputs", ""),
+    "knob": ("knob", ""),
+    "value": ("value", ""),
+    "seconds": ("ms", "ms"),
+    "ratio": ("time / default", ".3f"),
+    "blocks_ratio": ("blocks / default", ".2f"),
+    "image_exact": ("image RMS, exact", ".1e"),
+    "gradients_exact": ("gradients, exact", ".1e"),
+    "image_defined": ("image RMS, defined", ".1e"),
+    "gradients_defined": ("gradients, defined", ".1e"),
 }
 
 
@@ -74,77 +81,30 @@ class TunedPass(RasterPass):
         return {name: tensor.double() for name, tensor in ({"image": image} | grads).items()}
 
 
-def measure(name: str, inputs: RasterInputs, repeats: int) -> dict[str, Any]:
-    """Errors and seconds of every case on the same numbers; the seconds of a round are taken in turn."""
+def measure(name: str, inputs: RasterInputs, repeats: int) -> list[dict[str, Any]]:
+    """A line for every case on the same numbers: errors and seconds; those of a round are taken in turn."""
     passes = {case: TunedPass(inputs, knobs) for case, knobs in CASES.items()}
     oracles = {oracle: TunedPass(inputs, knobs).outputs() for oracle, knobs in ORACLES.items()}
     rows: list[dict[str, Any]] = []
+    blocks = 0
     for (knob, value), case in passes.items():
         outputs = case.outputs()
-        errors = {oracle: errors_against(outputs, exact) for oracle, exact in oracles.items()}
-        work = {"tile_pairs": case.work[0], "blocks": case.work[1]}
-        work |= {"more_blocks": case.work[1] / max(rows[0]["blocks"], 1) if rows else 1.0}
-        rows.append({"knob": knob, "value": value, "settings": asdict(case.knobs), "errors": errors} | work)
+        row = {"inputs": name, "knob": knob, "value": value, "gaussians": len(inputs)}
+        row |= {"width": inputs.width, "height": inputs.height}
+        for oracle, exact in oracles.items():
+            errors = errors_against(outputs, exact)
+            row[f"image_{oracle}"] = errors["image"]["rms"]
+            row[f"image_{oracle}_max"] = errors["image"]["max"]
+            row[f"gradients_{oracle}"] = errors["gradients"]["all"]["relative"]
+        blocks = blocks or case.work[1]
+        rows.append(row | {"tile_pairs": case.work[0], "blocks_ratio": case.work[1] / max(blocks, 1)})
     measured = interleaved(passes, repeats)
     for row, rounds in zip(rows, measured.values(), strict=True):
         ratios = rounds["total"] / measured["default", ""]["total"]  # in the same round
-        row |= {**whole(rounds), "ratio": ratios.median(), "ratio_quartiles": quartiles(ratios)}
-    beaten = [f"{row['knob']} {row['value']}" for row in rows if beats(row, rows[0])]
-    size = {"inputs": name, "gaussians": len(inputs), "width": inputs.width, "height": inputs.height}
-    return size | {"rows": rows, "beaten_by": beaten}
-
-
-def beats(row: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether `row` has no larger error than the default, whatever it is held against, in clearly less time:
-    three rounds of four were faster."""
-    no_worse = all(
-        error(row["errors"][oracle]) <= error(other["errors"][oracle])
-        for oracle in ORACLES
-        for error in ERRORS.values()
-    )
-    return no_worse and row["ratio_quartiles"][1] < 1
-
-
-def errors_table(result: dict[str, Any]) -> str:
-    """One row for each case; the errors against the exact result, then against the definition in float64."""
-    cosines = [row["errors"]["exact"]["gradients"]["all"]["cosine"] for row in result["rows"]]
-    turns = [None if cosine is None else 1 - cosine for cosine in cosines]
-    lines = [row | {"turn": turn} for row, turn in zip(result["rows"], turns, strict=True)]
-    size = f"{result['gaussians']:,} Gaussians, {result['width']} x {result['height']}"
-    return table(f"{result['inputs']}: {size}, forward and backward", lines, DATA["columns"])
-
-
-def chart(result: dict[str, Any]) -> Figure:
-    """Error against time on log axes: rows are what is held against, columns are image and gradients."""
-    figure, grid = panels(11, 8, len(ORACLES), len(ERRORS), sharex=True)
-    titles = {"exact": "against the exact result", "defined": "against the definition in float64"}
-    shown = ((oracle, what) for oracle in ORACLES for what in ERRORS)
-    for axes, (oracle, what) in zip(grid, shown, strict=True):
-        points = [
-            (1000 * row["seconds"], ERRORS[what](row["errors"][oracle]), row["knob"], row["value"])
-            for row in result["rows"]
-        ]
-        _panel(axes, [p for p in points if p[1] > 0])  # what has no error has no place on a log axis
-        axes.set_title(f"{what}, {titles[oracle]}", fontsize=9, loc="left")
-        axes.set_xlabel("forward and backward (ms)")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, **LEGEND)
-    figure.suptitle(f"{result['inputs']}, {result['gaussians']:,} Gaussians", fontsize=10)
-    return figure
-
-
-def _panel(axes: Axes, points: list[tuple[float, float, str, str]]) -> None:
-    times, errors = zip(*(points[k][:2] for k in unbeaten([p[:2] for p in points])), strict=True)
-    label = "no other one is better in both"
-    axes.plot(times, errors, color="#888888", lw=1.2, drawstyle="steps-post", label=label)
-    for k, knob in enumerate(dict.fromkeys(knob for knob, _ in CASES)):
-        own = [(x, y, value) for x, y, name, value in points if name == knob]
-        star: dict[str, Any] = {"marker": "*", "markersize": 13, "zorder": 4}
-        dot: dict[str, Any] = {"marker": "o", "markersize": 5, "zorder": 3}
-        look = star if knob == "default" else dot
-        axes.plot([p[0] for p in own], [p[1] for p in own], ls="", label=knob, color=color(k), **look)
-        for x, y, value in own:
-            axes.annotate(value, (x, y), xytext=(3, 3), textcoords="offset points", fontsize=6, rotation=40)
-    axes.set(xscale="log", yscale="log")
+        low, high = quartiles(ratios)
+        row |= {"seconds": rounds["total"].median(), "ratio": ratios.median()}
+        row |= {"ratio_low": low, "ratio_high": high} | facts()
+    return rows
 
 
 def errors_against(outputs: dict[str, Tensor], exact: dict[str, Tensor]) -> Errors:
@@ -197,26 +157,22 @@ def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInpu
     )
 
 
-def run(args: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> list[str]:
     """Measure every case on the clouds and on the trained Gaussians."""
     sizes = sizes_of(DATA, args)
-    report = Report(settings=sizes)
+    table = Table(args.out / "accuracy.csv")
     inputs = {f"cloud of {n:,}": make_inputs(n, *sizes["size"], seed=args.seed) for n in sizes["gaussians"]}
     print("accuracy: training the built-in scene", file=sys.stderr)
     scene = embedded_scene(args.out / "scene", *sizes["size"], num_views=sizes["trained_views"])
     inputs["built-in scene, trained"] = trained_inputs(
         scene, sizes["trained_steps"], sizes["trained_gaussians"], args.seed
     )
-    results = report.results["inputs"] = []
+    rows: list[dict[str, str]] = []
     for name, x in inputs.items():
         print(f"accuracy: {name}", file=sys.stderr)
-        results.append(measure(name, x, sizes["repeats"]))
-        report.tables.append(errors_table(results[-1]))
-    for result in results:
-        beaten = ", ".join(result["beaten_by"]) or "nothing"
-        report.tables.append(f"{result['inputs']}: better than the default in error and time: {beaten}.")
-        report.figures[result["inputs"].replace(" ", "_").replace(",", "")] = chart(result)
-    return report
+        rows += table.put(measure(name, x, sizes["repeats"]))
+    runs = table.frame(rows)
+    return [listed(runs, SHOWN), unbeaten_default(runs)]
 
 
 HELP = "error of the rasterizer against its run time, knob by knob"

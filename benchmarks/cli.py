@@ -1,16 +1,16 @@
-"""`python -m benchmarks NAME`: measure, print Markdown tables, write one JSON file and charts."""
+"""`python -m benchmarks NAME`: measure, add lines to a table of results, print them; write the pages."""
 
 from __future__ import annotations
 
 import argparse
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import hqgs
-from benchmarks import accuracy, endurance, export, features, frugality, time
-from benchmarks.output import Benchmark, command_line, write_results
+from benchmarks import accuracy, endurance, everything, export, features, frugality, time
+from benchmarks.command import Benchmark
 from benchmarks.pages import write as pages
 from benchmarks.protocol import add_options
 from benchmarks.quality import run as quality
@@ -21,10 +21,11 @@ from hqgs.training.trainer import TrainingError
 
 MODULES = (accuracy, endurance, export, features, frugality, quality, speed, stability, time)
 BENCHMARKS: dict[str, Benchmark] = {m.__name__.split(".")[1]: m.BENCHMARK for m in MODULES}
+OTHERS: dict[str, Callable[[argparse.Namespace], list[str]]] = {"all": everything.run, "pages": pages.run}
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """A subcommand for each benchmark."""
+    """A subcommand for each benchmark, one for all of them and one for the pages."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", description="Measure what hqgs needs and how right it is."
     )
@@ -33,15 +34,15 @@ def make_parser() -> argparse.ArgumentParser:
         parser_of_one = names.add_parser(name, help=benchmark.help, description=benchmark.help)
         add = parser_of_one.add_argument
         out = Path("out", "bench")
-        add("--out", type=Path, default=out, metavar="DIR", help=f"for {name}.json (%(default)s)")
-        add("--page", type=Path, metavar="FILE", help="also write all of it as one HTML file")
+        add("--out", type=Path, default=out, metavar="DIR", help=f"for {name}.csv (%(default)s)")
         add("--threads", type=int, metavar="T", help="(all cores)")
         add("--quick", action="store_true", help="tiny sizes, seconds: only a test")
         if benchmark.protocols is not None:
             add_options(parser_of_one, benchmark.protocols["standard"])
         for flag, how in benchmark.options.items():
             add(flag, **how)
-    pages.add_options(names.add_parser("pages", help="write the pages of results from their tables"))
+    for name, module in (("all", everything), ("pages", pages)):
+        module.add_options(names.add_parser(name, help=module.HELP, description=module.HELP))
     return parser
 
 
@@ -50,17 +51,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = make_parser().parse_args(argv)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM counts as Ctrl-C
+    name, out = args.benchmark, args.docs if args.benchmark == "pages" else args.out
     try:
-        if args.benchmark == "pages":
-            pages.run(args)
-            return 0
-        args.out.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
-        if args.page is not None and args.page.is_dir():
-            raise ValueError(f"--page {args.page} is a folder: name a file")
-        if args.threads is not None:
+        out.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
+        if vars(args).get("threads") is not None:
             hqgs.set_num_threads(args.threads)
-        report = BENCHMARKS[args.benchmark].run(args)
-        files = write_results(args.out, args.benchmark, command_line(args), report, args.page)
+        printed = OTHERS[name](args) if name in OTHERS else BENCHMARKS[name].run(args)
     except KeyboardInterrupt:
         return 130
     except BAD_INPUT as error:
@@ -68,10 +64,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except TrainingError as error:
         return fail(1, str(error))
     except OSError as error:
-        return fail(1, f"{args.out}: {error}")
-    for table in report.tables:
-        print(table, end="\n\n")
-    for entry in report.left_out:
-        print(f"left out: {entry['what']}: {entry['why']}")
-    print(f"written: {', '.join(map(str, files))}")
+        return fail(1, f"{out}: {error}")
+    print("\n\n".join(printed))
     return 0

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pandas import DataFrame
 
+from benchmarks.command import Benchmark
 from benchmarks.measure import Run, Training
-from benchmarks.output import LEGEND, Benchmark, Report, color, panels, table
-from benchmarks.protocol import Protocol, Row, read_protocols, read_toml
+from benchmarks.pages.figures import listed
+from benchmarks.protocol import Row, read_protocols
 from benchmarks.study import Cell, finished
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
@@ -76,18 +76,29 @@ class Case(Row):
         return replace(config, densify=densify)
 
 
-FILE = Path(__file__).with_suffix(".toml")
-PROTOCOLS, COLUMNS = read_protocols(FILE, Case), read_toml(FILE)["columns"]
-JUDGED = ["iteration", "gaussians", "values_not_finite", "losses_not_finite", "peak_rss_mb"]  # of each record
+PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"), Case)
+SHOWN = {
+    "row": ("case", ""),
+    "loss": ("last loss", ".4f"),
+    "psnr": ("PSNR (dB)", ".2f"),
+    "most_gaussians": ("most Gaussians", ",.0f"),
+    "peak_mb": ("peak (MB)", ",.0f"),
+    "slope_mb": ("MB per 1,000", "+.2f"),
+    "events": ("events", ".0f"),
+    "finite": ("finite", "yes|NO"),
+    "within_budget": ("in budget", "yes|NO"),
+    "passed": ("verdict", "pass|FAIL"),
+}
+JUDGED = ["iteration", "gaussians", "values_not_finite", "losses_not_finite", "peak_mb"]  # of each record
 
 
 def measure(cell: Cell, scene: Scene) -> Run:
     """Train the case of a cell on what it makes of the scene, which the cases share."""
-    return run_case(PHOTOS[cell.row.more["photos"]](scene), cell.config)
+    return run_case(PHOTOS[cell.row.more["photos"]](scene), cell.config)[0]
 
 
-def run_case(scene: Scene, config: TrainConfig) -> Run:
-    """Train one case; what it went through, as plain JSON values."""
+def run_case(scene: Scene, config: TrainConfig) -> tuple[Run, list[dict[str, Any]]]:
+    """Train one case: the columns of its line, and the records of its course."""
     done = Training(scene, config)
     trainer, interval = done.trainer, max(1, config.iterations // RECORDS)
     records: list[dict[str, Any]] = []
@@ -105,8 +116,12 @@ def run_case(scene: Scene, config: TrainConfig) -> Run:
         done.steps(config.iterations, after)
     except TrainingError as error:
         failure = str(error)
-    result = done.record() | {"records": records, "failure": failure, "guard": trainer.guard.summary()}
-    return result | verdict(result, config)
+    last = records[-1] if records else {}
+    result = {"records": records, "failure": failure}
+    run = {name: last.get(name) for name in ("loss", "psnr", "peak_mb")} | done.record()
+    run["most_gaussians"] = max((entry["gaussians"] for entry in records), default=None)
+    run |= {"events": trainer.guard.num_events, "failure": failure} | verdict(result, config)
+    return run, records
 
 
 def _so_far(done: Training, losses: NDArray[np.float64]) -> dict[str, Any]:
@@ -119,8 +134,7 @@ def _so_far(done: Training, losses: NDArray[np.float64]) -> dict[str, Any]:
         "loss": float(finite.mean()) if len(finite) else None,
         "losses_not_finite": len(losses) - len(finite),
         "values_not_finite": sum(int((~torch.isfinite(t)).sum()) for t in trainer.gaussians.named().values()),
-        "events": trainer.guard.num_events,
-        "peak_rss_mb": peak,  # since the last record
+        "peak_mb": peak,  # since the last record
     }
 
 
@@ -130,14 +144,10 @@ def verdict(result: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
     `slope_mb`: growth of the peak memory per 1,000 iterations in the second half, by least squares.
     """
     records = DataFrame(result["records"], columns=JUDGED)
-    late = (
-        records.loc[records["iteration"] > config.iterations // 2]
-        .dropna(subset=["peak_rss_mb"])
-        .astype(float)
-    )
+    late = records.loc[records["iteration"] > config.iterations // 2].dropna(subset=["peak_mb"]).astype(float)
     slope = None
     if len(late) > 2 and np.ptp(late["iteration"]) >= SHORTEST:
-        slope = float(np.polyfit(late["iteration"] / 1_000, late["peak_rss_mb"], 1)[0])
+        slope = float(np.polyfit(late["iteration"] / 1_000, late["peak_mb"], 1)[0])
     bad = records[["values_not_finite", "losses_not_finite"]].to_numpy().any()
     conditions = {
         "finite": result["failure"] is None and not bad,
@@ -147,48 +157,12 @@ def verdict(result: dict[str, Any], config: TrainConfig) -> dict[str, Any]:
     return conditions | {"slope_mb": slope, "passed": False not in conditions.values()}
 
 
-def cases_table(results: Sequence[dict[str, Any]], protocol: Protocol) -> str:
-    """One line for each case, with the last record's numbers."""
-    lines = []
-    for result in results:
-        most = max((r["gaussians"] for r in result["records"]), default=None)
-        last = (result["records"] or [dict.fromkeys(("loss", "psnr", "peak_rss_mb"))])[-1]
-        lines.append(result | last | {"most": most})
-    title = (
-        f"Photos at 1/{protocol.downscale:g}, {protocol.iterations:,} iterations, at most "
-        f"{protocol.config['densify']['max_gaussians']:,} Gaussians; memory may grow by {LIMIT_MB:g} MB per "
-        "1,000 iterations"
-    )
-    return table(title, lines, COLUMNS)
-
-
-def chart(results: Sequence[dict[str, Any]]) -> Figure:
-    """Held-out PSNR, Gaussians and peak memory over the iterations, a curve for each case."""
-    figure, grid = panels(8, 8, 3, sharex=True)
-    what = {"psnr": "held-out PSNR (dB)", "gaussians": "Gaussians", "peak_rss_mb": "peak memory (MB)"}
-    for axes, (name, label) in zip(grid, what.items(), strict=True):
-        for k, result in enumerate(results):
-            points = DataFrame(result["records"], columns=["iteration", name]).dropna()
-            axes.plot(*points.to_numpy().T, "o-", color=color(k), label=result["case"], ms=3, lw=1.5)
-        axes.set_ylabel(label)
-    if results:
-        grid[0].legend(**LEGEND)
-    grid[-1].set_xlabel("iterations")
-    return figure
-
-
-def run(args: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> list[str]:
     """Run the cases that are not finished, in their order; each is written as soon as it is done."""
-    study, report, _ = finished(args, PROTOCOLS, measure)
-    alone = len(study.scenes) == len(study.protocol.seeds) == 1
-    names = {cell: cell.row.label if alone else str(cell) for cell in study.cells}
-    results = [{"case": name, **study.runs[c]} for c, name in names.items() if c in study.runs]
-    passed = len(results) == len(study.cells) and all(result["passed"] for result in results)
-    report.settings["limit_mb"] = LIMIT_MB
-    report.results = {"passed": passed, "cases": results}
-    report.tables = [cases_table(results, study.protocol), "All passed." if passed else "NOT all passed."]
-    report.figures["runs"] = chart(results)
-    return report
+    study, runs = finished(args, PROTOCOLS, measure)
+    passed = len(runs) == len(study.cells) and bool(runs["passed"].all())
+    words = "All passed." if passed else "NOT all passed."
+    return [*([listed(runs, SHOWN)] if len(runs) else []), words, *study.missing()]
 
 
 HELP = "long runs on easy and hostile scenes: no NaN, flat memory, a bounded size"

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from pandas import DataFrame
 
+from benchmarks.command import Benchmark
 from benchmarks.measure import Run, train
-from benchmarks.output import Benchmark, Report, number, table
+from benchmarks.pages.rasterizing import features_table
 from benchmarks.patches import SWITCHES
-from benchmarks.protocol import Row, read_protocols, read_toml
+from benchmarks.protocol import Row, read_protocols
 from benchmarks.speed.timing import interleaved, quartiles, warmed
 from benchmarks.speed.training import still_trainer, trainer_from, whole_step
 from benchmarks.study import Cell, Study, begin
@@ -23,9 +22,6 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
 
 REFINED_SHARE = 4  # the Gaussians that were grown once are trained on for one such part of a run
-LIMIT_DB = 0.05  # what a feature that is on by default may cost, in the mean over the scenes
-SURE = 2.0  # standard errors by which whole runs must be over the limit before they fail a feature
-SHOWN = ("seed", "seconds", "gaussians", "history", "psnr", "refined_psnr")  # of a run, in the results
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,6 @@ class Feature(Row):
     """One choice that is made for speed, and how to train with the other one."""
 
     other: str = ""  # what is done instead in the run of this feature
-    by_default: bool = True  # whether the product has it on
     switch: Literal["", "float64", "boxes", "every block", "torch's loss", "torch's Adam", "one thread"] = ""
     refinable: bool = True  # whether Gaussians that were grown once and trained on can tell
 
@@ -47,7 +42,7 @@ class Feature(Row):
 
 
 FILE = Path(__file__).with_suffix(".toml")
-PROTOCOLS, COLUMNS = read_protocols(FILE, Feature), read_toml(FILE)["columns"]
+PROTOCOLS = read_protocols(FILE, Feature)
 DEFAULT, *FEATURES = [row for row in PROTOCOLS["standard"].rows if isinstance(row, Feature)]
 
 
@@ -66,9 +61,9 @@ class Features:
             done = train(photos, cell.config)
         if cell.row == DEFAULT:
             done.trainer.shown().save(self.grown(cell))
-        psnr = done.trainer.history[-1]["psnr"]
         refined = self.refined(cell, cell.row) if cell.row.refinable else None
-        return done.record() | {"psnr": psnr, "refined_psnr": refined}
+        psnr = done.trainer.history[-1]["psnr"]
+        return {"psnr": psnr, "refined_psnr": refined} | done.record()
 
     def grown(self, cell: Cell) -> Path:
         """The final Gaussians of the default run of the same scene and seed."""
@@ -95,103 +90,35 @@ class Features:
             cases[feature.label] = warmed(whole_step(trainer), feature.switched)
         return interleaved(cases, self.protocol.repeats)
 
-    def compare(self, scene: Scene) -> dict[str, Any] | None:
-        """The results of a scene; None where a run of it is not finished."""
-        runs: dict[str, list[Run]] = {feature.label: [] for feature in self.rows}
-        for cell in self.study.cells:
-            if cell.scene is scene:
-                if cell not in self.study.runs:
-                    return None
-                runs[cell.row.label].append({name: self.study.runs[cell][name] for name in SHOWN})
-        camera = scene.train[0].camera
-        return {
-            "scene": scene.name,
-            "width": camera.width,
-            "height": camera.height,
-            "iterations": self.protocol.iterations,
-            "default": runs[DEFAULT.label],
-            "features": compare(self.rows[1:], runs, self.final_steps(scene)),
+    def time_steps(self, scene: Scene) -> None:
+        """Add to the lines of the first seed how many times as fast a final step is by each feature."""
+        cells = {
+            label: self.cells[scene.name, label, self.protocol.seeds[0]] for label in self.protocol.labels
         }
+        lines = {label: self.study.runs.get(cell) for label, cell in cells.items()}
+        if None in lines.values() or all(
+            line and line.get("step_ratio") for line in list(lines.values())[1:]
+        ):
+            return
+        steps = self.final_steps(scene)
+        for feature in self.rows[1:]:
+            rounds = steps[feature.label]["total"] / steps[DEFAULT.label]["total"]
+            low, high = quartiles(rounds)
+            timed = {"step_ratio": float(rounds.median()), "step_low": low, "step_high": high}
+            line = dict(self.study.runs[cells[feature.label]]) | timed
+            self.study.runs[cells[feature.label]] = self.study.table.put([line])[0]
 
 
-def compare(
-    features: Sequence[Feature], runs: dict[str, list[dict[str, Any]]], steps: dict[str, DataFrame]
-) -> list[dict[str, Any]]:
-    """One row for each feature, from runs that hold `psnr`, `refined_psnr` and `seconds`.
-
-    `costs_db`: what the fast choice costs in held-out PSNR, run by run with the same seed, and
-    `refined_costs_db` the same of the Gaussians that were grown once and trained on, empty where they cannot
-    tell; `cost_db` and `refined_cost_db` their means. `speedup`: of the fast choice, over the other one.
-    """
-    rows, fast = [], DataFrame(runs[DEFAULT.label])
-    for feature in features:
-        other, sign = DataFrame(runs[feature.label]), 1 if feature.by_default else -1
-        row: dict[str, Any] = {"feature": feature.label, "other": feature.other}
-        row |= {"by_default": feature.by_default, "psnr": float(other["psnr"].mean())}
-        for kind in ("", "refined_"):
-            costs = sign * (other[f"{kind}psnr"].astype(float) - fast[f"{kind}psnr"]).dropna()
-            row[f"{kind}costs_db"] = costs.tolist()
-            row[f"{kind}cost_db"] = float(costs.mean()) if len(costs) else None
-        rounds = (steps[feature.label]["total"] / steps[DEFAULT.label]["total"]) ** sign
-        row["speedup_run"] = float(((other["seconds"] / fast["seconds"]) ** sign).mean())
-        row |= {"speedup_step": rounds.median(), "speedup_step_quartiles": quartiles(rounds)}
-        rows.append(row | {"runs": runs[feature.label]})
-    return rows
-
-
-def verdicts(scenes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Mean costs over the scenes, and whether the feature may be on.
-
-    Growth decides by thresholds, so that a change of one bit makes other Gaussians: whole runs scatter by
-    more than the limit. They fail a feature only where they are sure to be over it; the Gaussians that were
-    grown once and trained on with either choice scatter little, and are held against the limit itself.
-    """
-    found = []
-    for rows in zip(*(scene["features"] for scene in scenes), strict=True):  # of one feature
-        entry = {name: rows[0][name] for name in ("feature", "other", "by_default")} | {"limit_db": LIMIT_DB}
-        for kind in ("", "refined_"):
-            costs = [cost for row in rows for cost in row[f"{kind}costs_db"]]
-            error = float(np.std(costs, ddof=1) / np.sqrt(len(costs))) if costs[1:] else None
-            entry[f"{kind}cost_db"] = float(np.mean(costs)) if costs else None
-            entry[f"{kind}standard_error_db"] = error
-        sure = entry["cost_db"] - SURE * (entry["standard_error_db"] or 0.0)
-        worst = max(sure, -np.inf if entry["refined_cost_db"] is None else entry["refined_cost_db"])
-        found.append(entry | {"passed": not entry["by_default"] or bool(worst <= LIMIT_DB)})
-    return found
-
-
-def scene_table(scene: dict[str, Any]) -> str:
-    default = DataFrame(scene["default"])
-    title = (
-        f"{scene['scene']}, {scene['width']} x {scene['height']}, {scene['iterations']:,} iterations: "
-        f"default {default['psnr'].mean():.2f} dB, {default['seconds'].mean():.0f} s, "
-        f"{default['gaussians'][0]:,} Gaussians"
-    )
-    return table(title, scene["features"], COLUMNS["of_scene"])
-
-
-def verdict_table(rows: Sequence[dict[str, Any]]) -> str:
-    def with_error(row: dict[str, Any], kind: str) -> str:
-        error = row[f"{kind}standard_error_db"]
-        return number(row[f"{kind}cost_db"], "+.3f") + ("" if error is None else f" ± {error:.3f}")
-
-    lines = [row | {"cost": with_error(row, ""), "refined": with_error(row, "refined_")} for row in rows]
-    title = f"Mean cost with its standard error; what is on by default may cost {LIMIT_DB} dB"
-    return table(title, lines, COLUMNS["of_all"])
-
-
-def run(args: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> list[str]:
     """Train every scene with every feature switched, then time steps of all of them in turn."""
     rows = None if args.rows is None else list(dict.fromkeys([DEFAULT.label, *args.rows]))
     features = Features(begin(args, PROTOCOLS, rows=rows))
     features.study.train(features.measure)
-    report = features.study.report()
-    results = [found for scene in features.study.scenes if (found := features.compare(scene)) is not None]
-    report.results = {"scenes": results, "verdicts": verdicts(results)}
-    report.tables += map(scene_table, results)
-    if results:
-        report.tables.append(verdict_table(report.results["verdicts"]))
-    return report
+    if not args.finished:
+        for scene in features.study.scenes:
+            features.time_steps(scene)
+    runs = features.study.frame()
+    return [*([features_table(runs)] if len(runs) else []), *features.study.missing()]
 
 
 HELP = "what each speed feature saves in time and costs in held-out error"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
@@ -49,17 +48,13 @@ class Training:
         return self.trainer.held_out()
 
     def record(self) -> Run:
-        """What every study keeps of a run."""
+        """What every study keeps of a run, columns of its line."""
         return {
-            "seed": self.trainer.config.seed,
-            "iterations": self.trainer.iteration,
             "seconds": self.trainer.seconds,  # in training steps
             "cpu_seconds": self.cpu_seconds,
             "setup_seconds": self.setup_seconds,
-            "history": self.trainer.history,
             "initial_points": self.initial_points,
             "gaussians": len(self.trainer.gaussians),
-            "config": asdict(self.trainer.config),
         }
 
     def judged(self, views: HeldOutViews | None = None) -> Run:
@@ -67,7 +62,12 @@ class Training:
         rendered already."""
         self.trainer.evaluate(self.held_out() if views is None else views)
         last = self.trainer.history[-1]
-        return self.record() | {"psnr": last["psnr"], "ssim": last["ssim"]}
+        return {"psnr": last["psnr"], "ssim": last["ssim"]} | self.record()
+
+    def history(self) -> dict[str, float]:
+        """Held-out PSNR by seconds of training."""
+        known = [entry for entry in self.trainer.history if entry["psnr"] is not None]
+        return {f"{entry['seconds']:.5g}": float(f"{entry['psnr']:.5g}") for entry in known}
 
 
 def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training:

@@ -6,8 +6,10 @@ A list stands in one cell as `a:b|c:d`. An empty cell is a number that there is 
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -31,7 +33,20 @@ KEYS: dict[str, Sequence[str]] = {  # of each table's lines
     "stability": ("case", "dtype"),
 }
 TEXT = (
-    *("scene", "degradation", "row", "poses", "found", "file", "inputs", "knob", "value", "part", "case"),
+    *(
+        "study",
+        "scene",
+        "degradation",
+        "row",
+        "poses",
+        "found",
+        "file",
+        "inputs",
+        "knob",
+        "value",
+        "part",
+        "case",
+    ),
     *(
         "group",
         "dtype",
@@ -46,7 +61,7 @@ TEXT = (
         "digest",
     ),
 )
-DIGITS = ".6g"
+DIGITS = ".8g"
 
 
 class Table:
@@ -69,37 +84,55 @@ class Table:
             raise ValueError(f"{self.path} is damaged: {what}")
         return rows
 
+    def lines(self) -> dict[tuple[str, ...], dict[str, str]]:
+        """The lines by their keys."""
+        return {self.key_of(line): line for line in self.rows()}
+
     def find(self, row: Row) -> dict[str, str] | None:
         """The line of this key."""
-        wanted = self._key(row)
-        return next((line for line in self.rows() if self._key(line) == wanted), None)
+        return self.lines().get(self.key_of(row))
 
-    def put(self, rows: Iterable[Row]) -> None:
-        """Add lines, each in the place of one of the same key, and write the file atomically."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(self.path.with_name(f".{self.path.name}.lock")):
-            lines = {self._key(line): dict(line) for line in self.rows()}
-            for row in rows:
-                lines[self._key(row)] = {name: text_of(value) for name, value in row.items()}
-            heads = list(dict.fromkeys(name for line in lines.values() for name in line))
-            out = io.StringIO()
-            writer = csv.DictWriter(out, heads, restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(lines.values())
-            write_text(self.path, out.getvalue())
+    def put(self, rows: Iterable[Row]) -> list[dict[str, str]]:
+        """Add lines, each in the place of one of the same key, and write the file atomically.
 
-    def frame(self) -> DataFrame:
-        """The lines with numbers as numbers; NaN where there is none."""
-        rows = self.rows()
-        frame = DataFrame(rows, columns=None if rows else [*self.key])
+        Returns them as they stand in the file.
+        """
+        added = [{name: text_of(value) for name, value in row.items()} for row in rows]
+        with self._lock():
+            self._write(list((self.lines() | {self.key_of(line): line for line in added}).values()))
+        return added
+
+    def keep(self, wanted: Callable[[Row], bool]) -> None:
+        """Remove all other lines."""
+        with self._lock():
+            self._write([line for line in self.rows() if wanted(line)])
+
+    def frame(self, rows: Sequence[Row] | None = None) -> DataFrame:
+        """The lines, or these of them, with numbers as numbers; NaN where there is none."""
+        lines = self.rows() if rows is None else rows
+        frame = DataFrame(lines, columns=None if lines else [*self.key]).fillna("")
         for name in frame.columns:
             if name not in TEXT:
                 yes_no = frame[name].isin(["yes", "no", ""]).all() and frame[name].isin(["yes", "no"]).any()
                 frame[name] = frame[name] == "yes" if yes_no else pd.to_numeric(frame[name])
         return frame
 
-    def _key(self, row: Row) -> tuple[str, ...]:
+    def key_of(self, row: Row) -> tuple[str, ...]:
         return tuple(text_of(row[name]) for name in self.key)
+
+    def _lock(self) -> FileLock:
+        """Of this file, for all processes of this machine; it lies elsewhere, since it stays."""
+        name = hashlib.sha256(str(self.path.resolve()).encode()).hexdigest()[:16]
+        return FileLock(Path(tempfile.gettempdir()) / f"hqgs-{name}.lock")
+
+    def _write(self, lines: Sequence[Row]) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        heads = list(dict.fromkeys(name for line in lines for name in line)) or [*self.key]
+        out = io.StringIO()
+        writer = csv.DictWriter(out, heads, restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+        write_text(self.path, out.getvalue())
 
 
 def text_of(value: Any) -> str:

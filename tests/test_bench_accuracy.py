@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import reference
 import torch
-from PIL import Image
+from pandas import DataFrame
 from reference import reference_rasterization
 from scenes import random_scene
 
 import hqgs
 from benchmarks import cli
-from benchmarks.accuracy import CASES, ORACLES, Knobs, TunedPass, beats, errors_against
-from benchmarks.output import unbeaten
+from benchmarks.accuracy import CASES, ORACLES, Knobs, TunedPass, errors_against
+from benchmarks.pages.figures import unbeaten
+from benchmarks.pages.rasterizing import unbeaten_default
+from benchmarks.rows import Table
 from benchmarks.speed.inputs import make_inputs
 from benchmarks.speed.rasterizer import RasterPass
 from hqgs import _rust
@@ -33,7 +32,7 @@ def call(*arguments: str | Path) -> int:
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def quick(tmp_path_factory: pytest.TempPathFactory) -> DataFrame:
     out = tmp_path_factory.mktemp("bench")
     before = hqgs.get_num_threads()
     hqgs.set_num_threads(2)
@@ -42,81 +41,61 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         assert hqgs.get_num_threads() == 2
     finally:
         hqgs.set_num_threads(before)
-    for picture in ("accuracy_cloud_of_500.png", "accuracy_built-in_scene_trained.png"):
-        with Image.open(out / picture) as chart:
-            assert len(np.unique(np.asarray(chart.convert("RGB")).reshape(-1, 3), axis=0)) > 10
-    return json.loads((out / "accuracy.json").read_text(encoding="utf-8"))
+    return Table(out / "accuracy.csv").frame()
 
 
-def rows_of(result: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
-    return {(row["knob"], row["value"]): row for row in result["rows"]}
+INPUTS = ["cloud of 500", "built-in scene, trained"]
 
 
-def rms(row: dict[str, Any], oracle: str) -> float:
-    return row["errors"][oracle]["image"]["rms"]
+def rows_of(runs: DataFrame, inputs: str) -> dict[tuple[str, str], dict[str, Any]]:
+    lines = runs.loc[runs["inputs"] == inputs].to_dict("records")
+    return {(line["knob"], line["value"]): {str(k): v for k, v in line.items()} for line in lines}
 
 
-def gradient(row: dict[str, Any], oracle: str, name: str = "all") -> float:
-    return row["errors"][oracle]["gradients"][name]["relative"]
-
-
-def test_the_file_says_where_it_comes_from(quick: dict[str, Any]) -> None:
-    assert quick["benchmark"] == "accuracy"
-    assert quick["command"] == "python -m benchmarks accuracy --quick --seed 5"
-    assert datetime.fromisoformat(quick["date"]).utcoffset() is not None
-    assert quick["commit"] == quick["versions"]["git_commit"]
-    assert quick["machine"]["cores"] >= 1
-    assert [r["inputs"] for r in quick["results"]["inputs"]] == ["cloud of 500", "built-in scene, trained"]
-
-
-@pytest.mark.parametrize("k", [0, 1])
-def test_errors_are_ordered_as_their_causes(quick: dict[str, Any], k: int) -> None:
-    result = quick["results"]["inputs"][k]
-    rows = rows_of(result)
-    assert len(rows) == len(result["rows"]) == len(CASES)
+@pytest.mark.parametrize("inputs", INPUTS)
+def test_errors_are_ordered_as_their_causes(quick: DataFrame, inputs: str) -> None:
+    rows = rows_of(quick, inputs)
+    assert list(rows) == list(CASES)
     default = rows["default", ""]
-    for measure in (rms, gradient):
+    for what in ("image", "gradients"):
+        exact, defined = f"{what}_exact", f"{what}_defined"
         # against the definition: float64 is it, float32 rounds
-        assert measure(rows["dtype", "float64"], "defined") == 0 < measure(default, "defined") < 1e-4
+        assert rows["dtype", "float64"][defined] == 0 < default[defined] < 1e-4
         # against the exact result: the looser, the larger
         floors = [rows["cutoffs", "none"], *(rows["alpha floor", f"1/{n}"] for n in (1024, 128, 64))]
         floors.insert(2, default)
-        found = [measure(row, "exact") for row in floors]
+        found = [row[exact] for row in floors]
         assert found == sorted(found)
         assert 0 < found[0] < 0.01 * found[1]
         assert found[-1] > 2 * found[2]
-        assert measure(rows["cutoffs", "none, float64"], "exact") == 0
-    stops = [rms(rows["transmittance stop", stop], "exact") for stop in ("1e-5", "1e-3", "1e-2")]
-    assert stops[0] <= rms(default, "exact") * (1 + 1e-4)
+        assert rows["cutoffs", "none, float64"][exact] == 0
+    stops = [rows["transmittance stop", stop]["image_exact"] for stop in ("1e-5", "1e-3", "1e-2")]
+    assert stops[0] <= default["image_exact"] * (1 + 1e-4)
     assert stops[0] < stops[2]
 
 
-@pytest.mark.parametrize("k", [0, 1])
-def test_what_only_does_more_work_has_the_same_error(quick: dict[str, Any], k: int) -> None:
-    rows = rows_of(quick["results"]["inputs"][k])
+@pytest.mark.parametrize("inputs", INPUTS)
+def test_what_only_does_more_work_has_the_same_error(quick: DataFrame, inputs: str) -> None:
+    rows = rows_of(quick, inputs)
     default, boxes = rows["default", ""], rows["tiles", "bounding box"]
     unskipped = rows["block skipping", "off"]
-    assert default["errors"] == boxes["errors"] == unskipped["errors"]
+    for name in ("image_exact", "image_defined", "gradients_exact", "gradients_defined"):
+        assert default[name] == boxes[name] == unskipped[name]
     assert default["tile_pairs"] <= boxes["tile_pairs"]
     assert default["tile_pairs"] == unskipped["tile_pairs"]
-    assert default["blocks"] < unskipped["blocks"] <= 16 * unskipped["tile_pairs"]
+    assert default["blocks_ratio"] == 1 < unskipped["blocks_ratio"]
 
 
-def test_every_row_has_a_time_and_finite_errors(quick: dict[str, Any]) -> None:
-    for result in quick["results"]["inputs"]:
-        assert result["rows"][0]["ratio"] == 1
-        for row in result["rows"]:
-            low, high = row["seconds_quartiles"]
-            assert 0 < low <= row["seconds"] <= high
-            assert 0 < row["ratio_quartiles"][0] <= row["ratio"] <= row["ratio_quartiles"][1]
-            for errors in row["errors"].values():
-                image, grads = errors["image"], errors["gradients"]
-                assert list(grads) == ["means", "quats", "scales", "opacities", "sh", "all"]
-                assert 0 <= image["rms"] <= image["max"]
-                assert (image["psnr"] is None) == (image["rms"] == 0)
-                for entry in grads.values():
-                    assert 0 <= entry["relative"] < 10
-                    assert -1 <= entry["cosine"] <= 1
+def test_every_row_has_a_time_and_finite_errors(quick: DataFrame) -> None:
+    for inputs in INPUTS:
+        rows = rows_of(quick, inputs)
+        assert rows["default", ""]["ratio"] == 1
+        for row in rows.values():
+            assert row["seconds"] > 0
+            assert 0 < row["ratio_low"] <= row["ratio"] <= row["ratio_high"]
+            for oracle in ("exact", "defined"):
+                assert 0 <= row[f"image_{oracle}"] <= row[f"image_{oracle}_max"]
+                assert 0 <= row[f"gradients_{oracle}"] < 10
 
 
 @pytest.mark.parametrize(("floor", "stop"), [(1 / 64, 1e-2), (1 / 1024, 1e-5), (1e-12, 0.0)])
@@ -207,21 +186,22 @@ def test_pareto_front_of_a_hand_made_case() -> None:
 
 
 def test_the_default_is_beaten_only_by_what_is_clearly_faster_and_nowhere_worse() -> None:
-    def row(error: float, slowest: float, defined: float = 1.0) -> dict[str, Any]:
-        def entry(value: float) -> dict[str, Any]:
-            return {"image": {"rms": value}, "gradients": {"all": {"relative": value}}}
+    def words(error: float, slowest: float, defined: float = 1.0) -> str:
+        names = ("image_exact", "gradients_exact", "image_defined", "gradients_defined")
+        same = {"inputs": "cloud", "knob": "default", "value": "", "ratio_high": 1.0}
+        default = same | dict.fromkeys(names, 1.0)
+        other = same | {"knob": "tiles", "value": "box", "ratio_high": slowest}
+        other |= dict.fromkeys(names[:2], error) | dict.fromkeys(names[2:], defined)
+        return unbeaten_default(DataFrame([default, other]))
 
-        errors = {"exact": entry(error), "defined": entry(defined)}
-        return {"errors": errors, "ratio_quartiles": [0.5, slowest]}
-
-    default = row(1.0, 1.0)
-    assert beats(row(1.0, 0.9), default)
-    assert not beats(row(1.0, 1.1), default)  # within the noise
-    assert not beats(row(1.1, 0.9), default)
-    assert not beats(row(0.9, 0.9, defined=1.1), default)
+    assert words(1.0, 0.9) == "Better than the default in error and in time: tiles box (cloud)."
+    no = "No setting is better than the default in error and in time."
+    assert words(1.0, 1.1) == no  # within the noise
+    assert words(1.1, 0.9) == no
+    assert words(0.9, 0.9, defined=1.1) == no
 
 
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("--quick", "--out", tmp_path, "--repeats", "0") == 2
     assert "repeats is 0, wanted at least 1" in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "accuracy.json").exists()
+    assert not (tmp_path / "accuracy.csv").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,9 @@ import pytest
 import torch
 from tiny_scene import tiny_scene
 
-from benchmarks import cli, endurance, protocol
+from benchmarks import cli, protocol
 from benchmarks.endurance import PHOTOS, PROTOCOLS, Case, run_case, verdict
-from benchmarks.study import Store
+from benchmarks.rows import Table
 from hqgs.scene.scene import Scene
 from hqgs.training.methods.base import ThreeDGS
 
@@ -74,10 +73,12 @@ def test_every_case_runs(name: str) -> None:
     config = case(name).train_config(0, 20, SHORT)
     # Nothing is pruned as too large: the Gaussians of this scene are.
     config = replace(config, densify=replace(config.densify, prune_scale=100.0))
-    result = run_case(hostile(name, tiny_scene()), config)
+    result, records = run_case(hostile(name, tiny_scene()), config)
     assert result["passed"], result["failure"]
-    assert [r["iteration"] for r in result["records"]] == list(range(1, 21))
-    assert all(r["psnr"] > 0 and r["loss"] > 0 for r in result["records"])
+    assert [r["iteration"] for r in records] == list(range(1, 21))
+    assert all(r["psnr"] > 0 and r["loss"] > 0 for r in records)
+    assert result["psnr"] == records[-1]["psnr"]
+    assert result["most_gaussians"] == max(r["gaussians"] for r in records)
     assert result["slope_mb"] is None  # too short to tell
 
 
@@ -91,24 +92,23 @@ def test_a_nan_that_is_caught_is_counted_and_fails_the_case(monkeypatch: pytest.
 
     monkeypatch.setattr(ThreeDGS, "loss", spoiled)
     config = CASES[0].train_config(0, 20, SHORT)
-    result = run_case(tiny_scene(), config)
+    result, records = run_case(tiny_scene(), config)
     assert (result["finite"], result["passed"], result["failure"]) == (False, False, None)
-    assert [r["losses_not_finite"] for r in result["records"]].count(1) == 1
-    assert result["guard"]["num_events"] == 1
-    assert len(result["records"]) == 20
+    assert [r["losses_not_finite"] for r in records].count(1) == 1
+    assert result["events"] == 1
+    assert len(records) == 20
 
 
 def test_a_run_that_breaks_off_is_a_failed_case(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ThreeDGS, "loss", lambda self, render, view: render.sum() * torch.nan)
-    result = run_case(tiny_scene(), CASES[0].train_config(0, 40, SHORT))
+    result, _ = run_case(tiny_scene(), CASES[0].train_config(0, 40, SHORT))
     assert "20 steps in a row" in result["failure"]
     assert not result["passed"]
-    assert "FAIL" in endurance.cases_table([result | {"case": "it"}], PROTOCOLS["quick"])
 
 
 def made_up(peaks: list[float], gaussians: int = 100, bad: int = 0) -> dict[str, Any]:
     records = [
-        {"iteration": 1_000 * (k + 1), "peak_rss_mb": peak, "gaussians": gaussians}
+        {"iteration": 1_000 * (k + 1), "peak_mb": peak, "gaussians": gaussians}
         | {"values_not_finite": bad, "losses_not_finite": 0}
         for k, peak in enumerate(peaks)
     ]
@@ -146,27 +146,21 @@ def test_the_command_keeps_finished_cases(
     assert "[1/2] embedded, as it is, seed 0: " in err
     assert "[2/2] embedded, one photo, seed 0: " in err
     assert sizes == [(42, 32)]
-    report = json.loads((tmp_path / "endurance.json").read_text())
-    assert [c["case"] for c in report["results"]["cases"]] == ["as it is", "one photo"]
-    plain, one = (case["records"][-1]["psnr"] for case in report["results"]["cases"])
-    assert abs(plain - one) > 0.1  # each is trained on photos of its own
-    assert report["settings"]["iterations"] == PROTOCOLS["quick"].iterations
-    assert (tmp_path / "endurance_runs.png").stat().st_size > 10_000
-    here = Store(tmp_path).here
-    (one,) = here.glob("*one-photo*.json")
-    (plain,) = here.glob("*as-it-is*.json")
-    kept = one.read_bytes()
-    plain.unlink()
+    table = Table(tmp_path / "endurance.csv")
+    plain, one = table.rows()
+    assert [plain["row"], one["row"]] == ["as it is", "one photo"]
+    assert abs(float(plain["psnr"]) - float(one["psnr"])) > 0.1  # each is trained on photos of its own
+    table.keep(lambda line: line["row"] == "one photo")
     assert call(*options, "--finished") == 0
     assert "NOT all passed." in capsys.readouterr().out  # one is missing
     assert call(*options) == 0
     err = capsys.readouterr().err
     assert "2 runs, 1 left" in err
     assert "one photo" not in err  # the other one is not repeated
-    assert one.read_bytes() == kept
+    assert table.rows()[0] == one
     assert call(*options, "--iterations", "41") == 0  # other settings are other runs
     assert "2 runs, 2 left" in capsys.readouterr().err
-    assert one.read_bytes() == kept
+    assert table.rows()[0] == one
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from benchmarks.protocol import Row, narrowed
 from benchmarks.quality import rivals
 from benchmarks.quality import run as quality
 from benchmarks.quality.rivals import RivalRow, deblur, nerf
-from benchmarks.study import Study, grid, key_of
+from benchmarks.study import Study, digest_of, grid
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import scene_fingerprint
@@ -146,27 +146,27 @@ def test_rows_are_measured_as_all_others(tmp_path: Path, monkeypatch: pytest.Mon
     rows = ["3dgs", "deblur", "nerf"]
     protocol = narrowed(quality.PROTOCOLS["wild"], rows=rows, degradations=["none"], seeds=[0], iterations=5)
     args = argparse.Namespace(
-        out=tmp_path, validate=False, sfm=False, fit_cameras=False, pictures=1, known=None, finished=False
+        out=tmp_path, validate=False, sfm=False, fit_cameras=False, pictures=1, known=False, finished=False
     )
-    bench = quality.Quality(Study(args, "quality", protocol, [tiny_scene()], labelled=False))
+    bench = quality.Quality(Study(args, "quality", protocol, [tiny_scene()]))
+    bench.study.train(bench.measure)
     assert bench.study.failures == {}
-    bench.tables()
-    runs = bench.report.results["runs"]
-    assert [run["method"] for run in runs] == rows
-    assert all(run.keys() == runs[0].keys() for run in runs)
-    assert all(f"-{run['method']}-" in run["key"] for run in runs)
-    assert [bool(run["gaussians"]) for run in runs] == [True, True, False]
+    assert bench.sheets() == []
+    runs = bench.study.frame()
+    assert list(runs["row"]) == rows
+    assert runs[["psnr", "ssim", "seconds", "cpu_seconds", "render_ms"]].notna().to_numpy().all()
+    assert [bool(count) for count in runs["gaussians"]] == [True, True, False]
     assert len(list((tmp_path / "pictures").iterdir())) == 1
 
 
-def test_keys_hold_the_form_of_a_rival_and_leave_the_others_alone(
+def test_digests_hold_the_form_of_a_rival_and_leave_the_others_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = tiny_scene()
     protocol = narrowed(quality.PROTOCOLS["wild"], degradations=["none"], seeds=[0])
     cells = {cell.row.label: cell for cell in grid(protocol, [scene])}
     prints = scene_fingerprint(scene)
-    keys = {label: key_of(cell, prints) for label, cell in cells.items()}
+    keys = {label: digest_of(cell, prints) for label, cell in cells.items()}
     assert len(set(keys.values())) == len(keys) == 5
     for label in ("3dgs", "gains alone", "hqgs"):
         row = cells[label].row
@@ -176,5 +176,5 @@ def test_keys_hold_the_form_of_a_rival_and_leave_the_others_alone(
         (tmp_path / f"{name}.py").write_text("another form", encoding="utf-8")
     monkeypatch.setattr(rivals, "__file__", str(tmp_path / "__init__.py"))
     for cell in grid(protocol, [scene]):
-        same = key_of(cell, prints) == keys[cell.row.label]
+        same = digest_of(cell, prints) == keys[cell.row.label]
         assert same == (cell.row.label not in rivals.RIVALS)

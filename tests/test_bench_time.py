@@ -1,48 +1,23 @@
-"""The benchmark of error against seconds."""
+"""The benchmark `time`: runs that have seconds, and one that keeps its course."""
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
 
-from pandas import DataFrame
+import pytest
 
-from benchmarks.time import FIRST, levels, lines, then
-
-
-def one(row: str, seconds: float, psnr: float, **more: Any) -> dict[str, Any]:
-    means = {
-        "seconds": seconds,
-        "iterations": 100,
-        "gaussians": 10,
-        "psnr": psnr,
-        "ssim": 0.9,
-        "haarpsi": 0.9,
-    }
-    return {"scene": "desk", "row": row, "history": []} | means | more
+from benchmarks import cli
+from benchmarks.rows import Table, pairs_of
 
 
-HISTORY = [{"seconds": 9.0, "psnr": 20.0}, {"seconds": 31.0, "psnr": 25.0}, {"seconds": 90.0, "psnr": 28.0}]
-
-
-def test_the_reference_is_what_was_known_then() -> None:
-    assert then(HISTORY, 5.0) is None
-    assert then(HISTORY, 30.0) == 20.0
-    assert then(HISTORY, 31.0) == 25.0
-
-
-def test_lines_and_levels_by_hand() -> None:
-    reference = one("3dgs", 100.0, 28.0, history=HISTORY)
-    seeds = [one("30 s", 29.0, 26.0), one("30 s", 31.0, 27.0)]
-    runs = DataFrame([reference, *seeds, one("60 s", 61.0, 27.95), one("30 s, own points", 30.0, 24.0)])
-    earlier = [{"seconds": 20.0, "psnr": 22.0}], [{"seconds": 30.0, "psnr": 24.0}]
-    first, second = lines(runs, {FIRST: {"desk": earlier}})
-    assert (first["first"], first["gain"]) == (23.0, 3.5)
-    assert (first["asked"], first["seconds"], first["psnr"]) == (30.0, 30.0, 26.5)
-    assert (first["own"], first["reference"]) == (24.0, 20.0)
-    assert (second["own"], second["reference"]) == (None, 25.0)
-    assert levels(runs) == ["desk: 27.90 dB take 61 s, 3dgs 100 s to its end."]
-    (alone,) = lines(DataFrame([one("30 s", 29.0, 26.0)]), {})
-    assert alone["reference"] is None  # 3dgs is not finished there
-    assert alone["gain"] is None
-    (short,) = levels(DataFrame([reference, *seeds]))
-    assert "more than were tried" in short
+def test_a_quick_run_has_a_line_for_each_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["time", "--quick", "--out", str(tmp_path), "--threads", "1"]) == 0
+    assert "| embedded | 0.5 s | 0 |" in capsys.readouterr().out
+    base, timed = Table(tmp_path / "time.csv").frame().to_dict("records")
+    course = pairs_of(base["history"])
+    assert [base["row"], base["trained"], len(course)] == ["3dgs", 60, 1]
+    assert float(course[-1][0]) == pytest.approx(base["seconds"], rel=1e-4)
+    assert course[-1][1] == pytest.approx(base["psnr"], abs=0.01)
+    assert (timed["row"], timed["iterations"], timed["history"]) == ("0.5 s", 60, "")
+    assert timed["trained"] > 0
+    assert 0 < timed["haarpsi"] < 1

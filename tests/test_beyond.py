@@ -11,7 +11,7 @@ import pytest
 
 import hqgs
 from benchmarks.protocol import fewer_photos
-from benchmarks.quality.tables import fall
+from benchmarks.quality.cell import fall
 from hqgs.scene.builtin.beyond import BETWEEN, BEYOND, arc_cameras, between_and_beyond
 from hqgs.scene.builtin.sparse import TABLE
 from hqgs.scene.scene import Scene, View

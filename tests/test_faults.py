@@ -31,7 +31,7 @@ from run_state import State, assert_same, read_state
 from tiny_scene import tiny_config, tiny_scene
 
 from benchmarks import cli as benchmarks
-from benchmarks.output import Benchmark, Report
+from benchmarks.command import Benchmark
 from hqgs.base.files import CHECKPOINT, PLY, FolderBusyError, write_json
 from hqgs.cli import main as cli
 from hqgs.model.gaussians import Gaussians
@@ -353,9 +353,9 @@ def test_degrade_on_a_small_disk_leaves_nothing(
 def test_a_benchmark_on_a_full_disk_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(args: Any) -> Report:
+    def full(args: Any) -> list[str]:
         write_json(args.out / "run.json", "x" * 9_000)
-        return Report({})
+        return []
 
     monkeypatch.setitem(benchmarks.BENCHMARKS, "stability", Benchmark("full", full))
     with small_files(4_000):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 from reference import reference_rasterization
 
 from benchmarks import cli
+from benchmarks.rows import Table
 from benchmarks.stability import run
 from benchmarks.stability.cases import PIXELS, cases, scene
 from benchmarks.stability.oracle import GROUPS, Oracle
@@ -150,19 +150,21 @@ def test_rounding_of_geo_referenced_inputs_is_what_spoils_them() -> None:
     assert evaluate(CASES["world offset 1e6"], "f32").value_abs < 1e-5
 
 
-def test_command_writes_tables_and_chart(
+def test_command_writes_a_line_for_each_case_and_dtype(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = [CASES[name] for name in ("ordinary", "behind the camera", "NaN in means[0]", "world offset 1e6")]
-    monkeypatch.setattr(run, "cases", lambda long: few)
+    names = ("ordinary", "behind the camera", "NaN in means[0]", "no low-pass, anisotropy 1e6")
+    monkeypatch.setattr(run, "cases", lambda long: [CASES[name] for name in names])
     assert cli.main(["stability", "--quick", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert "| ordinary" in printed
-    assert "2 of 2 culled" in printed
-    results = json.loads((tmp_path / "stability.json").read_text())["results"]
-    assert [case["name"] for case in results["cases"]] == [case.name for case in few]
-    assert results["cases"][0]["outcomes"][1]["value_relative"] < VALUE_F64
-    assert (tmp_path / "stability_errors.png").stat().st_size > 10_000
+    assert "| shapes | 2 |" in printed
+    assert "| not finite | 1 | – | – | – | – | met |" in printed
+    assert "no low-pass, anisotropy 1e6, f64: gradient of" in printed
+    found = Table(tmp_path / "stability.csv").frame()
+    assert list(found["case"]) == [name for name in names for _ in range(2)]
+    assert list(found["met"]) == 6 * [True] + 2 * [False]
+    assert found["value_relative"][1] < VALUE_F64
+    assert (found["ulp_gradient"].dropna() > found["gradient"][6:]).all()
     assert cli.main(["stability", "--quick", "--long", "--out", str(tmp_path)]) == 2
 
 

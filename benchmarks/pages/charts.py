@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pandas import DataFrame
 
-from benchmarks.pages.figures import gain, pick, records
+from benchmarks.pages.figures import gain, pick, records, unbeaten
 from benchmarks.pages.sections import FIRST, OPENSPLAT, asked
 from benchmarks.rows import pairs_of
 
@@ -56,17 +55,6 @@ def panels(
 def color(k: int) -> str:
     """The colour of the k-th curve; beyond the last they start again."""
     return COLORS[k % len(COLORS)]
-
-
-def unbeaten(points: Sequence[tuple[float, float]]) -> list[int]:
-    """The indices of the points that no other one beats, with less of one and no more of the other: a Pareto
-    front by rising first coordinate."""
-
-    def beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
-        return a != b and a[0] <= b[0] and a[1] <= b[1]
-
-    order = sorted(range(len(points)), key=lambda k: points[k])
-    return [k for k in order if not any(beats(other, points[k]) for other in points)]
 
 
 def gain_map(runs: DataFrame, row: str = "hqgs", base: str = "3dgs") -> Figure:

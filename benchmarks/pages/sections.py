@@ -53,9 +53,13 @@ def reconstructions(poses: DataFrame) -> str:
         )
         name, registered = f"{line['scene']}, {line['degradation']}", f"{line['registered']}/{line['photos']}"
         points = f"{line['points']:,} ({line['own_points']:,})"
-        rows.append([name, registered, rotation, center, number(line["cameras_px"], ".2f"), points])
+        auc = "/".join(number(line.get(f"auc_{degrees}"), ".2f") for degrees in (1, 3, 5))
+        off = number(line["cameras_px"], ".2f")
+        rows.append([name, registered, rotation, *([auc] if "auc_1" in poses else []), center, off, points])
     heads = ("rotation (deg), median, max", "centre, median, max", "own cameras off (px)", "points (own)")
-    return table(["", "registered", *heads], rows)
+    first, *others = heads
+    told = ["AUC at 1/3/5 deg"] if "auc_1" in poses else []
+    return table(["", "registered", first, *told, *others], rows)
 
 
 def after(times: DataFrame, scene: str, row: str, seconds: float) -> float | None:

@@ -16,6 +16,8 @@ from hqgs.base.files import atomic_path, write_text
 
 HERE = Path(__file__).parent
 STUDIES: dict[str, str] = read_toml(HERE.parent / "studies.toml")["studies"]
+DOCS = HERE.parents[1] / "docs"
+HELP = "write the pages of results from their tables"
 RESULTS = Path("results")  # in the folder of the documentation: pages and tables
 INDEX = "results.md"
 HELPERS = (figures, rasterizing, sections)  # whose functions the templates call
@@ -74,14 +76,18 @@ def write(folder: Path, docs: Path) -> list[Path]:
     return written
 
 
+def add_docs(parser: argparse.ArgumentParser) -> None:
+    """Where the pages are written."""
+    parser.add_argument("--docs", type=Path, default=DOCS, metavar="DIR", help="for the pages (docs)")
+
+
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Where the tables are, and where the pages go."""
-    docs = HERE.parents[1] / "docs"
-    add = parser.add_argument
-    add("--tables", type=Path, default=docs / RESULTS, metavar="DIR", help="of the tables (docs/results)")
-    add("--docs", type=Path, default=docs, metavar="DIR", help="where the pages are written (docs)")
+    help = "of the tables (docs/results)"
+    parser.add_argument("--tables", type=Path, default=DOCS / RESULTS, metavar="DIR", help=help)
+    add_docs(parser)
 
 
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> list[str]:
     """Write all pages and say which."""
-    print(f"written: {', '.join(map(str, write(args.tables, args.docs)))}")
+    return [f"written: {path}" for path in write(args.tables, args.docs)]

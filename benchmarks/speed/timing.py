@@ -72,9 +72,10 @@ def median_ratio(rounds: DataFrame, others: DataFrame) -> float:
     return float((rounds["total"] / others["total"]).median())
 
 
-def whole(rounds: DataFrame) -> dict[str, Any]:
-    """Median and quartiles of the whole, as the tables have them."""
-    return {"seconds": rounds["total"].median(), "seconds_quartiles": quartiles(rounds["total"])}
+def whole(rounds: DataFrame) -> dict[str, float]:
+    """Median and quartiles of the whole, as columns."""
+    low, high = quartiles(rounds["total"])
+    return {"seconds": float(rounds["total"].median()), "seconds_low": low, "seconds_high": high}
 
 
 def exponent(x: Sequence[float], seconds: Sequence[float]) -> float:

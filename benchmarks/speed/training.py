@@ -14,12 +14,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import hqgs
-from benchmarks.output import UnavailableError, number
+from benchmarks.command import UnavailableError
 from benchmarks.patches import parts_of_step
 from benchmarks.speed.inputs import FAR, LEAVES, NEAR, RasterInputs, make_inputs
 from benchmarks.speed.timing import Seconds, StageClock, interleaved, median_ratio, whole
 from hqgs.base.machine import peak_rss_mb
-from hqgs.base.text import markdown_table
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
@@ -138,39 +137,16 @@ def step_by_parts(trainer: Trainer) -> Callable[[], Seconds]:
 
 
 def measure_steps(trainers: Mapping[str, Trainer], repeats: int) -> list[dict[str, Any]]:
-    """Seconds of a step, and the share of each part of it, for each trainer; `case` is its key."""
+    """Seconds of a step, and of each part of it, for each trainer; `case` is its key, `ratio` is over the
+    first one, `clocked` how much the clocks slow the step down."""
     ways = {"whole": whole_step, "parts": step_by_parts}
     cases = {(name, way): time(t) for name, t in trainers.items() for way, time in ways.items()}
     measured = interleaved(cases, repeats)
     first, rows = next(iter(measured.values())), []
     for name, trainer in trainers.items():
-        camera = trainer.scene.train[0].camera
-        method, n = trainer.config.method, len(trainer.gaussians)
+        camera, n = trainer.scene.train[0].camera, len(trainer.gaussians)
         rounds, parts = measured[name, "whole"], measured[name, "parts"]
-        stages = parts.drop(columns="total").median()
-        rows.append(
-            {"case": name, "method": method, "gaussians": n, "width": camera.width, "height": camera.height}
-            | whole(rounds)
-            | {
-                "over_first": median_ratio(rounds, first),
-                "clocked": median_ratio(parts, rounds),  # how much the clocks slow the step down
-                "stages": stages.to_dict(),
-                "percent": (100 * stages / stages.sum()).to_dict(),
-                "rounds": parts.to_dict("records"),
-            }
-        )
+        row = {"case": name, "gaussians": n, "width": camera.width, "height": camera.height}
+        row |= whole(rounds) | {"ratio": median_ratio(rounds, first), "clocked": median_ratio(parts, rounds)}
+        rows.append(row | {"stages": parts.drop(columns="total").median().to_dict()})
     return rows
-
-
-def steps_table(rows: list[dict[str, Any]]) -> str:
-    """One column for each case."""
-    first = rows[0]
-    body = [
-        ["whole step (ms)", *(number(r["seconds"], "ms") for r in rows)],
-        ["quartiles (ms)", *(number(r["seconds_quartiles"], "ms") for r in rows)],
-        [f"over {first['case']}", *(f"{r['over_first']:.2f}" for r in rows)],
-        *([f"{part} (%)", *(f"{r['percent'][part]:.1f}" for r in rows)] for part in first["percent"]),
-        ["with clocks / without", *(f"{r['clocked']:.2f}" for r in rows)],
-    ]
-    title = f"One training step, {first['width']} x {first['height']}"
-    return markdown_table(title, ["", *(r["case"] for r in rows)], body)

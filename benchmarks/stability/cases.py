@@ -35,6 +35,7 @@ class Case:
     ordinary: bool = False  # float32 must be within 1e-5
     ill_conditioned: bool = False  # one ulp of the inputs changes more than the targets allow
     poison: bool = False  # not finite: no oracle, only that the others do not notice
+    group: str = ""  # the table of cases.toml
 
     @property
     def compared(self) -> list[int]:
@@ -136,9 +137,13 @@ def poisons() -> Iterator[Case]:
         for slot in range(np.size(getattr(scene(), name)[0])):
             for label, value in (("NaN", math.nan), ("+Inf", math.inf), ("-Inf", -math.inf)):
                 title = f"{label} in {name}[{slot}]"
-                yield Case(title, "not finite", _slot(name, slot, value), (0,), poison=True)
+                yield Case(
+                    title, "not finite", _slot(name, slot, value), (0,), poison=True, group="not finite"
+                )
             gone = (0,) if name == "opacities" or (name, slot) == ("means", 2) else ()
-            yield Case(f"subnormal in {name}[{slot}]", "1e-40", _slot(name, slot, 1e-40), gone)
+            yield Case(
+                f"subnormal in {name}[{slot}]", "1e-40", _slot(name, slot, 1e-40), gone, group="subnormal"
+            )
 
 
 def _slot(name: str, slot: int, value: float) -> OracleScene:
@@ -156,5 +161,7 @@ def cases(long: bool = False) -> list[Case]:
         for table in tables if long or group != "long" else ():
             expected = {name: value for name, value in table.items() if name not in changes}
             made = changed(**{name: value for name, value in table.items() if name in changes})
-            found.append(build(Case, expected | {"scene": made}, f"{FILE.name}, {table.get('name')!r}"))
+            found.append(
+                build(Case, expected | {"scene": made, "group": group}, f"{FILE.name}, {table.get('name')!r}")
+            )
     return [*found, *poisons()]

@@ -7,18 +7,18 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 import hqgs
-from benchmarks.output import BLUE, ORANGE, Benchmark, Report, panels, table
-from benchmarks.protocol import read_toml
+from benchmarks.command import Benchmark
+from benchmarks.pages.figures import records
+from benchmarks.pages.rasterizing import families
+from benchmarks.rows import Table, facts
 from benchmarks.stability.cases import Case, cases
-from benchmarks.stability.oracle import DIGITS, GROUPS, KINDS, Array, Oracle, OracleScene, Pixel, load_mpmath
+from benchmarks.stability.oracle import GROUPS, KINDS, Array, Oracle, OracleScene, Pixel, load_mpmath
 
 CAMERA = (
     "width",
@@ -190,78 +190,34 @@ def input_rounding(case: Case) -> float:
     return value_errors(*([oracle.pixel(p) for p in case.pixels] for oracle in (exact, rounded)))[0]
 
 
-COLUMNS = read_toml(Path(__file__).with_name("columns.toml"))
+def line_of(case: Case, outcome: Outcome) -> dict[str, Any]:
+    """The columns of its line: where targets are missed, with what an ulp of the inputs changes. Inputs that
+    are not finite have no oracle."""
+    missed = misses(case, outcome)
+    line: dict[str, Any] = {"group": case.group, "case": case.name, "dtype": outcome.dtype}
+    if not case.poison:
+        line |= {"value_abs": outcome.value_abs, "value_relative": outcome.value_relative}
+        line |= {"gradient": outcome.gradient, "turn": max(0.0, 1 - outcome.cosine)}
+    line |= {"met": not missed, "by": "; ".join(missed)}
+    if missed and not case.poison:
+        limits = condition(case, outcome.dtype)
+        line |= {"ulp_value": limits.value_relative, "ulp_gradient": limits.gradient}
+    return line
 
 
-def run(args: argparse.Namespace) -> Report:
+def run(args: argparse.Namespace) -> list[str]:
     """Evaluate the catalogue."""
     load_mpmath()
     if args.quick and args.long:
         raise ValueError("--quick and --long exclude each other")
-    catalogue = cases(args.long)
-    found, conditions = [], []
-    for case in catalogue:
+    table, lines = Table(args.out / "stability.csv"), []
+    for case in cases(args.long):
         print(f"stability: {case.name}", file=sys.stderr)
-        outcomes = []
-        for outcome in (evaluate(case, dtype) for dtype in KINDS):
-            missed = misses(case, outcome)
-            outcomes.append(vars(outcome) | {"misses": missed})
-            if missed:
-                limits = vars(condition(case, outcome.dtype))
-                conditions.append({"name": case.name, "by": "; ".join(missed), **limits})
-        culled = {dtype: list(case.expected_culled(dtype)) for dtype in KINDS}
-        facts = {"name": case.name, "reason": case.why, "poison": case.poison, "culled": culled}
-        found.append(facts | {"outcomes": outcomes})
-    rounding = input_rounding(next(case for case in catalogue if case.name == "world offset 1e6"))
-    results = {"cases": found, "conditions": conditions, "world_offset_f32_input_rounding": rounding}
-    settings = {
-        "long": args.long, "digits": DIGITS, "f64_values": VALUE_F64, "f64_gradients": GRADIENT_F64,
-        "f32_ordinary": VALUE_F32, "cosine": COSINE, "negligible": NEGLIGIBLE,
-    }  # fmt: skip
-    return Report(settings, results=results, tables=tables(results), figures={"errors": chart(found)})
-
-
-def tables(results: dict[str, Any]) -> list[str]:
-    """Of what the JSON file holds."""
-    lines, poisoned = [], []
-    for case in results["cases"]:
-        f32, f64 = case["outcomes"]
-        if case["poison"]:
-            poisoned += [f32["misses"], f64["misses"]]
-            continue
-        counts = [len(gone) for gone in case["culled"].values()]
-        words = "f32 {}, f64 {}".format(*counts) if len(set(counts)) > 1 else str(counts[0] or "")
-        line = case | {"f32": f32, "f64": f64, "culled": words, "turn": max(0.0, 1 - f32["cosine"])}
-        lines.append(line | {"targets": "missed" if f32["misses"] or f64["misses"] else "met"})
-    missed, rounding = results["conditions"], results["world_offset_f32_input_rounding"]
-    return [
-        table("Error against the oracle, on the same rounded inputs", lines, COLUMNS["errors"]),
-        table("Targets that are missed, and what one ulp of the inputs changes", missed, COLUMNS["missed"]),
-        f"Inputs that are not finite: {poisoned.count([])} of {len(poisoned)} culled, with every other bit "
-        "unchanged.",
-        f"World offset 1e6: rounding the inputs to float32 alone changes a value by up to {rounding:.1e}.",
-    ]
-
-
-def chart(found: list[dict[str, Any]]) -> Figure:
-    """Two panels, values and gradients: one row per case, f32 and f64, the targets as lines."""
-    shown = [case for case in found if not case["poison"]]
-    figure, (left, right) = panels(10, 2 + 0.16 * len(shown), 1, 2, sharey=True)
-    y = np.arange(len(shown))
-    for axes, field, limit, what in (
-        (left, "value_relative", VALUE_F64, "values, relative"),
-        (right, "gradient", GRADIENT_F64, "gradients, relative L2"),
-    ):
-        for k, (dtype, color) in enumerate((("f32", ORANGE), ("f64", BLUE))):
-            errors = [max(case["outcomes"][k][field], 1e-18) for case in shown]
-            axes.plot(errors, y, "o", color=color, markersize=4, label=dtype)
-        axes.axvline(limit, color=BLUE, linestyle="--", linewidth=1, label=f"target f64, {limit:g}")
-        axes.set(xscale="log", xlabel=what)
-        axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.01), ncols=3, frameon=False)
-    left.axvline(VALUE_F32, color=ORANGE, linestyle="--", linewidth=1)  # absolute, but the values are near 1
-    left.set_yticks(y, [case["name"] for case in shown], fontsize=7)
-    left.set_ylim(len(shown), -1)
-    return figure
+        lines += [line_of(case, evaluate(case, dtype)) | facts() for dtype in KINDS]
+    runs = table.frame(table.put(lines))
+    lost = runs.loc[~runs["met"]]
+    words = [f"{line['case']}, {line['dtype']}: {line['by']}" for line in records(lost)]
+    return [families(runs), *words]
 
 
 OPTIONS = {"--long": {"action": "store_true", "help": "also deep stacks and a large image"}}

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from itertools import pairwise
 
 import numpy as np
@@ -95,12 +94,8 @@ class NerfTraining:
 
     def record(self) -> Run:
         """As that of a run of Gaussians, of which there are none."""
-        names = ("seconds", "cpu_seconds", "setup_seconds", "render_ms", "history")
-        none: Run = dict.fromkeys(("initial_points", "gaussians", "skipped_steps"), 0)
-        nowhere = {"gaussians": 0, "pixels": 0, "density": None}
-        none |= {"formation": None, "left_out": [], "regions": {"edge": nowhere, "flat": nowhere}}
-        run = none | {name: getattr(self, name) for name in names}
-        return run | {"seed": self.config.seed, "iterations": self.iteration, "config": asdict(self.config)}
+        names = ("seconds", "cpu_seconds", "setup_seconds", "render_ms")
+        return {name: getattr(self, name) for name in names} | {"initial_points": 0, "gaussians": 0}
 
     def peak_rss_mb(self) -> float | None:
         """Of all that the process held; None where the system does not tell."""
