@@ -263,7 +263,7 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
     if decisions.turned:
         config = replace(config, turn=(decisions.turned, decisions.length))
     model, left_out = trainer.shown(), trainer.left_out()
-    model.look = (scene.test or scene.train)[0].camera
+    model.look, model.world = (scene.test or scene.train)[0].camera, scene.world
     if out is not None and (rows := model.save(out / PLY)):
         left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
     if guard.skipped:

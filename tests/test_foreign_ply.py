@@ -128,16 +128,21 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     write(path, rows, [name for name in names if name not in ("scale_1", "rot_3")])
     refused("not a 3DGS scene, these properties are missing: scale_1, rot_3")
     write(path, [row | {"opacity": float("nan")} for row in rows], names)
-    refused("opacity is not finite in 3 rows, the first is row 0")
-    rows[2]["f_rest_5"] = float("inf")
-    write(path, rows, names)
-    refused("f_rest_5 is not finite in 1 rows, the first is row 2")
-    rows[2]["f_rest_5"] = 1e300
-    write(path, rows, names, types={"f_rest_5": "double"})
-    refused("f_rest_5 is not finite in 1 rows, the first is row 2")
+    refused("none of its 3 rows is finite")
+    for value, types in ((float("inf"), {}), (1e300, {"f_rest_5": "double"})):
+        rows[2]["f_rest_5"] = value
+        write(path, rows, names, types=types)
+        read = hqgs.Gaussians.load(path)
+        assert (len(read), read.notes) == (2, ["1 of 3 Gaussians hold NaN or Inf and were left out"])
     many = [*names, *(f"f_rest_{i}" for i in range(9, 72))]  # degree 4, which Brush can write
     write(path, values(many), many)
-    refused(r"72 f_rest_\* properties, wanted one of \[0, 9, 24, 45\]")
+    read = hqgs.Gaussians.load(path)
+    assert (read.sh_degree, read.notes) == (3, ["its harmonics of degree 4 were left out"])
+    last = [values(many)[1][f"f_rest_{24 * channel + 14}"] for channel in range(3)]
+    np.testing.assert_allclose(read.shN[1, 14], last)
+    odd = [*names, *(f"f_rest_{i}" for i in range(9, 30))]
+    write(path, values(odd), odd)
+    refused(r"30 f_rest_\* properties, wanted one of \[0, 9, 24, 45\]")
     data = write(path, values(names), names).read_bytes()
     path.write_bytes(data.replace(b"property float opacity", b"property list uchar float opacity"))
     refused("")

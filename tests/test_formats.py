@@ -232,9 +232,10 @@ def change_gltf(path: Path, change: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda c: c["nodes"][0].update(rotation=[1, 0, 0, 0]), "a node that moves, turns or scales it"),
-        (lambda c: c["meshes"].append(c["meshes"][0]), "2 primitives with KHR_gaussian_splatting"),
-        (lambda c: c["meshes"][0]["primitives"][0].pop("extensions"), "0 primitives"),
+        (lambda c: c["nodes"][0].update(scale=[1, 0, 1]), "a map that is singular"),
+        (lambda c: c["nodes"][0].update(rotation=[0, 0, 0, "x"]), "no Gaussians that can be read"),
+        (lambda c: c["nodes"][0].update(children=[0]), "no tree"),
+        (lambda c: c["meshes"][0]["primitives"][0].pop("extensions"), "no primitive with KHR_gaussian"),
         (lambda c: c["accessors"][1].update(componentType=5122), "accessor 1 is not float32 VEC4"),
         (lambda c: c["accessors"][0].update(count=10**12), "accessor 0 reaches beyond the data"),
         (lambda c: c["bufferViews"][0].update(byteOffset=-4), "accessor 0 reaches beyond the data"),

@@ -277,9 +277,9 @@ def test_every_cut_and_every_changed_byte_of_the_end_is_noticed(tmp_path: Path) 
     [
         ((0x5053474F, 3, 1, 0, 12, 0, 0), "not an SPZ file: its first number"),
         ((0x5053474E, 4, 1, 0, 12, 0, 0), "SPZ version 4, wanted 2 or 3"),
-        ((0x5053474E, 3, 1, 4, 12, 0, 0), "harmonics of degree 4"),
+        ((0x5053474E, 3, 1, 5, 12, 0, 0), "harmonics of degree 5"),
         ((0x5053474E, 3, 1, 0, 24, 0, 0), "24 fractional bits"),
-        ((0x5053474E, 3, 1, 0, 12, 2, 0), "flags 0x2"),
+        ((0x5053474E, 3, 1, 0, 12, 4, 0), "flags 0x4"),
         ((0x5053474E, 3, 4_000_000_000, 3, 12, 0, 0), "the header promises 4,000,000,000 Gaussians"),
         ((0x5053474E, 3, 9_000_000, 3, 12, 0, 0), "the header promises 9,000,000 Gaussians"),
         ((0x5053474E, 3, 2, 0, 12, 0, 0), "damaged: less data than 2 Gaussians have"),

@@ -103,10 +103,10 @@ def header(**changes: Any) -> bytes:
     ("changes", "message"),
     [
         ({"version": 5}, "SPZ version 5, wanted 4"),
-        ({"version": 3}, "SPZ version 3, wanted 4"),
-        ({"degree": 4}, "harmonics of degree 4"),
+        ({"version": 3}, "damaged: more data than 1 Gaussians have"),
+        ({"degree": 5}, "harmonics of degree 5"),
         ({"fraction": 24}, "24 fractional bits"),
-        ({"flags": 2}, "flags 0x2"),
+        ({"flags": 4}, "flags 0x4"),
         ({"streams": 6}, "the header promises 6 arrays at 32, wanted 5"),
         ({"table": 20}, "the header promises 5 arrays at 20"),
         ({"n": 4_000_000_000}, "the header promises 4,000,000,000 Gaussians"),

@@ -492,3 +492,20 @@ class Looking:
     def set_background_image(self, picture: np.ndarray, **_: Any) -> None:
         assert picture.ndim == 3
         Looking.pictures += 1
+
+
+def test_those_whose_browser_is_elsewhere_are_told_how(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hqgs.cli import view
+    from hqgs.show.viewer.guard import REFUSED
+
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 5000 10.0.0.2 22")
+    view._tell("http://127.0.0.1:8123", False)
+    assert "ssh -L 8123:localhost:8123" in capsys.readouterr().out
+    for words in ("http://localhost:8123", "ssh -L 8123:localhost:8123", "VS Code", "Docker", "JupyterHub"):
+        assert words in REFUSED.format(port=8123)
+    monkeypatch.delenv("SSH_CONNECTION")
+    monkeypatch.setattr(view, "elsewhere", lambda: False)
+    view._tell("http://127.0.0.1:8123", False)
+    assert "ssh" not in capsys.readouterr().out

@@ -9,6 +9,9 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 
 MAX_HEADER_BYTES = 1 << 16
+_TYPES = {1: "char uchar int8 uint8", 2: "short ushort int16 uint16", 8: "double float64"}
+_TYPES[4] = "int uint int32 uint32 float float32"
+SIZES = {name: size for size, names in _TYPES.items() for name in names.split()}  # bytes of a value
 
 
 def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
@@ -57,3 +60,22 @@ def _check_header(path: Path) -> None:
         raise ValueError(
             f"{path}: the header promises {max(promised, most)} values, the file has {size} bytes"
         )
+
+
+def header_of(path: Path) -> tuple[list[str], int]:
+    """The comments of a PLY file, and how many bytes follow its last element; 0 where lists hide that."""
+    with path.open("rb") as f:
+        head = f.read(MAX_HEADER_BYTES)
+    end = head.find(b"\n", head.find(b"end_header")) + 1
+    lines = head[:end].decode("latin-1").splitlines()
+    comments = [line.removeprefix("comment ") for line in lines if line.startswith("comment ")]
+    rows = size = 0
+    for words in (line.split() for line in lines):
+        if words[:1] == ["element"]:
+            rows = int(words[2])
+        elif words[:1] == ["property"]:
+            if words[1] not in SIZES:
+                return comments, 0
+            size += rows * SIZES[words[1]]
+    text = any(line.startswith("format ascii") for line in lines)
+    return comments, 0 if text else max(0, path.stat().st_size - end - size)

@@ -97,7 +97,7 @@ def run(options: Render) -> int:
 def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
     from hqgs.model.orbit import orbit
-    from hqgs.scene.camera_files import load_path
+    from hqgs.scene.camera_files import load_path, moved
     from hqgs.scene.paths import UP, camera_path
     from hqgs.show.frames import FPS
 
@@ -114,7 +114,8 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
             raise ValueError("--frames is for paths that are made here; a path file has its own")
         if not Path(path).is_file():
             raise FileNotFoundError(f"--path is {path!r}: no such file, and none of: {', '.join(PATHS)}")
-        return None, *load_path(path)
+        own, rate = load_path(path)
+        return None, [moved(camera, gaussians.world) for camera in own], rate
     if known is None or not known.train:
         return None, orbit(gaussians, count, up=UP if options.up is None else options.up), FPS
     up = known.up if options.up is None else options.up

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import webbrowser
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.model.formats.files import scene_file
-from hqgs.show.viewer.guard import PORT, check
+from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
 
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene
@@ -128,8 +129,17 @@ class LiveView:
 
 def _tell(url: str, open_browser: bool) -> None:
     print(f"look at {url} in a browser of this machine; Ctrl-C ends it", flush=True)
+    if elsewhere():
+        print(ELSEWHERE.format(port=url.rsplit(":", 1)[-1]), flush=True)
     if open_browser:
         webbrowser.open(url)
+
+
+def elsewhere() -> bool:
+    """Whether the browser is likely on another machine: from a container, an ssh session, a notebook."""
+    marks = ("SSH_CONNECTION", "SSH_TTY", "VSCODE_IPC_HOOK_CLI", "REMOTE_CONTAINERS", "CODESPACES")
+    marks += ("JUPYTERHUB_USER", "COLAB_RELEASE_TAG", "KUBERNETES_SERVICE_HOST")
+    return any(os.environ.get(mark) for mark in marks) or Path("/.dockerenv").exists()
 
 
 def _report(folder: Path) -> Any:

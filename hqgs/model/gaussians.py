@@ -12,21 +12,23 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs._rust import EPS2D
+from hqgs._rust import EPS2D, NEAR_PLANE
 from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE, SH_C0
 from hqgs.model.content import around
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.files import READERS, WRITERS, format_of, scene_file
+from hqgs.model.formats.files import format_of, read_scene, scene_file, write_scene
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import first_camera
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
+from hqgs.scene.world import SMALLEST, USUAL, World
 
 MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
 INITIAL_OPACITY = 0.1
+SAMPLED = 4096  # Gaussians that tell how large a scene is
 NEIGHBORS = 3  # a point's first scale comes from its 3 nearest neighbours
 
 
@@ -45,6 +47,9 @@ class Gaussians:
     sh0: Tensor  # [N, 1, 3], the SH coefficient of degree 0
     shN: Tensor  # noqa: N815  [N, K - 1, 3], the higher coefficients; K = (sh_degree + 1)^2
     look: Camera | None = field(default=None, init=False, compare=False)  # for notebooks; in no file
+    world: World = field(default_factory=World, init=False, compare=False)  # the frame of its files
+    antialiased: bool = field(default=False, init=False, compare=False)  # rendered with that compensation
+    notes: list[str] = field(default_factory=list, init=False, compare=False)  # of the file it was read from
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
@@ -78,19 +83,47 @@ class Gaussians:
 
     def named(self) -> dict[str, Tensor]:
         """The tensors by name, in the order of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "look"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.init}
+
+    def like(self, tensors: dict[str, Tensor]) -> Gaussians:
+        """Others with these tensors, in the same frame and seen in the same way."""
+        made = Gaussians(**tensors)
+        made.look, made.world, made.antialiased, made.notes = (
+            self.look,
+            self.world,
+            self.antialiased,
+            self.notes,
+        )
+        return made
+
+    def in_world(self, world: World) -> Gaussians:
+        """The same scene, held in another frame, such as that of its photos' cameras (`Scene.world`)."""
+        if self.world == world:
+            return self
+        means = world.into(self.world.out(self.means.detach().double().numpy()))
+        grown = math.log(self.world.unit / world.unit)
+        held = {"means": torch.from_numpy(means).to(self.means.dtype), "scales": self.scales + grown}
+        made = self.like(self.named() | held)
+        made.world, made.look = world, None
+        return made
+
+    def near_plane(self) -> float:
+        """What is nearer to a camera than this is not rendered: less in a scene of small units."""
+        few = self.means.detach()[:: max(1, len(self) // SAMPLED)].double().numpy()
+        few = few[np.isfinite(few).all(1)]
+        return near_for(few)
 
     def detached(self) -> Gaussians:
         """The same values (shared memory) without a gradient history."""
-        return Gaussians(**{name: tensor.detach() for name, tensor in self.named().items()})
+        return self.like({name: tensor.detach() for name, tensor in self.named().items()})
 
     def rows(self, chosen: Tensor) -> Gaussians:
         """Some of them: `chosen` bool [N], or the rows' numbers [M]."""
-        return Gaussians(**{name: tensor[chosen] for name, tensor in self.named().items()})
+        return self.like({name: tensor[chosen] for name, tensor in self.named().items()})
 
     def arrays(self) -> Arrays:
         """The same values (shared memory) as numpy arrays, by the names of the fields."""
-        return {
+        arrays: Arrays = {
             "means": self.means.detach().numpy(),
             "scales": self.scales.detach().numpy(),
             "quats": self.quats.detach().numpy(),
@@ -98,6 +131,11 @@ class Gaussians:
             "sh0": self.sh0.detach().numpy(),
             "shN": self.shN.detach().numpy(),
         }
+        if not self.world.ordinary:
+            arrays["world"] = self.world
+        if self.antialiased:
+            arrays["antialiased"] = True
+        return arrays
 
     def activated_scales(self) -> Tensor:
         """Standard deviations [N, 3] in world units."""
@@ -130,7 +168,8 @@ class Gaussians:
         if len(background) != 3:
             raise ValueError(f"background is {background}, wanted three numbers: R, G, B")
         with one_torch_thread():
-            return self.rasterize(camera, sh_degree=degree, background=background)[0][0]
+            near = self.near_plane()
+            return self.rasterize(camera, sh_degree=degree, background=background, near_plane=near)[0][0]
 
     def rasterize(
         self,
@@ -141,6 +180,7 @@ class Gaussians:
         background: Sequence[float] | None = None,
         render_mode: str = "RGB",
         eps2d: float = EPS2D,
+        near_plane: float = NEAR_PLANE,
     ) -> tuple[Tensor, Tensor, RasterizationMeta]:
         """`hqgs.rasterization` of these Gaussians for one camera.
 
@@ -148,7 +188,7 @@ class Gaussians:
             camera: size and pinhole intrinsics in pixels, world to camera.
             colors: [N, D] channels, or with `sh_degree` harmonics, [N, K, 3]; None: the Gaussians' own
                 harmonics, for which `sh_degree` must be given.
-            sh_degree, render_mode, eps2d: as `hqgs.rasterization` takes them.
+            sh_degree, render_mode, eps2d, near_plane: as `hqgs.rasterization` takes them.
             background: D numbers behind everything; None: 0.
 
         Returns:
@@ -171,6 +211,8 @@ class Gaussians:
             backgrounds=None if background is None else torch.tensor([[*background]], dtype=self.means.dtype),
             render_mode=render_mode,
             eps2d=eps2d,
+            near_plane=near_plane,
+            rasterize_mode="antialiased" if self.antialiased else "classic",
         )
 
     def save(self, path: str | Path, format: str | None = None) -> int:
@@ -186,7 +228,7 @@ class Gaussians:
             OSError: the file cannot be written; what was there before stays.
         """
         path = Path(path)
-        return WRITERS[format_of(path, format)](path, self.arrays())
+        return write_scene(path, self.arrays(), format_of(path, format, written=True))
 
     @classmethod
     def load(cls, path: str | Path, format: str | None = None) -> Gaussians:
@@ -201,7 +243,7 @@ class Gaussians:
             ValueError: it is no such file, or it is damaged; the message names the file and the property.
         """
         file = scene_file(path)
-        arrays = READERS[format_of(file, format)](file)
+        arrays = read_scene(file, format_of(file, format))
         made = cls(
             means=torch.from_numpy(arrays["means"]),
             scales=torch.from_numpy(arrays["scales"]),
@@ -211,6 +253,8 @@ class Gaussians:
             shN=torch.from_numpy(arrays["shN"]),
         )
         made.look = first_camera(file.parent) if file.name == PLY else None
+        made.world = arrays.get("world", made.world)
+        made.antialiased, made.notes = arrays.get("antialiased", False), arrays.get("notes", [])
         return made
 
     @classmethod
@@ -252,6 +296,12 @@ class Gaussians:
             sh0=sh0[:, None, :].contiguous(),
             shN=torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
         )
+
+
+def near_for(points: NDArray[np.float64]) -> float:
+    """The near plane for a scene of points [P, 3]: NEAR_PLANE, or less where its size is not ordinary."""
+    size = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))) if len(points) else 0
+    return NEAR_PLANE if not 0 < size < SMALLEST else NEAR_PLANE * 2.0 ** round(math.log2(size / USUAL))
 
 
 def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ def enlarge(gaussians: Gaussians, smallest: Tensor) -> Gaussians:
     Mip-Splatting's 3D smoothing without its change of the opacities: they are trained with it.
     """
     scales = _Enlarge.apply(gaussians.scales, smallest)
-    return Gaussians(**(gaussians.named() | {"scales": scales}))
+    return gaussians.like(gaussians.named() | {"scales": scales})
 
 
 class _Enlarge(torch.autograd.Function):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ from hqgs.base.files import atomic_path, write_json
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.paths import view_matrix, world_up
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.world import World
 
 CAMERAS, PHOTOS = "cameras.json", "photos"
 MAX_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to train
@@ -70,13 +71,14 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
                 "width": view.camera.width,
                 "height": view.camera.height,
                 "K": view.camera.K.tolist(),
-                "world_to_camera": view.camera.viewmat.tolist(),
+                "world_to_camera": scene.world.viewmat_out(view.camera.viewmat).tolist(),
                 "photo": photo,
             }
         )
     up = world_up([view.camera for view in scene.train], [view.turn for view in scene.train])
     frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
-    write_json(folder / CAMERAS, {"frame": frame, "up": up.tolist(), "views": entries})
+    content = {"frame": frame, "up": up.tolist(), "views": entries}
+    write_json(folder / CAMERAS, content | ({} if scene.world.ordinary else {"world": scene.world.json()}))
 
 
 def small_photo(view: View, most: int = MAX_SIDE) -> Image.Image:
@@ -88,7 +90,7 @@ def small_photo(view: View, most: int = MAX_SIDE) -> Image.Image:
 
 
 def load_cameras(folder: str | Path) -> RunCameras:
-    """Read cameras.json of a run's folder.
+    """Read cameras.json of a run's folder: cameras in the frame that `Gaussians.load` gives the scene.
 
     Raises:
         FileNotFoundError: there is none.
@@ -99,7 +101,8 @@ def load_cameras(folder: str | Path) -> RunCameras:
     value = _read_json(path)
     try:
         up = np.array(value["up"], np.float64)
-        views = [_known(path, folder, entry) for entry in value["views"]]
+        world = World.of_json(value["world"]) if "world" in value else World()
+        views = [_known(path, folder, entry, world) for entry in value["views"]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: no cameras of a run: {error!r}") from error
     if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
@@ -119,7 +122,7 @@ def first_camera(folder: Path) -> Camera | None:
     return next(iter([*known.test, *known.train]), None)
 
 
-def _known(path: Path, folder: Path, entry: Any) -> KnownCamera:
+def _known(path: Path, folder: Path, entry: Any, world: World) -> KnownCamera:
     name, photo = entry["name"], entry["photo"]
     if not isinstance(name, str):
         raise ValueError(f"a name is {name!r:.60}")
@@ -130,19 +133,29 @@ def _known(path: Path, folder: Path, entry: Any) -> KnownCamera:
             raise ValueError(f"photo {photo!r:.60} leaves the folder")
         file = folder / parts
     camera = checked_camera(entry["width"], entry["height"], entry["K"], entry["world_to_camera"])
-    return KnownCamera(name, camera, bool(entry["held_out"]), file)
+    return KnownCamera(name, moved(camera, world), bool(entry["held_out"]), file)
 
 
-def save_path(path: str | Path, cameras: Sequence[Camera], fps: float = 30.0) -> None:
+def moved(camera: Camera, world: World) -> Camera:
+    """A camera of a file in the frame in which its scene is held."""
+    return replace(camera, viewmat=world.viewmat_into(camera.viewmat))
+
+
+def save_path(
+    path: str | Path, cameras: Sequence[Camera], fps: float = 30.0, world: World | None = None
+) -> None:
     """Write a camera path as JSON, in the style of nerfstudio's camera_path files, atomically.
 
-    Poses are camera to world with OpenGL's axes, in this scene's world; `fov` is vertical, in degrees.
+    Poses are camera to world with OpenGL's axes, in the frame of the scene's files (`world`); `fov` is
+    vertical, in degrees.
     Principal points are taken for the middle. ValueError without a camera.
     """
     if not cameras:
         raise ValueError("cameras is empty, wanted at least one")
     frames = []
     for camera in cameras:
+        if world is not None:
+            camera = replace(camera, viewmat=world.viewmat_out(camera.viewmat))
         pose = np.eye(4)
         pose[:3, :3] = camera.viewmat[:3, :3].T @ _FLIP
         pose[:3, 3] = camera.center
@@ -160,7 +173,7 @@ def save_path(path: str | Path, cameras: Sequence[Camera], fps: float = 30.0) ->
 
 
 def load_path(path: str | Path) -> tuple[list[Camera], float]:
-    """Read a camera path: its cameras, and frames per second.
+    """Read a camera path: its cameras, in the frame of the scene's files (`moved`), and frames per second.
 
     Raises FileNotFoundError, or ValueError that names the file.
     """

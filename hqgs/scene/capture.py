@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.photo_files import MASKS, Named, below
 from hqgs.scene.scene import SfmReport, Tracks
+from hqgs.scene.world import World
 
 MAX_SIDE = 65_535  # the largest side a JPEG can have; larger ones come from damaged files
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
@@ -37,7 +38,7 @@ class Capture:
     source: str
     photos: list[Photo]
     downscale: float  # what is left to do on the photos' stored size
-    points: NDArray[np.float32]  # [P, 3], world; P may be 0
+    points: NDArray[np.floating]  # [P, 3], world of the files; P may be 0
     point_colors: NDArray[np.uint8]  # [P, 3]
     folder: Path | None = (
         None  # where every photo lies, registered or not; None: the photos have no one folder
@@ -45,26 +46,26 @@ class Capture:
     test_names: frozenset[str] | None = None  # the test views, where the format names them
     near_far: dict[str, tuple[float, float]] = field(default_factory=dict)  # depth range by photo name
     notes: list[str] = field(default_factory=list)
+    world: World = field(default_factory=World)  # the frame of the files, where that is another
     tracks: Tracks | None = None  # px of the cameras' own size
     seen: dict[str, NDArray[np.intp]] | None = None  # by photo, rows of the points that it shows
     sfm: SfmReport | None = None  # where cameras and points come from the photos
 
 
-def no_points() -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def no_points() -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """An empty point cloud: points [0, 3] and colours [0, 3]."""
-    return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
 def keep_finite(
     points: NDArray[np.float64], colors: NDArray[np.uint8], notes: list[str]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points as float32 without those that are not finite there; how many were dropped goes to `notes`."""
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Points without those that float32 cannot hold; how many were dropped goes to `notes`."""
     with np.errstate(over="ignore"):
-        points32 = points.astype(np.float32)
-    finite = np.isfinite(points32).all(1)
+        finite = np.isfinite(points.astype(np.float32)).all(1)
     if not finite.all():
         notes.append(f"{int((~finite).sum())} of {len(points)} points are not finite and were dropped")
-    return points32[finite], colors[finite]
+    return points[finite], colors[finite]
 
 
 def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: bool) -> NDArray[np.float64]:

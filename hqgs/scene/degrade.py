@@ -89,12 +89,17 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
         for name, view in views.items():
             if view.mask is not None:
                 _store(root / "masks", _with_suffix(name, ".png"), view.mask.astype(np.uint8) * 255)
-        cameras = {name: view.camera for name, view in views.items()}
+        world = scene.world
+        cameras = {
+            name: replace(view.camera, viewmat=world.viewmat_out(view.camera.viewmat))
+            for name, view in views.items()
+        }
         seen = None
         if scene.seen is not None:
             seen = {names[name]: rows for name, rows in scene.seen.items() if name in names}
         error = 0.0 if scene.tracks is None else scene.tracks.error
-        write_colmap(root / "sparse" / "0", cameras, scene.points, scene.point_colors, seen, error)
+        points = world.out(scene.points)
+        write_colmap(root / "sparse" / "0", cameras, points, scene.point_colors, seen, error)
         stored = "stored as the last step's JPEG files" if jpeg_last else "clipped and rounded to 8-bit PNGs"
         if enlarged:
             stored += " in low and enlarged to 8-bit PNGs"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_fo
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.photo_files import is_run
+from hqgs.scene.place import placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, Tracks, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -86,7 +86,7 @@ def load_scene(
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
     notes = list(capture.notes)
     test_names = held_out_names(root, capture, test_every, notes, degraded)
-    capture = without_missing(root, capture, notes)
+    capture = placed(without_strays(without_missing(root, capture, notes), notes), notes)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
     views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
@@ -102,7 +102,7 @@ def load_scene(
             f"{len(unreadable)} of {len(train_names)} training photos cannot be read and were left out: "
             + ", ".join(sorted(unreadable))
         )
-    points, colors = capture.points, capture.point_colors
+    points, colors = capture.points.astype(np.float32), capture.point_colors
     if len(points) == 0:
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)
@@ -118,6 +118,7 @@ def load_scene(
         tracks,
         capture.seen,
         capture.sfm,
+        world=capture.world,
     )
 
 
@@ -148,7 +149,8 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
     )
     notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
     nothing = no_points()
-    return Scene(root.name, views, [], *nothing, "photos", notes if photos.unreadable else [])
+    points, colors = nothing[0].astype(np.float32), nothing[1]
+    return Scene(root.name, views, [], points, colors, "photos", notes if photos.unreadable else [])
 
 
 def formats_of(root: Path, downscale: float) -> list[str]:
@@ -232,24 +234,6 @@ def bounded(capture: Capture, longest: int) -> Capture:
             f"{MOST_BYTES / 1e9:g} GB of memory then"
         )
     return replace(capture, downscale=downscale, notes=[*capture.notes, note])
-
-
-def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
-    """The capture without cameras whose photo is not there; `notes` names them.
-
-    The places of the others in the split stay what they were. FileNotFoundError where more than half miss.
-    """
-    missing = [photo for photo in capture.photos if not os.path.lexists(photo.path)]
-    if not missing:
-        return capture
-    names, count = some([photo.name for photo in missing]), len(capture.photos)
-    if 2 * len(missing) > count:
-        raise FileNotFoundError(
-            f"{len(missing)} of {count} cameras have no photo in {capture.folder or root}: {names}"
-        )
-    notes.append(f"{len(missing)} of {count} cameras have no photo any more and were left out: {names}")
-    gone = {photo.name for photo in missing}
-    return replace(capture, photos=[photo for photo in capture.photos if photo.name not in gone])
 
 
 def _with_lows(

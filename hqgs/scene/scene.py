@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.world import World
+
 MOST_DEPTHS = 1 << 22  # that `Scene.reach` looks at: they and their median take some 120 MB
+STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ class Scene:
     origin: dict[str, Any] | None = (
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
+    world: World = field(default_factory=World)  # the frame of its files, where that is another
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""
@@ -83,7 +87,10 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera."""
+        """Radius of the camera positions: `1.1 max |c - mean(c)|`, or 1 for a single camera.
+
+        Cameras that lie more than STRAY median distances from the others' middle do not count.
+        """
         return extent_of(np.stack([v.camera.center for v in self.train]))
 
     @property
@@ -102,8 +109,16 @@ class Scene:
         return max(self.extent, float(np.median(seen))) if seen.size else self.extent
 
 
+def strays(centers: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
+    """Which cameras at `centers` [C, 3] lie over `most` times as far from the middle as half of them, [C]."""
+    apart = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    usual = float(np.median(apart))
+    return apart > most * usual if usual > 0 else np.zeros(len(centers), np.bool_)
+
+
 def extent_of(centers: NDArray[np.float64]) -> float:
-    """The extent of a scene whose training cameras are at `centers` [C, 3]."""
+    """The extent of a scene whose training cameras are at `centers` [C, 3]; see `Scene.extent`."""
+    centers = centers[~strays(centers, STRAY)]
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
     return 1.1 * radius if radius > 0 else 1.0
 

@@ -21,6 +21,7 @@ from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
 from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.spz import encode_spz, write_spz
+from hqgs.model.formats.world_file import keep_world
 from hqgs.model.gaussians import Gaussians
 from hqgs.show.export_options import ExportOptions
 
@@ -53,9 +54,9 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     if options.format != "spz":
         reduced.save(path, options.format)
     else:
-        clipped = write_spz(
-            path, along_a_curve(reduced).arrays(), options.sh_bits, options.spz_version
-        ).clipped
+        arrays = along_a_curve(reduced).arrays()
+        clipped = write_spz(path, arrays, options.sh_bits, options.spz_version).clipped
+        keep_world(path, reduced.world)
     written = path.stat().st_size
     sizes = [_size(g, options) for g in (gaussians, *(step.gaussians for step in steps[:-1])) if steps]
     sizes.append(written if options.format == "spz" else _size(reduced, options))
@@ -151,14 +152,14 @@ def along_a_curve(gaussians: Gaussians) -> Gaussians:
 
 
 def _cut(gaussians: Gaussians, degree: int) -> Gaussians:
-    return Gaussians(**(gaussians.named() | {"shN": gaussians.shN[:, : (degree + 1) ** 2 - 1]}))
+    return gaussians.like(gaussians.named() | {"shN": gaussians.shN[:, : (degree + 1) ** 2 - 1]})
 
 
 def _without_bands(gaussians: Gaussians, degrees: Tensor) -> Gaussians:
     """With zeros for the coefficients above each Gaussian's degree."""
     places = torch.arange(gaussians.shN.shape[1])
     keep = places < ((degrees + 1).square() - 1)[:, None]
-    return Gaussians(**(gaussians.named() | {"shN": gaussians.shN * keep[:, :, None]}))
+    return gaussians.like(gaussians.named() | {"shN": gaussians.shN * keep[:, :, None]})
 
 
 def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:

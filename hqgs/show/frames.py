@@ -128,6 +128,10 @@ class Activated:
         g = gaussians.detached()
         self.degree: int = g.sh_degree
         colors = (g.sh0, g.shN) if g.sh_degree else g.sh0
+        self._how: dict[str, Any] = {
+            "near_plane": g.near_plane(),
+            "rasterize_mode": "antialiased" if g.antialiased else "classic",
+        }
         self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
 
     @torch.no_grad()
@@ -136,7 +140,7 @@ class Activated:
         behind = torch.tensor([[*background]], dtype=self._tensors[0].dtype)
         with one_torch_thread():
             image, _, _ = rasterization(
-                *self._tensors, *_of(camera), sh_degree=self.degree, backgrounds=behind
+                *self._tensors, *_of(camera), sh_degree=self.degree, backgrounds=behind, **self._how
             )
             return image[0].mul_(255).round_().clamp_(0, 255).byte().numpy()
 
@@ -147,7 +151,7 @@ class Activated:
             means, quats, scales, opacities, _ = self._tensors
             none = means.new_zeros(len(means), 1)
             image, alpha, _ = rasterization(
-                means, quats, scales, opacities, none, *_of(camera), render_mode="ED"
+                means, quats, scales, opacities, none, *_of(camera), render_mode="ED", **self._how
             )
         return image[0, ..., 0].float().numpy(), alpha[0, ..., 0].float().numpy()
 

@@ -7,10 +7,20 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.world import World
+
 Floats = NDArray[np.float32] | NDArray[np.float64]
 
 
-class Arrays(TypedDict):
+class Told(TypedDict, total=False):
+    """What a file says beside its numbers."""
+
+    world: World  # the frame of the file, where that is another
+    antialiased: bool  # it was trained with, and is to be seen with, the compensation of "antialiased"
+    notes: list[str]  # what was left out or changed on reading
+
+
+class Arrays(Told):
     """N Gaussians as `hqgs.Gaussians` has them, before their activations."""
 
     means: Floats  # [N, 3], world units

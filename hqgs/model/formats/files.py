@@ -3,15 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from hqgs.base.files import PLY
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from hqgs.model.formats.gltf import read_gltf, write_gltf
+from hqgs.model.formats.ksplat import read_ksplat
 from hqgs.model.formats.ply import read_ply, write_ply
+from hqgs.model.formats.sog import read_sog
 from hqgs.model.formats.splat import read_splat, write_splat
 from hqgs.model.formats.spz import read_spz, write_spz
+from hqgs.model.formats.world_file import keep_world, read_world
+from hqgs.scene.world import World
+
+OWN_PLACE = ("ply", "glb", "gltf")  # formats that hold the frame themselves
+
+
+def read_scene(path: Path, format: str) -> Arrays:
+    """What a scene file holds, with the frame that stands beside it, if one does."""
+    arrays = READERS[format](path)
+    if "world" not in arrays and not (world := read_world(path)).ordinary:
+        arrays["world"] = world
+    return arrays
+
+
+def write_scene(path: Path, arrays: Arrays, format: str) -> int:
+    """Write a scene file, and its frame beside it where the format has no place for that."""
+    left_out = WRITERS[format](path, arrays)
+    keep_world(path, World() if format in OWN_PLACE else arrays.get("world", World()))
+    return left_out
 
 
 def _read_any_ply(path: Path) -> Arrays:
@@ -25,6 +47,11 @@ READERS: dict[str, Callable[[Path], Arrays]] = {
     "splat": read_splat,
     "compressed.ply": read_compressed_ply,
     "glb": read_gltf,
+    "gltf": read_gltf,
+    "full.ply": _read_any_ply,
+    "sog": read_sog,
+    "meta.json": read_sog,
+    "ksplat": read_ksplat,
 }
 WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
     "ply": write_ply,
@@ -32,25 +59,36 @@ WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
     "splat": write_splat,
     "compressed.ply": write_compressed_ply,
     "glb": write_gltf,
+    "full.ply": partial(write_ply, full=True),
 }
 
 
-def format_of(path: Path, name: str | None = None) -> str:
-    """The format of that name, or the one that the file's suffix says. ValueError where there is none."""
+def format_of(path: Path, name: str | None = None, *, written: bool = False) -> str:
+    """The format of that name, or the one that the file's suffix says. ValueError where there is none, or,
+    of a file that is to be `written`, where it is only read."""
+    known = [*WRITERS] if written else [*READERS]
     if name is not None:
-        if name not in READERS:
-            raise ValueError(f"format is {name!r}, wanted one of: {', '.join(READERS)}")
+        if name not in known:
+            raise ValueError(f"format is {name!r}, wanted one of: {', '.join(known)}")
         return name
-    fitting = [format for format in READERS if path.name.lower().endswith(f".{format}")]
+    if path.is_dir() and (path / "meta.json").is_file():
+        return "meta.json"
+    lower = path.name.lower()
+    fitting = [format for format in known if lower.endswith(f".{format}") or lower == format]
     if not fitting:
-        raise ValueError(f"{path}: the suffix says no format; wanted .{', .'.join(READERS)}")
+        raise ValueError(f"{path}: the suffix says no format; wanted .{', .'.join(known)}")
     return max(fitting, key=len)
 
 
 def scene_file(path: str | Path) -> Path:
-    """The file itself, or scene.ply of a run's folder. FileNotFoundError where there is none."""
+    """The file itself, scene.ply of a run's folder, or meta.json of a SOG scene's that was unpacked.
+
+    FileNotFoundError where there is none.
+    """
     path = Path(path)
     file = path / PLY if path.is_dir() else path
+    if path.is_dir() and not file.is_file() and (path / "meta.json").is_file():
+        file = path / "meta.json"
     if not file.is_file():
         raise FileNotFoundError(f"there is no {file}")
     return file

@@ -1,4 +1,4 @@
-"""Binary glTF files with KHR_gaussian_splatting, the extension that Khronos has ratified.
+"""glTF files with KHR_gaussian_splatting, the extension that Khronos has ratified.
 
 One mesh primitive of points, float32 throughout: POSITION, ROTATION (x y z w), SCALE (standard deviations,
 where drafts had logs), OPACITY (0..1), SH_DEGREE_l_COEF_n. glTF has y up and z towards the viewer, here y is
@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 
 from hqgs.base.files import atomic_path
 from hqgs.model.constants import MAX_SH_DEGREE
-from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.arrays import Arrays, Floats
+from hqgs.model.formats.gltf_nodes import BIN, JSON, MAGIC, VERSION, content_of, placed_meshes
 from hqgs.model.formats.rows import finite_rows, pick, to_logits, to_opacities
 from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH
+from hqgs.model.formats.turned import mapped
+from hqgs.scene.world import World, world_for
 
 NAME = "KHR_gaussian_splatting"
-MAGIC, VERSION, JSON, BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 FLOAT, POINTS = 5126, 0
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 SMALLEST = 1e-30  # a scale of 0 has no log
@@ -68,12 +70,17 @@ def write_gltf(path: str | Path, arrays: Arrays) -> int:
         "attributes": {name: k for k, name in enumerate(parts)},
         "extensions": {NAME: settings},
     }
+    world, node = arrays.get("world", World()), dict[str, Any](mesh=0)
+    asset: dict[str, Any] = {"version": "2.0", "generator": "hqgs"}
+    if not world.ordinary:  # the node places it, and what is read again is held as it was
+        node |= {"translation": (FLIP_MEANS * world.shift).tolist(), "scale": [world.unit] * 3}
+        asset["extras"] = {"hqgs_world": world.json()}
     content = {
-        "asset": {"version": "2.0", "generator": "hqgs"},
+        "asset": asset,
         "extensionsUsed": [NAME],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": at}],
         "bufferViews": views,
@@ -89,47 +96,88 @@ def write_gltf(path: str | Path, arrays: Arrays) -> int:
 
 
 def read_gltf(path: str | Path) -> Arrays:
-    """Read a .glb file with one primitive of Gaussians: float32 arrays.
+    """Read all Gaussians of a .glb or .gltf file, where its nodes place them: float32 arrays.
+
+    Of several primitives those with fewer harmonics get zeros. A scene that its nodes take far from the
+    origin is held around its middle (`world`).
 
     Raises FileNotFoundError, or ValueError that names the file: damaged, without Gaussians, or with what is
-    not read here: several primitives, integers, compression, a node that moves or turns them.
+    not read here: integers, compression.
     """
     path = Path(path)
-    content, data = _chunks(path)
+    content, buffers = content_of(path)
     try:
-        primitive = _primitive(content)
-        attributes, count = (
-            primitive["attributes"],
-            content["accessors"][primitive["attributes"]["POSITION"]]["count"],
-        )
-        higher = sum(name.startswith(f"{NAME}:SH_DEGREE_") for name in attributes) - 1
-        degree = math.isqrt(higher + 1) - 1 if higher >= 0 else -1
-        if not 0 <= degree <= MAX_SH_DEGREE or (degree + 1) ** 2 - 1 != higher:
-            raise ValueError(f"{higher + 1} coefficients of harmonics, wanted 1, 4, 9 or 16")
-        if type(count) is not int or count < 0:
-            raise ValueError(f"a count of {count!r:.40}")
-
-        def values(name: str, kind: str) -> NDArray[np.float64]:
-            return _values(content, data, attributes[name], kind, count).astype(np.float64)
-
-        means = values("POSITION", "VEC3")
-        quats = values(f"{NAME}:ROTATION", "VEC4")
-        scales = values(f"{NAME}:SCALE", "VEC3")
-        opacities = values(f"{NAME}:OPACITY", "SCALAR")[:, 0]
-        sh0 = values(f"{NAME}:SH_DEGREE_0_COEF_0", "VEC3")
-        rest = [FLIP_SH[k] * values(_harmonic(k), "VEC3") for k in range(higher)]
+        extras = content["asset"].get("extras")
+        said = extras.get("hqgs_world") if isinstance(extras, dict) else None
+        world = World() if said is None else World.of_json(said)
+        parts = [
+            _placed(_gaussians(content, buffers, primitive), matrix, placed=said is None)
+            for number, matrix in placed_meshes(content)
+            for primitive in content["meshes"][number]["primitives"]
+            if NAME in primitive.get("extensions", {})
+        ]
+        if not parts:
+            raise ValueError(f"no primitive with {NAME}")
     except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError) as error:
         raise ValueError(f"{path}: no Gaussians that can be read: {error!r:.160}") from error
-    shN = np.stack(rest, axis=1) if rest else np.zeros((count, 0, 3))
+    most = max(part["shN"].shape[1] for part in parts)
+    means = np.concatenate([part["means"] for part in parts])
+    if said is None and len(means):
+        world = World(1.0, world_for(means, means).shift)
+        means = world.into(means)
+    found: Arrays = {
+        "means": means.astype(np.float32),
+        "scales": np.concatenate([part["scales"] for part in parts]).astype(np.float32),
+        "quats": np.concatenate([part["quats"] for part in parts]).astype(np.float32),
+        "opacities": np.concatenate([part["opacities"] for part in parts]).astype(np.float32),
+        "sh0": np.concatenate([part["sh0"] for part in parts]).astype(np.float32),
+        "shN": np.concatenate([_widened(part["shN"], most) for part in parts]),
+    }
+    if not world.ordinary:
+        found["world"] = world
+    return found
+
+
+def _widened(harmonics: Floats, most: int) -> NDArray[np.float32]:
+    """With zeros up to so many coefficients."""
+    return np.pad(harmonics.astype(np.float32), ((0, 0), (0, most - harmonics.shape[1]), (0, 0)))
+
+
+def _placed(arrays: Arrays, matrix: NDArray[np.float64], *, placed: bool) -> Arrays:
+    """The Gaussians where a node has them, in our axes; as they are where the file says the frame itself."""
+    if not placed or np.array_equal(matrix, np.eye(4)):
+        return arrays
+    flip = np.diag(FLIP_MEANS)
+    return mapped(arrays, flip @ matrix[:3, :3] @ flip, flip @ matrix[:3, 3])
+
+
+def _gaussians(content: Any, buffers: list[bytes], primitive: Any) -> Arrays:
+    """Those of one primitive, in our axes; means are float64."""
+    if "extensions" in primitive["extensions"][NAME]:
+        raise ValueError("a compressed primitive")
+    attributes = primitive["attributes"]
+    count = content["accessors"][attributes["POSITION"]]["count"]
+    higher = sum(name.startswith(f"{NAME}:SH_DEGREE_") for name in attributes) - 1
+    degree = math.isqrt(higher + 1) - 1 if higher >= 0 else -1
+    if not 0 <= degree <= MAX_SH_DEGREE or (degree + 1) ** 2 - 1 != higher:
+        raise ValueError(f"{higher + 1} coefficients of harmonics, wanted 1, 4, 9 or 16")
+    if type(count) is not int or count < 0:
+        raise ValueError(f"a count of {count!r:.40}")
+
+    def values(name: str, kind: str) -> NDArray[np.float64]:
+        return _values(content, buffers, attributes[name], kind, count).astype(np.float64)
+
+    means, scales = values("POSITION", "VEC3"), values(f"{NAME}:SCALE", "VEC3")
     if (scales < 0).any():
-        raise ValueError(f"{path}: a scale is below 0; drafts of {NAME} had logs there")
+        raise ValueError(f"a scale is below 0; drafts of {NAME} had logs there")
+    rest = [FLIP_SH[k] * values(_harmonic(k), "VEC3") for k in range(higher)]
     return {
-        "means": (FLIP_MEANS * means).astype(np.float32),
+        "means": FLIP_MEANS * means,
         "scales": np.log(np.maximum(scales, SMALLEST)).astype(np.float32),
-        "quats": np.roll(FLIP_QUATS * quats, 1, axis=1).astype(np.float32),
-        "opacities": to_logits(opacities, STEP),
-        "sh0": sh0[:, None].astype(np.float32),
-        "shN": shN.astype(np.float32),
+        "quats": np.roll(FLIP_QUATS * values(f"{NAME}:ROTATION", "VEC4"), 1, axis=1).astype(np.float32),
+        "opacities": to_logits(values(f"{NAME}:OPACITY", "SCALAR")[:, 0], STEP),
+        "sh0": values(f"{NAME}:SH_DEGREE_0_COEF_0", "VEC3")[:, None].astype(np.float32),
+        "shN": (np.stack(rest, axis=1) if rest else np.zeros((count, 0, 3))).astype(np.float32),
     }
 
 
@@ -139,51 +187,14 @@ def _harmonic(k: int) -> str:
     return f"{NAME}:SH_DEGREE_{degree}_COEF_{k + 1 - degree * degree}"
 
 
-def _chunks(path: Path) -> tuple[Any, bytes]:
-    file = path.read_bytes()
-    if len(file) < 20 or struct.unpack_from("<II", file) != (MAGIC, VERSION):
-        raise ValueError(f"{path}: not a binary glTF file of version 2")
-    size, kind = struct.unpack_from("<II", file, 12)
-    if kind != JSON or 20 + size > len(file):
-        raise ValueError(f"{path}: damaged: its text ends beyond the file")
-    try:
-        content = json.loads(file[20 : 20 + size])
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: damaged: its text is not valid JSON: {error}") from error
-    at = 20 + size
-    if at + 8 > len(file):
-        return content, b""
-    size, kind = struct.unpack_from("<II", file, at)
-    if kind != BIN or at + 8 + size > len(file):
-        raise ValueError(f"{path}: damaged: its data ends beyond the file")
-    return content, file[at + 8 : at + 8 + size]
-
-
-def _primitive(content: Any) -> Any:
-    found = [
-        (number, primitive)
-        for number, mesh in enumerate(content["meshes"])
-        for primitive in mesh["primitives"]
-        if NAME in primitive.get("extensions", {})
-    ]
-    if len(found) != 1:
-        raise ValueError(f"{len(found)} primitives with {NAME}, wanted one")
-    if "extensions" in found[0][1]["extensions"][NAME]:
-        raise ValueError("a compressed primitive")
-    moved = {"matrix", "translation", "rotation", "scale"}
-    if any(moved & node.keys() for node in content.get("nodes", [])):
-        raise ValueError("a node that moves, turns or scales it")
-    return found[0][1]
-
-
-def _values(content: Any, data: bytes, number: int, kind: str, count: int) -> NDArray[np.float32]:
+def _values(content: Any, buffers: list[bytes], number: int, kind: str, count: int) -> NDArray[np.float32]:
     accessor = content["accessors"][number]
     view = content["bufferViews"][accessor["bufferView"]]
     if (accessor["componentType"], accessor["type"]) != (FLOAT, kind) or "sparse" in accessor:
         raise ValueError(f"accessor {number} is not float32 {kind}")
-    width = WIDTHS[kind]
-    if accessor["count"] != count or view.get("byteStride", 4 * width) != 4 * width or view["buffer"] != 0:
-        raise ValueError(f"accessor {number} has another count or stride, or another buffer")
+    width, data = WIDTHS[kind], buffers[view["buffer"]]
+    if accessor["count"] != count or view.get("byteStride", 4 * width) != 4 * width:
+        raise ValueError(f"accessor {number} has another count or stride")
     start, offset, length = view.get("byteOffset", 0), accessor.get("byteOffset", 0), view["byteLength"]
     sound = all(type(value) is int and value >= 0 for value in (start, offset, length))
     if not sound or offset + 4 * width * count > length or start + length > len(data):

@@ -7,44 +7,83 @@ find columns by their names; the normals of 3DGS, which are all zero, are not wr
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from hqgs.base.files import atomic_path
-from hqgs.base.ply import read_vertices
+from hqgs.base.ply import header_of, read_vertices
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.rows import pick, whole_rows
+from hqgs.scene.world import World, world_for
 
 _REST_COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]  # 0, 9, 24, 45
+_REST_4 = 72  # of degree 4, which some exporters write
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+_WORLD, _ANTIALIASED = "hqgs world ", "hqgs antialiased"  # comments of the header
+MOST_LOGIT = 18.0  # of an opacity that is stored as infinite: float32 rounds its sigmoid to 1 or next to 0
+LEAST_LOG = math.log(1e-20)  # of a scale of 0
 
 
-def write_ply(path: str | Path, arrays: Arrays) -> int:
-    """Write Gaussians atomically, without the rows that hold a NaN or Inf; return how many those were."""
+def write_ply(path: str | Path, arrays: Arrays, *, full: bool = False) -> int:
+    """Write Gaussians atomically, without the rows that hold a NaN or Inf; return how many those were.
+
+    Of a scene that is held in another frame than its files', positions and scales go back to that, positions
+    as float64 where its origin was moved; the header says so in a comment. `full`: all 62 columns of 3DGS,
+    for readers of a fixed layout, normals and harmonics of 0 where there are none, float32 throughout.
+    """
     n, higher = arrays["shN"].shape[:2]
+    world = arrays.get("world", World())
+    if full:
+        world = World()  # which is said beside the file
+    means, scales = world.out(arrays["means"]), arrays["scales"]
+    if world.unit != 1:
+        scales = scales + np.float32(math.log(world.unit))
     # [N, K - 1, 3] to channel-major [N, 3 (K - 1)]
     rest = arrays["shN"].transpose(0, 2, 1).reshape(n, 3 * higher)
+    normals = []
+    if full:
+        rest = np.zeros((n, _REST_COUNTS[-1]), rest.dtype)
+        for channel in range(3):
+            rest[:, 15 * channel : 15 * channel + higher] = arrays["shN"][:, :, channel]
+        normals = [(["nx", "ny", "nz"], np.zeros((n, 3), np.float32))]
     columns = [
-        (_MEANS, arrays["means"]),
+        (_MEANS, means),
+        *normals,
         (_DC, arrays["sh0"][:, 0]),
         ([f"f_rest_{i}" for i in range(rest.shape[1])], rest),
         (["opacity"], arrays["opacities"][:, None]),
-        (_SCALES, arrays["scales"]),
+        (_SCALES, scales),
         (_QUATS, arrays["quats"]),
     ]
     names = [name for group, _ in columns for name in group]
     with np.errstate(over="ignore"):  # of float64: such a row is left out
         rows = np.concatenate([values for _, values in columns], axis=1, dtype=np.dtype("<f4"))
     finite = np.isfinite(rows).all(axis=1)
-    vertices = np.ascontiguousarray(rows[finite]).view([(name, "<f4") for name in names])[:, 0]
+    far = any(world.shift)
+    kinds = [(name, "<f8" if far and name in _MEANS else "<f4") for name in names]
+    if far:
+        vertices = np.empty(int(finite.sum()), kinds)
+        for k, name in enumerate(names):
+            vertices[name] = means[finite, k] if name in _MEANS else rows[finite, k]
+    else:
+        vertices = np.ascontiguousarray(rows[finite]).view(kinds)[:, 0]
+    says = []
+    if not world.ordinary:
+        says.append(f"{_WORLD}{json.dumps(world.json())}")
+    if arrays.get("antialiased"):
+        says.append(_ANTIALIASED)
     with atomic_path(path) as tmp:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(tmp))
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=says).write(str(tmp))
     return int(n - finite.sum())
 
 
@@ -52,40 +91,86 @@ def read_ply(path: str | Path) -> Arrays:
     """Read the Gaussians that hqgs, 3DGS, gsplat or Brush wrote: float32 arrays.
 
     Properties are found by name, in any order, as numbers of any kind; others are passed by. Text files and
-    binary ones of either byte order are read.
+    binary ones of either byte order are read. An infinite opacity and a scale of 0 (a log of -inf) become the
+    nearest that there is; other rows that are not finite are left out, harmonics above degree 3 too, and
+    `notes` counts them. Positions of float64 that lie far from the origin are held around their middle.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not a PLY file, not this layout, an SH degree above 3, more rows promised than the file
-            can hold, or a value that is not finite. The message names the file and the property.
+        ValueError: not a PLY file, not this layout, more rows promised than the file can hold, or no row that
+            is finite. The message names the file and the property.
     """
+    path, notes = Path(path), list[str]()
     vertices = read_vertices(path)
     present = {name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
     rest = [f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in present))]
     missing = [n for n in [*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_QUATS] if n not in present]
     if missing:
         raise ValueError(f"{path}: not a 3DGS scene, these properties are missing: {', '.join(missing)}")
-    if len(rest) not in _REST_COUNTS:
+    if len(rest) not in [*_REST_COUNTS, _REST_4]:
         raise ValueError(f"{path}: {len(rest)} f_rest_* properties, wanted one of {_REST_COUNTS}")
 
-    def columns(names: list[str]) -> NDArray[np.float32]:
-        found = np.empty((len(vertices), len(names)), np.float32)
+    def columns(names: list[str], kind: type = np.float32) -> NDArray[Any]:
+        found = np.empty((len(vertices), len(names)), kind)
         for k, name in enumerate(names):
             with np.errstate(over="ignore"):  # of float64
                 found[:, k] = vertices[name]
-            bad = np.flatnonzero(~np.isfinite(found[:, k]))
-            if bad.size:
-                raise ValueError(
-                    f"{path}: {name} is not finite in {bad.size} rows, the first is row {bad[0]}"
-                )
         return found
 
+    comments, more = header_of(path)
+    world = World()
+    for line in comments:
+        if line.startswith(_WORLD):
+            world = _world_of(path, line)
+    wide = any(vertices.dtype[name].itemsize > 4 for name in _MEANS)
+    means = columns(_MEANS, np.float64) if wide or not world.ordinary else columns(_MEANS)
+    scales, opacities = columns(_SCALES), columns(["opacity"])[:, 0]
+    if wide and world.ordinary and np.isfinite(means).any():
+        finite = means[np.isfinite(means).all(1)]
+        world = World(1.0, world_for(finite, finite).shift)
+    if not world.ordinary:
+        means = world.into(means)
+        scales -= np.float32(math.log(world.unit))
+    means = means.astype(np.float32)
+    clamped = int(np.isinf(opacities).sum()), int((scales == -np.inf).any(1).sum())
+    opacities = np.where(np.isinf(opacities), np.copysign(np.float32(MOST_LOGIT), opacities), opacities)
+    scales = np.where(scales == -np.inf, np.float32(LEAST_LOG), scales)
     higher = columns(rest).reshape(len(vertices), 3, len(rest) // 3).transpose(0, 2, 1)
-    return {
-        "means": columns(_MEANS),
-        "scales": columns(_SCALES),
+    if len(rest) == _REST_4:
+        notes.append("its harmonics of degree 4 were left out")
+        higher = higher[:, : _REST_COUNTS[-1] // 3]
+    arrays: Arrays = {
+        "means": means,
+        "scales": scales,
         "quats": columns(_QUATS),
-        "opacities": columns(["opacity"])[:, 0],
+        "opacities": opacities,
         "sh0": columns(_DC)[:, None, :],
         "shN": np.ascontiguousarray(higher),
     }
+    keep = whole_rows(arrays)
+    if not keep.all():
+        if not keep.any():
+            raise ValueError(
+                f"{path}: none of its {len(keep)} rows is finite, the first is {vertices[0]!s:.200}"
+            )
+        notes.append(f"{int((~keep).sum())} of {len(keep)} Gaussians hold NaN or Inf and were left out")
+        arrays = pick(arrays, keep)
+    for count, what in zip(clamped, ("infinite opacities", "scales of 0"), strict=True):
+        if count:
+            notes.append(f"{count} {what} became the nearest that there is")
+    if more:
+        notes.append(f"{more} bytes after its last row were passed by")
+    if not world.ordinary:
+        arrays["world"] = world
+    if _ANTIALIASED in comments:
+        arrays["antialiased"] = True
+    if notes:
+        arrays["notes"] = notes
+    return arrays
+
+
+def _world_of(path: Path, line: str) -> World:
+    try:
+        return World.of_json(json.loads(line.removeprefix(_WORLD)))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: its comment {line!r:.80} is damaged: {error}") from error

@@ -12,7 +12,12 @@ CURVE_BITS = 10  # of a cell along each axis
 
 def finite_rows(arrays: Arrays) -> NDArray[np.bool_]:
     """Which Gaussians hold no NaN or Inf, and a rotation that is one, [N]."""
-    keep = np.square(arrays["quats"].astype(np.float64)).sum(axis=1) > 0
+    return whole_rows(arrays) & (np.square(arrays["quats"].astype(np.float64)).sum(axis=1) > 0)
+
+
+def whole_rows(arrays: Arrays) -> NDArray[np.bool_]:
+    """Which Gaussians hold no NaN or Inf, [N]."""
+    keep = np.ones(len(arrays["means"]), np.bool_)
     for name in ("means", "scales", "quats", "opacities", "sh0", "shN"):
         values = arrays[name]
         keep &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))

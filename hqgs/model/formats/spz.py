@@ -46,6 +46,7 @@ VERSION = VERSIONS[0]  # what more programs read
 SH_BITS = (8, 8)  # of degree 1, of degrees 2 and 3; less rounds small values that many Gaussians share to 0
 
 LIMIT = (1 << 23) - 1  # of a 24-bit number; its negative is used alike
+TENSORS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 FINE = 1 / 64  # the error of a position, as a share of its Gaussian's largest scale, that is fine enough
 COARSE = 1 / 8  # and the one that shows
 MISFIT_SHARE = 0.01  # of the Gaussians, whose positions or sizes the format may miss
@@ -105,7 +106,7 @@ def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS, version: i
         raise ValueError(f"{n:,} Gaussians, but an SPZ file takes at most {MAX_GAUSSIANS:,}")
     from scipy.special import expit  # here: what reads no SPZ needs no scipy
 
-    arrays: dict[str, Array] = {name: np.asarray(a, np.float64) for name, a in gaussians.items()}
+    arrays: dict[str, Array] = {name: np.asarray(gaussians[name], np.float64) for name in TENSORS}
     norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
         arrays["quats"] = np.roll(arrays["quats"] / norm, -1, axis=1)  # x y z w
@@ -131,14 +132,16 @@ def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS, version: i
         _pack_quats(FLIP_QUATS * arrays["quats"]),
         byte("shN", FLIP_SH[:rest, None] * arrays["shN"] * SH_ONE + SH_ONE, steps[:rest, None]),
     ]
-    content = Content(version, len(means), math.isqrt(rest + 1) - 1, fraction, sections)
+    antialiased = gaussians.get("antialiased", False)
+    content = Content(version, len(means), math.isqrt(rest + 1) - 1, fraction, sections, antialiased)
     return SpzFile(pack(content), len(means), n - len(means), fraction, clipped)
 
 
 def read_spz(path: str | Path) -> Arrays:
-    """Read an SPZ file of version 2, 3 or 4 with harmonics of degree 0 to 3: float32 arrays.
+    """Read an SPZ file of version 2, 3 or 4: float32 arrays, with harmonics of degree 0 to 3.
 
-    An opacity of 0 or 1 has no finite logit: it is taken a quarter of a step inwards.
+    Those of degree 4, and extensions, are left out, which `notes` says. An opacity of 0 or 1 has no finite
+    logit: it is taken a quarter of a step inwards.
 
     Raises:
         FileNotFoundError: no such file.
@@ -148,21 +151,30 @@ def read_spz(path: str | Path) -> Arrays:
     """
     path = Path(path)
     file = unpack(path.read_bytes(), path)
-    n, rest = file.gaussians, (file.sh_degree + 1) ** 2 - 1
+    n, stored = file.gaussians, (file.sh_degree + 1) ** 2 - 1
+    rest = min(stored, len(FLIP_SH))
     means, opacities, colors, scales, quats, sh = file.arrays
     fixed = np.zeros((n, 3, 4), np.uint8)
     fixed[..., 1:] = means.reshape(n, 3, 3)  # in the upper bytes, so that the shift below keeps the sign
     xyzw = _unpack_quats(quats) if file.version >= 3 else _first_three(quats)
     from scipy.special import logit
 
-    return {
+    found: Arrays = {
         "means": _floats(FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**file.fraction),
         "scales": _floats(scales / LOG_SCALE - LOG_OFFSET),
         "quats": _floats(np.roll(FLIP_QUATS * xyzw, 1, axis=1)),
         "opacities": _floats(logit(opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255)),
         "sh0": _floats(((colors - 127.5) / COLOR)[:, None]),
-        "shN": _floats(FLIP_SH[:rest, None] * (sh.reshape(n, rest, 3) / SH_ONE - 1)),
+        "shN": _floats(FLIP_SH[:rest, None] * (sh.reshape(n, stored, 3)[:, :rest] / SH_ONE - 1)),
     }
+    notes = ["its harmonics of degree 4 were left out"] if stored > rest else []
+    if file.extended:
+        notes.append("its extensions were passed by")
+    if notes:
+        found["notes"] = notes
+    if file.antialiased:
+        found["antialiased"] = True
+    return found
 
 
 def _floats(values: NDArray[Any]) -> NDArray[np.float32]:

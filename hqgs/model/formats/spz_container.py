@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.model.constants import MAX_SH_DEGREE
-
 Bytes = NDArray[np.uint8]
 
 VERSIONS = (3, 4)  # that are written; 2 is read too
 MAGIC = 0x5053474E  # "NGSP"
+ANTIALIASED, EXTENDED = 0x1, 0x2  # flags
+MOST_DEGREE = 4  # of the harmonics that a file may hold
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, Gaussians, SH degree, fractional bits, flags, 0
 HEADER_4 = struct.Struct("<IIIBBBBI12s")  # up to the flags the same; arrays, where the table begins, zeros
 ENTRY = struct.Struct("<QQ")  # of the table
@@ -42,6 +42,8 @@ class Content:
     sh_degree: int
     fraction: int  # bits after the point of a position
     arrays: list[Bytes]  # [n, width]: positions, opacities, colours, scales, rotations, SH
+    antialiased: bool = False  # trained with the compensation of "antialiased"
+    extended: bool = False  # the file holds more, for those who know it
 
 
 def widths(version: int, sh_degree: int) -> list[int]:
@@ -52,7 +54,8 @@ def widths(version: int, sh_degree: int) -> list[int]:
 def pack(content: Content) -> bytes:
     """The file."""
     data = [array.tobytes() for array in content.arrays]
-    start = MAGIC, content.version, content.gaussians, content.sh_degree, content.fraction, 0
+    flags = ANTIALIASED if content.antialiased else 0
+    start = MAGIC, content.version, content.gaussians, content.sh_degree, content.fraction, flags
     if content.version == 4:
         parts = [part for part in data if part]
         frames = [_frame(part) for part in parts]
@@ -66,7 +69,11 @@ def pack(content: Content) -> bytes:
 def unpack(packed: bytes, path: Path) -> Content:
     """What a file holds. ValueError, which names it, for one that is not whole or promises too much."""
     if packed[:4] == MAGIC.to_bytes(4, "little"):
-        return _unpack_4(packed, path)
+        raw = len(packed) >= HEADER.size and int.from_bytes(packed[4:8], "little") in (2, 3)
+        if not raw:
+            return _unpack_4(packed, path)
+        packer = zlib.compressobj(1, wbits=GZIP)  # some tools leave the stream as it is
+        packed = packer.compress(packed) + packer.flush()
     unpacker = zlib.decompressobj(wbits=GZIP)
     head = _inflate(unpacker, packed, HEADER.size, path)
     if len(head) < HEADER.size:
@@ -78,10 +85,11 @@ def unpack(packed: bytes, path: Path) -> Content:
     size = sum(sizes)
     data = np.frombuffer(_inflate(unpacker, unpacker.unconsumed_tail, size, path), np.uint8)
     more = _inflate(unpacker, unpacker.unconsumed_tail, 1, path) or unpacker.unused_data
-    if len(data) < size or not unpacker.eof or more:
+    extended = bool(flags & EXTENDED)
+    if len(data) < size or (not extended and (not unpacker.eof or more)):
         raise _damaged(path, n, bool(more))
     arrays = np.split(data, np.cumsum(sizes)[:-1])
-    return _content(version, n, sh_degree, fraction, arrays)
+    return _content(version, n, sh_degree, fraction, arrays, flags)
 
 
 def _unpack_4(packed: bytes, path: Path) -> Content:
@@ -91,7 +99,9 @@ def _unpack_4(packed: bytes, path: Path) -> Content:
     sizes = _checked(path, len(packed), version, (4,), n, sh_degree, fraction, flags)
     wanted = [size for size in sizes if size]
     place = table + count * ENTRY.size
-    if count != len(wanted) or table != HEADER_4.size or zeros.strip(b"\0") or place > len(packed):
+    extended = bool(flags & EXTENDED)  # what it adds lies between the header and the table
+    moved = table < HEADER_4.size if extended else table != HEADER_4.size or zeros.strip(b"\0")
+    if count != len(wanted) or moved or place > len(packed):
         raise ValueError(f"{path}: the header promises {count} arrays at {table}, wanted {len(wanted)}")
     found: list[Bytes] = []
     for k, size in enumerate(wanted):
@@ -100,12 +110,11 @@ def _unpack_4(packed: bytes, path: Path) -> Content:
             raise _damaged(path, n, promised > size)
         found.append(np.frombuffer(_unframe(packed[place : place + length], size, path, n), np.uint8))
         place += length
-    if place < len(packed):
+    if place < len(packed) and not extended:
         raise _damaged(path, n, True)
     parts = iter(found)
-    return _content(
-        version, n, sh_degree, fraction, [next(parts) if size else np.zeros(0, np.uint8) for size in sizes]
-    )
+    arrays = [next(parts) if size else np.zeros(0, np.uint8) for size in sizes]
+    return _content(version, n, sh_degree, fraction, arrays, flags)
 
 
 def _checked(
@@ -121,10 +130,10 @@ def _checked(
     """The sizes of the arrays in bytes; ValueError for a header that is not to be believed."""
     if version not in versions:
         raise ValueError(f"{path}: SPZ version {version}, wanted {' or '.join(map(str, versions))}")
-    if sh_degree > MAX_SH_DEGREE:
-        raise ValueError(f"{path}: harmonics of degree {sh_degree}, wanted 0..{MAX_SH_DEGREE}")
-    if flags:
-        raise ValueError(f"{path}: flags {flags:#x}: antialiased scenes and extensions are not supported")
+    if sh_degree > MOST_DEGREE:
+        raise ValueError(f"{path}: harmonics of degree {sh_degree}, wanted 0..{MOST_DEGREE}")
+    if flags & ~(ANTIALIASED | EXTENDED):
+        raise ValueError(f"{path}: flags {flags:#x}, of which only {ANTIALIASED | EXTENDED:#x} are known")
     if fraction > MAX_FRACTION:
         raise ValueError(f"{path}: {fraction} fractional bits, wanted at most {MAX_FRACTION}")
     sizes = [n * width for width in widths(version, sh_degree)]
@@ -133,9 +142,12 @@ def _checked(
     return sizes
 
 
-def _content(version: int, n: int, sh_degree: int, fraction: int, arrays: Sequence[Bytes]) -> Content:
+def _content(
+    version: int, n: int, sh_degree: int, fraction: int, arrays: Sequence[Bytes], flags: int
+) -> Content:
     shaped = [a.reshape(n, w) for a, w in zip(arrays, widths(version, sh_degree), strict=True)]
-    return Content(version, n, sh_degree, fraction, shaped)
+    antialiased, extended = bool(flags & ANTIALIASED), bool(flags & EXTENDED)
+    return Content(version, n, sh_degree, fraction, shaped, antialiased, extended)
 
 
 def _damaged(path: Path, n: int, more: bool) -> ValueError:

@@ -233,7 +233,7 @@ def model_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], N
 def write_colmap(
     folder: Path,
     cameras: dict[str, Camera],
-    points: NDArray[np.float32],
+    points: NDArray[np.floating],
     colors: NDArray[np.uint8],
     seen: dict[str, NDArray[np.intp]] | None = None,
     reprojection_error: float = 0.0,

@@ -24,6 +24,17 @@ if TYPE_CHECKING:
 HOST = "127.0.0.1"
 PORT = 8080
 MAX_MESSAGE = 1 << 20  # bytes; what a page of ours sends takes hundreds
+# Words for those whose browser is not on this machine: a container, a remote editor, a notebook in a cloud.
+ELSEWHERE = (
+    "From another machine, forward the port to it under the same number: "
+    "`ssh -L {port}:localhost:{port} HOST`; VS Code: the tab Ports; Docker: run with `--network host`, then as "
+    "for HOST; JupyterHub and Colab: no page of another origin may speak to this one, so send report.html "
+    "instead, which needs no server."
+)
+REFUSED = (
+    "This page answers http://localhost:{port} and http://127.0.0.1:{port} alone, so that no page elsewhere "
+    "and no other machine can read it.\n" + ELSEWHERE + "\n"
+)
 _OURS = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d{1,5})?")
 _patching = threading.Lock()
 
@@ -33,6 +44,12 @@ def allowed(host: str | None, origin: str | None) -> bool:
     if host is None or not _OURS.fullmatch(host):
         return False
     return origin is None or origin == f"http://{host}"
+
+
+def port_of(connection: Any) -> int:
+    """The port at which a connection came in."""
+    address = getattr(connection, "local_address", None)
+    return int(address[1]) if address else PORT
 
 
 def check(port: int) -> None:
@@ -75,7 +92,7 @@ def start_server(port: int = PORT, label: str = "hqgs") -> viser.ViserServer:
             hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
             single = len(hosts) == 1 and len(origins) <= 1
             if not single or not allowed(hosts[0], origins[0] if origins else None):
-                text = b"This page belongs to another program on this machine.\n"
+                text = REFUSED.format(port=port_of(connection)).encode()
                 headers = Headers({"Content-Type": "text/plain", "Content-Length": str(len(text))})
                 return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, text)
             return answer(connection, request)

@@ -69,7 +69,7 @@ class Viewer:
 
     def set_scene(self, gaussians: Gaussians, stats: Sequence[tuple[str, str]] = ()) -> None:
         """Show these Gaussians (copied) from now on, and rows of numbers beside them."""
-        copy = Gaussians(**{name: t.detach().clone() for name, t in gaussians.named().items()})
+        copy = gaussians.like({name: t.detach().clone() for name, t in gaussians.named().items()})
         first = self._scene is None
         scene = Activated(copy)
         with self._lock:
@@ -314,7 +314,7 @@ class Viewer:
             self._tell("This scene has no folder to save it in.")
         else:
             path = self._folder / PATH_FILE
-            save_path(path, self._path())
+            save_path(path, self._path(), world=None if self._gaussians is None else self._gaussians.world)
             self._tell(f"Saved. `hqgs render {self._folder} --path {path} --out path.mp4`")
 
     def _tell(self, text: str = "") -> None:

@@ -1,0 +1,93 @@
+"""What of a capture is used, and in which frame: cameras without a photo or far off, units, the origin."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.base.text import some
+from hqgs.scene.capture import Capture, Photo
+from hqgs.scene.scene import strays
+from hqgs.scene.world import world_for
+
+FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
+FAR_ALONE = 50.0  # the same where there are no points
+SHOWN = 0.02  # of a photo's sides, which the points must span at least
+LOOKED_AT = 1000  # points
+
+
+def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
+    """The capture without cameras whose photo is not there; `notes` names them.
+
+    The places of the others in the split stay what they were. FileNotFoundError where more than half miss.
+    """
+    missing = [photo for photo in capture.photos if not os.path.lexists(photo.path)]
+    if not missing:
+        return capture
+    names, count = some([photo.name for photo in missing]), len(capture.photos)
+    if 2 * len(missing) > count:
+        raise FileNotFoundError(
+            f"{len(missing)} of {count} cameras have no photo in {capture.folder or root}: {names}"
+        )
+    notes.append(f"{len(missing)} of {count} cameras have no photo any more and were left out: {names}")
+    return _without(capture, {photo.name for photo in missing})
+
+
+def without_strays(capture: Capture, notes: list[str]) -> Capture:
+    """The capture without cameras that lie far from all others and show nothing; `notes` names them.
+
+    A camera over FAR_OFF times as far away as half of them goes if the points are outside of its picture, or
+    a dot in it: its pose is a mistake of the reconstruction. Without points it goes over FAR_ALONE times.
+    """
+    if len(capture.photos) < 4:
+        return capture
+    centers = _centers(capture)
+    points = capture.points[:: max(1, len(capture.points) // LOOKED_AT)].astype(np.float64)
+    far = strays(centers, FAR_OFF if len(points) else FAR_ALONE)
+    gone = {
+        photo.name
+        for photo, away in zip(capture.photos, far, strict=True)
+        if away and not (len(points) and _shows(photo, points))
+    }
+    if gone:
+        notes.append(
+            f"{len(gone)} of {len(capture.photos)} cameras lie far from all others, show none of the points "
+            f"and were left out: {some(sorted(gone))}"
+        )
+    return _without(capture, gone)
+
+
+def placed(capture: Capture, notes: list[str]) -> Capture:
+    """The capture near the origin and of an ordinary size; `notes` says in which frame, if in another."""
+    world = world_for(_centers(capture), capture.points)
+    if world.ordinary:
+        return capture
+    notes.append(f"coordinates are held with {world}; what is written goes back to the frame of the files")
+    photos = [replace(photo, viewmat=world.viewmat_into(photo.viewmat)) for photo in capture.photos]
+    bounds = {k: (near / world.unit, far / world.unit) for k, (near, far) in capture.near_far.items()}
+    return replace(capture, photos=photos, points=world.into(capture.points), near_far=bounds, world=world)
+
+
+def _without(capture: Capture, gone: set[str]) -> Capture:
+    kept = [photo for photo in capture.photos if photo.name not in gone]
+    return capture if not gone else replace(capture, photos=kept)
+
+
+def _centers(capture: Capture) -> NDArray[np.float64]:
+    return np.stack([-p.viewmat[:3, :3].T @ p.viewmat[:3, 3] for p in capture.photos])
+
+
+def _shows(photo: Photo, points: NDArray[np.float64]) -> bool:
+    """Whether points [P, 3] are in a photo, as more than a dot. What a lens bends does not matter here."""
+    rows = points @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3]
+    rows = rows[rows[:, 2] > 0]
+    if not len(rows):
+        return False
+    pixels = rows @ photo.camera.calibration_matrix().T
+    shares = pixels[:, :2] / pixels[:, 2:] / (photo.camera.width, photo.camera.height)
+    inside = shares[((shares >= 0) & (shares <= 1)).all(1)]
+    return len(inside) > 0 and float(np.ptp(inside, axis=0).max()) > SHOWN

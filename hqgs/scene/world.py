@@ -1,0 +1,103 @@
+"""The frame in which a scene is held, beside that of its files: a unit, and a shift of the origin.
+
+Training and rendering round to float32, and a few of their bounds (the near plane, say) are lengths. A scene
+in millimetres, or one whose origin lies 5,000 km away, would suffer from both. On load it is brought near the
+origin and to an ordinary size, by a power of two, which changes no bit of its digits; what is written goes
+back to the frame of the files. A scene of an ordinary size and place stays as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SMALLEST, LARGEST = 0.25, 256.0  # sizes that are ordinary, world units
+USUAL = 4.0  # the size that others are brought next to
+FAR = 100.0  # sizes from the origin: from here on the origin is moved
+
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class World:
+    """Coordinates of the files are `unit * x + shift` of those in memory."""
+
+    unit: float = 1.0  # a power of two
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def ordinary(self) -> bool:
+        """Whether both frames are one."""
+        return self == World()
+
+    def out(self, points: Array) -> Array:
+        """Points [..., 3] in the frame of the files, float64; themselves where that is the same."""
+        return points if self.ordinary else points.astype(np.float64) * self.unit + self.shift
+
+    def into(self, points: Array) -> Array:
+        """Points [..., 3] of the files in the scene's frame, float64; themselves where that is the same."""
+        return points if self.ordinary else (points.astype(np.float64) - self.shift) / self.unit
+
+    def viewmat_out(self, viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A world-to-camera matrix [4, 4] for the frame of the files; its camera's units are theirs."""
+        if self.ordinary:
+            return viewmat
+        moved = viewmat.copy()
+        moved[:3, 3] = self.unit * viewmat[:3, 3] - viewmat[:3, :3] @ np.array(self.shift)
+        return moved
+
+    def viewmat_into(self, viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A world-to-camera matrix [4, 4] of the files for the scene's frame."""
+        if self.ordinary:
+            return viewmat
+        moved = viewmat.copy()
+        moved[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ np.array(self.shift)) / self.unit
+        return moved
+
+    def json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {"unit": self.unit, "shift": [*self.shift]}
+
+    @classmethod
+    def of_json(cls, value: Any) -> World:
+        """What `json` gave. ValueError for anything else."""
+        try:
+            unit, shift = float(value["unit"]), tuple(float(x) for x in value["shift"])
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
+            raise ValueError(f"no unit and shift of a world: {value!r:.80}") from error
+        if not (0 < unit < math.inf) or len(shift) != 3 or not all(map(math.isfinite, shift)):
+            raise ValueError(f"no unit and shift of a world: {value!r:.80}")
+        return cls(unit, (shift[0], shift[1], shift[2]))
+
+    def __str__(self) -> str:
+        words = []
+        if self.unit != 1:
+            words.append(f"a unit of {self.unit:g} of the files' units")
+        if any(self.shift):
+            words.append(f"the origin at {', '.join(f'{x:.15g}' for x in self.shift)}")
+        return " and ".join(words) or "the frame of the files"
+
+
+def world_for(centers: Array, points: Array) -> World:
+    """The frame for a scene with cameras at `centers` [C, 3] and `points` [P, 3], P may be 0.
+
+    Its size is the median distance of cameras and of points from the cameras' middle (a median too), the
+    larger of the two: none that lies far off moves it.
+    """
+    middle = np.median(centers, axis=0)
+    size = float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    if len(points):
+        size = max(size, float(np.median(np.linalg.norm(points.astype(np.float64) - middle, axis=1))))
+    if not 0 < size < math.inf:
+        return World()
+    shift = (0.0, 0.0, 0.0)
+    if np.abs(middle).max() > FAR * size:
+        step = 10.0 ** math.ceil(math.log10(size))
+        x, y, z = (round(float(value) / step) * step for value in middle)
+        shift = (x, y, z)
+    unit = 1.0 if SMALLEST <= size < LARGEST else 2.0 ** round(math.log2(size / USUAL))
+    return World(unit, shift)
