@@ -27,8 +27,8 @@ MAX_MESSAGE = 1 << 20  # bytes; what a page of ours sends takes hundreds
 # Words for those whose browser is not on this machine: a container, a remote editor, a notebook in a cloud.
 ELSEWHERE = (
     "From another machine, forward the port to it under the same number: "
-    "`ssh -L {port}:localhost:{port} HOST`; VS Code: the tab Ports; Docker: run with `--network host`, then as "
-    "for HOST; JupyterHub and Colab: no page of another origin may speak to this one, so send report.html "
+    "`ssh -L {port}:localhost:{port} HOST`; VS Code: the tab Ports; Docker: run with `--network host`, then "
+    "as for HOST; JupyterHub and Colab: no page of another origin may speak to this one: send report.html "
     "instead, which needs no server."
 )
 REFUSED = (
