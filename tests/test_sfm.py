@@ -128,6 +128,11 @@ def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> Non
     nearest = [np.linalg.norm(cards.points - point, axis=1).min() for point in found.points]
     assert report.point_distance == pytest.approx(np.median(nearest) / cards.extent, rel=1e-4)
     assert (report.own_points, report.own_track_length) == (500, None)
+    assert set(report.sure_px) == {view.name for view in found.train}
+    assert 0 < min(report.sure_px.values()) <= max(report.sure_px.values()) < 0.5
+    assert report.auc is not None
+    assert 0.5 < report.auc["1"] < report.auc["3"] < report.auc["5"] < 1
+    assert "poses are sure to" in str(report)
     json.dumps(asdict(report), allow_nan=False)
     assert found.notes == [*cards.notes, str(report)]
     assert "7 of 7 registered" in str(report)

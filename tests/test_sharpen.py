@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from hqgs.scene.sfm.sharpen import sharpened
-from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, usual
+from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
 from hqgs.scene.sfm.versions import join, smoothed_copies
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 160, 120, 150.0, 4.0
@@ -154,6 +154,38 @@ def test_tracks_are_read_and_written(made: tuple[pycolmap.Reconstruction, list[n
     both = kept.joined(replace(kept))
     assert len(both.points) == 2 * len(kept.points)
     assert both.point.max() == len(both.points) - 1
+
+
+def test_sureness_is_what_a_pose_is_off_by_noise(
+    made: tuple[pycolmap.Reconstruction, list[np.ndarray], Path],
+) -> None:
+    """Where the points are known: the poses are fitted to sightings that scatter by 0.7 px."""
+    model, _, _ = made
+    names, tracks = read_tracks(model)
+    rng, sigma = np.random.default_rng(2), 0.7
+    images = {image.name: image for image in model.images.values()}
+    where = np.zeros_like(tracks.xy)
+    for k, name in enumerate(names):
+        mine = tracks.view == k
+        inside = images[name].cam_from_world() * tracks.points[tracks.point[mine]]
+        where[mine] = images[name].camera.img_from_cam(inside)
+    moved = []
+    for _ in range(10):
+        noisy = rebuilt(model, names, replace(tracks, xy=where + sigma * rng.standard_normal(where.shape)))
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = options.refine_points3D = False
+        options.refine_focal_length = options.refine_extra_params = False
+        pycolmap.bundle_adjustment(noisy, options)
+        for k, name in enumerate(names):
+            mine = tracks.view == k
+            image = next(image for image in noisy.images.values() if image.name == name)
+            at = image.camera.img_from_cam(image.cam_from_world() * tracks.points[tracks.point[mine]])
+            moved.append(np.square(at - where[mine]).sum(1).mean())
+    sure = sureness(noisy)
+    assert sorted(sure) == names
+    assert np.median(list(sure.values())) == pytest.approx(np.sqrt(np.mean(moved)), rel=0.35)
+    few = tracks.chosen((tracks.view > 0) | (np.arange(len(tracks.view)) % 4 == 0))
+    assert sureness(rebuilt(noisy, names, few))["0.png"] > 1.5 * sure["0.png"]
 
 
 def test_versions_lie_side_by_side(tmp_path: Path) -> None:

@@ -100,6 +100,8 @@ class SfmRecord(TypedDict):
     unreadable: dict[str, str]
     first_pass: int | None
     advice: str | None
+    sure_px: dict[str, float]
+    auc: dict[str, float] | None
 
 
 class PhotoRecord(TypedDict):

@@ -151,6 +151,7 @@ class SfmReport:
     unreadable: dict[str, str] = field(default_factory=dict)  # files that were left out before, and why
     first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do
+    sure_px: dict[str, float] = field(default_factory=dict)  # of each photo with a place; see `sureness`
     auc: dict[str, float] | None = None  # of pairs' pose errors up to "1", "3", "5" degrees; see `pose_auc`
 
     def __str__(self) -> str:
@@ -164,6 +165,10 @@ class SfmReport:
                 f"; {len(self.not_registered)} left out, as COLMAP found no place for them: "
                 f"{', '.join(self.not_registered)}"
             )
+        if self.sure_px:
+            name, least = max(self.sure_px.items(), key=lambda item: item[1])
+            usual = float(np.median(list(self.sure_px.values())))
+            text += f"; poses are sure to {usual:.2f} px (median), that of {name} to {least:.2f} px"
         if self.unreadable:
             files = ", ".join(f"{name} ({why})" for name, why in self.unreadable.items())
             text += f"; left out, as they cannot be read ({len(self.unreadable)}): {files}"

@@ -17,6 +17,7 @@ from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, Tracks
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.run import run_colmap
+from hqgs.scene.sfm.tracks import sureness
 
 UP = np.array([0.0, -1.0, 0.0])  # in the world of photos alone, as in an upright camera's frame
 LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
@@ -63,6 +64,7 @@ def find_cameras(
         unreadable=photos.unreadable,
         first_pass=ran.first_pass,
         advice=ran.advice(),
+        sure_px={names[file]: px for file, px in sureness(model).items()},
     )
     return FoundCameras(photos, model, report)
 

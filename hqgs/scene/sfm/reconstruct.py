@@ -17,6 +17,7 @@ from hqgs.scene.formats.colmap import model_points, seen_points
 from hqgs.scene.scene import Scene, SfmReport, Tracks, View
 from hqgs.scene.sfm.align import Observations, align, camera_centers, pose_auc, refine, rotation_angles
 from hqgs.scene.sfm.run import run_colmap
+from hqgs.scene.sfm.tracks import sureness
 
 
 def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) -> Scene:
@@ -69,6 +70,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) ->
         own_track_length=None if scene.tracks is None else scene.tracks.length,
         own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
         first_pass=ran.first_pass,
+        sure_px={views[file].name: px for file, px in sureness(model).items()},
         auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),
     )
     return replace(
