@@ -20,7 +20,7 @@ from hqgs.photos.jpeg import encode_jpeg
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.degrade import degrade_scene, write_degraded_scene
 from hqgs.scene.load import load_scene
-from hqgs.scene.scene import Scene, Tracks
+from hqgs.scene.scene import Scene, TrackStatistics
 
 KINDS = [
     "none",
@@ -128,7 +128,7 @@ def test_a_written_scene_tells_which_photos_show_which_points(tmp_path: Path) ->
     seen = {view.name: np.flatnonzero(rng.random(len(scene.points)) < 0.5) for view in views}
     seen[views[0].name] = np.zeros(0, np.intp)
     length = sum(map(len, seen.values())) / len(np.unique(np.concatenate(list(seen.values()))))
-    scene = replace(scene, seen=seen, tracks=Tracks(length, 0.75))
+    scene = replace(scene, seen=seen, tracks=TrackStatistics(length, 0.75))
     back = load_scene(write(scene, tmp_path / "out", "jpeg:9"))
     assert back.tracks is not None
     assert (back.tracks.length, back.tracks.error) == pytest.approx((length, 0.75))

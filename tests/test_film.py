@@ -88,7 +88,7 @@ def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.
     (tmp_path / "empty").rmdir()
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(
-        ValueError, match=r"is a film, which needs the extra 'video': pip install 'hqgs\[video\]'"
+        ValueError, match=r"is a film, which needs PyAV, the extra 'video': pip install 'hqgs\[video\]'"
     ):
         load(tmp_path / "no.mp4")
 

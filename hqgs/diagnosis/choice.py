@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.base.text import some
 from hqgs.diagnosis.constants import (
@@ -35,7 +36,7 @@ class Sight:
     def __init__(self, views: Sequence[View], points: NDArray[np.float32]) -> None:
         """`points` [*, 3], world."""
         count = min(max(CHECKS // len(views) ** 2, LEAST_POINTS), CHOICE_MOST_POINTS, len(points))
-        world = points[np.linspace(0, len(points) - 1, count).astype(np.int64)].astype(np.float64)
+        world = points[evenly(len(points), count)].astype(np.float64)
         self._inside = np.stack([in_frame(view.camera, world) for view in views])  # [N, P]
         rays = world - np.stack([view.camera.center for view in views])[:, None]
         lengths = np.linalg.norm(rays, axis=-1, keepdims=True)

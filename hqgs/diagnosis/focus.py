@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
+from hqgs.base.evenly import evenly
 from hqgs.diagnosis.constants import (
     BORDER,
     FEWEST_PHOTOS,
@@ -54,7 +55,7 @@ def focus_signs(scene: Scene) -> FocusSigns | None:
     """
     if scene.seen is None or len(scene.train) < FEWEST_PHOTOS:
         return None
-    chosen = np.unique(np.linspace(0, len(scene.train) - 1, MOST_PHOTOS).round().astype(int))
+    chosen = evenly(len(scene.train), MOST_PHOTOS)
     views = [scene.train[k] for k in chosen]
     points = most_shown(len(scene.points), scene.seen, views, FOCUS_MOST_POINTS)
     sharp, depths = (np.full((len(views), len(points)), np.nan) for _ in range(2))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.diagnosis.constants import (
@@ -117,7 +118,7 @@ class Inspector:
         """As `diagnose_scene`."""
         if max_photos < 1:
             raise ValueError(f"max_photos is {max_photos}, wanted at least 1")
-        chosen = np.unique(np.linspace(0, len(scene.train) - 1, max_photos).round().astype(np.int64))
+        chosen = evenly(len(scene.train), max_photos)
         found: list[Inspected] = []
         taken = 0  # to be like the probes
         for view in (scene.train[k] for k in chosen):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from hqgs.base.evenly import evenly
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.photos.pixels import as_floats, to_uint8
 
@@ -25,7 +26,7 @@ def learned_picture(
     out of focus (four times as large) in its middle and its gain in the caption.
     """
     order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"] - 2 * learned[k]["defocus_px"])
-    chosen = [order[k] for k in np.linspace(0, len(order) - 1, min(MOST, len(order))).round().astype(int)]
+    chosen = [order[k] for k in evenly(len(order), MOST)]
     tiles = [_tile(photos[k], learned[k]) for k in chosen]
     width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
     columns = min(COLUMNS, len(tiles))

@@ -81,6 +81,13 @@ class Gaussians:
         """The degree that the coefficients reach, 0..3."""
         return math.isqrt(self.shN.shape[1] + 1) - 1
 
+    def finite(self) -> Tensor:
+        """Which hold no NaN or Inf in any tensor, bool [N]."""
+        tensors = [
+            tensor.detach().reshape(len(self), -1) for tensor in self.named().values() if tensor.numel()
+        ]
+        return torch.cat([torch.zeros(len(self), 1), *tensors], dim=1).isfinite().all(dim=1)
+
     def named(self) -> dict[str, Tensor]:
         """The tensors by name, in the order of the fields."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.init}

@@ -52,7 +52,7 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[Frame
     PyAV. ValueError without PyAV (the extra `video`) or its encoder,
     or for photos of several sizes.
     """
-    av = _pyav()
+    av = pyav("video")
     sizes = sorted({image.shape[1::-1] for image in images})
     if len(sizes) > 1:
         each = " and ".join(f"{w} x {h}" for w, h in sizes[:2])
@@ -98,14 +98,14 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[Frame
     ]
 
 
-def _pyav() -> Any:
-    """The module, which is imported when it is used: only films need it."""
+def pyav(what: str) -> Any:
+    """The module PyAV, which is imported when it is used. ValueError where it is missing: `what` needs it."""
     try:
         import av
         import av.error
     except ImportError as error:
         raise ValueError(
-            f"video needs PyAV, the extra 'video': pip install 'hqgs[video]' ({error})"
+            f"{what} needs PyAV, the extra 'video': pip install 'hqgs[video]' ({error})"
         ) from error
     return av
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.photo_files import MASKS, Named, below
-from hqgs.scene.scene import SfmReport, Tracks
+from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.world import World
 
 MAX_SIDE = 65_535  # the largest side a JPEG can have; larger ones come from damaged files
@@ -47,7 +47,7 @@ class Capture:
     near_far: dict[str, tuple[float, float]] = field(default_factory=dict)  # depth range by photo name
     notes: list[str] = field(default_factory=list)
     world: World = field(default_factory=World)  # the frame of the files, where that is another
-    tracks: Tracks | None = None  # px of the cameras' own size
+    tracks: TrackStatistics | None = None  # px of the cameras' own size
     seen: dict[str, NDArray[np.intp]] | None = None  # by photo, rows of the points that it shows
     sfm: SfmReport | None = None  # where cameras and points come from the photos
 

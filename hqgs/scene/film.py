@@ -19,6 +19,7 @@ from hqgs.base.files import FRAMES, missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
+from hqgs.photos.video import pyav
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
 LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
@@ -37,7 +38,7 @@ def film_frames(
     """
     if count is not None and count < 3:
         raise ValueError(f"frames is {count}, wanted at least 3")
-    av = _pyav(path)
+    av = pyav(f"{path} is a film, which")
     state = path.stat()
     name = f"4 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
@@ -147,15 +148,3 @@ def _sharpness(frame: Any) -> float:
     inner = luma[1:-1, 1:-1]
     laplacian = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:] - 4 * inner
     return float(np.square(laplacian).mean())
-
-
-def _pyav(path: Path) -> Any:
-    """The module, which is imported when it is used: only films need it."""
-    try:
-        import av
-        import av.error
-    except ImportError as error:
-        raise ValueError(
-            f"{path} is a film, which needs the extra 'video': pip install 'hqgs[video]'"
-        ) from error
-    return av

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from hqgs.base.evenly import evenly
 from hqgs.base.files import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
 from hqgs.base.stages import OnStage, untold
 from hqgs.base.text import some
@@ -22,7 +23,7 @@ from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.photo_files import is_run
 from hqgs.scene.place import placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points
-from hqgs.scene.scene import Scene, Tracks, View
+from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
 from hqgs.scene.views import load_views
@@ -132,7 +133,7 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
-    chosen = sorted({round(k) for k in np.linspace(0, len(photos.names) - 1, most)})
+    chosen = evenly(len(photos.names), most)
     cameras = [
         pycolmap.Camera.create_from_model_name(
             1, "SIMPLE_PINHOLE", 1.2 * max(photos.sizes[k]), *photos.sizes[k]
@@ -261,7 +262,7 @@ def _check_half(train: list[View], unreadable: dict[str, UnreadableError]) -> No
         raise unreadable[min(unreadable)]
 
 
-def _tracks(capture: Capture, views: list[View]) -> Tracks | None:
+def _tracks(capture: Capture, views: list[View]) -> TrackStatistics | None:
     """Those of the capture, in px of the views."""
     if capture.tracks is None:
         return None

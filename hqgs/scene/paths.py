@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hqgs.base.evenly import evenly
 from hqgs.scene.scene import Camera
 
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
@@ -250,7 +251,7 @@ def _keys(cameras: list[Camera]) -> list[Camera]:
         np.linalg.norm(np.diff(centers[walk], axis=0), axis=1).sum() for walk in (tour, own)
     )
     order = own if own_length <= 1.5 * length else tour
-    chosen = np.unique(np.linspace(0, len(order) - 1, min(len(order), MOST_KEYS)).round().astype(int))
+    chosen = evenly(len(order), MOST_KEYS)
     return [cameras[order[k]] for k in chosen]
 
 

@@ -47,7 +47,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Tracks:
+class TrackStatistics:
     """How the photos bear out the points of a COLMAP model."""
 
     length: float  # photos that see a point, mean
@@ -65,7 +65,7 @@ class Scene:
     point_colors: NDArray[np.uint8]  # [P, 3]
     source: str  # the format it was read from: "colmap", "llff", "transforms", "photos", "embedded"
     notes: list[str] = field(default_factory=list)  # what a reader of the report should know
-    tracks: Tracks | None = None  # of the points, px of the views; None: its files do not tell
+    tracks: TrackStatistics | None = None  # of the points, px of the views; None: its files do not tell
     seen: dict[str, NDArray[np.intp]] | None = None  # rows of the points that each photo shows; None as above
     sfm: SfmReport | None = None  # of poses and points from the photos; None: they are its files'
     origin: dict[str, Any] | None = (

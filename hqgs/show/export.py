@@ -82,9 +82,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
     steps: list[Reduction] = []
     g = gaussians.detached()
     n = len(g)
-    finite = torch.stack(
-        [t.isfinite().reshape(n, math.prod(t.shape[1:])).all(dim=1) for t in g.named().values()]
-    ).all(dim=0)
+    finite = g.finite()
     visible = (g.activated_opacities() >= ALPHA_MIN) & (g.quats.square().sum(dim=1) >= QUAT_NORM2_MIN)
     for keep, others, why in (
         (finite, n, "they hold NaN or Inf"),

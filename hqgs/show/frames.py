@@ -14,12 +14,14 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.base.evenly import evenly
 from hqgs.base.files import FILM_SUFFIXES, atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.video import pyav
 from hqgs.scene.scene import Camera
 
 SHOWN = ("color", "depth", "alpha")
@@ -79,7 +81,7 @@ def render_frames(
         if len(sizes) > 1:
             each = " and ".join(f"{w} x {h}" for w, h in sizes[:2])
             raise ValueError(f"{out}: a film has frames of one size, these cameras have {each} px")
-        av = _pyav() if suffix == ".mp4" else None
+        av = pyav(".mp4 (.gif does not)") if suffix == ".mp4" else None
         with atomic_path(out) as tmp:
             if av is None:
                 _write_gif(tmp, pictures, fps)
@@ -116,7 +118,7 @@ def frames(
     elif show == "alpha":
         yield from (_grey(prepared.depth(camera)[1]) for camera in cameras)
     else:
-        places = np.unique(np.linspace(0, len(cameras) - 1, SAMPLES).round().astype(int))
+        places = evenly(len(cameras), SAMPLES)
         low_high = depth_range([prepared.depth(cameras[k]) for k in places])
         yield from (depth_picture(*prepared.depth(camera), low_high) for camera in cameras)
 
@@ -195,17 +197,6 @@ def _counted(pictures: Iterator[Picture], total: int, progress: OnFrame | None) 
         yield picture
         if progress is not None:
             progress(done, total)
-
-
-def _pyav() -> Any:
-    """The module, which is imported when it is used: only films need it."""
-    try:
-        import av
-    except ImportError as error:
-        raise ValueError(
-            f".mp4 needs PyAV, the extra 'video': pip install 'hqgs[video]' ({error}); .gif does not"
-        ) from error
-    return av
 
 
 def _write_mp4(av: Any, path: Path, pictures: Iterator[Picture], fps: float) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hqgs.base.evenly import evenly
 from hqgs.photos.shake import exposure_times, path_points
 from hqgs.scene.scene import Camera
 
@@ -48,7 +49,7 @@ class Exposure:
             every = list(self.cameras[0])
         else:
             every = [camera for row in self.cameras[rows] for camera in row]
-        picks = np.unique(np.linspace(0, len(every) - 1, OUTLINES).round().astype(int))
+        picks = evenly(len(every), OUTLINES)
         return [every[k] for k in picks], MARGIN
 
 

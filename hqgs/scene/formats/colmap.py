@@ -24,7 +24,7 @@ from hqgs.scene.formats.colmap_photos import photos_of, whole_names
 from hqgs.scene.geometry import project
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
 from hqgs.scene.photo_files import is_run
-from hqgs.scene.scene import Camera, Tracks
+from hqgs.scene.scene import Camera, TrackStatistics
 
 _FILES = ("cameras", "images", "points3D")
 CALLED = ("colmap", "distorted", "model", "reconstruction")  # folders of a model
@@ -145,12 +145,12 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     )
 
 
-def _tracks(model: pycolmap.Reconstruction, path: Path) -> Tracks | None:
+def _tracks(model: pycolmap.Reconstruction, path: Path) -> TrackStatistics | None:
     """How the photos saw the points; None where the model does not tell."""
     try:
         if not model.compute_num_observations():
             return None
-        return Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+        return TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     except ValueError as e:
         raise ValueError(f"{path}: a point was seen by a photo that the model lacks: {e}") from e
 

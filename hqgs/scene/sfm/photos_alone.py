@@ -14,7 +14,7 @@ from hqgs.base.stages import OnStage, untold
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
-from hqgs.scene.scene import SfmReport, Tracks
+from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.tracks import sureness
@@ -103,7 +103,7 @@ def read_photos(
         colors,
         folder=folder,
         notes=notes,
-        tracks=Tracks(cameras.report.track_length, cameras.report.reprojection_error_px),
+        tracks=TrackStatistics(cameras.report.track_length, cameras.report.reprojection_error_px),
         seen=seen,
         sfm=cameras.report,
     )

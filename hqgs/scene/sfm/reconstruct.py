@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from hqgs.base.stages import OnStage, untold
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import model_points, seen_points
-from hqgs.scene.scene import Scene, SfmReport, Tracks, View
+from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
 from hqgs.scene.sfm.align import Observations, align, camera_centers, pose_auc, refine, rotation_angles
 from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.tracks import sureness
@@ -54,7 +54,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) ->
     degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", viewmats[:, :3, :3], own[:, :3, :3])))
     apart = np.linalg.norm(camera_centers(viewmats) - camera_centers(own), axis=1) / scene.extent
     distances, _ = KDTree(scene.points).query(points)
-    tracks = Tracks(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    tracks = TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     report = SfmReport(
         photos=len(views),
         not_registered=[view.name for file, view in views.items() if file not in poses],

@@ -61,10 +61,7 @@ def pack_scene(gaussians: Gaussians, most: int = MOST) -> PackedScene:
     the page stays small: 50,000 Gaussians of degree 3 take less than 5 MB.
     """
     g = gaussians.detached()
-    finite = torch.stack(
-        [t.isfinite().flatten(1).all(1) if t.dim() > 1 else t.isfinite() for t in g.named().values()]
-    )
-    keep = finite.all(0) & (g.activated_opacities() > 1 / 255) & (g.quats.square().sum(1) > 1e-12)
+    keep = g.finite() & (g.activated_opacities() > 1 / 255) & (g.quats.square().sum(1) > 1e-12)
     if int(keep.sum()) > most:
         area = g.scales.double().sort(dim=1).values[:, 1:].sum(1)
         shown = torch.where(keep, area + torch.nn.functional.logsigmoid(g.opacities.double()), -torch.inf)

@@ -15,6 +15,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.base.evenly import evenly
 from hqgs.base.files import write_text
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.held_out import RenderedView, names_of
@@ -194,7 +195,7 @@ def _chosen(views: Sequence[RenderedView], measured: dict[str, ViewMetricValues]
         return -np.inf if value is None else value
 
     ordered = sorted(range(len(views)), key=psnr, reverse=True)
-    places = np.unique(np.linspace(0, len(ordered) - 1, PAIRS).round().astype(int)) if ordered else []
+    places = evenly(len(ordered), PAIRS)
     return [views[ordered[k]] for k in places]
 
 

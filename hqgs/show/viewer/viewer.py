@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from hqgs.base.evenly import evenly
 from hqgs.model.content import content
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
@@ -207,7 +208,7 @@ class Viewer:
     def _build_frustums(self) -> list[Any]:
         made = []
         views = [*self._views.values()]
-        chosen = np.unique(np.linspace(0, len(views) - 1, FRUSTUMS).round().astype(int)) if views else []
+        chosen = evenly(len(views), FRUSTUMS)
         extent = np.linalg.norm(np.ptp([v.camera.center for v in views], axis=0)) if views else 1.0
         for k in chosen:
             view, image = views[k], None
