@@ -25,7 +25,7 @@ from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import give_back_memory, peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
-from hqgs.base.stages import OnStage, untold
+from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
@@ -40,6 +40,7 @@ from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
 from hqgs.training.notes import learned_record, run_notes
 from hqgs.training.pace import fit_to_seconds
+from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values
 from hqgs.training.trainer import Trainer
@@ -197,6 +198,8 @@ def open_run(
             ranks.agree(scene_fingerprint(trainer.scene), "the scene")
             ranks.agree(trainer.plan, "the plan")
         _check_agreement(trainer)
+        if ranks.first:
+            told(Stage("planned", 0, 0, essential(trainer.plan)))
         if folder is not None:
             asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
             write_json(folder / CONFIG, asked)

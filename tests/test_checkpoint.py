@@ -15,7 +15,7 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.base.files import CHECKPOINT
 from hqgs.pipeline import open_run, train
 from hqgs.scene.scene import Scene, View
-from hqgs.training.checkpoint import OTHER, load_checkpoint, save_checkpoint, scene_fingerprint
+from hqgs.training.checkpoint import OTHER, check_scene, load_checkpoint, save_checkpoint, scene_fingerprint
 from hqgs.training.config import DensifyConfig
 from hqgs.training.trainer import Trainer
 
@@ -166,3 +166,12 @@ def test_any_changed_byte_and_any_cut_is_noticed(tmp_path: Path) -> None:
 def test_a_missing_checkpoint_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*a\.safetensors"):
         load_checkpoint(tmp_path / "a.safetensors")
+
+
+def test_a_scene_that_lacks_what_the_saved_one_had_is_another_scene(tmp_path: Path) -> None:
+    """Not only what the present scene has is compared."""
+    scene = tiny_scene()
+    saved = scene_fingerprint(scene)
+    check_scene(tmp_path, saved, scene)
+    with pytest.raises(ValueError, match="is of another scene: it had surroundings"):
+        check_scene(tmp_path, saved | {"surroundings": "0123"}, scene)

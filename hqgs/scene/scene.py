@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -77,6 +78,10 @@ class Scene:
         """ValueError where it cannot be trained on."""
         if not self.train:
             raise ValueError(f"scene {self.name!r} has no training views")
+        names = Counter(view.name for view in self.train)
+        name, count = names.most_common(1)[0]
+        if count > 1:  # what is learned of a photo's camera, and which points it sees, goes by its name
+            raise ValueError(f"{count} training views of scene {self.name!r} are named {name!r}")
         for view in [*self.train, *self.test]:
             wanted = (view.camera.height, view.camera.width, 3)
             if view.image.dtype not in (np.uint8, np.float32) or view.image.shape != wanted:

@@ -153,6 +153,7 @@ class Rule:
     what: str  # it decides
     decide: Callable[[Draft], Sequence[Choice]]  # nothing where it does not apply
     source: str  # paper and equation, or where the measurement is that chose it
+    of_photos: bool = False  # needs no poses
 
 
 def plan_by(rules: Sequence[Rule], facts: Facts, diagnosis: Diagnosis | None, asked: TrainConfig) -> RunPlan:
@@ -171,6 +172,14 @@ def plan_by(rules: Sequence[Rule], facts: Facts, diagnosis: Diagnosis | None, as
 def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
     """What a run does without by these rows."""
     return [LeftOut(row.left_out, row.why, row.evidence or None) for row in rows if row.left_out is not None]
+
+
+ESSENTIAL = ("method", "formation", "loss", "budget", "first points", "length")
+
+
+def essential(plan: RunPlan) -> str:
+    """The rows that a user should know of before the run, as lines."""
+    return plan_table([row for row in plan.rows if row.what in ESSENTIAL])
 
 
 def plan_table(rows: Sequence[PlanRow]) -> str:

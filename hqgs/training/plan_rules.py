@@ -321,9 +321,9 @@ def held_photos(draft: Draft) -> Sequence[Choice]:
 
 RULES = (
     Rule("a photo", photos, "what a broken or an empty photo teaches is wrong"),
-    Rule("method", method, "the default of hqgs train"),
-    Rule("formation", formation, "hqgs/diagnosis/, thresholds beside each measurement"),
-    Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN),
+    Rule("method", method, "the default of hqgs train", of_photos=True),
+    Rule("formation", formation, "hqgs/diagnosis/, thresholds beside each measurement", of_photos=True),
+    Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN, of_photos=True),
     Rule("cameras", cameras, "shake, focus and exposure as the diagnosis tells them"),
     Rule("budget", budget, "Candes and Donoho 2004 under noise; " + CHOSEN),
     Rule("first points", first_points, f"one for each 100 pixels, or the budget: {CHOSEN}"),

@@ -20,8 +20,8 @@ from hqgs.training.config import AUTO, FORMATION, TrainConfig
 from hqgs.training.looks import Looks
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
-from hqgs.training.plan import Facts, RunPlan, StepSeconds
-from hqgs.training.plan_rules import plan_run
+from hqgs.training.plan import Facts, RunPlan, StepSeconds, plan_by
+from hqgs.training.plan_rules import RULES, plan_run
 
 
 class Prepared:
@@ -74,6 +74,14 @@ class Prepared:
             more = points_along_edges(scene.train, points, scene.seen, count, seed, agreement, self._told)
             self._points[wanted] = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
         return self._points[wanted]
+
+
+def plan_of_photos(scene: Scene, asked: TrainConfig) -> tuple[RunPlan, list[str]]:
+    """The plan of photos that have no poses yet, as far as it goes; and what is not decided before that."""
+    diagnosis = Inspector().diagnose(scene) if asks_for_diagnosis(asked) else None
+    known = [rule for rule in RULES if rule.of_photos]
+    later = [rule.what for rule in RULES if not rule.of_photos and rule.what != "a photo"]
+    return plan_by(known, facts_of(scene), diagnosis, asked), later
 
 
 def facts_of(scene: Scene, unused: list[LeftOut] | None = None) -> Facts:

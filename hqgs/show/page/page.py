@@ -20,7 +20,7 @@ from hqgs.base.files import write_text
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
-from hqgs.evaluation.records import HistoryEntry, Report, ViewMetricValues, alike
+from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8
@@ -124,6 +124,7 @@ def page_text(page: Page) -> str:
         learned=[_row(record["name"], learned_words(record)) for record in report["learned"]],
         learned_picture=None if page.learned is None else _jpeg(page.learned, LEARNED_SIDE),
         left_out=[_left_out(dict(item)) for item in report["left_out"]],
+        plan=[_plan_row(row) for row in report.get("plan", [])],
         notes=report["notes"],
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
@@ -221,6 +222,12 @@ def _jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
 
 def _row(name: str, words: dict[str, str]) -> tuple[str, ...]:
     return name, *words.values()
+
+
+def _plan_row(row: PlanRowRecord) -> tuple[str, ...]:
+    """The cells of a decision."""
+    when = f"after iteration {row['iteration']:,}: " if "iteration" in row else ""
+    return row["what"], row["value"], when + row["why"], row.get("evidence", ""), row.get("rule", "")
 
 
 def _left_out(item: dict[str, Any]) -> dict[str, str]:

@@ -1,0 +1,158 @@
+"""A run is planned once, by rules, from facts; what is decided later is added to what a resumed run reads."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from planned import planned
+from test_diagnose import degraded_scene
+from tiny_scene import tiny_config, tiny_scene
+
+from hqgs.base.files import CHECKPOINT, PAGE
+from hqgs.cli.main import main
+from hqgs.photos.formula import parse_degradation
+from hqgs.pipeline import open_run
+from hqgs.scene.degrade import write_degraded_scene
+from hqgs.training import plan_length
+from hqgs.training.config import HQGSConfig, run_config
+from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, plan_by
+from hqgs.training.plan_rules import RULES, plan_run
+from hqgs.training.prepare import Prepared, facts_of
+from hqgs.training.trainer import Trainer
+
+
+def value(plan: RunPlan, what: str) -> str:
+    return next(row.value for row in plan.rows if row.what == what)
+
+
+def test_a_plan_follows_from_facts_alone_and_comes_back_from_json() -> None:
+    config = tiny_config(method="auto", hqgs=HQGSConfig(formation="noise:12"))
+    prepared = Prepared(tiny_scene(), config)
+    plan = plan_run(prepared.facts, None, config)
+    assert (
+        plan
+        == plan_run(prepared.facts, None, config)
+        == prepared.plan()
+        == Trainer(tiny_scene(), config).plan
+    )
+    assert RunPlan.of_values(json.loads(json.dumps(plan.values())), "here") == plan
+    with pytest.raises(FrozenInstanceError):
+        plan.discs = True  # type: ignore[misc]
+    assert all(row.what and row.value and row.why and row.rule for row in plan.rows)
+    assert (value(plan, "method"), value(plan, "formation")) == ("hqgs", "noise:12")
+    assert f"{plan.settings.densify.max_gaussians:,} Gaussians" in value(plan, "budget")
+
+
+def test_the_formation_is_what_the_photos_show_and_why() -> None:
+    scene = degraded_scene("noise:25", photos=4)
+    plan = Prepared(scene, run_config()).plan()
+    row = next(row for row in plan.rows if row.what == "formation")
+    assert row.value.startswith("noise:2")
+    assert "levels" in row.evidence
+    assert row.why == "what the photos show"
+    none = next(row for row in plan.rows if row.what == "a correction for blur")
+    assert (none.value, none.left_out) == ("none", "a correction for blur")
+
+
+def test_a_rule_is_one_entry() -> None:
+    def seed(draft: Draft) -> list[Choice]:
+        return [Choice("7", "for luck", changes={"seed": 7, "densify.every": 3})] if draft.formed else []
+
+    facts = facts_of(tiny_scene())
+    rules = (*RULES, Rule("seed", seed, "nowhere"))
+    config = tiny_config(method="auto", hqgs=HQGSConfig(formation="none"))
+    plan = plan_by(rules, facts, None, config)
+    assert (plan.settings.seed, plan.settings.densify.every) == (7, 3)
+    assert plan.rows[-1].rule == "seed: nowhere"
+    assert plan_by(rules, facts, None, tiny_config()).settings.seed == tiny_config().seed
+
+
+def test_seconds_are_a_fact_of_the_machine() -> None:
+    config = replace(run_config(method="3dgs"), seconds=60.0)
+    facts = replace(facts_of(tiny_scene()), as_photographed=True)
+    slow, fast = (plan_run(replace(facts, seconds=StepSeconds(s, s / 4)), None, config) for s in (0.1, 0.01))
+    assert slow.settings.iterations == pytest.approx(60 / (0.1 * plan_length.GROWTH), rel=0.01)
+    assert fast.settings.iterations == pytest.approx(60 / (0.01 * plan_length.GROWTH), rel=0.01)
+    assert slow.follows_clock
+    assert not planned(config, tiny_scene().train).follows_clock
+
+
+def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_path: Path) -> None:
+    config = tiny_config(30, turn=(20, 26))
+    trainer = Trainer(tiny_scene(), config)
+    before = trainer.plan
+    while trainer.iteration < 22:
+        trainer.step()
+    assert trainer.plan is before
+    assert [(row.what, row.value, row.iteration) for row in trainer.state.rows] == [
+        ("length", "26 iterations", 20)
+    ]
+    trainer.save(tmp_path / "checkpoint")
+    again = Trainer(tiny_scene(), config)
+    again.restore(tmp_path / "checkpoint")
+    assert again.rows == trainer.rows
+
+
+def test_a_run_of_seconds_resumes_by_the_same_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped in the middle, and at its end: its length is the one that was planned, not 30,000."""
+    monkeypatch.setattr(plan_length, "FEWEST", 40)
+    monkeypatch.setattr(plan_length, "MOST", 41)
+
+    config = replace(run_config(leave_out="none", method="3dgs"), seconds=1e3)
+
+    def goes_on(to: int) -> Trainer:
+        with open_run(tiny_scene(), config, tmp_path, resume=True) as trainer:
+            while trainer.iteration < min(to, trainer.length):
+                trainer.step()
+            trainer.save(tmp_path / CHECKPOINT)
+        return trainer
+
+    plan = goes_on(12).plan
+    assert plan.settings.iterations == 40
+    ended = goes_on(30_000)
+    assert (ended.plan, ended.iteration) == (plan, ended.length)
+    assert ended.length < 200
+    assert goes_on(30_000).iteration == ended.iteration
+
+
+def test_two_photos_of_one_name_are_refused() -> None:
+    """They would share what is learned of their cameras."""
+    scene = tiny_scene()
+    twins = replace(scene, train=[*scene.train, replace(scene.train[0])])
+    with pytest.raises(ValueError, match=r"2 training views of scene 'tiny' are named 'view1.png'"):
+        Trainer(twins, tiny_config())
+
+
+def test_the_command_prints_what_the_page_shows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = tmp_path / "desk", tmp_path / "run"
+    write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)
+    options = ["--formation", "noise:9", "--iterations", "12"]
+    assert main(["plan", str(scene), *options]) == 0
+    said = capsys.readouterr().out
+    assert main(["train", str(scene), "--out", str(out), *options]) == 0
+    trained = capsys.readouterr().err
+    rows = json.loads((out / "report.json").read_text())["plan"]
+    page = (out / PAGE).read_text()
+    for row in rows:
+        assert row["what"] in said
+        assert row["value"] in said
+        assert row["value"].replace("'", "&#39;").replace(">", "&gt;") in page
+    assert "noise:9" in trained
+    assert "12 iterations" in trained
+
+
+def test_photos_alone_have_a_plan_as_far_as_it_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+
+    for view in degraded_scene("noise:25", photos=4).train:
+        pixels = (view.image.clip(0, 1) * 255).round().astype("uint8")
+        Image.fromarray(pixels).save(tmp_path / view.name)
+    assert main(["plan", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "noise:2" in said
+    assert "not known before the photos have poses" in said
