@@ -341,7 +341,7 @@ def test_ways_are_learned_and_the_scene_gets_sharper() -> None:
     )
     cosines = []
     for photo, way in zip(learned.method.found(), ways, strict=True):
-        along = photo.way[-1] - photo.way[0]
+        along = photo.trajectory[-1] - photo.trajectory[0]
         cosines.append(abs(along @ way) / (np.linalg.norm(along) * 8 + 1e-9))
     assert np.median(cosines) > 0.9
     moved, rested = ([photo.extent for photo in t.method.found()] for t in (learned, still))

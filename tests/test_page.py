@@ -95,7 +95,7 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
             "shake_px": 4.0,
             "defocus_px": 0.0,
             "focus": None,
-            "way_px": way,
+            "trajectory_px": way,
             "gains": [2.0, 2.0, 0.5],
         },
         {
@@ -103,7 +103,7 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
             "shake_px": 0.0,
             "defocus_px": 1.5,
             "focus": 2.0,
-            "way_px": [[0.0, 0.0]] * 9,
+            "trajectory_px": [[0.0, 0.0]] * 9,
             "gains": [1.0, 1.0, 1.0],
         },
     ]

@@ -16,14 +16,14 @@ from hqgs.photos.pixels import as_floats, to_uint8
 
 MOST, COLUMNS = 12, 4  # photos of a picture, and side by side
 SIDE, LINE, GAP = 260, 18, 6  # px: of a photo, a caption, and between photos
-LARGER = 4  # times: ways are drawn so much larger than the photo
+LARGER = 4  # times: trajectories are drawn so much larger than the photo
 
 
 def learned_picture(
     photos: Sequence[NDArray[np.uint8] | NDArray[np.float32]], learned: Sequence[LearnedRecord]
 ) -> Image.Image:
-    """Up to 12 photos [H, W, 3], the least sharp one first, each with its camera's way and largest disc
-    out of focus (four times as large) in its middle and its gain in the caption.
+    """Up to 12 photos [H, W, 3], the least sharp one first, each with its camera's trajectory and largest
+    disc out of focus (four times as large) in its middle and its gain in the caption.
     """
     order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"] - 2 * learned[k]["defocus_px"])
     chosen = [order[k] for k in evenly(len(order), MOST)]
@@ -49,12 +49,12 @@ def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord)
     facts += [f"{stops:+.2f} stops"] if np.ptp(record["gains"]) or stops else []
     draw.text((2, 3), f"{Path(record['name']).stem[-16:]}  {', '.join(facts)}", fill=(25, 25, 25))
     middle = np.array([picture.width / 2, LINE + picture.height / 2])
-    way = [tuple(middle + LARGER * scale * np.array(point)) for point in record["way_px"]]
+    trajectory = [tuple(middle + LARGER * scale * np.array(point)) for point in record["trajectory_px"]]
     if record["defocus_px"]:
         radius = LARGER * scale * record["defocus_px"]
         for width, color in ((3, (0, 0, 0)), (1, (255, 210, 0))):
             draw.circle(tuple(middle), radius, outline=color, width=width)
     if record["shake_px"]:
-        draw.line(way, fill=(0, 0, 0), width=5, joint="curve")
-        draw.line(way, fill=(255, 210, 0), width=3, joint="curve")
+        draw.line(trajectory, fill=(0, 0, 0), width=5, joint="curve")
+        draw.line(trajectory, fill=(255, 210, 0), width=3, joint="curve")
     return tile

@@ -122,7 +122,7 @@ class LearnedRecord(TypedDict):
 
     name: str
     shake_px: float  # how far the picture's middle went during the exposure
-    way_px: list[list[float]]  # its way, [9, 2], x to the right and y down; of mean 0
+    trajectory_px: list[list[float]]  # its trajectory, [9, 2], x to the right and y down; of mean 0
     defocus_px: float  # radius of the largest disc that a point becomes
     focus: (
         float | None

@@ -19,11 +19,11 @@ def orbit(
     up: ArrayLike | None = None,
     like: Camera | None = None,
 ) -> list[Camera]:
-    """Cameras on a way around a scene, all of which look at its middle.
+    """Cameras on a path around a scene, all of which look at its middle.
 
     Args:
         about: the Gaussians, or cameras that look at the scene, such as those of the training views. The
-            cameras say how far away and how high the way is; if they stand on one side only, it is a small
+            cameras say how far away and how high the path is; if they stand on one side only, it is a small
             ellipse on that side.
         frames: how many, at least 1.
         up: [3], the axis of the orbit; None: up as most of the cameras were held, and of Gaussians 0 -1 0,

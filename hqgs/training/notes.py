@@ -35,12 +35,12 @@ def run_notes(trainer: Trainer) -> list[str]:
         why = "pixels held back from the noisy photos showed no gain any more"
         notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
     if found := trainer.method.found():
-        ways = sorted(photo.extent for photo in found)
-        if moved := sum(way > 0 for way in ways):
+        lengths = sorted(photo.extent for photo in found)
+        if moved := sum(length > 0 for length in lengths):
             notes.append(
-                f"{moved} of {len(ways)} photos are shaken, by {ways[len(ways) // 2]:.1f} px in the median "
-                f"and {ways[-1]:.1f} px at most; held-out photos that are shaken themselves measure a sharp "
-                "scene as worse than it is"
+                f"{moved} of {len(lengths)} photos are shaken, by {lengths[len(lengths) // 2]:.1f} px in the "
+                f"median and {lengths[-1]:.1f} px at most; held-out photos that are shaken themselves "
+                "measure a sharp scene as worse than it is"
             )
         discs = sorted(photo.defocus for photo in found)
         if soft := sum(disc > 0 for disc in discs):
@@ -60,7 +60,7 @@ def learned_record(found: Found) -> LearnedRecord:
     return {
         "name": found.name,
         "shake_px": found.extent,
-        "way_px": found.way.tolist(),
+        "trajectory_px": found.trajectory.tolist(),
         "defocus_px": found.defocus,
         "focus": found.focus,
         "gains": found.gains.tolist(),

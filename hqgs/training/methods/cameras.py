@@ -1,8 +1,8 @@
-"""What each photo's camera did, learned with the scene: its way during the exposure, its lens and its gains.
+"""What each photo's camera did, learned with the scene: its trajectory in the exposure time, lens and gains.
 
-One render, warped along the way and over the lens (`hqgs/photos/exposure.py`), stands for the whole exposure.
-What photos cannot tell is fixed by construction: the mean of a way is the photo's pose, the mean of the log
-gains is that which they start with.
+One render, warped along the trajectory and over the lens (`hqgs/photos/exposure.py`), stands for the whole
+exposure. What photos cannot tell is fixed by construction: the mean of a trajectory is the photo's pose, the
+mean of the log gains is that which they start with.
 """
 
 from __future__ import annotations
@@ -24,16 +24,19 @@ from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.methods.lens import SMALLEST, first_lens, lens_warps, samples, sharp_at, widest
 
-BEGIN = 0.1  # of the run: before, ways would only hide what the scene does not show yet
-LOOKS = (0.5, 0.75)  # of the run: when short ways are given up
-SHORTEST = 0.7  # px, of the way of the picture's middle: less than that a photo stands still
-FIRST = 1e-3  # of the photo's width, standard deviation: from 0 a way has no direction to grow in
+BEGIN = 0.1  # of the run: before, trajectories would only hide what the scene does not show yet
+LOOKS = (0.5, 0.75)  # of the run: when short trajectories are given up
+SHORTEST = 0.7  # px, of the trajectory of the picture's middle: less than that a photo stands still
+FIRST = 1e-3  # of the photo's width, standard deviation: from 0 a trajectory has no direction to grow in
 PATH_RATE, GAIN_RATE = 8e-4, 0.005  # learning rates: of the photo's width, and of the log gains
 LENS_RATE = 4e-4  # the same for lenses, of the photo's width
 NARROW = 200  # px: narrower photos count as that wide
 LAST = 0.1  # of the rates, at the end of the run
-WAY = 9  # points that stand for a way
-SPACING, MOST = 1.5, 17  # px of a way from one sample of the exposure to the next, and the most samples
+TRAJECTORY_POINTS = 9  # that stand for a trajectory
+SPACING, MOST = (
+    1.5,
+    17,
+)  # px of a trajectory from one sample of the exposure to the next, and the most samples
 MOST_MARGIN = 48  # px around a render
 REFRESH = 8  # visits of a photo until its depths are looked at again
 COARSER = 4  # times the photo's pixels: of the map of depths
@@ -53,7 +56,7 @@ class Found:
     """What was found of a photo's camera."""
 
     name: str
-    way: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
+    trajectory: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
     gains: NDArray[np.float64]  # [3], of red, green and blue in linear light
     lens: NDArray[np.float64]  # [2], px: see `hqgs.training.methods.lens`
 
@@ -69,15 +72,16 @@ class Found:
 
     @property
     def extent(self) -> float:
-        """The longest distance of two points of the way, px."""
-        return float(np.linalg.norm(self.way[:, None] - self.way, axis=-1).max())
+        """The longest distance of two points of the trajectory, px."""
+        return float(np.linalg.norm(self.trajectory[:, None] - self.trajectory, axis=-1).max())
 
 
 class LearnedCameras:
     """The cameras of a scene's training photos.
 
-    A way is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and move in
-    all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median depth.
+    A trajectory is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and
+    move in all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median
+    depth.
     """
 
     def __init__(
@@ -172,7 +176,7 @@ class LearnedCameras:
         return [
             Found(
                 name,
-                np.zeros((WAY, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
+                np.zeros((TRAJECTORY_POINTS, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
             )
@@ -230,14 +234,15 @@ class LearnedCameras:
         count, still, sharp = 0, bool(self._still[number]), bool(self._sharp[number])
         if not still:
             with torch.no_grad():
-                moved = _moved(_way_warps(self._paths[number], camera, WAY), camera, nearness=1.0)
+                whole = _trajectory_warps(self._paths[number], camera, TRAJECTORY_POINTS)
+                moved = _moved(whole, camera, nearness=1.0)
             extent = max(_longest(moved[:, k]) for k in range(moved.shape[1]))
             count = min(max(3, math.ceil(extent / SPACING) + 1), MOST)
         if not sharp:
             count = max(count, samples(self._lenses[number]))
         warps = torch.zeros(count, 3, 4, dtype=torch.float64)
         if not still:
-            warps = warps + _way_warps(self._paths[number], camera, count)
+            warps = warps + _trajectory_warps(self._paths[number], camera, count)
         if not sharp:
             warps = warps + lens_warps(self._lenses[number], count)
         return warps
@@ -256,14 +261,14 @@ def no_shot(view: View) -> Shot:
 
 
 def _steps(path: Tensor, count: int) -> Tensor:
-    """Where a way is in the middles of `count` equal parts of the exposure, [count, 6]; of mean 0."""
+    """Where a trajectory is in the middles of `count` equal parts of the exposure, [count, 6]; of mean 0."""
     t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
     square = t.square()
     return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
 
 
-def _way_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
-    """Warps of a camera that goes along a way, [count, 3, 4]."""
+def _trajectory_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
+    """Warps of a camera that goes along a trajectory, [count, 3, 4]."""
     steps, focal, K = _steps(path, count), float(camera.K[0, 0]), torch.from_numpy(camera.K)
     turned = K @ _turns(steps[:, :3] / focal) @ torch.linalg.inv(K)
     moved = steps[:, 3:] @ (K / focal).T
@@ -279,8 +284,8 @@ def _center(tensors: Sequence[Tensor], wanted: Tensor) -> None:
 
 
 def _middle(path: Tensor) -> Tensor:
-    """The way of the picture's middle at the median depth, px, [9, 2]."""
-    steps = _steps(path.detach(), WAY)
+    """The trajectory of the picture's middle at the median depth, px, [9, 2]."""
+    steps = _steps(path.detach(), TRAJECTORY_POINTS)
     return torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
 
 

@@ -52,7 +52,7 @@ def lens_warps(lens: Tensor, count: int) -> Tensor:
 def _sunflower(count: int) -> Tensor:
     """Points spread evenly over the unit disc, [count, 2], of mean 0.
 
-    Neighbours in the list lie far apart: the same warps may stand for a way, one moment after another.
+    Neighbours in the list lie far apart: the same warps may stand for a trajectory, one moment after another.
     """
     k = torch.arange(count, dtype=torch.float64)
     order = (k * (GOLDEN / (2 * math.pi)) % 1).argsort().double()
