@@ -121,7 +121,7 @@ CASES: dict[str, Case] = {
     "3dgs some": asked(textured, method="3dgs", leave_out=SOME),
     "3dgs batch": asked(textured, "resumed", "ranks", method="3dgs", batch=2),
     "3dgs turn": asked(textured, "resumed", method="3dgs", changes={"turn": (35, 50)}),
-    "3dgs rates": asked(textured, method="3dgs", changes={"brisk": True}),
+    "3dgs rates": asked(textured, method="3dgs", changes={"faster_rates": True}),
     "srgs": asked(lambda: textured("lowres:2"), method="srgs"),
     "srgs noise": asked(lambda: textured("noise:12"), method="srgs", leave_out="none"),
     "paper": asked(textured, "resumed", method="hqgs", guidance="paper"),

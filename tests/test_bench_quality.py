@@ -283,7 +283,7 @@ def test_the_digest_covers_what_a_result_depends_on(monkeypatch: pytest.MonkeyPa
         digest(srgs),
         digest(srgs, srgs=SRGSConfig(texture_weight=0.8)),
         digest(replace(base, poses=PHOTOS)),
-        digest(base, brisk=True),
+        digest(base, faster_rates=True),
         digest(replace(base, row=replace(base.row, method="hqgs"))),
     ]
     monkeypatch.setattr(hqgs, "__version__", "999")

@@ -68,10 +68,16 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
 
 def test_a_coarse_film_has_the_rates_of_3dgs() -> None:
     """Alone; what else happened to the photos asks for the higher ones."""
-    scene, brisk = tiny_scene(), {}
+    scene, faster = tiny_scene(), {}
     for kind in ("none", "video", "jpeg:30", "video+exposure", "noise:10"):
-        brisk[kind] = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed(kind))).config.brisk
-    assert brisk == {"none": True, "video": False, "jpeg:30": False, "video+exposure": True, "noise:10": True}
+        faster[kind] = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed(kind))).config.faster_rates
+    assert faster == {
+        "none": True,
+        "video": False,
+        "jpeg:30": False,
+        "video+exposure": True,
+        "noise:10": True,
+    }
 
 
 def test_a_shaken_film_trains_as_shaken_photos() -> None:

@@ -106,27 +106,27 @@ def test_learning_rates_by_hand() -> None:
     ],
 )
 def test_short_runs_may_have_higher_rates(iterations: int, faster: float, last: float) -> None:
-    plain, brisk = TrainConfig(iterations=iterations), TrainConfig(iterations=iterations, brisk=True)
-    before, rates = (learning_rates(config, extent=2.0, part=1.0) for config in (plain, brisk))
+    plain, short = TrainConfig(iterations=iterations), TrainConfig(iterations=iterations, faster_rates=True)
+    before, rates = (learning_rates(config, extent=2.0, part=1.0) for config in (plain, short))
     assert before["means"] == pytest.approx(2 * 1.6e-6)
     assert rates["means"] == pytest.approx(2 * last)
     assert rates["opacities"] == before["opacities"]
     for name in ("scales", "quats", "sh0", "shN"):
         assert rates[name] == pytest.approx(faster * before[name])
-    assert learning_rates(brisk, 2.0, 0.0)["means"] == learning_rates(plain, 2.0, 0.0)["means"]
+    assert learning_rates(short, 2.0, 0.0)["means"] == learning_rates(plain, 2.0, 0.0)["means"]
 
 
 def test_means_move_in_units_of_the_reach_in_short_runs() -> None:
     """Where 3DGS is asked for, and of photos that a codec alone spoiled, in units of the extent."""
 
-    def times(iterations: int, reach: float, brisk: bool = True) -> list[float]:
-        config = TrainConfig(iterations=iterations, brisk=brisk)
+    def times(iterations: int, reach: float, faster_rates: bool = True) -> list[float]:
+        config = TrainConfig(iterations=iterations, faster_rates=faster_rates)
         pairs = [(learning_rates(config, 2.0, p, r) for r in (reach, None)) for p in (0.0, 1.0)]
         return [mine["means"] / other["means"] for mine, other in pairs]
 
     assert times(600, 8.0) == pytest.approx([4.0, 4.0])
     assert times(600, 200.0) == pytest.approx([50**0.6, 50**0.6])
-    assert times(30_000, 8.0) == times(600, 8.0, brisk=False) == times(600, 1.0) == [1.0, 1.0]
+    assert times(30_000, 8.0) == times(600, 8.0, faster_rates=False) == times(600, 1.0) == [1.0, 1.0]
     scene = tiny_scene()
     far = replace(scene, points=scene.points + 100 * scene.train[0].camera.viewmat[2, :3].astype(np.float32))
     assert far.reach > 9 * far.extent
@@ -144,14 +144,14 @@ def test_means_move_in_units_of_the_reach_in_short_runs() -> None:
 
 
 def test_methods_of_our_own_have_them_unless_asked_not_to() -> None:
-    def brisk(method: str, asked: bool | None) -> bool | None:
-        return Trainer(tiny_scene(), tiny_config(method=method, brisk=asked)).config.brisk
+    def faster(method: str, asked: bool | None) -> bool | None:
+        return Trainer(tiny_scene(), tiny_config(method=method, faster_rates=asked)).config.faster_rates
 
-    assert [brisk(method, None) for method in ("auto", "hqgs", "3dgs", "srgs")] == [True, True, None, None]
-    assert not brisk("auto", False)
-    assert brisk("3dgs", True)
+    assert [faster(method, None) for method in ("auto", "hqgs", "3dgs", "srgs")] == [True, True, None, None]
+    assert not faster("auto", False)
+    assert faster("3dgs", True)
     told = [tiny_config(method="hqgs", hqgs=HQGSConfig(formation=f)) for f in ("jpeg:10", "noise:9+jpeg:10")]
-    assert [Trainer(tiny_scene(), config).config.brisk for config in told] == [False, True]
+    assert [Trainer(tiny_scene(), config).config.faster_rates for config in told] == [False, True]
 
 
 # --- the example of a method ---

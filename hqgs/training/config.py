@@ -219,7 +219,7 @@ class TrainConfig:
     lr_opacities: float = 5e-2
     lr_sh0: float = 2.5e-3
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
-    brisk: bool | None = None  # higher rates in short runs (`learning_rates`); None: if the method has them
+    faster_rates: bool | None = None  # in short runs (`learning_rates`); None: if the method has them
     start_points: int = 100_000  # to start from at most, where photos agree on more than the scene has
     adam_eps: float = 1e-15
     leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays

@@ -127,7 +127,7 @@ def cameras(draft: Draft) -> Sequence[Choice]:
 
 
 def rates(draft: Draft) -> Sequence[Choice]:
-    asked, has = draft.asked.brisk, draft.kinds
+    asked, has = draft.asked.faster_rates, draft.kinds
     if asked is not None or not draft.formed:
         return [
             Choice(
@@ -137,9 +137,9 @@ def rates(draft: Draft) -> Sequence[Choice]:
         ]
     if has in ({"jpeg"}, {"video"}):
         why = "what a codec leaves open is learned sooner at higher rates, and nothing holds it back"
-        return [Choice("those of 3DGS", why, changes={"brisk": False})]
+        return [Choice("those of 3DGS", why, changes={"faster_rates": False})]
     why = "those of 3DGS suit its 30,000 iterations"
-    return [Choice("higher in short runs", why, changes={"brisk": True})]
+    return [Choice("higher in short runs", why, changes={"faster_rates": True})]
 
 
 def first_points(draft: Draft) -> Sequence[Choice]:

@@ -183,8 +183,8 @@ def learning_rates(
     """Of each tensor of the Gaussians. The means' is in units of the extent and falls exponentially.
 
     Those of 3DGS suit its 30,000 iterations: in a tenth of them a Gaussian cannot become as large, as thin or
-    as bright as it should, and stands still before it is where it should be. `brisk` lets sizes, rotations
-    and colours of a run of n iterations change (30,000 / n)^0.3 times as fast, twice at most, and the means'
+    as bright as it should, and stands still before it is where it should be. `faster_rates` lets sizes,
+    rotations and colours of n iterations change (30,000 / n)^0.3 times as fast, twice at most, and the means'
     rate end (30,000 / n)^1.5 times as high, at a third of the first at most.
 
     With `reach`, that of the scene, the means of such a run move (30,000 / n)^0.6 times as fast, at most
@@ -193,7 +193,7 @@ def learning_rates(
     """
     names = ("scales", "quats", "sh0", "shN")
     faster, farther, last = 1.0, 1.0, config.lr_means_final
-    if config.brisk:
+    if config.faster_rates:
         shorter = max(1.0, TrainConfig.iterations / config.iterations)
         faster = min(shorter**0.3, FASTER)
         last = max(last, min(last * shorter**1.5, LAST_OF_FIRST * config.lr_means))
