@@ -243,11 +243,16 @@ fn unblend<S: Simd, T: Real, const D: usize, const P: usize>(
     tile: usize,
     begins: &[usize; TILE_BLOCKS + 1],
     layout: PairLayout,
-    adjoint: &mut Adjoint<T>,
+    adjoint: &Adjoint<T>,
     layers: &[T],
 ) -> Result<Vec<T>, Error> {
     let list = &input.tiles.lists[tile];
     let channels = if D > 0 { D } else { layout.channels };
+    // Copies, which the compiler knows to lie apart from everything else.
+    let (mut behind, mut v_colors) = (adjoint.behind, [[T::ZERO; TILE_PIXELS]; D]);
+    for (v_color, from) in v_colors.iter_mut().zip(&adjoint.v_colors) {
+        *v_color = *from;
+    }
     // Of each block the layers in front, of which the last ones may not have been reached.
     let mut left = [0; TILE_BLOCKS];
     for (left, ends) in left.iter_mut().zip(list.begins.windows(2)) {
@@ -268,13 +273,15 @@ fn unblend<S: Simd, T: Real, const D: usize, const P: usize>(
             let k = begins[block] + left[block];
             if k < begins[block + 1] {
                 let layer = &layers[k * LAYER..(k + 1) * LAYER];
+                let many = (color, &adjoint.v_colors[..]);
                 sums.add::<D>(
                     simd,
                     grid,
                     block,
                     layer,
-                    color,
-                    adjoint,
+                    &mut behind,
+                    &v_colors,
+                    many,
                     layout.absolute,
                     out,
                 );

@@ -24,8 +24,7 @@ pub const LAYER: usize = 2 * BLOCK_PIXELS;
 pub struct Adjoint<T> {
     /// 1 inside the image, 0 outside.
     pub transmittance: Pixels<T>,
-    /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance; then behind
-    /// each layer, back to front.
+    /// `sum_c v_c color_c` of all that lies behind the last layer, as seen through full transmittance.
     pub behind: Pixels<T>,
     /// Cotangent of each channel.
     pub v_colors: Vec<Pixels<T>>,
@@ -117,8 +116,9 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         }
     }
 
-    /// Step in front of the Gaussian in one block, of which `replay` stored `layer`, and add its gradients there.
-    /// With D = 0 that of the colour goes straight to `out`.
+    /// Step in front of the Gaussian in one block, of which `replay` stored `layer`, and add its gradients there. The
+    /// cotangents of the channels are `few`; with D = 0 the colour and they are `many`, and the gradient of the colour
+    /// goes straight to `out`.
     ///
     /// `behind` is a convex combination, `alpha q + (1 - alpha) behind`: nothing is divided, nothing cancels, however
     /// deep the layer.
@@ -129,39 +129,46 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         grid: &Grid<T>,
         block: usize,
         layer: &[T],
-        color: &[T],
-        adjoint: &mut Adjoint<T>,
+        behind: &mut Pixels<T>,
+        few: &[Pixels<T>; D],
+        many: (&[T], &[Pixels<T>]),
         absolute: bool,
         out: &mut [T],
     ) {
         let n = width::<S, T>();
         let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+        let load = |from: &[T]| Lanes::<T, S>::from_slice(simd, &from[..n]);
         let (before, alphas) = layer.split_at(BLOCK_PIXELS);
-        let mut weights = [T::ZERO; BLOCK_PIXELS];
+        // Two loops, since all that one needs would not fit into the registers of AVX2.
+        let (mut ws, mut weights) = ([T::ZERO; BLOCK_PIXELS], [T::ZERO; BLOCK_PIXELS]);
         for i in (0..BLOCK_PIXELS).step_by(n) {
-            let at = block * BLOCK_PIXELS + i..block * BLOCK_PIXELS + i + n;
-            let load = |from: &[T]| Lanes::<T, S>::from_slice(simd, from);
-            let (alpha, behind) = (load(&alphas[i..i + n]), load(&adjoint.behind[at.clone()]));
-            let weight = load(&before[i..i + n]) * alpha;
-            let (mut q, mut v_colors) = (zero, [zero; D]);
+            let at = block * BLOCK_PIXELS + i;
+            let (alpha, last) = (load(&alphas[i..]), load(&behind[at..]));
+            let weight = load(&before[i..]) * alpha;
+            let mut q = zero;
             if D > 0 {
-                for (c, v_color) in v_colors.iter_mut().enumerate() {
-                    *v_color = load(&adjoint.v_colors[c][at.clone()]);
-                    q = v_color.mul_add(self.color[c], q);
+                for (v, color) in few.iter().zip(self.color) {
+                    q = load(&v[at..]).mul_add(color, q);
                 }
             } else {
-                for (v, color) in adjoint.v_colors.iter().zip(color) {
-                    q = load(&v[at.clone()]).mul_add(Lanes::<T, S>::splat(simd, *color), q);
+                for (v, color) in many.1.iter().zip(many.0) {
+                    q = load(&v[at..]).mul_add(Lanes::<T, S>::splat(simd, *color), q);
                 }
-                weight.store_slice(&mut weights[i..i + n]);
             }
             // d loss / d alpha = T (q - behind); d alpha / d sigma = -alpha, 0 under the cap.
-            let w = alpha.simd_lt(self.cap).select(weight * (behind - q), zero);
+            let w = alpha.simd_lt(self.cap).select(weight * (last - q), zero);
             alpha
-                .mul_add(q - behind, behind)
-                .store_slice(&mut adjoint.behind[at.clone()]);
-            let (x, y) = (load(&grid.x[at.clone()]), load(&grid.y[at]));
-            let (u, v) = self.record.position(x, y);
+                .mul_add(q - last, last)
+                .store_slice(&mut behind[at..at + n]);
+            w.store_slice(&mut ws[i..i + n]);
+            weight.store_slice(&mut weights[i..i + n]);
+        }
+        for i in (0..BLOCK_PIXELS).step_by(n) {
+            let at = block * BLOCK_PIXELS + i;
+            let (w, weight) = (load(&ws[i..]), load(&weights[i..]));
+            let (u, v) = self
+                .record
+                .position(load(&grid.x[at..]), load(&grid.y[at..]));
             let (wu, wv) = (w * u, w * v);
             let (lanes, p) = (&mut self.lanes, i / n % P);
             lanes[0][p] += w;
@@ -170,8 +177,8 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
             lanes[3][p] = wu.mul_add(u, lanes[3][p]);
             lanes[4][p] = wu.mul_add(v, lanes[4][p]);
             lanes[5][p] = wv.mul_add(v, lanes[5][p]);
-            for (c, v_color) in v_colors.iter().enumerate() {
-                lanes[MOMENTS + c][p] = weight.mul_add(*v_color, lanes[MOMENTS + c][p]);
+            for (c, v) in few.iter().enumerate() {
+                lanes[MOMENTS + c][p] = weight.mul_add(load(&v[at..]), lanes[MOMENTS + c][p]);
             }
             if absolute {
                 lanes[MOMENTS + D][p] += wu.abs();
@@ -181,7 +188,7 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         }
         if D == 0 {
             let at = block * BLOCK_PIXELS;
-            for (out, v) in out[MOMENTS..].iter_mut().zip(&adjoint.v_colors) {
+            for (out, v) in out[MOMENTS..].iter_mut().zip(many.1) {
                 add_products::<S, T, P>(simd, &weights, &v[at..at + BLOCK_PIXELS], out);
             }
         }
