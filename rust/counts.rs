@@ -1,6 +1,7 @@
 //! Counts of the work that was done, for reports and tests.
 //!
-//! They are by-products: a few additions for each tile or group of Gaussians, always on.
+//! They are by-products, always on: a few additions for each tile and group of Gaussians, and in the forward pass of
+//! compositing for each layer of a block, where they take 2 to 4 % of its kernel.
 
 macro_rules! counts {
     ($($(#[$doc:meta])* $name:ident,)*) => {
