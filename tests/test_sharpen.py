@@ -12,6 +12,7 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from hqgs.scene.sfm import sharpen
 from hqgs.scene.sfm.sharpen import sharpened
 from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
 from hqgs.scene.sfm.versions import join, smoothed_copies
@@ -114,6 +115,18 @@ def test_patches_make_poses_and_sightings_more_precise(
     for k in range(1, 9):
         a, b = (m.images[k].cam_from_world().matrix() for m in (better, again))
         assert a.tobytes() == b.tobytes()
+
+
+def test_large_photos_are_looked_at_smaller(
+    made: tuple[pycolmap.Reconstruction, list[np.ndarray], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, true, folder = made
+    adjust(model, 1.0, True)
+    by_features, off = turned(model, true), usual(model)
+    monkeypatch.setattr(sharpen, "SIDE", 100)
+    better = sharpened(model, folder, adjust)
+    assert usual(better) < 0.6 * off
+    assert turned(better, true) < 0.6 * by_features
 
 
 def test_photos_that_do_not_fit_change_nothing(
