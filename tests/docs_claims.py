@@ -168,9 +168,9 @@ def _paths(code: str) -> list[str]:
 
 
 def _names(code: str) -> list[str]:
-    """`hqgs.a.b`, and attributes of classes: `Scene.extent`."""
+    """`hqgs.a.b`, and attributes of classes: `Scene.extent`; `NAME.txt` stands for a file of any name."""
     names = re.findall(r"(?<![\w/.\"'])(?:hqgs(?:\.[A-Za-z_]\w*)+|[A-Z]\w*\.[a-z_]\w*)(?![\w/\"'])", code)
-    return [name for name in names if not name.endswith(SOURCES)]
+    return [name for name in names if not name.endswith(SOURCES) and not name.split(".")[0].isupper()]
 
 
 def _resolves(name: str) -> bool:

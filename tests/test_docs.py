@@ -35,7 +35,7 @@ def test_pages_are_short_enough_to_be_read(pages: set[Path], most: int) -> None:
     [
         "see `hqgs/scene/load.py`, `rust/`, `docs/results/*.csv` and [the README](README.md)",
         "`train --sfm`, `--leave-out none`, `python -m hqgs export`, `uv run pytest tests/test_docs.py`",
-        "`hqgs.rasterization`, `hqgs.scene.load.load_scene`, `Scene.seen`; not `report.json` or `sparse/0`",
+        "`hqgs.rasterization`, `hqgs.scene.load.load_scene`, `Scene.seen`; not `report.json`, `NAME.txt`",
         "```sh\nuv run python -m hqgs train FOLDER --out DIR  # a comment\n```",
         "```python\nimport hqgs\nhqgs.set_num_threads(2)\n```",
     ],
