@@ -14,11 +14,12 @@ from scipy import ndimage
 from test_diagnose import clean_photo
 
 from hqgs.photos.camera import draw_gains
+from hqgs.photos.constants import PHONE_WHITE_BALANCE
 from hqgs.photos.degrade import degrade_image, degrade_sequence, shake
 from hqgs.photos.formation import formation
 from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
 from hqgs.photos.light import to_linear, to_srgb
-from hqgs.photos.phone import WHITE_BALANCE, bayer_mosaic, demosaic, denoise, phone_jpeg
+from hqgs.photos.phone import bayer_mosaic, demosaic, denoise, phone_jpeg
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.shake import (
     draw_path,
@@ -262,7 +263,7 @@ def test_denoising_lowers_noise_and_keeps_edges() -> None:
     white, rng = 375.0, np.random.default_rng(2)
     clean = np.full((60, 60, 3), 0.1)
     clean[:, 30:] = 0.8
-    gains = np.array(WHITE_BALANCE)
+    gains = np.array(PHONE_WHITE_BALANCE)
     variance = gains * clean / white + (2.5 * gains / white) ** 2
     noisy = clean + np.sqrt(variance) * rng.standard_normal(clean.shape)
     out = denoise(noisy, white)

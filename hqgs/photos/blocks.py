@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn
 
+from hqgs.photos.constants import ENOUGH_BLOCKS, MAX_BLOCKS
 from hqgs.photos.pixels import Floats, luma
 
-ENOUGH_BLOCKS = 40  # without clipped pixels; where there are fewer, all blocks are taken
-MAX_BLOCKS = 4_000  # whose details are looked at
 _WAVES = np.add.outer(np.arange(8), np.arange(8))
 _FINE, _COARSE = _WAVES >= 7, (_WAVES >= 3) & (_WAVES <= 5)
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.photos.constants import CAMERA_WHITE_BALANCE
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.pixels import Float32
-
-WHITE_BALANCE = 0.25  # of the range of stops: the range of red's and blue's gains against green's
 
 
 def draw_gains(rng: np.random.Generator, stops: float) -> NDArray[np.float64]:
@@ -18,7 +17,7 @@ def draw_gains(rng: np.random.Generator, stops: float) -> NDArray[np.float64]:
     order.
     """
     exposure = rng.uniform(-stops, stops)
-    red, blue = rng.uniform(-stops * WHITE_BALANCE, stops * WHITE_BALANCE, 2)
+    red, blue = rng.uniform(-stops * CAMERA_WHITE_BALANCE, stops * CAMERA_WHITE_BALANCE, 2)
     return 2.0 ** np.array([exposure + red, exposure, exposure + blue])
 
 

@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 
 from hqgs.base.threads import one_torch_thread
 from hqgs.photos.camera import draw_gains, expose
+from hqgs.photos.constants import CHAT_QUALITIES, FULL_WELL, KERNEL_REACH
 from hqgs.photos.formula import VIDEOS, Degradation, DegradationStep, small_side
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
-from hqgs.photos.kernels import REACH, disc_kernel, motion_kernel
+from hqgs.photos.kernels import disc_kernel, motion_kernel
 from hqgs.photos.light import to_linear, to_srgb
-from hqgs.photos.phone import FULL_WELL, phone_jpeg
+from hqgs.photos.phone import phone_jpeg
 from hqgs.photos.pixels import Float32, as_floats
 from hqgs.photos.resize import resize
 from hqgs.photos.shake import draw_path, draw_strength, path_length, shake_kernel
 from hqgs.photos.video import film
 
-CHAT_QUALITIES = (40, 70)  # of a messenger's JPEG: the lowest and highest, all equally likely
 JPEG_FILES = ("jpeg", "phone")  # these kinds end in a JPEG file
 
 Record = dict[str, Any]  # what one step did to one photo: "kind", "value" and the kind's own values, for JSON
@@ -164,7 +164,7 @@ def gaussian_blur(image: Float32, sigma: float) -> Float32:
     import torch  # with kornia, which takes seconds to import
     from kornia.filters import gaussian_blur2d
 
-    radius = math.ceil(REACH * sigma)
+    radius = math.ceil(KERNEL_REACH * sigma)
     _check_fits(image, radius, f"blur of sigma {sigma:g} px")
     channels = torch.from_numpy(image.astype(np.float64)).permute(2, 0, 1)[None]
     with one_torch_thread():

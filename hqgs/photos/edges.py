@@ -5,11 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hqgs.photos.constants import SOBEL_ROUNDING
 from hqgs.photos.pixels import floats
-
-# Sobel sums of equal numbers differ by rounding alone up to about this, times the largest |value|. 8-bit
-# photos have steps of at least 1/255, far above it.
-ROUNDING = 1e-5
 
 
 def edge_magnitude(image: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -42,7 +39,7 @@ def edge_magnitude(image: Tensor, mask: Tensor | None = None) -> Tensor:
     else:
         inside, counted = None, magnitude
     low, high = counted.amin(), counted.amax()
-    if high - low <= ROUNDING * values.abs().amax():
+    if high - low <= SOBEL_ROUNDING * values.abs().amax():
         return torch.zeros_like(values)
     # A pixel outside the mask may lie outside the range; it gets 0 below.
     g = (magnitude - low) / (high - low)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hqgs.photos.constants import KERNEL_REACH
 from hqgs.photos.formula import Degradation, check_formation, small_side
-from hqgs.photos.kernels import REACH, disc_kernel, motion_kernel
+from hqgs.photos.kernels import disc_kernel, motion_kernel
 from hqgs.photos.operators import Kernel, Separable
 from hqgs.photos.resize import resize_matrix
 
@@ -105,7 +106,7 @@ def blur_matrix(size: int, sigma: float) -> NDArray[np.float64]:
 
     Sampled, ends at 4 sigma, sums to 1; the picture is mirrored at its border without repeating the edge.
     """
-    reach = int(np.ceil(REACH * sigma))
+    reach = int(np.ceil(KERNEL_REACH * sigma))
     offsets = np.arange(-reach, reach + 1)
     kernel = np.exp(-0.5 * (offsets / sigma) ** 2)
     kernel /= kernel.sum()

@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-REACH = 4  # sigmas at which the Gaussian kernel ends
-
 
 def disc_kernel(radius: float) -> NDArray[np.float64]:
     """A filled disc of `radius` px (defocus), square and of odd size, sum 1. kornia has none.

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from hqgs.photos.constants import CUBIC_A, CUBIC_RADIUS, RESIZE_BAND
+
 Pixels = NDArray[np.uint8] | NDArray[np.float32]
-A = -0.5  # of Keys's cubic: the value at which it reproduces quadratics
-RADIUS = 2  # of the cubic, in samples
-BAND = 8  # new rows at a time: what is between then fits into the caches
 
 
 def resize_matrix(size_in: int, size_out: int) -> NDArray[np.float64]:
@@ -30,8 +29,8 @@ def resize_matrix(size_in: int, size_out: int) -> NDArray[np.float64]:
     step = size_in / size_out
     widening = max(step, 1.0)
     centers = (np.arange(size_out) + 0.5) * step - 0.5
-    first = np.floor(centers - RADIUS * widening).astype(np.int64)
-    at = first[:, None] + np.arange(int(np.ceil(2 * RADIUS * widening)) + 2)
+    first = np.floor(centers - CUBIC_RADIUS * widening).astype(np.int64)
+    at = first[:, None] + np.arange(int(np.ceil(2 * CUBIC_RADIUS * widening)) + 2)
     weights = _cubic((at - centers[:, None]) / widening)
     weights /= weights.sum(axis=1, keepdims=True)
 
@@ -60,9 +59,9 @@ def resize(image: NDArray[np.float32], height: int, width: int) -> NDArray[np.fl
 
 def _cubic(x: NDArray[np.float64]) -> NDArray[np.float64]:
     x = np.abs(x)
-    inner = (A + 2) * x**3 - (A + 3) * x**2 + 1
-    outer = A * (x**3 - 5 * x**2 + 8 * x - 4)
-    return np.where(x <= 1, inner, np.where(x < RADIUS, outer, 0.0))
+    inner = (CUBIC_A + 2) * x**3 - (CUBIC_A + 3) * x**2 + 1
+    outer = CUBIC_A * (x**3 - 5 * x**2 + 8 * x - 4)
+    return np.where(x <= 1, inner, np.where(x < CUBIC_RADIUS, outer, 0.0))
 
 
 def area_downscale(
@@ -110,13 +109,13 @@ def _area_sum(
     columns, rows = _overlaps(old_width, width, size[0]), _overlaps(old_height, height, size[1])
     pixels = image.reshape(old_height, -1)
     out = np.empty((height, width, pixels.shape[1] // old_width))
-    for top in range(0, height, BAND):
-        band = rows[top : top + BAND]
+    for top in range(0, height, RESIZE_BAND):
+        band = rows[top : top + RESIZE_BAND]
         first, last = int(band.indices.min()), int(band.indices.max()) + 1
         tall = band[:, first:last] @ pixels[first:last].astype(np.float64)  # [B, W C]
         turned = tall.reshape(len(tall), old_width, -1).swapaxes(0, 1).reshape(old_width, -1)  # [W, B C]
         wide = (columns @ turned).reshape(width, len(tall), -1)
-        out[top : top + BAND] = wide.swapaxes(0, 1)
+        out[top : top + RESIZE_BAND] = wide.swapaxes(0, 1)
     return out.reshape(height, width, *image.shape[2:])
 
 
