@@ -106,7 +106,7 @@ def test_file_path_outside_is_refused(tmp_path: Path, entry: str) -> None:
 
 
 def test_blender_set(tmp_path: Path) -> None:
-    """RGBA photos: alpha becomes the mask, colours stay as stored; the files name the split."""
+    """RGBA photos: what is transparent is empty, black behind; the files name the split."""
     truth = make_truth(6)
     alpha = np.zeros((HEIGHT, WIDTH), np.uint8)
     alpha[5:30, 10:40] = 255
@@ -127,12 +127,12 @@ def test_blender_set(tmp_path: Path) -> None:
     assert [v.name for v in scene.train] == [f"train/r_{i}.png" for i in range(4)]
     assert [v.name for v in scene.test] == ["test/r_0.png", "test/r_1.png"]
     np.testing.assert_allclose(scene.test[1].camera.viewmat, truth.viewmats[4], atol=1e-12)
-    expected = np.zeros((HEIGHT, WIDTH), bool)
-    expected[6:30, 10:40] = True
-    for view in scene.train + scene.test:
-        assert view.mask is not None
-        np.testing.assert_array_equal(view.mask, expected)
-    np.testing.assert_array_equal(scene.train[0].image, truth.photos[1])
+    for view, photo in zip(
+        scene.train + scene.test, [truth.photos[k] for k in (1, 0, 2, 5, 3, 4)], strict=True
+    ):
+        assert view.mask is None
+        np.testing.assert_array_equal(view.image, np.rint(photo * (alpha[..., None] / 255)).astype(np.uint8))
+    assert any("the 6 photos are cut out" in note for note in scene.notes)
     assert "the test views are the 2 of transforms_test.json" in scene.notes[0]
     # The random points were drawn where the masks count, around the point all cameras look at.
     assert len(scene.points) == 20_000

@@ -149,3 +149,21 @@ def test_colmap_bears_orientations_that_there_are_none_of(tmp_path: Path) -> Non
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.split()[-1] == "3"
+
+
+def test_alpha_of_some_photos_stays_a_mask(tmp_path: Path) -> None:
+    """A set is of cut-out objects where all its photos can be transparent, and none has a mask."""
+    truth = make_truth(4)
+    write_colmap(truth, tmp_path)
+    alpha = np.full((36, 48), 255, np.uint8)
+    alpha[:, :24] = 0
+    rgba = np.dstack([truth.photos[1], alpha])
+    Image.fromarray(rgba).save(tmp_path / "images/view_01.png")
+    view = load_scene(tmp_path, test_every=0).train[1]
+    assert view.mask is not None
+    assert view.mask.mean() == 0.5
+    for k in (0, 2, 3):
+        Image.fromarray(np.dstack([truth.photos[k], alpha])).save(tmp_path / f"images/view_{k:02d}.png")
+    scene = load_scene(tmp_path, test_every=0)
+    assert all(view.mask is None and not view.image[:, :24].any() for view in scene.train)
+    np.testing.assert_array_equal(scene.train[2].image[:, 24:], truth.photos[2][:, 24:])

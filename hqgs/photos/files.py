@@ -103,13 +103,24 @@ def stored_format(path: Path) -> str:
         return ""
 
 
+def is_cut_out(path: Path) -> bool:
+    """Whether a photo can be transparent: of an object that was cut out, or rendered before nothing."""
+    try:
+        with open_photo(path) as photo:
+            return photo.has_transparency_data
+    except DECODE_ERRORS:
+        return False
+
+
 def decode(
-    path: Path, least: tuple[int, int] | None = None
+    path: Path, least: tuple[int, int] | None = None, over: tuple[float, float, float] | None = None
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """The photo as uint8 RGB [H, W, 3], and its mask [H, W] (alpha >= 128) where it is not opaque everywhere.
 
     `least`: the width and height that are enough. A JPEG file is then decoded at 1/2, 1/4 or 1/8 of its
     sides, rounded up, where that is at least as much; `shrunk` tells by how much. None: at its full size.
+
+    `over`: a colour (R, G, B, 1 is white) that shows where the photo is transparent, in place of a mask.
 
     Greyscale becomes three equal channels, 16 bits become 8. Colours are as stored: nothing is composited,
     no colour profile is applied. EXIF orientation is not applied either: the cameras were computed for the
@@ -128,6 +139,10 @@ def decode(
                 return np.repeat(((grey + 128) // 257).astype(np.uint8)[..., None], 3, -1), None
             if photo.has_transparency_data:
                 rgba = np.array(photo.convert("RGBA"))
+                if over is not None:
+                    alpha = rgba[..., 3:] / 255
+                    mixed = alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(over)
+                    return np.rint(mixed).astype(np.uint8), None
                 opaque = bool((rgba[..., 3] == 255).all())
                 return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
             return np.array(photo.convert("RGB")), None

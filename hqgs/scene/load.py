@@ -21,7 +21,7 @@ from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_fo
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.photo_files import is_run
-from hqgs.scene.place import placed, without_missing, without_strays
+from hqgs.scene.place import BEHIND, cut_outs, placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -90,7 +90,8 @@ def load_scene(
     capture = placed(without_strays(without_missing(root, capture, notes), notes), notes)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
-    views, unreadable = load_views(capture.photos, capture.downscale, optional, told)
+    over = BEHIND if cut_outs(capture, notes) else None
+    views, unreadable = load_views(capture.photos, capture.downscale, optional, told, over)
     if degraded is not None and downscale == 1:
         views = _with_lows(views, degraded, root, optional, unreadable)
     train = [v for v in views if v.name not in test_names]

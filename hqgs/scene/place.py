@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
+from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
@@ -18,6 +19,7 @@ FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the p
 FAR_ALONE = 50.0  # the same where there are no points
 SHOWN = 0.02  # of a photo's sides, which the points must span at least
 LOOKED_AT = 1000  # points
+BEHIND = (0.0, 0.0, 0.0)  # cut-out photos: what renders have behind everything, unless they are told
 
 
 def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
@@ -59,6 +61,20 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
             f"and were left out: {some(sorted(gone))}"
         )
     return _without(capture, gone)
+
+
+def cut_outs(capture: Capture, notes: list[str]) -> bool:
+    """Whether the photos are of cut-out objects, so that what is transparent is empty; `notes` says so.
+
+    They are where each of them can be transparent and none has a mask file. In other sets alpha is a mask.
+    """
+    photos = [photo for photo in capture.photos if photo.path.is_file()]
+    if not photos or any(photo.mask_path is not None for photo in photos):
+        return False
+    if not all(is_cut_out(photo.path) for photo in photos):
+        return False
+    notes.append(f"the {len(photos)} photos are cut out: what is transparent is empty, and black behind")
+    return True
 
 
 def placed(capture: Capture, notes: list[str]) -> Capture:

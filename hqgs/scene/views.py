@@ -48,12 +48,15 @@ def load_views(
     downscale: float,
     optional: frozenset[str] = frozenset(),
     told: OnStage = untold,
+    over: tuple[float, float, float] | None = None,
 ) -> tuple[list[View], dict[str, UnreadableError]]:
     """Decode `photos`, in their order, as pinhole views scaled down by `downscale` (at least 1).
 
     Intrinsics scale with the true ratio of sizes, per axis. The second result tells, by name, why photos of
     the names in `optional` have no view: they, or their masks, cannot be decoded. `told` hears of each photo.
     No more than MAX_WORKERS photos are in memory at more than the wanted size.
+
+    `over`: what shows where photos are transparent, in place of a mask (`decode`).
 
     Raises FileNotFoundError for a camera without photo, ValueError for a photo that does not fit its camera
     or gets smaller than 8 px, UnreadableError for another that cannot be decoded; each names the photo.
@@ -81,7 +84,7 @@ def load_views(
 
     def load(photo: Photo) -> View | None:
         try:
-            return _load_view(photo, downscale, pinhole)
+            return _load_view(photo, downscale, pinhole, over)
         except UnreadableError as error:
             if photo.name not in optional:
                 raise
@@ -103,13 +106,18 @@ def load_views(
     return views, {photo.name: unreadable[photo.name] for photo in photos if photo.name in unreadable}
 
 
-def _load_view(photo: Photo, downscale: float, pinhole: Callable[[_CameraKey], Pinhole]) -> View:
+def _load_view(
+    photo: Photo,
+    downscale: float,
+    pinhole: Callable[[_CameraKey], Pinhole],
+    over: tuple[float, float, float] | None,
+) -> View:
     camera, stored = photo.camera, stored_size(photo.path)
     check_size(camera, *stored, photo.name)
     # A mask hides colours that must not be mixed into what it shows: such photos are decoded whole.
     enough = downscale > 1 and photo.mask_path is None
     least = (math.ceil(DENSE * stored[0] / downscale), math.ceil(DENSE * stored[1] / downscale))
-    image, mask = decode(photo.path, least if enough else None)
+    image, mask = decode(photo.path, least if enough else None, over)
     height, width = image.shape[:2]
     if photo.mask_path is not None:
         counts = decode_mask(photo.mask_path, width, height)
