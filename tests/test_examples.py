@@ -59,7 +59,7 @@ def test_train_llff(run: Run, folder: Path, tmp_path: Path) -> None:
     told = run("train_llff.py", folder, "--iterations", "20")
     out = tmp_path / "outputs" / "desk"
     report = json.loads((out / "report.json").read_text())
-    assert (report["method"], report["iterations"]) == ("3dgs", 20)
+    assert (report["method"], report["iterations"]) == ("hqgs", 20)
     assert report["config"]["leave_out"] == list(AUTOMATIC)
     assert f"{report['gaussians']} Gaussians after 20 iterations" in told
     assert f"psnr  {report['metrics']['mean']['psnr']:.4f}" in told
