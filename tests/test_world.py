@@ -14,12 +14,14 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 import hqgs
+from hqgs.evaluation.held_out import held_out_renders
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.camera_files import load_cameras, load_path, moved, save_cameras, save_path
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
+from hqgs.scene.world import World
 
 UTM = np.array([500000.0, 5200000.0, 300.0])
 PLACES = [(1e-3, 0.0), (1e3, 0.0), (1.0, 5e6), (1e-3, 5e6), (1e3, 5e6)]
@@ -169,6 +171,19 @@ def test_a_foreign_scene_of_small_units_is_seen(tmp_path: Path) -> None:
         with torch.no_grad():
             seen = small.render(replace(view.camera, viewmat=viewmat))
         assert (seen - picture).abs().max() <= 2e-5
+
+
+def test_a_file_in_the_frame_of_the_cameras_is_measured_in_it(tmp_path: Path) -> None:
+    """A scene file that says nothing of a frame, float32, beside cameras in small units."""
+    truth = placed(make_truth(), 1e-3, np.zeros(3))
+    scene = load_scene(write_colmap(truth, tmp_path, binary=False))
+    model = Gaussians.from_points(scene.points, scene.point_colors, 0)
+    model.world = scene.world
+    foreign = model.in_world(World())
+    np.testing.assert_allclose(foreign.means, truth.points, rtol=1e-5)
+    own, other = (held_out_renders(scene, g)[0].render for g in (model, foreign))
+    assert own.max() > 0.05
+    np.testing.assert_allclose(other, own, atol=1e-4)
 
 
 def test_training_decides_the_same(tmp_path: Path) -> None:

@@ -85,6 +85,8 @@ def run(args: ExportScene) -> int:
     except OSError as error:
         return fail(1, f"{args.out}: {error}")
     print(_table(source, gaussians, before, written, after), end="\n\n")
+    for note in gaussians.notes:
+        print(f"read: {note}")
     for entry in written.left_out:
         evidence = "" if entry.evidence is None else f" ({entry.evidence})"
         saved = "" if entry.bytes is None else f": {entry.bytes:,} bytes"

@@ -98,7 +98,10 @@ def held_out_renders(
 ) -> HeldOutViews:
     """The scene's held-out views; `sh_degree` None: the Gaussians' own."""
     return HeldOutViews(
-        scene.test, gaussians, gaussians.sh_degree if sh_degree is None else sh_degree, background
+        scene.test,
+        gaussians.in_world(scene.world),
+        gaussians.sh_degree if sh_degree is None else sh_degree,
+        background,
     )
 
 
