@@ -39,7 +39,7 @@ class Fitted:
 
     view: View
     rotation_deg: float  # by which it was turned
-    pixels: float  # by which that and the shift move what it sees in its middle depth
+    pixels: float  # by which the Gaussians moved in its picture, median
 
 
 def fit_cameras(
@@ -82,17 +82,22 @@ def fit_camera(
         camera = view.camera
     own, now = view.camera.viewmat, camera.viewmat
     turn = Rotation.from_matrix(now[:3, :3] @ own[:3, :3].T).magnitude()
-    middle = np.array([0.0, 0.0, units[3] * view.camera.K[0, 0]])
-    world = own[:3, :3].T @ (middle - own[:3, 3])
-    there = now[:3, :3] @ world + now[:3, 3]
-    at = view.camera.K[:2] @ (there / there[2]) - view.camera.K[:2, 2]
-    return Fitted(replace(view, camera=camera), float(np.rad2deg(turn)), float(np.linalg.norm(at)))
+    means = gaussians.means.detach().numpy().astype(np.float64)
+    (at, depths), (there, _) = project(view.camera, means), project(camera, means)
+    shown = _shown(view.camera, at, depths)
+    moved = float(np.median(np.linalg.norm(there - at, axis=1)[shown])) if shown.any() else 0.0
+    return Fitted(replace(view, camera=camera), float(np.rad2deg(turn)), moved)
+
+
+def _shown(camera: Camera, pixels: Floats, depths: Floats) -> NDArray[np.bool_]:
+    """Which of projected points lie in the picture."""
+    return (depths > NEAR_PLANE) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
 
 
 def _units(camera: Camera, gaussians: Gaussians) -> Floats:
     """Turns and shifts [6] that move a picture about one pixel: 1 / f, and the middle depth / f."""
     pixels, depths = project(camera, gaussians.means.detach().numpy().astype(np.float64))
-    inside = (depths > NEAR_PLANE) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    inside = _shown(camera, pixels, depths)
     depth = float(np.median(depths[inside])) if inside.any() else 1.0
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     return np.array([1.0, 1, 1, depth, depth, depth]) / focal
