@@ -221,6 +221,10 @@ class TrainConfig:
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
     faster_rates: bool | None = None  # in short runs (`learning_rates`); None: if the method has them
     start_points: int = 100_000  # to start from at most, where photos agree on more than the scene has
+    opacity_decay: float | None = None  # share of the opacities that each view takes away; None: by the plan
+    dropout: float | None = (
+        None  # share of Gaussians left out of a step, at the end of the run; None: likewise
+    )
     adam_eps: float = 1e-15
     leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays
     background: tuple[float, float, float] = BACKGROUND  # RGB
@@ -243,6 +247,9 @@ class TrainConfig:
         for name in ("seed", "start_points"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        for name in ("opacity_decay", "dropout"):
+            if (share := getattr(self, name)) is not None and not 0 <= share < 1:
+                raise ValueError(f"{name} is {share}, wanted at least 0 and below 1")
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree is {self.sh_degree}, wanted 0..{MAX_SH_DEGREE}")
         for name, value in vars(self).items():

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from hqgs.base.ranks import Ranks
+from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
 from hqgs.training.batch import Part, Rest, descend, exchanged, note_views, part_of, to_rasterize
+from hqgs.training.few_photos import with_dropout
 from hqgs.training.guard import Fault
 from hqgs.training.looks import Look, Looks
 from hqgs.training.schedule import Plan
@@ -64,7 +66,7 @@ def gradients_of(
 
 class _OfOne:
     def __init__(self, plan: Plan, looks: Looks, state: TrainState) -> None:
-        self._look: Look = looks.at(plan, looks.method.modulate(state.gaussians))
+        self._look: Look = looks.at(plan, _of_step(looks.method.modulate(state.gaussians), plan, state))
         state.optimizer.zero_grad()
         self.faults: list[Fault | None] = [self._look.backward(state.gaussians, state.optimizer)]
         self.loss: float = float(self._look.loss.detach())
@@ -98,7 +100,7 @@ class _OfSeveral:
 
         def make(k: int) -> tuple[Part, Callable[[], Rest]]:
             modulated = looks.method.modulate(state.gaussians)
-            look = looks.at(plans[k], to_rasterize(state.gaussians, modulated))
+            look = looks.at(plans[k], _of_step(to_rasterize(state.gaussians, modulated), plans[k], state))
             state.optimizer.zero_grad()
             fault = look.backward(state.gaussians, state.optimizer)
             if not rendered:
@@ -117,3 +119,8 @@ class _OfSeveral:
             modulated = self._method.modulate(state.gaussians)
         rests = descend(self._parts, self._others, state.gaussians, modulated, state.optimizer)
         note_views(self._parts, rests, [plan.observes for plan in self._plans], state.densifier)
+
+
+def _of_step(gaussians: Gaussians, plan: Plan, state: TrainState) -> Gaussians:
+    """Those of `gaussians` that a view is rendered of."""
+    return with_dropout(gaussians, plan.dropout, state.densifier.seed, plan.iteration)

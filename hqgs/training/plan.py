@@ -36,6 +36,9 @@ class Facts:
     shortest_side: int  # px, of all photos
     points: int  # of the reconstruction
     linked: bool  # whether it tells which photos see which of its points (`Scene.seen`)
+    agreed: float | None = (
+        None  # share of pixels along edges on whose depth photos agree; None: not looked at
+    )
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
     # What the method tells of the photos (`Method.facts`):
     as_photographed: bool = False  # renders are compared with photos as they are, of any size

@@ -15,6 +15,7 @@ from hqgs.photos.formula import LEARNED, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, TrainConfig
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import first_points_wanted, gaussians_determined, kept_gradient, sharp_pixels
+from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
 from hqgs.training.plan_length import fitting
 from hqgs.training.schedule import (
     COARSE_FACTOR,
@@ -334,6 +335,8 @@ RULES = (
     Rule("half size", half_size_until, "60 % of the run, 1,500 iterations at most: " + CHOSEN),
     Rule("growth", growth, "Kerbl et al. 2023, section 5.2; from 140 on: " + CHOSEN),
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
+    Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {WHERE}"),
+    Rule("dropout of Gaussians", dropout, f"DropGaussian, Park et al. 2025; {WHERE}"),
     Rule("learning rates", rates, "learning_rates in schedule.py; " + CHOSEN),
     Rule("rates under noise", noise_rates, f"white noise of a pixel tells nothing of the next; {CHOSEN}"),
     Rule("left out where needless", needless, "half the time and a third of the bytes on four scenes"),

@@ -21,6 +21,7 @@ from hqgs.training.looks import Looks
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, plan_by
+from hqgs.training.plan_few_photos import asks_for_agreement
 from hqgs.training.plan_rules import RULES, plan_run
 
 
@@ -50,7 +51,17 @@ class Prepared:
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
         """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""
-        return plan_run(replace(self.facts, seconds=seconds), self.diagnosis, self.asked)
+        facts = replace(self.facts, seconds=seconds)
+        plan = plan_run(facts, self.diagnosis, self.asked)
+        if (
+            asks_for_agreement(facts.photos)
+            and plan.first_points > facts.points
+            and self.scene.seen is not None
+        ):
+            found = len(self._first_points(plan.first_points)[0]) - facts.points
+            facts = replace(facts, agreed=found / (plan.first_points - facts.points))
+            plan = plan_run(facts, self.diagnosis, self.asked)
+        return plan
 
     def first_gaussians(self, plan: RunPlan) -> Gaussians:
         """Those that a run of this plan trains."""

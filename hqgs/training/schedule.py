@@ -49,6 +49,7 @@ class Plan:
     coarse: bool  # photo and camera at 1 / COARSE_FACTOR of the sides
     part: float  # of the run that is done with it, 0..1: what the learning rates follow
     degree: int  # of the harmonics that are trained
+    dropout: float  # share of the Gaussians that are left out of it
     observes: bool  # its gradients count for growth
     grows: bool  # Gaussians are added and removed after it
     finest: float | None  # px of the photo that sees a Gaussian best: finer ones do not grow; None: any may
@@ -94,6 +95,7 @@ class Schedule:
             coarse=smaller_part,
             part=self.part(iteration, decisions),
             degree=self.degree(iteration),
+            dropout=(self.config.dropout or 0.0) * self.part(iteration, decisions),
             observes=iteration < stop,
             grows=densify.start < iteration < stop and iteration % densify.every == 0,
             finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,

@@ -25,6 +25,7 @@ from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
 from hqgs.training.densify import Densifier, Growth
+from hqgs.training.few_photos import decay_opacities
 from hqgs.training.frugality import Frugality
 from hqgs.training.gradients import gradients_of
 from hqgs.training.guard import Fault, Guard, parameter_fault
@@ -253,6 +254,8 @@ class Trainer:
         step = Step(found.loss, found.photo, found.view)
         if self._sound([looks.views[plan.view] for plan in plans], found.faults, step):
             found.apply(state)
+            if decay := self.config.opacity_decay:
+                decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
         return step, found.measured
 
     def _grow(self, plan: Plan) -> Growth:

@@ -1,0 +1,107 @@
+"""Few photos: opacities decay and Gaussians drop out in training."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_scene import tiny_config, tiny_scene
+
+from hqgs.model.gaussians import Gaussians
+from hqgs.training.config import TrainConfig, run_config
+from hqgs.training.few_photos import DROPPED, OPAQUE, decay_opacities, with_dropout
+from hqgs.training.plan import Facts
+from hqgs.training.plan_few_photos import DECAY, DROPOUT
+from hqgs.training.plan_rules import plan_run
+from hqgs.training.trainer import Trainer
+
+
+@pytest.mark.parametrize("share", [1e-4, 0.005, 0.5])
+def test_decay_multiplies_opacities(share: float) -> None:
+    logits = torch.tensor([-40.0, -5.0, 0.0, 3.0, 12.0, 40.0, 90.0])
+    wanted = [(1 - share) / (1 + math.exp(-x)) for x in logits.tolist()]
+    decay_opacities(logits, share)
+    assert torch.isfinite(logits).all()
+    got = 1 / (1 + np.exp(-logits.double().numpy()))
+    np.testing.assert_allclose(got, wanted, rtol=2e-5)
+
+
+def gaussians(n: int) -> Gaussians:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1, 1, (n, 3)).astype(np.float32)
+    made = Gaussians.from_points(points, np.full((n, 3), 128, np.uint8), 1)
+    return replace(made, opacities=torch.from_numpy(rng.uniform(-3, 3, n).astype(np.float32)))
+
+
+def test_dropout_leaves_out_a_share_and_keeps_the_mean_opacity() -> None:
+    made, share = gaussians(20_000), 0.2
+    opacities = torch.logit(torch.sigmoid(made.opacities).clamp(max=0.5)).requires_grad_()
+    some = with_dropout(replace(made, opacities=opacities), share, 0, 7)
+    dropped = some.opacities == DROPPED
+    assert abs(float(dropped.float().mean()) - share) < 0.01
+    mean = float(some.activated_opacities().detach().mean())
+    assert mean == pytest.approx(float(torch.sigmoid(opacities.detach()).mean()), rel=0.02)
+    some.opacities.sum().backward()
+    assert opacities.grad is not None
+    assert (opacities.grad[dropped] == 0).all()
+    assert (opacities.grad[~dropped] > 0).all()
+    again = with_dropout(replace(made, opacities=opacities), share, 0, 7)
+    assert torch.equal(again.opacities, some.opacities)
+    assert not torch.equal(with_dropout(made, share, 0, 8).opacities == DROPPED, dropped)
+    assert with_dropout(made, 0.0, 0, 7) is made
+    opaque = with_dropout(replace(made, opacities=torch.full_like(made.opacities, 9.0)), share, 0, 7)
+    assert float(opaque.activated_opacities().max()) == pytest.approx(OPAQUE, rel=1e-5)
+
+
+def facts(photos: int, agreed: float | None = None) -> Facts:
+    return Facts(photos, 10_000, 100, 50, True, agreed, as_photographed=True, sizes=((100, 100),) * photos)
+
+
+@pytest.mark.parametrize(
+    ("photos", "agreed", "decay", "dropout"),
+    [
+        (3, None, DECAY, DROPOUT),
+        (12, None, DECAY, None),
+        (23, 0.72, DECAY, None),
+        (23, None, DECAY, None),
+        (17, 0.91, None, None),
+        (43, 0.7, None, None),
+    ],
+)
+def test_the_plan_asks_for_decay_and_dropout_where_photos_are_few(
+    photos: int, agreed: float | None, decay: float | None, dropout: float | None
+) -> None:
+    asked = run_config(iterations=1000, method="hqgs", formation="none")
+    plan = plan_run(facts(photos, agreed), None, asked)
+    assert (plan.settings.opacity_decay, plan.settings.dropout) == (decay, dropout)
+    row = next(row for row in plan.rows if row.what == "opacity decay")
+    assert f"{photos} photos" in row.evidence
+    assert "2410.18822" in row.rule
+    off = plan_run(facts(photos, agreed), None, replace(asked, opacity_decay=0.0, dropout=0.0))
+    assert (off.settings.opacity_decay, off.settings.dropout) == (0.0, 0.0)
+    plain = plan_run(facts(photos, agreed), None, run_config(iterations=1000, method="3dgs"))
+    assert (plain.settings.opacity_decay, plain.settings.dropout) == (None, None)
+
+
+def test_a_share_out_of_range_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"opacity_decay is 1\.0, wanted at least 0 and below 1"):
+        TrainConfig(opacity_decay=1.0)
+    with pytest.raises(ValueError, match=r"dropout is -0\.1"):
+        TrainConfig(dropout=-0.1)
+
+
+def test_a_step_decays_what_it_trains_once_for_each_view() -> None:
+    def after_a_step(decay: float, batch: int) -> torch.Tensor:
+        config = replace(
+            tiny_config(12, method="3dgs", batch=batch), lr_opacities=1e-12, opacity_decay=decay, dropout=0.0
+        )
+        trainer = Trainer(tiny_scene(), config)
+        trainer.step()
+        return trainer.gaussians.activated_opacities().detach()
+
+    for batch in (1, 3):
+        ratio = after_a_step(0.1, batch) / after_a_step(0.0, batch)
+        torch.testing.assert_close(ratio, torch.full_like(ratio, 0.9**batch), rtol=1e-5, atol=0)
