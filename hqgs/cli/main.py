@@ -34,6 +34,7 @@ COMMANDS = {
     "view": Command("hqgs.cli.view", "look at a scene in a browser (train --view: while it trains)"),
     "export": Command("hqgs.cli.export", "write a scene file with what the scene needs alone"),
     "plan": Command("hqgs.cli.plan", "say what a run would be, and why, without training"),
+    "clean": Command("hqgs.cli.clean", "remove fog and shards between the photos, of any scene file"),
     "diagnose": Command("hqgs.cli.diagnose", "say what degraded photos"),
     "degrade": Command("hqgs.cli.degrade", "write a scene with degraded training photos"),
     "info": Command("hqgs.cli.info", "say what a run, a scene file or a folder of photos holds"),

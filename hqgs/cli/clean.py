@@ -1,0 +1,73 @@
+"""`hqgs clean SOURCE --out FILE`: remove fog and shards between the photos, where held-out photos gain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import Factor, Number, ready
+from hqgs.model.formats.files import format_of, scene_file
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clean:
+    """Options of `hqgs clean`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """The folder of a run, or a scene file of this or another program."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """The scene file to write; nothing is written where held-out photos do not gain."""
+    photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
+    """The photos with their cameras, in the frame of the scene file (those that the run was trained on)."""
+    downscale: Factor = None
+    """Divide the sides of the photos of --photos by F."""
+    steps: Number = None
+    """Training views to see (600)."""
+
+
+OPTIONS = Clean
+
+
+def run(options: Clean) -> int:
+    """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
+    try:
+        source = scene_file(options.source)
+        format_of(options.out)
+        if options.photos is None and not options.source.is_dir():
+            raise ValueError(f"{options.source} is a file: --photos names the photos that it was made of")
+        if options.out.exists() and options.out.samefile(source):
+            raise ValueError(f"--out is the source {source} itself; what is removed would be lost")
+        if options.photos is not None:
+            ready(options.photos)
+        from hqgs.model.gaussians import Gaussians  # here: they load torch
+        from hqgs.scene.source import load, load_again
+        from hqgs.training.cleaning import STEPS, clean
+
+        with LoadingScreen() as screen:
+            if options.photos is None:
+                scene = load_again(options.source, told=screen.stage)
+            else:
+                factor = 1.0 if options.downscale is None else options.downscale
+                scene = load(options.photos, downscale=factor, longest=1600, told=screen.stage)
+            gaussians = Gaussians.load(source).in_world(scene.world)
+            done = clean(gaussians, scene, options.steps or STEPS, told=screen.stage)
+        kept = len(done.gaussians)
+        told = (
+            f"{sum(done.before) / len(done.before):.2f} -> {sum(done.after) / len(done.after):.2f} dB on "
+            f"{len(done.after)} held-out photos ({done.gain:+.2f} +- {done.scatter:.2f})"
+        )
+        if not done.pays:
+            why = "nothing is written. Photos that the scene was trained on cannot tell what hides the others"
+            return fail(1, f"{source}: cleaning does not pay: {told}; {why}")
+        done.gaussians.save(options.out)
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out}: {error}")
+    print(f"{options.out}: {told}; {done.removed:,} of {kept + done.removed:,} Gaussians faded and are gone")
+    return 0

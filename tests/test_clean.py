@@ -1,0 +1,81 @@
+"""`hqgs clean`: what hangs before one photo alone goes, and held-out photos tell whether it paid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_scene import tiny_config, tiny_scene
+
+from hqgs.cli.main import main
+from hqgs.model.gaussians import Gaussians
+from hqgs.scene.scene import Scene
+from hqgs.training.cleaning import Cleaned, clean
+from hqgs.training.trainer import Trainer
+
+FOG = 12  # Gaussians in the air
+
+
+@cache
+def scene() -> Scene:
+    """With two held-out photos, so that a gain has a scatter."""
+    made = tiny_scene(8, 60)
+    return replace(made, test=[*made.test, made.train[-1]], train=made.train[:-1])
+
+
+@cache
+def foggy() -> Gaussians:
+    """A trained scene, with opaque blobs of wrong colours halfway between the cameras and the plane."""
+    trainer = Trainer(scene(), tiny_config(150))
+    for _ in range(150):
+        trainer.step()
+    shown, rng = trainer.shown(), np.random.default_rng(0)
+    means = np.concatenate([rng.uniform(-0.7, 0.7, (FOG, 2)), np.full((FOG, 1), 1.5)], 1).astype(np.float32)
+    blobs = Gaussians.from_points(means, np.full((FOG, 3), 255, np.uint8), shown.sh_degree)
+    blobs = replace(blobs, scales=torch.full((FOG, 3), -2.5), opacities=torch.full((FOG,), 1.0))
+    both = zip(shown.named().items(), blobs.named().values(), strict=True)
+    return shown.like({name: torch.cat([tensor, other]) for (name, tensor), other in both})
+
+
+def test_fog_goes_and_held_out_photos_gain() -> None:
+    done = clean(foggy(), scene(), steps=200)
+    assert done.gain > 1.0
+    assert done.pays
+    assert done.removed + len(done.gaussians) == len(foggy())
+    left = done.gaussians.means[:, 2] < 2
+    faded = done.gaussians.activated_opacities()[left].sum()
+    assert float(faded) < 0.5 * float(foggy().activated_opacities()[-FOG:].sum())
+    again = clean(foggy(), scene(), steps=200)
+    assert torch.equal(again.gaussians.opacities, done.gaussians.opacities)
+
+
+def test_a_gain_must_exceed_its_scatter() -> None:
+    def done(*gains: float) -> Cleaned:
+        return Cleaned(foggy(), 0, (20.0,) * len(gains), tuple(20.0 + gain for gain in gains))
+
+    assert done(0.5, 0.6, 0.4).pays
+    assert not done(2.0, -1.5, 0.1).pays
+    assert not done(1.0).pays  # one photo tells no scatter
+    assert not done(-0.2, -0.3).pays
+
+
+def test_bad_input_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="tiny has no held-out photo"):
+        clean(foggy(), replace(scene(), test=[]))
+    with pytest.raises(ValueError, match="steps is 0, wanted at least 1"):
+        clean(foggy(), scene(), steps=0)
+    file = tmp_path / "scene.ply"
+    foggy().save(file)
+    for options, message in (
+        ([str(file), "--out", str(tmp_path / "new.ply")], "--photos names the photos"),
+        ([str(file), "--out", str(file), "--photos", "embedded"], "what is removed would be lost"),
+        ([str(file), "--out", str(tmp_path / "new.obj"), "--photos", "embedded"], "new.obj"),
+        ([str(tmp_path / "no.ply"), "--out", str(tmp_path / "new.ply")], "no.ply"),
+    ):
+        assert main(["clean", *options]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "new.ply").exists()
