@@ -65,8 +65,8 @@ def test_canonical_text() -> None:
     [
         (
             "",
-            "unknown degradation ''; there are: jpeg, noise, lowres, blur, defocus, motion, shake, focus, "
-            "grain, exposure, chat, phone, video, video265, mixed, none, some:KIND, and steps joined by \\+",
+            f"unknown degradation ''; there are: {', '.join(KINDS)}, mixed, none, some:KIND, and steps "
+            "joined by \\+",
         ),
         ("fog:3", "unknown degradation 'fog'"),
         ("blur:2+", "unknown degradation ''"),

@@ -169,10 +169,7 @@ def check_formation(degradation: Degradation) -> Degradation:
     for step in degradation.steps:
         if step.some or not KINDS[step.kind].formation:
             known = ", ".join(name for name, kind in KINDS.items() if kind.formation)
-            raise ValueError(
-                f"{step} differs from photo to photo and has no operator in the loss; a formation is made of "
-                f"{known}"
-            )
+            raise ValueError(f"{step} has no operator in the loss; a formation is made of {known}")
         if step.kind in OWN and step.value is not None:
             raise ValueError(f"{step}: each photo has its own of it, which is found; write {step.kind}")
     return degradation
