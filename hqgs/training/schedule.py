@@ -35,8 +35,8 @@ class Decisions:
     """What a run has decided so far, as far as its steps depend on it."""
 
     length: int  # iterations of the run as far as it is known: those of the configuration, or fewer
-    released: int = 0  # the iteration after which the held-back photos came back; 0: not yet
-    turned: int = 0  # the iteration after which the clock gave the run another length; 0: it did not
+    released: int  # the iteration after which the held-back photos came back; 0: not yet
+    turned: int  # the iteration after which the clock gave the run another length; 0: it did not
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Schedule:
 
     def start(self) -> Decisions:
         """Before the first step."""
-        return Decisions(self.config.iterations)
+        return Decisions(self.config.iterations, released=0, turned=0)
 
     def plan(self, iteration: int, decisions: Decisions) -> Plan:
         """What step number `iteration` (1, 2, ...) does."""

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hqgs.base.typed import build
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import Adam
@@ -73,7 +74,8 @@ class TrainState:
 
         ValueError names a tensor of another shape or type.
         """
-        decisions, n = Decisions(**values["decisions"]), len(tensors["gaussians.means"])
+        n = len(tensors["gaussians.means"])
+        decisions = build(Decisions, values["decisions"], f"{path}: decisions")
 
         def check(name: str, tensor: Tensor, like: Tensor) -> None:
             if tensor.shape != like.shape or tensor.dtype != like.dtype:
