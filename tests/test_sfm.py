@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -222,6 +223,16 @@ def test_masked_pixels_give_no_points(cards: Scene) -> None:
     found = sfm_scene(replace(cards, train=[masked(view) for view in cards.train]))
     assert len(found.points) > 50
     assert (np.abs(found.points[:, 2] - 3.0) < 0.3).mean() < 0.02
+
+
+def test_all_code_that_a_reconstruction_depends_on_is_in_its_key() -> None:
+    waiting, found = [colmap_run.PROGRAM], set[Path]()
+    while waiting:
+        path = waiting.pop()
+        found.add(path)
+        names = re.findall(r"^from hqgs\.scene\.sfm\.(\w+) import", path.read_text(), re.MULTILINE)
+        waiting += [other for name in names if (other := path.with_name(f"{name}.py")) not in found]
+    assert found == set(colmap_run.PARTS)
 
 
 def test_photos_that_make_no_scene_are_refused(cards: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
