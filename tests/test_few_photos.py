@@ -56,6 +56,12 @@ def test_dropout_leaves_out_a_share_and_keeps_the_mean_opacity() -> None:
     assert float(opaque.activated_opacities().max()) == pytest.approx(OPAQUE, rel=1e-5)
 
 
+def test_dropout_leaves_open_how_the_rest_is_seen() -> None:
+    made = gaussians(40)
+    made.antialiased = True
+    assert with_dropout(made, 0.2, 0, 7).antialiased
+
+
 def facts(photos: int, agreed: float | None = None) -> Facts:
     return Facts(photos, 10_000, 100, 50, True, agreed, as_photographed=True, sizes=((100, 100),) * photos)
 

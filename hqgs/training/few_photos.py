@@ -7,7 +7,6 @@ as well as surfaces do. Both parts here make what one photo alone holds up fade.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -41,4 +40,7 @@ def with_dropout(gaussians: Gaussians, share: float, seed: int, iteration: int) 
     drawn = np.random.default_rng([seed, iteration]).random(len(gaussians), np.float32)
     opacities = gaussians.activated_opacities() / (1 - share)
     kept = torch.logit(opacities.clamp(max=OPAQUE))
-    return replace(gaussians, opacities=torch.where(torch.from_numpy(drawn) < share, DROPPED, kept))
+    some = torch.where(torch.from_numpy(drawn) < share, DROPPED, kept)
+    return gaussians.like(
+        gaussians.named() | {"opacities": some}
+    )  # as they are to be seen: antialiased or not
