@@ -68,7 +68,7 @@ def run(options: Evaluate) -> int:
                 )
         if not scene.test:
             raise ValueError(f"{scene.name} has no held-out photo to measure with")
-        gaussians = Gaussians.load(source)
+        gaussians = Gaussians.load(source).in_world(scene.world)
         views = held_out_renders(scene, gaussians)
         each = measured(views)
         mean = mean_metrics(each)
