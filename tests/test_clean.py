@@ -13,7 +13,9 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.cli.main import main
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene import source as scene_source
 from hqgs.scene.scene import Scene
+from hqgs.scene.world import World
 from hqgs.training.cleaning import Cleaned, clean
 from hqgs.training.trainer import Trainer
 
@@ -51,6 +53,25 @@ def test_fog_goes_and_held_out_photos_gain() -> None:
     assert float(faded) < 0.5 * float(foggy().activated_opacities()[-FOG:].sum())
     again = clean(foggy(), scene(), steps=200)
     assert torch.equal(again.gaussians.opacities, done.gaussians.opacities)
+
+
+def test_a_foreign_file_is_cleaned_in_its_own_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It says nothing of the frame in which the photos' scene is held, and it is antialiased."""
+    world = World(0.25, (3.0, 0.0, -2.0))
+    held = foggy().like(foggy().named())
+    held.world, held.antialiased = world, True
+    foreign = held.in_world(World())
+    foreign.save(tmp_path / "foreign.spz")
+    monkeypatch.setattr(scene_source, "room", lambda *_: replace(scene(), world=world))
+    out, options = tmp_path / "clean.glb", ["--photos", "embedded", "--steps", "200"]
+    assert main(["clean", str(tmp_path / "foreign.spz"), "--out", str(out), *options]) == 0
+    assert "left out: the antialias flag: a .glb file has no place for it" in capsys.readouterr().out
+    found = Gaussians.load(out)
+    assert found.world.ordinary
+    read = Gaussians.load(tmp_path / "foreign.spz").means
+    assert float((found.means[:, None] - read).abs().amax(2).amin(1).max()) < 1e-5
 
 
 def test_a_gain_must_exceed_its_scatter() -> None:

@@ -10,8 +10,8 @@ import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Number, ready
-from hqgs.model.formats.files import format_of, scene_file
+from hqgs.cli.scenes import Factor, Number, ready, tell_read
+from hqgs.model.formats.files import ANTIALIASED, format_of, scene_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
     try:
         source = scene_file(options.source)
-        format_of(options.out)
+        format = format_of(options.out, written=True)
         if options.photos is None and not options.source.is_dir():
             raise ValueError(f"{options.source} is a file: --photos names the photos that it was made of")
         if options.out.exists() and options.out.samefile(source):
@@ -54,8 +54,8 @@ def run(options: Clean) -> int:
             else:
                 factor = 1.0 if options.downscale is None else options.downscale
                 scene = load(options.photos, downscale=factor, longest=1600, told=screen.stage)
-            gaussians = Gaussians.load(source).in_world(scene.world)
-            done = clean(gaussians, scene, options.steps or STEPS, told=screen.stage)
+            gaussians = Gaussians.load(source)
+            done = clean(gaussians.in_world(scene.world), scene, options.steps or STEPS, told=screen.stage)
         kept = len(done.gaussians)
         told = (
             f"{sum(done.before) / len(done.before):.2f} -> {sum(done.after) / len(done.after):.2f} dB on "
@@ -64,10 +64,13 @@ def run(options: Clean) -> int:
         if not done.pays:
             why = "nothing is written. Photos that the scene was trained on cannot tell what hides the others"
             return fail(1, f"{source}: cleaning does not pay: {told}; {why}")
-        done.gaussians.save(options.out)
+        done.gaussians.in_world(gaussians.world).save(options.out)  # in the frame of the source
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
         return fail(1, f"{options.out}: {error}")
+    tell_read(gaussians)
+    if gaussians.antialiased and format not in ANTIALIASED:
+        print(f"left out: the antialias flag: a .{format} file has no place for it")
     print(f"{options.out}: {told}; {done.removed:,} of {kept + done.removed:,} Gaussians faded and are gone")
     return 0

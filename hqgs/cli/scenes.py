@@ -19,6 +19,7 @@ from hqgs.cli.errors import fail
 
 if TYPE_CHECKING:
     from hqgs.cli.progress import LoadingScreen
+    from hqgs.model.gaussians import Gaussians
     from hqgs.scene.scene import Scene
 
 SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -79,6 +80,12 @@ def tell_notes(scene: Scene) -> None:
     for note in scene.notes:
         print(f"  {note}")
     sys.stdout.flush()
+
+
+def tell_read(gaussians: Gaussians) -> None:
+    """What the reading of a scene file left out or changed."""
+    for note in gaussians.notes:
+        print(f"read: {note}", flush=True)
 
 
 def load(photos: Photos, screen: LoadingScreen) -> Scene:

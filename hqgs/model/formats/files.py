@@ -19,6 +19,7 @@ from hqgs.model.formats.world_file import keep_world, read_world
 from hqgs.scene.world import World
 
 OWN_PLACE = ("ply", "glb", "gltf")  # formats that hold the frame themselves
+ANTIALIASED = ("ply", "full.ply", "spz")  # formats that are written with that flag
 
 
 def read_scene(path: Path, format: str) -> Arrays:
