@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -117,7 +118,9 @@ def test_a_far_camera_that_shows_the_scene_stays_and_moves_no_size(tmp_path: Pat
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
-def test_what_is_written_is_in_the_frame_of_the_files(tmp_path: Path, scale: float) -> None:
+def test_what_is_written_is_in_the_frame_of_the_files(
+    tmp_path: Path, scale: float, capsys: pytest.CaptureFixture[str]
+) -> None:
     truth = placed(make_truth(), scale, UTM)
     scene = load(truth, tmp_path / "scene")
     model = Gaussians.from_points(scene.points, scene.point_colors, 0)
@@ -133,6 +136,10 @@ def test_what_is_written_is_in_the_frame_of_the_files(tmp_path: Path, scale: flo
             np.testing.assert_allclose(out, truth.points, atol=scale * 1e-5 + 1e-9)
         assert (pictures(scene, read) - wanted).abs().max() < (2e-5 if exact else 0.1)
         assert (tmp_path / f"{name}.world.json").exists() == (name not in ("a.ply", "a.glb"))
+    assert main(["info", str(tmp_path / "a.spz")]) == 0
+    told = re.search(r"lie in x, y, z: \S+ to \S+, (\S+) to ", capsys.readouterr().out)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(UTM[1], rel=0.01)
     vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     assert vertices["x"].dtype == np.float64
     np.testing.assert_allclose(vertices["y"], truth.points[:, 1], rtol=1e-12)

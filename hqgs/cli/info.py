@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
 from hqgs.base.files import CONFIG, existing_folder
@@ -49,12 +50,14 @@ def _file(path: Path) -> list[str]:
     from hqgs.model.gaussians import Gaussians  # here: it loads torch
 
     gaussians = Gaussians.load(path)
-    lowest, highest = (gaussians.means.quantile(q, dim=0).tolist() for q in (0.05, 0.95))
+    means = gaussians.world.out(gaussians.means.numpy())
+    lowest, highest = (np.quantile(means, q, axis=0).tolist() for q in (0.05, 0.95))
     box = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(lowest, highest, strict=True))
     return [
         f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
         f"{path.stat().st_size / 1e6:.1f} MB",
         f"nine tenths of them lie in x, y, z: {box}",
+        *(f"read: {note}" for note in gaussians.notes),
     ]
 
 
