@@ -237,6 +237,34 @@ def test_the_format_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert len(Gaussians.load(tmp_path / "b", "spz")) == 300
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("a.glb", True), ("a.splat", True), ("a.compressed.ply", True), ("a.spz", False), ("a.full.ply", False)],
+)
+def test_a_lost_antialias_flag_is_told(
+    tmp_path: Path, name: str, told: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    g = some_gaussians()
+    g.antialiased = True
+    g.save(tmp_path / "source.ply")
+    assert call(tmp_path / "source.ply", "--out", tmp_path / name) == 0
+    assert ("left out: the antialias flag: a ." in capsys.readouterr().out) == told
+    assert Gaussians.load(tmp_path / name).antialiased != told
+
+
+def test_what_the_reading_left_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.ply"
+    some_gaussians().save(path)
+    path.write_bytes(path.read_bytes() + b"end")
+    for arguments in (
+        ["info", path],
+        ["render", path, "--out", tmp_path / "a.png", "--size", "16", "16"],
+        ["export", path, "--out", tmp_path / "a.spz"],
+    ):
+        assert cli.main([*map(str, arguments)]) == 0
+        assert "read: 3 bytes after its last row were passed by" in capsys.readouterr().out
+
+
 def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     some_gaussians().save(tmp_path / "a.ply")
     far = some_gaussians()
@@ -246,6 +274,7 @@ def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, capsys: pytest
     before = sorted(tmp_path.iterdir())
     for source, out, message, *more in (
         ("a.ply", "b.xyz", "the suffix says no format"),
+        ("a.ply", "b.sog", "the suffix says no format"),
         ("a.ply", "a.ply", "--out is the source"),
         ("none.ply", "b.ply", "there is no"),
         ("empty", "b.ply", "scene.ply"),

@@ -15,7 +15,7 @@ from hqgs.base.stages import Stage
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, ready
+from hqgs.cli.scenes import Factor, ready, tell_read
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import scene_file
 
@@ -98,6 +98,7 @@ def run(options: Evaluate) -> int:
         return fail(2, error)
     except OSError as error:
         return fail(1, f"{options.source}: {error}")
+    tell_read(gaussians)
     title = f"{source} on the held-out photos of {scene.name}"
     print(_table(title, [*zip(views.names, each, strict=True), ("mean", mean)]))
     if fits:

@@ -11,8 +11,8 @@ import tyro
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Photos, load, ready
-from hqgs.model.formats.files import READERS, format_of, scene_file
+from hqgs.cli.scenes import Factor, Photos, load, ready, tell_read
+from hqgs.model.formats.files import WRITERS, format_of, scene_file
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class ExportScene:
     """The file to write."""
     format: Annotated[
         str | None,
-        tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(READERS)} (as FILE ends)."),
+        tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITERS)} (as FILE ends)."),
     ] = None
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
     """Of the harmonics, at most."""
@@ -55,7 +55,7 @@ def run(args: ExportScene) -> int:
     """Export what `args` say and print tables; return the exit code (0 done, 1 failed, 2 bad input)."""
     try:
         options = ExportOptions(
-            format=format_of(args.out, args.format),
+            format=format_of(args.out, args.format, written=True),
             sh_degree=args.sh_degree,
             band_tolerance=args.band_tolerance,
             sh_bits=args.sh_bits,
@@ -85,8 +85,7 @@ def run(args: ExportScene) -> int:
     except OSError as error:
         return fail(1, f"{args.out}: {error}")
     print(_table(source, gaussians, before, written, after), end="\n\n")
-    for note in gaussians.notes:
-        print(f"read: {note}")
+    tell_read(gaussians)
     for entry in written.left_out:
         evidence = "" if entry.evidence is None else f" ({entry.evidence})"
         saved = "" if entry.bytes is None else f": {entry.bytes:,} bytes"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import Factor, Number
+from hqgs.cli.scenes import Factor, Number, tell_read
 from hqgs.model.formats.files import scene_file
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def run(options: Render) -> int:
         from hqgs.show.frames import render_frames  # here: they load torch
 
         gaussians = Gaussians.load(file)
+        tell_read(gaussians)
         names, cameras, rate = _cameras(options, gaussians)
         if size is not None:
             cameras = [resized(camera, *size) for camera in cameras]

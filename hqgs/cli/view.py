@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.scenes import tell_read
 from hqgs.model.formats.files import scene_file
 from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
 
@@ -59,6 +60,7 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
     except BAD_INPUT as error:
         return fail(2, error)
     try:
+        tell_read(gaussians)
         viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
         viewer.set_facts({} if report is None else facts_of_photos(report))
         _tell(viewer.url, options.open)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
+from hqgs.model.formats.files import ANTIALIASED
 from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.spz import encode_spz, write_spz
 from hqgs.model.formats.world_file import keep_world
@@ -64,6 +65,9 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     for step, (before, after) in zip(steps, pairwise(sizes), strict=True):
         saved = None if before is None or after is None else before - after
         left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
+    if gaussians.antialiased and options.format not in ANTIALIASED:
+        why = f"a .{options.format} file has no place for it: what is finer than a pixel is shown too opaque"
+        left_out.append(LeftOut("the antialias flag", why))
     return Export(path, written, len(reduced), reduced.sh_degree, left_out, clipped)
 
 
@@ -165,6 +169,8 @@ def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
     n, higher = len(gaussians), 3 * gaussians.shN.shape[1]
     if options.format in ("ply", "glb"):
         return 4 * n * (3 + 3 + higher + 1 + 3 + 4)
+    if options.format == "full.ply":
+        return 4 * n * 62
     if options.format == "splat":
         return 32 * n
     if options.format == "compressed.ply":
