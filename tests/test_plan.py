@@ -6,10 +6,12 @@ import json
 from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from planned import planned
 from test_diagnose import degraded_scene
+from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.base.files import CHECKPOINT, PAGE
@@ -56,6 +58,20 @@ def test_the_formation_is_what_the_photos_show_and_why() -> None:
     assert row.why == "what the photos show"
     none = next(row for row in plan.rows if row.what == "a correction for blur")
     assert (none.value, none.left_out) == ("none", "a correction for blur")
+
+
+def test_photos_that_agree_on_no_more_points_have_the_rules_of_few() -> None:
+    scene = textured_scene(8, 64)
+    config = run_config(method="hqgs", formation="none")
+    dense = Prepared(scene, config).plan()
+    assert dense.discs
+    assert dense.half_size_until
+    flat = [replace(view, image=np.full(view.image.shape, 128, np.uint8)) for view in scene.train]
+    plan = Prepared(replace(scene, train=flat), config).plan()
+    assert plan.first_points == len(scene.points)
+    row = next(row for row in plan.rows if row.what == "first points")
+    assert (row.why, row.left_out) == ("the photos agree on no more", None)
+    assert (plan.discs, plan.half_size_until) == (False, 0)
 
 
 def test_a_rule_is_one_entry() -> None:

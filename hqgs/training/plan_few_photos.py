@@ -42,8 +42,3 @@ def dropout(draft: Draft) -> Sequence[Choice]:
     why = "no Gaussian may explain a photo alone"
     value = f"up to {DROPOUT:.0%} of the Gaussians in a step"
     return [Choice(value, why, f"{photos} photos", changes={"dropout": DROPOUT})]
-
-
-def asks_for_agreement(photos: int) -> bool:
-    """Whether the number of photos alone does not tell."""
-    return FEW < photos <= MANY

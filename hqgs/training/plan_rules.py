@@ -162,6 +162,8 @@ def first_points(draft: Draft) -> Sequence[Choice]:
     if facts.points >= wanted:
         why = f"it has {facts.points} points for {wanted} that are called for"
         return [Choice(own, why, left_out=what)]
+    if facts.agreed == 0:
+        return [Choice(own, "the photos agree on no more", left_out=what)]
     evidence = f"{facts.points:,} points of the reconstruction, {facts.pixels / 1e6:.1f} megapixels"
     return [Choice(f"{wanted:,}, along the photos' edges", why, evidence, changes={"first_points": wanted})]
 

@@ -21,7 +21,6 @@ from hqgs.training.looks import Looks
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, plan_by
-from hqgs.training.plan_few_photos import asks_for_agreement
 from hqgs.training.plan_rules import RULES, plan_run
 
 
@@ -53,11 +52,7 @@ class Prepared:
         """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""
         facts = replace(self.facts, seconds=seconds)
         plan = plan_run(facts, self.diagnosis, self.asked)
-        if (
-            asks_for_agreement(facts.photos)
-            and plan.first_points > facts.points
-            and self.scene.seen is not None
-        ):
+        if plan.first_points > facts.points and self.scene.seen is not None:
             found = len(self._first_points(plan.first_points)[0]) - facts.points
             facts = replace(facts, agreed=found / (plan.first_points - facts.points))
             plan = plan_run(facts, self.diagnosis, self.asked)
