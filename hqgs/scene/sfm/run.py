@@ -101,7 +101,8 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
     """A sentence on how long COLMAP takes, where that may be more than a minute; else nothing.
 
     `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all, or of many photos the likely ones.
-    The range is that of photos with little and with much detail, measured on two threads of an AMD EPYC.
+    The range is that of photos with little and with much detail, measured on two threads of an AMD EPYC,
+    where the first pass places enough of them: of the others (`program.py`) the sentence has no number.
     """
     count = len(sizes)
     if pairs is None:
@@ -121,7 +122,8 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
     return (
         f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
         f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} threads, more the "
-        f"more detail they show{advice}"
+        f"more detail they show; where photos find no place, smoothed copies are looked at as well, which "
+        f"takes several times as long{advice}"
     )
 
 
