@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 import hqgs
+from hqgs.base.stages import Stage
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.load import load_scene
@@ -257,10 +258,15 @@ def test_photos_that_make_no_scene_are_refused(cards: Scene, monkeypatch: pytest
 
 
 def test_a_folder_of_photos_alone_becomes_a_scene(cards: Scene, tmp_path: Path) -> None:
-    folder = tmp_path
+    folder, heard = tmp_path / "images", list[Stage]()
+    folder.mkdir()
+    (tmp_path / "transforms.json").write_text("{}")
     for view in [*cards.train, *cards.test]:
         Image.fromarray(view.image).save(folder / view.name.replace(".jpg", ".png"))
-    scene = load_scene(folder)
+    scene = load_scene(folder, told=heard.append)
+    above = f"{tmp_path} holds cameras and points (transforms.json), which are not read: give that folder"
+    assert [stage.note for stage in heard if stage.note] == [f"{above} to train with them"]
+    assert scene.notes[-1].startswith(above)
     assert [view.name for view in scene.test] == ["photo 0.png", "photo 8.png"]
     assert len(scene.train) == 7
     assert scene.source == "photos"

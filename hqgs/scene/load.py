@@ -11,7 +11,7 @@ import pycolmap
 
 from hqgs.base.evenly import evenly
 from hqgs.base.files import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
-from hqgs.base.stages import OnStage, untold
+from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
@@ -184,8 +184,21 @@ def _read(
     if not sfm and (broken := _broken(root)) is not None:
         raise ValueError(f"{broken}; `--sfm` takes cameras and points from the photos alone")
     if (photos := bare_photos(root, downscale)) is not None:
-        return read_photos(root, photos, keep_sfm, told, coarse)
+        above = [] if sfm else _above(root)
+        if above:
+            told(Stage("COLMAP", 0, len(photos.names), above[0]))
+        capture = read_photos(root, photos, keep_sfm, told, coarse)
+        return replace(capture, notes=[*capture.notes, *above])
     raise ValueError(_nothing(root))
+
+
+def _above(root: Path) -> list[str]:
+    """That the folder above has cameras, which are not read for a folder of photos; or nothing."""
+    above = root.parent
+    found = [COLMAP] if find_models(above) else []
+    found += [name for name in (SINGLE, TRAIN, POSES) if (above / name).is_file()]
+    which = f"{above} holds cameras and points ({', '.join(found)})"
+    return [f"{which}, which are not read: give that folder to train with them"] if found else []
 
 
 def _broken(root: Path) -> str | None:
