@@ -160,8 +160,7 @@ def first_points(draft: Draft) -> Sequence[Choice]:
     if not facts.linked:
         return [Choice(own, "the scene does not tell which photos see which of its points", left_out=what)]
     if facts.points >= wanted:
-        why = f"it has {facts.points} points for {wanted} that are called for"
-        return [Choice(own, why, left_out=what)]
+        return [Choice(own, f"it has {facts.points} points for {wanted} that are called for", left_out=what)]
     if facts.agreed == 0:
         return [Choice(own, "the photos agree on no more", left_out=what)]
     evidence = f"{facts.points:,} points of the reconstruction, {facts.pixels / 1e6:.1f} megapixels"
