@@ -12,7 +12,7 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 import hqgs.training.frugality as module
-from hqgs.base.left_out import LeftOut, format_left_out
+from hqgs.base.left_out import CORRECTION, LeftOut, format_left_out
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
 from hqgs.training import plan_rules
@@ -193,6 +193,13 @@ def test_the_table() -> None:
     assert format_left_out(items) == (
         "left out:\n  a    2 s, 2.5 MB, -0.01 dB  not needed\n  bcd                         no use"
     )
+    table = format_left_out([LeftOut(f"{CORRECTION}blur", "sharp"), *items, LeftOut(f"{CORRECTION}jpeg", "")])
+    first, *rest = table.splitlines()[1:]
+    assert first.split(None, 1) == [
+        "corrections",
+        "the photos need none for blur, jpeg; the report tells why",
+    ]
+    assert [row.split()[0] for row in rest] == ["a", "bcd"]
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:

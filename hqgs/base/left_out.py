@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TypedDict, cast
 
+CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not need
+
 
 class _Named(TypedDict):
     what: str
@@ -41,9 +43,17 @@ class LeftOut:
 
 
 def format_left_out(items: Sequence[LeftOut]) -> str:
-    """A short table of what was left out and what that saved; empty if nothing was."""
-    rows = []
+    """A short table of what was left out and what that saved; empty if nothing was.
+
+    Corrections share a row: why each is not needed fills a screen, and the report tells it.
+    """
+    rows = list[tuple[str, str, str]]()
+    steps = [item.what.removeprefix(CORRECTION) for item in items if item.what.startswith(CORRECTION)]
+    if steps:
+        rows.append(("corrections", "", f"the photos need none for {', '.join(steps)}; the report tells why"))
     for item in items:
+        if item.what.startswith(CORRECTION):
+            continue
         saved = [] if item.seconds is None else [f"{item.seconds:.0f} s"]
         saved += [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
         saved += [] if item.cost_db is None else [f"{-item.cost_db:+.2f} dB"]

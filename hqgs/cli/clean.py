@@ -62,8 +62,10 @@ def run(options: Clean) -> int:
             f"{len(done.after)} held-out photos ({done.gain:+.2f} +- {done.scatter:.2f})"
         )
         if not done.pays:
-            why = "nothing is written. Photos that the scene was trained on cannot tell what hides the others"
-            return fail(1, f"{source}: cleaning does not pay: {told}; {why}")
+            held = (
+                "" if options.photos is None else " (photos that the scene was trained on cannot show a gain)"
+            )
+            return fail(1, f"{source}: cleaning does not pay, and nothing is written: {told}{held}")
         done.gaussians.in_world(gaussians.world).save(options.out)  # in the frame of the source
     except BAD_INPUT as error:
         return fail(2, error)

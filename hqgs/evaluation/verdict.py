@@ -9,7 +9,7 @@ _LEVELS = (
     (
         20.0,
         "poor",
-        "below 20 dB the scene is hardly recognisable: wrong poses, too few photos, or too short a run",
+        "below 20 dB renders are far from held-out photos: wrong poses, too few photos, or too short a run",
     ),
     (25.0, "fair", "20 to 25 dB: the scene is recognisable and soft; a longer run or more photos help"),
     (30.0, "good", "25 to 30 dB: details are there"),

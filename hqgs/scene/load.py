@@ -238,10 +238,12 @@ def bounded(capture: Capture, longest: int) -> Capture:
     if downscale <= capture.downscale:
         return capture
     width, height = (round(side / downscale) for side in largest)
+    straight = all(photo.camera.model.name.endswith("PINHOLE") for photo in capture.photos)
+    then = "" if straight else ", before undistortion moves their borders"
     up_to, count = "" if len(set(sizes)) == 1 else "up to ", len(sizes)
     note = (
         f"{count} photos of {up_to}{largest[0]} x {largest[1]} px are used at {up_to}{width} x {height} px "
-        f"(sides divided by {downscale:.3g}); `--downscale 1` takes their full size, and far longer"
+        f"(sides divided by {downscale:.3g}{then}); `--downscale 1` takes their full size, and far longer"
     )
     if downscale > bounded:
         note += (

@@ -173,7 +173,9 @@ class SfmReport:
         if self.sure_px:
             name, least = max(self.sure_px.items(), key=lambda item: item[1])
             usual = float(np.median(list(self.sure_px.values())))
-            text += f"; poses are sure to {usual:.2f} px (median), that of {name} to {least:.2f} px"
+            text += (
+                f"; poses are sure to {usual:.2f} px (median), the least sure, of {name}, to {least:.2f} px"
+            )
         if self.unreadable:
             files = ", ".join(f"{name} ({why})" for name, why in self.unreadable.items())
             text += f"; left out, as they cannot be read ({len(self.unreadable)}): {files}"

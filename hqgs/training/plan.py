@@ -178,11 +178,13 @@ def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
 
 
 ESSENTIAL = ("method", "formation", "loss", "budget", "first points", "length")
+OF_FEW_PHOTOS = ("opacity decay", "dropout of Gaussians")  # essential where they are used
 
 
 def essential(plan: RunPlan) -> str:
     """The rows that a user should know of before the run, as lines."""
-    return plan_table([row for row in plan.rows if row.what in ESSENTIAL])
+    used = [row.what for row in plan.rows if row.what in OF_FEW_PHOTOS and row.value != "none"]
+    return plan_table([row for row in plan.rows if row.what in (*ESSENTIAL, *used)])
 
 
 def plan_table(rows: Sequence[PlanRow]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.photos.formula import LEARNED, parse_formation
@@ -68,7 +69,7 @@ def formation(draft: Draft) -> Sequence[Choice]:
     ]
     for name, needed, why in diagnosis.needs():
         if not needed:
-            what = f"a correction for {name}"
+            what = f"{CORRECTION}{name}"
             rows.append(Choice("none", f"not needed: {why}", what=what, left_out=what))
     return rows
 
