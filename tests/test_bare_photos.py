@@ -249,7 +249,7 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     assert told(128, 1200, 900, coarse=True)[1] < 8
     assert told(128, 1200, 900)[1] > 10
     text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
-    assert text.startswith("200 photos of 12.0 megapixels, which COLMAP looks at at 1.9: ")
+    assert text.startswith("200 photos of 12.0 megapixels, which COLMAP sees at 1.9: ")
     assert text.endswith("; 100 photos are plenty for most scenes")
     with LoadingScreen() as screen:
         screen.stage(Stage("COLMAP", 0, 200, text))

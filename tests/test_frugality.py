@@ -197,7 +197,7 @@ def test_the_table() -> None:
     first, *rest = table.splitlines()[1:]
     assert first.split(None, 1) == [
         "corrections",
-        "the photos need none for blur, jpeg; the report tells why",
+        "the photos show no need of any for blur, jpeg: see the report",
     ]
     assert [row.split()[0] for row in rest] == ["a", "bcd"]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TypedDict, cast
 
-CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not need
+CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not show
 
 
 class _Named(TypedDict):
@@ -45,12 +45,14 @@ class LeftOut:
 def format_left_out(items: Sequence[LeftOut]) -> str:
     """A short table of what was left out and what that saved; empty if nothing was.
 
-    Corrections share a row: why each is not needed fills a screen, and the report tells it.
+    Corrections share a row: why each was not made fills a screen, and the report tells it.
     """
     rows = list[tuple[str, str, str]]()
     steps = [item.what.removeprefix(CORRECTION) for item in items if item.what.startswith(CORRECTION)]
     if steps:
-        rows.append(("corrections", "", f"the photos need none for {', '.join(steps)}; the report tells why"))
+        rows.append(
+            ("corrections", "", f"the photos show no need of any for {', '.join(steps)}: see the report")
+        )
     for item in items:
         if item.what.startswith(CORRECTION):
             continue

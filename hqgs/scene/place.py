@@ -56,8 +56,9 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
         if away and not (len(points) and _shows(photo, points))
     }
     if gone:
+        blind = ", show none of the points" if len(points) else ""
         notes.append(
-            f"{len(gone)} of {len(capture.photos)} cameras lie far from all others, show none of the points "
+            f"{len(gone)} of {len(capture.photos)} cameras lie far from all others{blind} "
             f"and were left out: {some(sorted(gone))}"
         )
     return _without(capture, gone)

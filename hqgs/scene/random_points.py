@@ -41,7 +41,8 @@ def random_points(
         raise ValueError("the masks hide every pixel of every training view")
     depths = "a guessed depth range" if guessed else "the given depth bounds"
     note = (
-        f"no points in the scene: {COUNT} random points (seed {SEED}) within {depths} of the training views"
+        f"no points in the scene: {COUNT} random points (seed {SEED}) within {depths} of the training views; "
+        "`--sfm` finds cameras and points from the photos"
     )
     return np.concatenate(points).astype(np.float32), np.concatenate(colors), note
 

@@ -67,10 +67,8 @@ def formation(draft: Draft) -> Sequence[Choice]:
     rows += [
         Choice("left out", item.why, what=item.what, left_out=item.what) for item in diagnosis.passed_over
     ]
-    for name, needed, why in diagnosis.needs():
-        if not needed:
-            what = f"{CORRECTION}{name}"
-            rows.append(Choice("none", f"not needed: {why}", what=what, left_out=what))
+    unseen = [(CORRECTION + name, why) for name, needed, why in diagnosis.needs() if not needed]
+    rows += [Choice("none", f"not seen: {why}", what=what, left_out=what) for what, why in unseen]
     return rows
 
 
@@ -147,7 +145,7 @@ def rates(draft: Draft) -> Sequence[Choice]:
 def first_points(draft: Draft) -> Sequence[Choice]:
     facts, settings, what = draft.facts, draft.settings, "first points along edges"
     if not draft.formed:
-        return [Choice(f"the reconstruction's {facts.points:,}", "as published")]
+        return [Choice(f"the scene's own {facts.points:,}", "as published")]
     if draft.undegraded:
         most = min(settings.start_points, settings.densify.max_gaussians)
         wanted, what = first_points_wanted(facts, most), None
@@ -155,7 +153,7 @@ def first_points(draft: Draft) -> Sequence[Choice]:
     else:
         wanted = int(settings.hqgs.first_points * settings.densify.max_gaussians)
         why = "bad photos give few points, and under a budget little grows"
-    own = f"the reconstruction's {facts.points:,}"
+    own = f"the scene's own {facts.points:,}"
     if not wanted:
         return [Choice(own, "more were not asked for")]
     if not facts.linked:

@@ -117,7 +117,7 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
         most = share * (1.1 * seen.sum() + 0.03 * pairs) + 0.02 * pairs + 0.4 * count
     if most < LONG:
         return ""
-    shrunk = f", which COLMAP looks at at {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
+    shrunk = f", which COLMAP sees at {seen.mean():.1f}" if seen.mean() < 0.9 * stored.mean() else ""
     advice = "; 100 photos are plenty for most scenes" if count > MANY else ""
     return (
         f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
