@@ -216,4 +216,5 @@ def test_a_split_beside_a_model(tmp_path: Path, file: str, content: str) -> None
     (tmp_path / file).write_text(content, encoding="utf-8")
     scene = load_scene(tmp_path)
     assert split_of(scene) == ([0, 1, 3, 5], [2, 4])
+    assert not any("are no photo of the scene" in note for note in scene.notes)
     assert file in next(note for note in scene.notes if "split" in note)

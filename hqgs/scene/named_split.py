@@ -94,7 +94,7 @@ def held_out(
     if rest:
         notes.append(f"{len(rest)} photos are in no list of {split.source} that counts: {some(rest)}")
     listed = [*(split.train or []), *(split.test or []), *(split.val or [])]
-    if missing := [name for name in listed if name not in known]:
+    if missing := [name for name in listed if photo(name) is None]:
         notes.append(f"{len(missing)} names in {split.source} are no photo of the scene: {some(missing)}")
     return frozenset(chosen), frozenset(held)
 
