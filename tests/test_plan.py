@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from hqgs.training.config import HQGSConfig, run_config
 from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_rules import RULES, plan_run
 from hqgs.training.prepare import Prepared, facts_of
+from hqgs.training.settings import PRESETS
 from hqgs.training.trainer import Trainer
 
 
@@ -159,6 +161,20 @@ def test_the_command_prints_what_the_page_shows(tmp_path: Path, capsys: pytest.C
         assert row["value"].replace("'", "&#39;").replace(">", "&gt;") in page
     assert "noise:9" in trained
     assert "12 iterations" in trained
+
+
+def test_the_command_takes_photos_of_the_size_that_a_run_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_degraded_scene(tiny_scene(), tmp_path, parse_degradation("none"), 0)
+    told = []
+    for longest in (1600, 20):
+        monkeypatch.setitem(PRESETS, "standard", replace(PRESETS["standard"], longest=longest))
+        assert main(["plan", str(tmp_path), "--formation", "noise:9"]) == 0
+        found = re.search(r"as\s+much\s+as\s+([\d,]+)\s+sharp", capsys.readouterr().out)
+        assert found is not None
+        told.append(int(found[1].replace(",", "")))
+    assert told[1] < told[0] / 1.2
 
 
 def test_photos_alone_have_a_plan_as_far_as_it_goes(

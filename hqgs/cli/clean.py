@@ -12,6 +12,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, ready, tell_read
 from hqgs.model.formats.files import ANTIALIASED, format_of, scene_file
+from hqgs.training.settings import longest_side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,8 @@ def run(options: Clean) -> int:
                 scene = load_again(options.source, told=screen.stage)
             else:
                 factor = 1.0 if options.downscale is None else options.downscale
-                scene = load(options.photos, downscale=factor, longest=1600, told=screen.stage)
+                longest = longest_side("standard", options.downscale)
+                scene = load(options.photos, downscale=factor, longest=longest, told=screen.stage)
             gaussians = Gaussians.load(source)
             done = clean(gaussians.in_world(scene.world), scene, options.steps or STEPS, told=screen.stage)
         kept = len(done.gaussians)

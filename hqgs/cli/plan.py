@@ -13,6 +13,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Number, Photos, ready
 from hqgs.training.config import AUTO, FORMATION, METHODS, run_config
+from hqgs.training.settings import longest_side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +55,19 @@ def run(options: PlanOptions) -> int:
         from hqgs.training.prepare import Prepared, plan_of_photos
 
         downscale = 1.0 if options.downscale is None else options.downscale
+        longest = longest_side("standard", options.downscale)
         posed = options.out is not None and (options.out / KEPT).exists()
         with LoadingScreen() as screen:
             if posed:
-                scene = load(options.scene, downscale=downscale, cache=options.out, told=screen.stage)
+                scene = load(
+                    options.scene,
+                    downscale=downscale,
+                    longest=longest,
+                    cache=options.out,
+                    told=screen.stage,
+                )
             else:
-                scene = pictures(options.scene, downscale=downscale)
+                scene = pictures(options.scene, downscale=downscale, longest=longest)
             later: list[str] = []
             if len(scene.points):
                 plan = Prepared(scene, config).plan()

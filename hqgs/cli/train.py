@@ -31,6 +31,7 @@ from hqgs.training.settings import (
     PRESETS,
     config_of_values,
     config_values,
+    longest_side,
     read_config,
     with_iterations,
     with_plan,
@@ -321,7 +322,7 @@ def _asked(options: Train, config: TrainConfig) -> dict[str, Any]:
     sized = options.downscale is not None or options.preset != Train.preset
     before = scene_of_run(options.out) if options.resume else {}
     if sized or not before:
-        asked["longest"] = PRESETS[options.preset].longest if options.downscale is None else None
+        asked["longest"] = longest_side(options.preset, options.downscale)
         before.pop("downscale", None)
     if "restore" in asked:
         asked["restore"] = str(asked["restore"])

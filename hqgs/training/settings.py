@@ -32,6 +32,11 @@ PRESETS = {
 }
 
 
+def longest_side(preset: str, downscale: float | None) -> int | None:
+    """Px that a side of the photos may have: as the preset says, where no `downscale` is asked for."""
+    return PRESETS[preset].longest if downscale is None else None
+
+
 def config_values(config: TrainConfig) -> dict[str, Any]:
     """A configuration as JSON values, as `read_config` takes it."""
     return json.loads(json.dumps(asdict(config)))
