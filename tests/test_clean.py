@@ -85,8 +85,9 @@ def test_a_gain_must_exceed_its_scatter() -> None:
 
 
 def test_bad_input_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(ValueError, match="tiny has no held-out photo"):
-        clean(foggy(), replace(scene(), test=[]))
+    for count in (0, 1):
+        with pytest.raises(ValueError, match=f"tiny has {count} held-out photos, wanted at least 2"):
+            clean(foggy(), replace(scene(), test=scene().test[:count]))
     with pytest.raises(ValueError, match="steps is 0, wanted at least 1"):
         clean(foggy(), scene(), steps=0)
     file = tmp_path / "scene.ply"

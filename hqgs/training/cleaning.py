@@ -62,11 +62,12 @@ def clean(
 ) -> Cleaned:
     """The Gaussians fitted on to the scene's training photos for so many steps.
 
-    Same seed, same bits, for any number of threads. ValueError where the scene has no held-out photo, or
-    `steps` is below 1.
+    Same seed, same bits, for any number of threads. ValueError where the scene has fewer than 2 held-out
+    photos, or `steps` is below 1.
     """
-    if not scene.test:
-        raise ValueError(f"{scene.name} has no held-out photo that could tell whether cleaning pays")
+    if len(scene.test) < 2:
+        held = f"{scene.name} has {len(scene.test)} held-out photos"
+        raise ValueError(f"{held}, wanted at least 2: the scatter of their gains tells whether cleaning pays")
     if steps < 1:
         raise ValueError(f"steps is {steps}, wanted at least 1")
     before = _held_out(gaussians, scene)
