@@ -163,8 +163,9 @@ def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(source, "sfm_scene", reconstruct)
     monkeypatch.setattr(source, "restore_scene", restored)
+    monkeypatch.setattr(source, "check_weights", lambda weights: calls.append(("check", weights)))
     scene = hqgs.load("embedded", sfm=True, degrade="noise:25", seed=3, restore="w.pth", cache="kept")
-    assert calls == [("sfm", Path("kept/sfm")), ("restore", "w.pth")]
+    assert calls == [("check", "w.pth"), ("sfm", Path("kept/sfm")), ("restore", "w.pth")]
     by_hand = hqgs.degrade(tiny_scene(), "noise:25", seed=3)
     assert all(np.array_equal(a.image, b.image) for a, b in zip(scene.train, by_hand.train, strict=True))
 

@@ -160,11 +160,20 @@ def test_a_folder_that_another_run_holds_stays_as_it_is(
     assert "another run is writing into" in one_line(capsys)
 
 
+def test_the_folder_of_the_photos_is_no_folder_for_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"")
+    assert call("train", tmp_path, "--out", tmp_path / "." / "") == 2
+    assert one_line(capsys) == f"hqgs: --out {tmp_path} is the folder of the photos: name another for the run"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
         ("--formation", "fog", "hqgs: unknown degradation 'fog'"),
-        ("--restore", "/no/such/weights.pth", "hqgs: "),
+        ("--restore", "/no/such/weights.pth", "hqgs: there is no file of weights /no/such/weights.pth"),
     ],
 )
 def test_bad_settings_of_hqgs_are_exit_code_2(

@@ -109,6 +109,7 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
             ["degrade", "x", "--out", "y", "--degrade", "blur:2"],
             "missing: --kind KIND; there is no option --degrade (h",
         ),
+        (["train", "x", "z", "--out", "y"], "one argument too many: z (hqgs train --help)"),
         (["train", "x"], "missing: --out DIR"),
         (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick',"),
         (["--iterations", "3"], "there is no option '--iterations'"),

@@ -17,6 +17,7 @@ T = TypeVar("T")
 MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
 DEEP = 8  # columns from the border of tyro's boxes on which an option is explained
 WORDS = {  # tyro's, and ours
+    r"Unrecognized options?: (?!-)": "one argument too many: ",
     r"Unrecognized options?:": "there is no option",
     r"Missing from hqgs \w+:": "missing:",
     r"Perhaps you meant:": "- did you mean",

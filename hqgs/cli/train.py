@@ -307,6 +307,8 @@ def _checked(options: Train) -> TrainConfig:
             f"{options.out} holds a run; continue it with --resume, begin anew with --overwrite, or "
             "choose another --out"
         )
+    if options.out.is_dir() and Path(options.scene).is_dir() and options.out.samefile(options.scene):
+        raise ValueError(f"--out {options.out} is the folder of the photos: name another for the run")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"--out {options.out} is a file: name a folder for the run")
     if options.view:

@@ -113,13 +113,20 @@ def restore_scene(scene: Scene, weights: str | Path, config: RestoreConfig = DEF
     return replace(scene, train=train, notes=[*scene.notes, note])
 
 
-def _load(weights: Path) -> tuple[_Network, str]:
-    """The network of a file and the file's SHA-256."""
+def check_weights(weights: str | Path) -> None:
+    """Tell at once of what would fail after minutes: ValueError without spandrel, FileNotFoundError."""
     if importlib.util.find_spec("spandrel") is None:
         raise ValueError(
             "restoring photos needs the optional package spandrel, which is not installed "
             "(pip install 'hqgs[restore]')"
         )
+    if not Path(weights).is_file():
+        raise FileNotFoundError(f"there is no file of weights {weights}")
+
+
+def _load(weights: Path) -> tuple[_Network, str]:
+    """The network of a file and the file's SHA-256."""
+    check_weights(weights)
     import spandrel  # takes a second, and is optional
 
     data = weights.read_bytes()

@@ -18,7 +18,7 @@ from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import film_frames
 from hqgs.scene.load import load_pictures, load_scene
-from hqgs.scene.restore import restore_scene
+from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 
@@ -84,6 +84,8 @@ def load(
         "frames": frames,
     }
     degradation = parse_degradation(degrade)
+    if restore is not None:
+        check_weights(restore)
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
     if is_room(path):

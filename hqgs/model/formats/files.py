@@ -91,5 +91,6 @@ def scene_file(path: str | Path) -> Path:
     if path.is_dir() and not file.is_file() and (path / "meta.json").is_file():
         file = path / "meta.json"
     if not file.is_file():
-        raise FileNotFoundError(f"there is no {file}")
+        wanted = ": give the folder of a run, or a scene file" if path.is_dir() else ""
+        raise FileNotFoundError(f"there is no {file}{wanted}")
     return file
