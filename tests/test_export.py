@@ -253,7 +253,7 @@ def test_a_lost_antialias_flag_is_told(
 
 
 def test_what_the_reading_left_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "a.ply"
+    path = tmp_path / "a.PLY"
     some_gaussians().save(path)
     path.write_bytes(path.read_bytes() + b"end")
     for arguments in (

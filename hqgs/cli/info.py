@@ -14,7 +14,7 @@ from hqgs.base.files import CONFIG, existing_folder
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
 from hqgs.evaluation.verdict import judged_by, verdict
-from hqgs.model.formats.files import READERS, scene_file
+from hqgs.model.formats.files import READERS, has_format, scene_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ def run(options: Info) -> int:
     """Print what is there; return the exit code (0 done, 1 failed, 2 bad input)."""
     path = options.path
     try:
-        if path.is_file() and path.suffix[1:] in READERS:
+        if path.is_file() and has_format(path):
             lines = _file(path)
         elif (path / "report.json").is_file():
             lines = _run(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -64,6 +64,16 @@ WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
 }
 
 
+def has_format(path: Path) -> bool:
+    """Whether the name of a file says a format that is read."""
+    return bool(_fitting(path, [*READERS]))
+
+
+def _fitting(path: Path, known: Sequence[str]) -> list[str]:
+    lower = path.name.lower()
+    return [format for format in known if lower.endswith(f".{format}") or lower == format]
+
+
 def format_of(path: Path, name: str | None = None, *, written: bool = False) -> str:
     """The format of that name, or the one that the file's suffix says. ValueError where there is none, or,
     of a file that is to be `written`, where it is only read."""
@@ -74,8 +84,7 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
         return name
     if path.is_dir() and (path / "meta.json").is_file():
         return "meta.json"
-    lower = path.name.lower()
-    fitting = [format for format in known if lower.endswith(f".{format}") or lower == format]
+    fitting = _fitting(path, known)
     if not fitting:
         raise ValueError(f"{path}: the suffix says no format; wanted .{', .'.join(known)}")
     return max(fitting, key=len)
