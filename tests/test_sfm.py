@@ -138,6 +138,8 @@ def test_the_report_says_how_far_they_are_off(cards: Scene, found: Scene) -> Non
     json.dumps(asdict(report), allow_nan=False)
     assert found.notes == [*cards.notes, str(report)]
     assert "7 of 7 registered" in str(report)
+    behind = str(replace(report, own_cameras_px=None))
+    assert "its own cameras see the new points behind them" in behind
 
 
 def test_no_thread_and_no_held_out_view_changes_a_bit(cards: Scene, found: Scene) -> None:

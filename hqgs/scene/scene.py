@@ -142,7 +142,8 @@ class SfmReport:
     rotation_error_deg: dict[str, float] | None  # of the cameras: "median", "max"
     translation_error: dict[str, float] | None
     own_cameras_px: (
-        float | None  # median distance from where the scene's own cameras see the new points to the photos
+        float | None  # median distance from where the scene's own cameras see the new points to the photos;
+        # None: they have most of them behind them
     )
     points: int
     point_distance: (
@@ -196,12 +197,15 @@ class SfmReport:
         assert rotation is not None
         assert translation is not None
         found = self.photos - len(self.not_registered)
+        seen = "behind them: the files may mean other axes of a camera than they are read with"
+        if self.own_cameras_px is not None:
+            seen = f"{self.own_cameras_px:.2f} px off the photos (median)"
         text = (
             f"poses and points by COLMAP from the training photos: {found} of {self.photos} registered; "
             f"rotations off the scene's own by {rotation['median']:.3f} deg (median) and "
             f"{rotation['max']:.3f} deg (max), centres by {translation['median']:.2%} and "
             f"{translation['max']:.2%} of the extent, so that its own cameras see the new points "
-            f"{self.own_cameras_px:.2f} px off the photos (median); {self.points} points, its own "
+            f"{seen}; {self.points} points, its own "
             f"{self.own_points}, the nearest {self.point_distance:.2%} of the extent away (median); "
             f"{self.track_length:.1f} photos a point, {self.reprojection_error_px:.2f} px off (mean)"
         )

@@ -55,13 +55,14 @@ def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) ->
     apart = np.linalg.norm(camera_centers(viewmats) - camera_centers(own), axis=1) / scene.extent
     distances, _ = KDTree(scene.points).query(points)
     tracks = TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
+    off = float(np.median(misses))  # infinite where the own cameras have most of the points behind them
     report = SfmReport(
         photos=len(views),
         not_registered=[view.name for file, view in views.items() if file not in poses],
         outliers=[view.name for view, inlier in zip(kept, inliers, strict=True) if not inlier],
         rotation_error_deg=_median_and_max(degrees),
         translation_error=_median_and_max(apart),
-        own_cameras_px=float(np.median(misses)),
+        own_cameras_px=off if np.isfinite(off) else None,
         points=len(points),
         point_distance=float(np.median(distances)) / scene.extent,
         track_length=tracks.length,
