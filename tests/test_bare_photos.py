@@ -18,7 +18,7 @@ from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 from hqgs.base.stages import Stage
 from hqgs.cli.progress import LoadingScreen
 from hqgs.photos.exif import read_exif
-from hqgs.photos.files import UnreadableError, check_whole, decode
+from hqgs.photos.files import UnreadableError, decode, glance
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.load import load_pictures, load_scene
 from hqgs.scene.scene import Scene
@@ -72,14 +72,16 @@ def test_exif_tells_orientation_camera_and_focal_length(tmp_path: Path) -> None:
 
 
 def test_photos_share_a_camera_by_size_make_and_zoom(tmp_path: Path) -> None:
-    for name, size, focal in (
-        ("a", (40, 30), 28),
-        ("b", (40, 30), 28),
-        ("c", (40, 30), 56),
-        ("d", (30, 40), 28),
-        ("e", (40, 30), 0),
+    for seed, (name, size, focal) in enumerate(
+        (
+            ("a", (40, 30), 28),
+            ("b", (40, 30), 28),
+            ("c", (40, 30), 56),
+            ("d", (30, 40), 28),
+            ("e", (40, 30), 0),
+        )
     ):
-        picture(0, size).save(tmp_path / f"{name}.jpg", exif=exif(1, focal, "Phone"))
+        picture(seed, size).save(tmp_path / f"{name}.jpg", exif=exif(1, focal, "Phone"))
     found = bare_photos(tmp_path, 1)
     assert found is not None
     guess = readable(found).guess()
@@ -126,8 +128,8 @@ def test_heic_photos_are_read_or_the_extra_is_named(tmp_path: Path, monkeypatch:
     heif.register_heif_opener()
     image = Image.fromarray(np.full((64, 96, 3), (200, 60, 90), np.uint8))
     for k in range(3):
-        image.save(tmp_path / f"{k}.HEIC")
-    assert check_whole(tmp_path / "0.HEIC") == (96, 64)
+        image.resize((96, 64 + 8 * k)).save(tmp_path / f"{k}.HEIC")
+    assert glance(tmp_path / "0.HEIC").size == (96, 64)
     assert np.abs(decode(tmp_path / "0.HEIC")[0].mean((0, 1)) - (200, 60, 90)).max() < 4
     found = bare_photos(tmp_path, 1)
     assert found is not None

@@ -12,7 +12,7 @@ from fixtures_scenes import make_truth, write_colmap
 from PIL import Image, ImageDraw
 
 from hqgs.photos.exif import read_exif
-from hqgs.photos.files import check_whole, decode, decode_mask, stored_format
+from hqgs.photos.files import decode, decode_mask, glance
 from hqgs.scene.load import load_scene
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 
@@ -22,7 +22,7 @@ RED = Image.fromarray(np.full((64, 96, 3), (200, 60, 90), np.uint8))
 def test_a_jpeg_called_heic_is_a_jpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the extra too, which it does not need."""
     for k in range(3):
-        RED.save(tmp_path / f"{k}.HEIC", "jpeg")
+        RED.resize((96, 64 + 8 * k)).save(tmp_path / f"{k}.HEIC", "jpeg")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     found = bare_photos(tmp_path, 1)
     assert found is not None
@@ -37,10 +37,10 @@ def test_a_heic_of_another_suffix_is_read_in_a_new_process(tmp_path: Path, suffi
     heif.register_heif_opener()
     path = tmp_path / f"a{suffix}"
     RED.save(path, "heif")
-    code = f"from hqgs.photos.files import *; print(check_whole(Path({str(path)!r})))"
+    code = f"from hqgs.photos.files import *; print(glance(Path({str(path)!r})).size)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "(96, 64)"
-    assert stored_format(path) == "HEIF"
+    assert glance(path).format == "HEIF"
 
 
 def test_colmap_is_given_what_it_reads(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_colmap_is_given_what_it_reads(tmp_path: Path) -> None:
     assert list(photos.colmap_names) == names
     (tmp_path / "out").mkdir()
     photos.write(tmp_path / "out")
-    assert [stored_format(tmp_path / "out" / name) for name in names] == ["JPEG", "JPEG", "PNG", "JPEG"]
+    assert [glance(tmp_path / "out" / name).format for name in names] == ["JPEG", "JPEG", "PNG", "JPEG"]
 
 
 def disc(width: int = 96, height: int = 72) -> Image.Image:
@@ -114,7 +114,7 @@ def test_orientations_that_there_are_none_of(tmp_path: Path, orientation: int, t
     exif[0x0112] = orientation
     RED.save(tmp_path / "a.jpg", exif=exif)
     assert read_exif(tmp_path / "a.jpg").turn == turn
-    assert check_whole(tmp_path / "a.jpg") == (96, 64)
+    assert glance(tmp_path / "a.jpg").size == (96, 64)
 
 
 def test_the_pictures_of_a_run_are_no_photos(tmp_path: Path) -> None:

@@ -100,5 +100,6 @@ def _photos(path: Path) -> list[str]:
         f"{sum(exif.turn > 0 for exif in photos.exif)} photos lie on their side",
         f"poses: {poses}",
     ]
+    lines += photos.notes
     lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
     return lines

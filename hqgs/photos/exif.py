@@ -11,6 +11,8 @@ from hqgs.photos.files import DECODE_ERRORS, open_photo
 
 _ORIENTATION, _MAKE, _MODEL, _MORE = 274, 271, 272, 0x8769  # tags; the last one is a table of its own:
 _FOCAL, _FOCAL_35MM, _WIDTH, _X_RESOLUTION, _RESOLUTION_UNIT = 37386, 41989, 40962, 41486, 41488
+_GPS = 0x8825  # another such table, with these:
+_NORTH_OR_SOUTH, _LATITUDE, _EAST_OR_WEST, _LONGITUDE, _BELOW_SEA, _ALTITUDE = range(1, 7)
 _MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
 _DIAGONAL = math.hypot(36, 24)  # mm, of 35 mm film
 _TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}  # quarter turns clockwise that show a photo upright
@@ -24,6 +26,7 @@ class Exif:
     turn: int = 0  # quarter turns clockwise that show the stored pixels upright: 0..3
     camera: tuple[str, ...] = ()  # make, model and focal length: photos with the same ones share a camera
     focal: float = 0.0  # px of the stored photo
+    gps: tuple[float, float, float] | None = None  # degrees north and east, m up; nan: no altitude
 
 
 def read_exif(path: Path) -> Exif:
@@ -33,6 +36,7 @@ def read_exif(path: Path) -> Exif:
             width, height = photo.size
             found = photo.getexif()
             more = found.get_ifd(_MORE)
+            gps = _position(found.get_ifd(_GPS))
     except DECODE_ERRORS:
         return Exif()
     turn = _TURNS.get(found.get(_ORIENTATION, 1), 0)
@@ -42,7 +46,7 @@ def read_exif(path: Path) -> Exif:
     names = tuple(str(found.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL))
     lens = f"{_number(more, _FOCAL):g} {_number(more, _FOCAL_35MM):g}"
     known = any(names) or focal > 0
-    return Exif(turn, (*names, lens) if known else (), focal)
+    return Exif(turn, (*names, lens) if known else (), focal, gps)
 
 
 def _focal(more: dict[int, Any], width: int, height: int) -> float:
@@ -52,6 +56,31 @@ def _focal(more: dict[int, Any], width: int, height: int) -> float:
     stored = _number(more, _WIDTH) or max(width, height)  # the sensor's side, if the photo was shrunk since
     per_mm = _number(more, _X_RESOLUTION) / _MM.get(int(_number(more, _RESOLUTION_UNIT)), 25.4)
     return _number(more, _FOCAL) * per_mm * max(width, height) / stored
+
+
+def _position(tags: dict[int, Any]) -> tuple[float, float, float] | None:
+    """Where a photo was taken; None where it is not told, or 0, 0, which phones write without a fix."""
+    north = _degrees(tags.get(_LATITUDE), tags.get(_NORTH_OR_SOUTH), "S")
+    east = _degrees(tags.get(_LONGITUDE), tags.get(_EAST_OR_WEST), "W")
+    if not (abs(north) <= 90 and abs(east) <= 180) or (north, east) == (0, 0):
+        return None
+    try:
+        up = float(tags[_ALTITUDE])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        up = math.nan
+    if tags.get(_BELOW_SEA) in (b"\1", 1):
+        up = -up
+    return north, east, up if math.isfinite(up) else math.nan
+
+
+def _degrees(parts: Any, side: Any, negative: str) -> float:
+    """Degrees, minutes and seconds as one number; nan where they are none."""
+    try:
+        degrees, minutes, seconds = (float(part) for part in parts)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return math.nan
+    value = degrees + minutes / 60 + seconds / 3600
+    return -value if str(side).strip("\0 ").upper() == negative else value
 
 
 def _number(tags: dict[int, Any], tag: int) -> float:

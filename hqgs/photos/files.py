@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
@@ -22,6 +23,7 @@ _HEAD = 64  # bytes that tell HEIC from other files
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1")
 _registering = Lock()
 _LOSSY = ("JPEG", "MPO", "HEIF", "JPEG2000", "AVIF")  # formats that change values around an edge
+GRID = 4  # cells of a glance's small picture, each way
 _HALF = 128  # of 8 bits: from here on a pixel of a lossy mask counts
 
 
@@ -68,14 +70,23 @@ def _register_heic() -> bool:
     return True
 
 
-def check_whole(path: Path) -> tuple[int, int]:
-    """Width and height of a photo that can be decoded to its end. UnreadableError: it cannot."""
+@dataclass(frozen=True)
+class Glance:
+    """What a quick look at a whole photo tells."""
+
+    size: tuple[int, int]  # width and height as stored
+    format: str  # Pillow's name of what the file holds
+    small: NDArray[np.uint8]  # [GRID, GRID], its brightness: nearly the same for the same picture
+
+
+def glance(path: Path) -> Glance:
+    """Look at a photo that can be decoded to its end. UnreadableError: it cannot."""
     try:
         with open_photo(path) as photo:
             size = photo.size
             photo.draft("L", (size[0] // 8, size[1] // 8))  # a JPEG is quickly read like this
-            photo.load()
-            return size
+            small = photo.convert("L").resize((GRID, GRID), Image.Resampling.BOX)
+            return Glance(size, photo.format or "", np.array(small))
     except UnidentifiedImageError as error:
         raise UnreadableError("no picture") from error
     except DECODE_ERRORS as error:
@@ -92,15 +103,6 @@ def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
             return photo.size
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
-
-
-def stored_format(path: Path) -> str:
-    """Pillow's name of what the file holds, such as "JPEG"; empty where it is no picture."""
-    try:
-        with open_photo(path) as photo:
-            return photo.format or ""
-    except DECODE_ERRORS:
-        return ""
 
 
 def is_cut_out(path: Path) -> bool:

@@ -18,14 +18,15 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import (
     PHOTO_SUFFIXES,
+    Glance,
     UnreadableError,
-    check_whole,
     decode,
+    glance,
     needs_heic,
-    stored_format,
 )
 from hqgs.scene.capture import photo_folder
 from hqgs.scene.photo_files import MASKS, is_run
+from hqgs.scene.sfm.front_door import copies, films_beside, photos_below, strays, understood
 from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
@@ -45,6 +46,7 @@ class BarePhotos:
     exif: list[Exif] = field(default_factory=list)  # of each
     unreadable: dict[str, str] = field(default_factory=dict)  # others, and why
     notes: list[str] = field(default_factory=list)
+    strays: dict[str, str] = field(default_factory=dict)  # what seems not to be of their camera, and why
     others: frozenset[str] = frozenset()  # whose files hold what COLMAP does not read, whatever their suffix
 
     @property
@@ -92,20 +94,27 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
         return None
     folder, left, notes = photo_folder(root, downscale) or (root, downscale, [])
     names = _photos_in(folder)
-    if not names:
-        below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != MASKS and p.name[0] != ".")
-        found = {path.name: _photos_in(path) for path in below if not is_run(path)}
+    below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != MASKS and p.name[0] != ".")
+    found = {path.name: inside for path in below if not is_run(path) and (inside := _photos_in(path))}
+    if names:
+        notes = [*notes, *photos_below(folder, names, found)]
+    else:
         names = [f"{inner}/{name}" for inner, inside in found.items() for name in inside]
-        inner = [name for name, inside in found.items() if inside]
+        inner = [*found]
         if len(inner) == 1:
             folder, names = folder / inner[0], found[inner[0]]
         if inner:
             notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
-    return BarePhotos(folder, left, names, notes=notes) if names else None
+    if not names:
+        return None
+    return BarePhotos(folder, left, names, notes=[*notes, *films_beside(folder, names)])
 
 
 def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
     """The photos that can be decoded, with their sizes and EXIF data; the others are in `unreadable`.
+
+    Of those that hold the same pixels one is used, but for frames of a film. The first note says in a line
+    what was understood, as `told` hears.
 
     ValueError where HEIC photos lack the extra that reads them, or less than half can be read.
     """
@@ -114,12 +123,12 @@ def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
             f"{photos.folder}: {len(heic)} of {len(photos.names)} photos are HEIC ({some(heic)}), which "
             "needs the extra 'heic': pip install 'hqgs[heic]'"
         )
-    sizes: dict[str, tuple[int, int]] = {}
+    looked: dict[str, Glance] = {}
     unreadable: dict[str, str] = {}
 
-    def look(name: str) -> tuple[int, int] | str:
+    def look(name: str) -> Glance | str:
         try:
-            return check_whole(photos.folder / name)
+            return glance(photos.folder / name)
         except UnreadableError as error:
             return str(error)
 
@@ -128,18 +137,34 @@ def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
             if isinstance(found, str):
                 unreadable[name] = found
             else:
-                sizes[name] = found
+                looked[name] = found
             told(Stage("photos looked at", k + 1, len(photos.names)))
-    if len(sizes) < len(unreadable):
+    if len(looked) < len(unreadable):
         reasons = some([f"{name} ({why})" for name, why in unreadable.items()])
         raise ValueError(
             f"{photos.folder}: {len(unreadable)} of {len(photos.names)} photos cannot be read: {reasons}"
         )
-    names = list(sizes)
-    exif = [read_exif(photos.folder / name) for name in names]
-    others = frozenset(n for n in names if stored_format(photos.folder / n) not in COLMAP_FORMATS)
+    exif = {name: read_exif(photos.folder / name) for name in looked}
+    film = (photos.folder / FRAMES).is_file()
+    twice = {} if film else copies(photos.folder, looked, exif)
+    notes = list(photos.notes)
+    if twice:
+        pairs = some([f"{name} (of {own})" for name, own in twice.items()])
+        notes.append(f"{len(twice)} of {len(looked)} photos are copies of others and were left out: {pairs}")
+    names = [name for name in looked if name not in twice]
+    looked, tags = {name: looked[name] for name in names}, {name: exif[name] for name in names}
+    if not film:
+        notes.insert(0, understood([*tags.values()], names, len(twice)))
+        told(Stage("photos looked at", len(photos.names), len(photos.names), notes[0]))
     return replace(
-        photos, names=names, sizes=[*sizes.values()], exif=exif, unreadable=unreadable, others=others
+        photos,
+        names=names,
+        sizes=[seen.size for seen in looked.values()],
+        exif=[*tags.values()],
+        unreadable=unreadable,
+        notes=notes,
+        strays={} if film else strays(looked, tags),
+        others=frozenset(name for name, seen in looked.items() if seen.format not in COLMAP_FORMATS),
     )
 
 

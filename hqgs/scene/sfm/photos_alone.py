@@ -16,6 +16,7 @@ from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
+from hqgs.scene.sfm.front_door import tell_strays
 from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.tracks import sureness
 
@@ -90,7 +91,8 @@ def read_photos(
         name = names[file]
         mask = find_mask(root, name)
         found.append(Photo(name, folder / name, of_image[file], viewmat, mask, details.get(name)))
-    notes = [str(cameras.report), *cameras.photos.notes]
+    placed = {photo.name for photo in found}
+    notes = [str(cameras.report), *cameras.photos.notes, *tell_strays(cameras.photos.strays, placed)]
     points, colors = keep_finite(*model_points(model), notes)
     seen = None
     if len(points) == model.num_points3D():

@@ -1,0 +1,144 @@
+"""What people's folders hold beside the photos of one scene: copies, screenshots, films, bursts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from hqgs.base.files import FILM_SUFFIXES
+from hqgs.base.text import some
+from hqgs.photos.exif import Exif
+from hqgs.photos.files import Glance, UnreadableError, decode
+
+_BURST = re.compile(r"(.*?)BURST(\d{8,})?", re.IGNORECASE)  # with the time of a burst, or its photos' numbers
+_ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
+_OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
+_LEAST = 3  # photos of that camera
+_DRAWN = ("PNG", "WEBP", "GIF", "BMP")  # what screens are stored as
+
+
+def copies(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> dict[str, str]:
+    """Photos that hold the same pixels as another, and which other one is used in their place.
+
+    That is the one with EXIF data, highest up, with the shortest name: IMG_1.jpg, not "IMG_1 (1).jpg". Only
+    files that a glance could not tell apart are decoded.
+    """
+    by_size: dict[tuple[int, int], list[str]] = {}
+    for name, seen in looked.items():
+        by_size.setdefault(seen.size, []).append(name)
+    alike: dict[bytes, list[str]] = {}
+    for names in by_size.values():
+        small = np.stack([looked[name].small.ravel().astype(np.int16) for name in names])
+        for name, row in zip(names, small, strict=True):
+            if (np.abs(small - row).max(1) <= _ALIKE).sum() > 1:
+                alike.setdefault(_digest(folder / name), []).append(name)
+    found: dict[str, str] = {}
+    for names in alike.values():
+        best = min(names, key=lambda n: (not exif[n].camera, n.count("/"), len(n), n))
+        found |= {name: best for name in names if name != best}
+    return dict(sorted(found.items()))
+
+
+def _digest(path: Path) -> bytes:
+    """Of the pixels and the mask of a photo; of its bytes where its pixels are of a kind that is not read."""
+    try:
+        pixels, mask = decode(path)
+    except UnreadableError:
+        return sha256(path.read_bytes()).digest()
+    whole = sha256(repr(pixels.shape).encode())
+    whole.update(pixels.tobytes())
+    whole.update(b"" if mask is None else mask.tobytes())
+    return whole.digest()
+
+
+def strays(looked: dict[str, Glance], exif: dict[str, Exif]) -> dict[str, str]:
+    """Pictures among the photos of one camera that it did not take, by name, and what they look like.
+
+    They say nothing of a camera, and have a size that none of its photos has, upright or turned.
+    """
+    own = [name for name, tags in exif.items() if any(tags.camera[:2])]
+    enough = len(own) >= max(_LEAST, _OF_ONE_CAMERA * len(looked))
+    if not enough or len({exif[name].camera[:2] for name in own}) > 1:
+        return {}
+    sizes = {tuple(sorted(looked[name].size)) for name in own}
+    return {
+        name: f"a {'screenshot' if seen.format in _DRAWN else 'picture from elsewhere'} "
+        f"({seen.format} of {seen.size[0]} x {seen.size[1]} px, no camera in EXIF)"
+        for name, seen in looked.items()
+        if not exif[name].camera and tuple(sorted(seen.size)) not in sizes
+    }
+
+
+def tell_strays(strays: dict[str, str], placed: set[str]) -> list[str]:
+    """What became of them, in sentences."""
+    return [
+        f"{name} looks like {what}: "
+        + ("it fits among the photos all the same, and is used" if name in placed else "it was left out")
+        for name, what in strays.items()
+    ]
+
+
+def understood(exif: Sequence[Exif], names: Sequence[str], left_out: int) -> str:
+    """One line: how many photos of how many cameras, and what else their names and EXIF data tell."""
+    cameras = {tags.camera[:2] for tags in exif if any(tags.camera[:2])}
+    known = sum(any(tags.camera[:2]) for tags in exif)
+    text = _count(len(names), "photo")
+    if known == len(names):
+        text += f" of {_count(len(cameras), 'camera')}"
+    else:
+        text += f", {known} of them of {_count(len(cameras), 'camera')}" if known else ", no camera in EXIF"
+    if left_out:
+        text += f", {_count(left_out, 'duplicate')} left out"
+    if located := sum(tags.gps is not None for tags in exif):
+        text += f", GPS in {located}"
+    bursts = [match.group(2) or match.group(1) for name in names if (match := _BURST.match(name))]
+    if bursts:
+        text += f", {len(bursts)} in {_count(len(set(bursts)), 'burst')}"
+    return text
+
+
+def films_beside(folder: Path, names: Sequence[str]) -> list[str]:
+    """What becomes of films that lie beside the photos, in sentences: no film is a second capture."""
+    films = sorted(p for p in folder.iterdir() if p.suffix.lower() in FILM_SUFFIXES and p.name[0] != ".")
+    stems = {Path(name).stem.casefold() for name in names if "/" not in name}
+    live = [p.name for p in films if p.stem.casefold() in stems]
+    others = [p.name for p in films if p.name not in live]
+    told = []
+    if live:
+        told.append(f"{_count(len(live), 'film')} of Live Photos, of which the photos are used: {some(live)}")
+    if others:
+        told.append(
+            f"{_count(len(others), 'film')} beside the photos, which are used alone: {some(others)}; give "
+            f"{folder / others[0]} in place of the folder to use that"
+        )
+    return told
+
+
+def photos_below(folder: Path, names: Sequence[str], below: dict[str, list[str]]) -> list[str]:
+    """That photos in folders further down (`below`, by folder) are not used, and how many are copies."""
+    by_size: dict[int, list[Path]] = {}
+    for name in names:
+        by_size.setdefault((folder / name).stat().st_size, []).append(folder / name)
+    told = []
+    for inner, inside in below.items():
+        paths = [folder / inner / name for name in inside]
+        same = sum(_copied(path, by_size.get(path.stat().st_size, [])) for path in paths)
+        what = f"{_count(len(paths), 'photo')} in the folder {inner}"
+        if same == len(paths):
+            told.append(f"{what}: copies, not used")
+            continue
+        some_same = f", {same} of them copies" if same else ""
+        told.append(f"{what}{some_same}: not used; put those of one scene into one folder to use them")
+    return told
+
+
+def _copied(path: Path, others: list[Path]) -> bool:
+    return bool(others) and any(path.read_bytes() == other.read_bytes() for other in others)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -1,0 +1,163 @@
+"""Folders of photos with what people keep beside them: copies, screenshots, films, bursts, GPS."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from test_bare_photos import exif, picture
+from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
+
+from hqgs.base.stages import Stage
+from hqgs.photos.exif import read_exif
+from hqgs.scene.load import load_scene
+from hqgs.scene.scene import Scene
+from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
+
+
+def looked_at(folder: Path) -> BarePhotos:
+    found = bare_photos(folder, 1)
+    assert found is not None
+    return readable(found)
+
+
+def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
+    for k in range(3):
+        picture(k, (64, 64)).save(tmp_path / f"IMG_{k}.jpg", exif=exif(1, 28, "Phone"))
+    shutil.copy(tmp_path / "IMG_1.jpg", tmp_path / "IMG_1 (1).jpg")
+    with Image.open(tmp_path / "IMG_2.jpg") as photo:
+        photo.save(tmp_path / "A.png")  # the same pixels, without EXIF
+    picture(3).save(tmp_path / "close.png")
+    changed = picture(3)
+    changed.putpixel((4, 5), (1, 2, 3))
+    changed.save(tmp_path / "closer.png")
+    stages: list[Stage] = []
+    found = bare_photos(tmp_path, 1)
+    assert found is not None
+    photos = readable(found, stages.append)
+    assert photos.names == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg", "close.png", "closer.png"]
+    assert len(photos.sizes) == len(photos.exif) == 5
+    assert photos.notes == [
+        "5 photos, 3 of them of 1 camera, 2 duplicates left out",
+        "2 of 7 photos are copies of others and were left out: A.png (of IMG_2.jpg), "
+        "IMG_1 (1).jpg (of IMG_1.jpg)",
+    ]
+    assert stages[-1].note == photos.notes[0]
+
+
+def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
+    for k in range(3):
+        picture(0).save(tmp_path / f"{k}.png")
+    assert looked_at(tmp_path).names == ["0.png"]
+    (tmp_path / "frames.json").write_text("{}")
+    assert looked_at(tmp_path).names == ["0.png", "1.png", "2.png"]
+
+
+def test_photos_in_folders_below_others_are_told_and_copies_among_them(tmp_path: Path) -> None:
+    for name in ("copy", "more", "masks"):
+        (tmp_path / name).mkdir()
+    for k in range(3):
+        picture(k).save(tmp_path / f"{k}.jpg")
+    for name in ("copy", "more"):
+        shutil.copy(tmp_path / "0.jpg", tmp_path / name / "x.jpg")
+    picture(5).save(tmp_path / "more" / "new.jpg")
+    picture(5).save(tmp_path / "masks" / "0.png")
+    assert looked_at(tmp_path).notes == [
+        "3 photos, no camera in EXIF",
+        "1 photo in the folder copy: copies, not used",
+        "2 photos in the folder more, 1 of them copies: not used; put those of one scene into one folder to "
+        "use them",
+    ]
+    for k in range(3):
+        (tmp_path / f"{k}.jpg").unlink()
+    assert looked_at(tmp_path).names == ["copy/x.jpg", "more/new.jpg"]
+
+
+def test_films_beside_photos_are_no_second_capture(tmp_path: Path) -> None:
+    for k in range(3):
+        picture(k).save(tmp_path / f"IMG_{k}.JPG", exif=exif(1, 28, "Phone"))
+    (tmp_path / "IMG_1.MOV").write_bytes(b"a film")
+    (tmp_path / "walk.mp4").write_bytes(b"another one")
+    photos = looked_at(tmp_path)
+    assert photos.notes == [
+        "3 photos of 1 camera",
+        "1 film of Live Photos, of which the photos are used: IMG_1.MOV",
+        "1 film beside the photos, which are used alone: walk.mp4; give "
+        f"{tmp_path / 'walk.mp4'} in place of the folder to use that",
+    ]
+
+
+def test_bursts_and_places_are_counted(tmp_path: Path) -> None:
+    for k, name in enumerate(
+        [
+            "IMG_20240102_030405_BURST001.jpg",
+            "IMG_20240102_030405_BURST002.jpg",
+            "00000IMG_00000_BURST20240203040506789_COVER.jpg",
+            "00001IMG_00001_BURST20240203040506789.jpg",
+            "IMG_7.jpg",
+        ]
+    ):
+        tags = exif(1, 28, "Phone" if k < 3 else "Camera")
+        if k < 2:
+            tags.get_ifd(0x8825).update({1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0)})
+        picture(k).save(tmp_path / name, exif=tags)
+    assert looked_at(tmp_path).notes == ["5 photos of 2 cameras, GPS in 2, 4 in 2 bursts"]
+
+
+@pytest.mark.parametrize(
+    ("tags", "wanted"),
+    [
+        (
+            {1: "N", 2: (48.0, 30.0, 18.0), 3: "E", 4: (9.0, 3.0, 36.0), 5: b"\0", 6: 321.5},
+            (48.505, 9.06, 321.5),
+        ),
+        ({1: "S", 2: (1.0, 0.0, 0.0), 3: "W", 4: (2.0, 0.0, 0.0), 5: b"\1", 6: 3.0}, (-1, -2, -3)),
+        ({1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)}, None),  # no fix
+        ({1: "N", 2: (95.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 1.0)}, None),
+        ({1: "N", 2: (5.0, 0.0, 0.0)}, None),
+    ],
+)
+def test_exif_tells_the_place(
+    tags: dict[int, object], wanted: tuple[float, float, float] | None, tmp_path: Path
+) -> None:
+    own = Image.Exif()
+    own.get_ifd(0x8825).update(tags)
+    picture(0).save(tmp_path / "a.jpg", exif=own)
+    found = read_exif(tmp_path / "a.jpg").gps
+    assert found == (None if wanted is None else pytest.approx(wanted, abs=1e-9))
+
+
+def test_a_place_without_altitude_or_of_zeros_over_zeros(tmp_path: Path) -> None:
+    own = Image.Exif()
+    own.get_ifd(0x8825).update({1: "N", 2: (5.0, 0.0, 0.0), 3: "E", 4: (6.0, 0.0, 0.0)})
+    picture(0).save(tmp_path / "a.jpg", exif=own)
+    found = read_exif(tmp_path / "a.jpg").gps
+    assert found is not None
+    assert found[:2] == (5, 6)
+    assert found[2] != found[2]
+
+
+def test_a_screenshot_is_left_out_where_it_has_no_place_and_used_where_it_has(
+    cards: Scene,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
+    for k, view in enumerate(views):
+        if k == 4:  # a photo that was cut and sent on as PNG
+            Image.fromarray(view.image[: HEIGHT - 6]).save(tmp_path / f"{k}.png")
+        else:
+            photo = Image.fromarray(view.image)
+            photo.save(tmp_path / f"{k}.jpg", exif=exif(1, 0, "Phone"), quality=98)
+    picture(7, (HEIGHT // 2, WIDTH)).save(tmp_path / "shot.png")
+    scene = load_scene(tmp_path)
+    assert scene.sfm is not None
+    assert scene.sfm.not_registered == ["shot.png"]
+    assert scene.notes[1] == "10 photos, 8 of them of 1 camera"
+    size = f"{HEIGHT // 2} x {WIDTH} px"
+    assert scene.notes[2:4] == [
+        f"4.png looks like a screenshot (PNG of {WIDTH} x {HEIGHT - 6} px, no camera in EXIF): it fits among "
+        "the photos all the same, and is used",
+        f"shot.png looks like a screenshot (PNG of {size}, no camera in EXIF): it was left out",
+    ]
