@@ -30,7 +30,7 @@ from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.photo_facts import photo_record
-from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord
+from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord, WorldRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
@@ -323,6 +323,7 @@ def _report(
         scene_bytes=None if out is None else (out / PLY).stat().st_size,
         config=asdict(config),
         plan=rows,
+        world=cast(WorldRecord, {"metres": None} | scene.world.json()),
         sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
         guard=trainer.guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,

@@ -26,6 +26,7 @@ SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 Factor = Annotated["float | None", tyro.conf.arg(metavar="F", help_behavior_hint="")]
 Number = Annotated["int | None", tyro.conf.arg(metavar="N", help_behavior_hint="")]
+Apart = Annotated["tuple[str, str, float] | None", tyro.conf.arg(metavar="A B METRES", help_behavior_hint="")]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 KINDS = (
     "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "

@@ -21,7 +21,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
-from hqgs.cli.scenes import Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.photos.formula import parse_degradation
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 EXPERT = "--config."
 # Options that shape the scene.
-LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames")
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "distance")
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
@@ -81,6 +81,8 @@ class Train(Photos):
     """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
+    distance: Apart = None
+    """Metres between the cameras of the photos A and B: the scene is written in metres."""
     degrade: Kind = "none"
     restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="")] = None
     """Send the training photos through this restoration network first."""

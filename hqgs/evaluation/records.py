@@ -153,6 +153,14 @@ class PlanRowRecord(_Decided, total=False):
     iteration: int  # after which it was decided; none: before the first step
 
 
+class WorldRecord(TypedDict):
+    """The frame of what the run wrote: `World`."""
+
+    unit: float  # of coordinates in memory, in those that were written
+    shift: list[float]
+    metres: float | None  # a written unit is a metre, and one of the files that were read this many
+
+
 class RunRecord(TypedDict):
     """A run without its metrics."""
 
@@ -172,6 +180,7 @@ class RunRecord(TypedDict):
     history: list[HistoryEntry]
     left_out: list[LeftOutRecord]
     guard: GuardRecord
+    world: WorldRecord | None
     sfm: SfmRecord | None  # None: poses and points are the scene's own
     photos: list[PhotoRecord]  # those that were looked at; empty where the method does not ask for it
     ranks: list[RankRecord]  # empty where one process did all

@@ -33,6 +33,7 @@ from hqgs.evaluation.records import (
     Report,
     RunRecord,
     SfmRecord,
+    WorldRecord,
     alike,
 )
 from hqgs.photos.files import PHOTO_SUFFIXES
@@ -75,6 +76,7 @@ class RunResult:
     culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
     views: Sequence[RenderedView] = field(repr=False)
     plan: list[PlanRowRecord] = field(default_factory=list)
+    world: WorldRecord | None = None
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
     photos: list[PhotoRecord] = field(default_factory=list)

@@ -107,8 +107,9 @@ class Gaussians:
         """The same scene, held in another frame, such as that of its photos' cameras (`Scene.world`)."""
         if self.world == world:
             return self
-        means = world.into(self.world.out(self.means.detach().double().numpy()))
-        grown = math.log(self.world.unit / world.unit)
+        ratio = self.world.unlike(world)  # 1, unless one of them is in metres
+        means = world.into(ratio * self.world.out(self.means.detach().double().numpy()))
+        grown = math.log(ratio * self.world.unit / world.unit)
         held = {"means": torch.from_numpy(means).to(self.means.dtype), "scales": self.scales + grown}
         made = self.like(self.named() | held)
         made.world, made.look = world, None

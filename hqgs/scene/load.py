@@ -20,6 +20,7 @@ from hqgs.scene.formats.colmap import find_models, find_models_below, half_model
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
+from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.photo_files import is_run
 from hqgs.scene.place import BEHIND, cut_outs, placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points
@@ -153,6 +154,13 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
     nothing = no_points()
     points, colors = nothing[0].astype(np.float32), nothing[1]
     return Scene(root.name, views, [], points, colors, "photos", notes if photos.unreadable else [])
+
+
+def check_names(path: str | Path, downscale: float, distance: Distance) -> None:
+    """ValueError where photos alone lack one of the two that a distance names: before COLMAP works."""
+    root = existing_folder(path)
+    if not formats_of(root, downscale) and (found := bare_photos(root, downscale)) is not None:
+        named_photos(found.names, distance)
 
 
 def formats_of(root: Path, downscale: float) -> list[str]:

@@ -6,6 +6,7 @@ The command line and `import hqgs` both call what is here, so that both have one
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,8 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import film_frames
-from hqgs.scene.load import load_pictures, load_scene
+from hqgs.scene.load import check_names, load_pictures, load_scene
+from hqgs.scene.metres import distance_of, in_metres
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
@@ -38,6 +40,7 @@ def load(
     cache: str | Path | None = None,
     longest: int | None = None,
     frames: int | None = None,
+    distance: Sequence[str | float] | None = None,
     told: OnStage = untold,
 ) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
@@ -61,6 +64,7 @@ def load(
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
         frames: how many of a film; None: two a second, 30 to 90.
+        distance: (A, B, metres) between the cameras of two photos: what is written is in metres then.
         told: hears what is being done, and how far it is.
 
     Returns:
@@ -82,7 +86,9 @@ def load(
         "skip_unreadable": skip_unreadable,
         "longest": longest,
         "frames": frames,
+        "distance": None if distance is None else [*distance],
     }
+    apart = None if distance is None else distance_of(distance)
     degradation = parse_degradation(degrade)
     if restore is not None:
         check_weights(restore)
@@ -104,6 +110,8 @@ def load(
                 folder = kept or Path(stack.enter_context(TemporaryDirectory(prefix="hqgs-film-")))
                 path, note = film_frames(Path(path), folder / "frames", frames, told)
                 notes.append(note)
+            elif apart is not None:
+                check_names(path, downscale, apart)
             scene = load_scene(
                 path,
                 downscale,
@@ -120,6 +128,7 @@ def load(
     if sfm and (scene.source != "photos" or degradation.steps):
         scene = sfm_scene(scene, models, told)
     scene = scene if restore is None else restore_scene(scene, restore)
+    scene = scene if apart is None else in_metres(scene, apart)
     return replace(scene, origin=origin)
 
 

@@ -24,10 +24,14 @@ Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class World:
-    """Coordinates of the files are `unit * x + shift` of those in memory."""
+    """Coordinates of the files are `unit * x + shift` of those in memory.
 
-    unit: float = 1.0  # a power of two
+    Where the length of a metre was told, what is written is in metres, and unit and shift lead to those.
+    """
+
+    unit: float = 1.0  # a power of two, times `metres`
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    metres: float | None = None  # that a unit of the files that were read has; None: nobody knows
 
     @property
     def ordinary(self) -> bool:
@@ -41,6 +45,10 @@ class World:
     def into(self, points: Array) -> Array:
         """Points [..., 3] of the files in the scene's frame, float64; themselves where that is the same."""
         return points if self.ordinary else (points.astype(np.float64) - self.shift) / self.unit
+
+    def unlike(self, other: World) -> float:
+        """What lengths of this frame's files are multiplied by in those of another one."""
+        return (other.metres or 1.0) / (self.metres or 1.0)
 
     def viewmat_out(self, viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
         """A world-to-camera matrix [4, 4] for the frame of the files; its camera's units are theirs."""
@@ -60,23 +68,27 @@ class World:
 
     def json(self) -> dict[str, Any]:
         """As JSON values."""
-        return {"unit": self.unit, "shift": [*self.shift]}
+        known = {} if self.metres is None else {"metres": self.metres}
+        return {"unit": self.unit, "shift": [*self.shift], **known}
 
     @classmethod
     def of_json(cls, value: Any) -> World:
         """What `json` gave. ValueError for anything else."""
         try:
             unit, shift = float(value["unit"]), tuple(float(x) for x in value["shift"])
+            metres = float(value["metres"]) if "metres" in value else None
         except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise ValueError(f"no unit and shift of a world: {value!r:.80}") from error
-        if not (0 < unit < math.inf) or len(shift) != 3 or not all(map(math.isfinite, shift)):
+        known = metres is None or 0 < metres < math.inf
+        if not (0 < unit < math.inf and known) or len(shift) != 3 or not all(map(math.isfinite, shift)):
             raise ValueError(f"no unit and shift of a world: {value!r:.80}")
-        return cls(unit, (shift[0], shift[1], shift[2]))
+        return cls(unit, (shift[0], shift[1], shift[2]), metres)
 
     def __str__(self) -> str:
         words = []
         if self.unit != 1:
-            words.append(f"a unit of {self.unit:g} of the files' units")
+            units = "of the files' units" if self.metres is None else "m"
+            words.append(f"a unit of {self.unit:g} {units}")
         if any(self.shift):
             words.append(f"the origin at {', '.join(f'{x:.15g}' for x in self.shift)}")
         return " and ".join(words) or "the frame of the files"

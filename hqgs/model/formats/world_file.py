@@ -17,7 +17,8 @@ def keep_world(path: Path, world: World) -> None:
     if world.ordinary:
         beside.unlink(missing_ok=True)
     else:
-        says = "file coordinates of the photos' cameras are unit * x + shift of those in the scene file"
+        whose = "file coordinates of the photos' cameras" if world.metres is None else "metres"
+        says = f"{whose} are unit * x + shift of those in the scene file"
         write_json(beside, {"frame": says, **world.json()})
 
 

@@ -1,0 +1,87 @@
+"""Scenes in metres: from the distance between the cameras of two photos, as somebody has measured it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from hqgs.base.text import some
+from hqgs.scene.scene import Scene
+from hqgs.scene.world import World
+
+Distance = tuple[str, str, float]  # two photos' names, and how many metres lie between their cameras
+
+
+def distance_of(value: Sequence[str | float]) -> Distance:
+    """Two names and metres as they were given. ValueError where they can be no distance."""
+    try:
+        a, b, length = str(value[0]), str(value[1]), float(value[2])
+    except (IndexError, TypeError, ValueError) as error:
+        raise ValueError(f"distance takes two photos' names and metres, got {list(value)}") from error
+    if a == b:
+        raise ValueError(f"distance: both photos are {a!r}; name two whose cameras stood apart")
+    if not 0 < length < math.inf:
+        raise ValueError(f"distance: {length:g} m between {a} and {b}; it must be more than 0")
+    return a, b, length
+
+
+def named_photos(names: Sequence[str], distance: Distance) -> tuple[int, int]:
+    """Where in `names` the two photos are, by whole name, else by its last part, with suffix or without.
+
+    ValueError where one is not among them or could be several, or where both are one.
+    """
+    a, b = (_named(names, wanted) for wanted in distance[:2])
+    if a == b:
+        raise ValueError(f"distance: {distance[0]!r} and {distance[1]!r} are both the photo {names[a]}")
+    return a, b
+
+
+def _named(names: Sequence[str], wanted: str) -> int:
+    key = wanted.replace("\\", "/").casefold()
+    paths = [PurePosixPath(name.casefold()) for name in names]
+    for forms in (
+        names,
+        [str(path) for path in paths],
+        [path.name for path in paths],
+        [path.stem for path in paths],
+    ):
+        found = [k for k, form in enumerate(forms) if form == (wanted if forms is names else key)]
+        if len(found) > 1:
+            raise ValueError(
+                f"distance: {wanted!r} can be {some([names[k] for k in found])}; give one's whole name"
+            )
+        if found:
+            return found[0]
+    near = get_close_matches(key, [str(path) for path in paths], n=1, cutoff=0)
+    which = names[[str(path) for path in paths].index(near[0])] if near else "none"
+    raise ValueError(
+        f"distance: no photo with a camera is called {wanted!r}; the most similar name of the "
+        f"{len(names)} is {which}"
+    )
+
+
+def in_metres(scene: Scene, distance: Distance) -> Scene:
+    """The same scene, which is written in metres: the cameras of the two photos are that far apart then.
+
+    Nothing that is trained or rendered changes. ValueError as `named_photos` raises it, or where both cameras
+    are in one place.
+    """
+    views = [*scene.train, *scene.test]
+    a, b = named_photos([view.name for view in views], distance)
+    world = scene.world
+    apart = float(np.linalg.norm(views[a].camera.center - views[b].camera.center)) * world.unit
+    if not apart > 1e-6 * world.unit * scene.extent:
+        raise ValueError(f"distance: {views[a].name} and {views[b].name} were taken from one place")
+    metres = distance[2] / apart
+    x, y, z = (metres * value for value in world.shift)
+    note = (
+        f"the cameras of {views[a].name} and {views[b].name} are {distance[2]:g} m apart, as --distance "
+        f"says: what is written is in metres (1 unit of the cameras as they were found is {metres:.6g} m)"
+    )
+    made = World(world.unit * metres, (x, y, z), metres)
+    return replace(scene, world=made, notes=[*scene.notes, note])
