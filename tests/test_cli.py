@@ -192,6 +192,10 @@ def test_bad_settings_of_hqgs_are_exit_code_2(
     ("arguments", "message"),
     [
         (["/no/such/scene", "--kind", "blur"], "hqgs: there is no scene folder /no/such/scene"),
+        (
+            ["embeded", "--kind", "blur"],
+            f"hqgs: there is no scene folder {Path('embeded').resolve()}; did you",
+        ),
         (["embedded", "--kind", "jpeg:0"], "hqgs: jpeg is 0, wanted a quality, an integer in 1..95"),
         (["embedded", "--kind", "noise:9", "--seed", "-1"], "hqgs: seed is -1, wanted at least 0"),
         (["embedded", "--kind", "blur:20"], "hqgs: photo 'view1.png': a blur of sigma 20 px reaches 80 px"),

@@ -60,6 +60,8 @@ def existing_folder(path: str | Path) -> Path:
             names = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()]
             alike = get_close_matches(folder.name, names, n=1)
             near = f"; did you mean {folder.parent / alike[0]}?" if alike else ""
+        if not near and (alike := get_close_matches(str(path), ROOMS, n=1)):
+            near = f"; did you mean the built-in {alike[0]}?"
         raise FileNotFoundError(f"there is no scene folder {folder}{near}")
     if folder.is_dir():
         if all(entry.name.startswith(".") for entry in folder.iterdir()):

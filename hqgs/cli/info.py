@@ -55,7 +55,7 @@ def _file(path: Path) -> list[str]:
     box = ", ".join(f"{low:.3g} to {high:.3g}" for low, high in zip(lowest, highest, strict=True))
     return [
         f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
-        f"{path.stat().st_size / 1e6:.1f} MB",
+        f"{path.stat().st_size / 1e6:.3g} MB",
         f"nine tenths of them lie in x, y, z: {box}",
         *(f"read: {note}" for note in gaussians.notes),
     ]
@@ -96,8 +96,8 @@ def _photos(path: Path) -> list[str]:
     lines = [
         f"{root}: {len(photos.names)} photos of {', '.join(f'{w} x {h}' for w, h in sizes[:4])} px"
         + (" and other sizes" if len(sizes) > 4 else ""),
-        f"cameras: {len(guess.sizes)}, the focal length of {focal} is in EXIF; "
-        f"{sum(exif.turn > 0 for exif in photos.exif)} photos lie on their side",
+        f"cameras: {len(guess.sizes)}; EXIF tells the focal length of {focal} photos, and that "
+        f"{sum(exif.turn > 0 for exif in photos.exif)} lie on their side",
         f"poses: {poses}",
     ]
     lines += photos.notes
