@@ -399,10 +399,10 @@ def test_a_path_that_was_made_in_the_page_is_rendered(folder: Path, tmp_path: Pa
 def test_view_ends_by_itself_and_says_where_to_look(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert view.run(view.View(source=folder, port=0), seconds=0.1) == 0
+    assert view.run(view.ViewOptions(source=folder, port=0), seconds=0.1) == 0
     assert "look at http://127.0.0.1:" in capsys.readouterr().out
     hqgs.Gaussians.load(folder).save(tmp_path / "bare.ply")
-    assert view.run(view.View(source=tmp_path / "bare.ply", port=0), seconds=0.1) == 0
+    assert view.run(view.ViewOptions(source=tmp_path / "bare.ply", port=0), seconds=0.1) == 0
     assert cli.main(["view", str(tmp_path / "nothing")]) == 2
     assert "there is no" in capsys.readouterr().err
 
