@@ -324,6 +324,7 @@ def _report(
         config=asdict(config),
         plan=rows,
         world=cast(WorldRecord, {"metres": None} | scene.world.json()),
+        place=None if scene.place is None else asdict(scene.place),
         sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
         guard=trainer.guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,

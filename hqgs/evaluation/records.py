@@ -181,6 +181,7 @@ class RunRecord(TypedDict):
     left_out: list[LeftOutRecord]
     guard: GuardRecord
     world: WorldRecord | None
+    place: dict[str, Json] | None  # `Georeference`, by the photos' GPS; None: it does not tell
     sfm: SfmRecord | None  # None: poses and points are the scene's own
     photos: list[PhotoRecord]  # those that were looked at; empty where the method does not ask for it
     ranks: list[RankRecord]  # empty where one process did all

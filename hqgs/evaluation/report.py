@@ -77,6 +77,7 @@ class RunResult:
     views: Sequence[RenderedView] = field(repr=False)
     plan: list[PlanRowRecord] = field(default_factory=list)
     world: WorldRecord | None = None
+    place: dict[str, Json] | None = None
     sfm: SfmRecord | None = None
     learned: list[LearnedRecord] = field(default_factory=list)
     photos: list[PhotoRecord] = field(default_factory=list)

@@ -22,7 +22,7 @@ from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.photo_files import is_run
-from hqgs.scene.place import BEHIND, cut_outs, placed, without_missing, without_strays
+from hqgs.scene.place import BEHIND, cut_outs, located, placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -110,6 +110,8 @@ def load_scene(
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)
     tracks = _tracks(capture, views)
+    if (place := located(capture)) is not None:
+        notes.append(str(place))
     return Scene(
         root.name,
         train,
@@ -122,6 +124,7 @@ def load_scene(
         capture.seen,
         capture.sfm,
         world=capture.world,
+        place=place,
     )
 
 

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
+from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
+from hqgs.scene.georeference import LEAST, Georeference, georeference
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
 
@@ -87,6 +89,16 @@ def placed(capture: Capture, notes: list[str]) -> Capture:
     photos = [replace(photo, viewmat=world.viewmat_into(photo.viewmat)) for photo in capture.photos]
     bounds = {k: (near / world.unit, far / world.unit) for k, (near, far) in capture.near_far.items()}
     return replace(capture, photos=photos, points=world.into(capture.points), near_far=bounds, world=world)
+
+
+def located(capture: Capture) -> Georeference | None:
+    """Where on Earth the frame of the capture's files is, by the GPS of its photos; None: nothing tells."""
+    gps = [read_exif(photo.path).gps for photo in capture.photos]
+    rows = [k for k, place in enumerate(gps) if place is not None]
+    if len(rows) < LEAST:
+        return None
+    centers = capture.world.out(_centers(capture))[rows].astype(np.float64)
+    return georeference(centers, [place for place in gps if place is not None])
 
 
 def _without(capture: Capture, gone: set[str]) -> Capture:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.georeference import Georeference
 from hqgs.scene.world import World
 
 MOST_DEPTHS = 1 << 22  # that `Scene.reach` looks at: they and their median take some 120 MB
@@ -73,6 +74,7 @@ class Scene:
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
     world: World = field(default_factory=World)  # the frame of its files, where that is another
+    place: Georeference | None = None  # on Earth, of the files' frame; None: nothing tells
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""

@@ -1,0 +1,187 @@
+"""Where on Earth a scene is, and how large: from the places that GPS gave its photos.
+
+The similarity from camera centres to metres east, north and up (Umeyama 1991) is fitted to most photos: with
+twelve and more of them, those that lie far from the best fit of three (least median of squares, Rousseeuw
+1984) do not count. How sure its scale is follows from what is left over, per axis, as errors of GPS are
+larger upwards; errors that all photos share cannot be seen and do not count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+LEAST = 4  # photos with a place
+ROBUST_FROM = 12  # photos; of fewer every one counts
+SPREAD = 3.0  # times what is left over: less, and GPS says nothing of the scale
+TRIPLES = 100  # of photos that are tried, at most
+FAR = 3.5  # median errors: what lies beyond does not count
+ROUNDS = 5
+_A, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: semi-major axis, m, and squared eccentricity
+
+Array = NDArray[np.float64]
+Gps = tuple[float, float, float]  # degrees north and east, metres above the ellipsoid or the sea, or nan
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """A similarity from the frame of a scene's files to metres east, north and up. JSON values only."""
+
+    scale: float  # metres of a unit of the files
+    interval: list[float]  # two values: the true scale lies between in 95 % of cases
+    rotation: list[list[float]]  # [3, 3], from the axes of the files to east, north, up
+    up: list[float]  # [3], up in the frame of the files
+    origin: list[
+        float
+    ]  # degrees north, degrees east, m: where the origin of the files lies; two: no altitude
+    photos: int  # that have a place
+    used: int  # of them
+    residual: float  # m, root of the mean square of what is left over
+    spread: float  # m, root of the mean square distance of the photos' places from their middle
+
+    def __str__(self) -> str:
+        north, east, *above = self.origin
+        lower, upper = self.interval
+        place = f"{north:.6f}, {east:.6f}" + "".join(f", {value:.1f} m" for value in above)
+        up = ", ".join(f"{value:.3f}" for value in self.up)
+        return (
+            f"GPS of {self.used} of {self.photos} photos: a unit is {self.scale:.4g} m (95 % interval "
+            f"{lower:.4g} to {upper:.4g}), up is ({up}), the origin lies at {place}; places are "
+            f"{self.residual:.2g} m off (they spread over {self.spread:.3g} m)"
+        )
+
+
+def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
+    """The place of a scene with camera centres [N, 3] in the frame of its files, and GPS of each.
+
+    None where that does not tell: fewer than LEAST photos or different places, or places that spread less
+    than SPREAD times as far as they are off. Fewer than LEAST altitudes: all count as equally high.
+    """
+    gps = np.asarray(places, np.float64).reshape(-1, 3)
+    high = np.isfinite(gps[:, 2])
+    level = int(high.sum()) < LEAST
+    if level:
+        gps = np.column_stack([gps[:, :2], np.zeros(len(gps))])
+    else:
+        gps, centers = gps[high], centers[high]
+    if len(np.unique(gps, axis=0)) < LEAST:
+        return None
+    start = np.median(gps, axis=0)
+    target = _enu(gps, start)
+    used = np.ones(len(target), bool) if len(target) < ROBUST_FROM else _agreeing(centers, target)
+    fit = similarity(centers[used], target[used])
+    if fit is None or used.sum() < max(LEAST, len(target) / 2):
+        return None
+    scale, R, shift = fit
+    off = target[used] - (scale * centers[used] @ R.T + shift)
+    count = int(used.sum())
+    axes = (off**2).sum(0) / max(count - 7 / 3, 1)  # variance along each; 7 values were fitted to 3 N
+    spread = math.sqrt(float(((target[used] - target[used].mean(0)) ** 2).sum() / count))
+    residual = math.sqrt(float(axes.sum()))
+    if not spread > SPREAD * residual:
+        return None
+    turned = (centers[used] - centers[used].mean(0)) @ R.T
+    power = float((turned**2).sum())
+    error = math.sqrt(float((turned**2 @ axes).sum())) / power
+    sure = float(student.ppf(0.975, 3 * count - 7)) * error
+    north, east, above = _geodetic(shift, start)
+    return Georeference(
+        scale=scale,
+        interval=[max(scale - sure, 0.0), scale + sure],
+        rotation=R.tolist(),
+        up=R[2].tolist(),
+        origin=[north, east] if level else [north, east, above],
+        photos=len(places),
+        used=count,
+        residual=residual,
+        spread=spread,
+    )
+
+
+def similarity(source: Array, target: Array) -> tuple[float, Array, Array] | None:
+    """Scale, rotation [3, 3] and shift [3] that take source [N, 3] to target in least squares (Umeyama 1991).
+
+    None where the source lies on a line, so that any turn about it would do.
+    """
+    middle, aim = source.mean(0), target.mean(0)
+    a, b = source - middle, target - aim
+    U, values, Vt = np.linalg.svd(b.T @ a)
+    own = np.linalg.svd(a, compute_uv=False)
+    if not own[1] > 1e-3 * own[0]:
+        return None
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt)) or 1.0])
+    R = (U * sign) @ Vt
+    scale = float((values * sign).sum() / (a**2).sum())
+    return (scale, R, aim - scale * R @ middle) if scale > 0 else None
+
+
+def _agreeing(source: Array, target: Array) -> NDArray[np.bool_]:
+    """Which of the points agree with most of the others, [N]."""
+    count = len(source)
+    rng = np.random.default_rng(0)
+    triples = list(combinations(range(count), 3)) if math.comb(count, 3) <= TRIPLES else []
+    while len(triples) < min(TRIPLES, math.comb(count, 3)):
+        triples.append(tuple(sorted(rng.choice(count, 3, replace=False).tolist())))
+    best, least = np.full(count, math.inf), math.inf
+    for triple in triples:
+        off = _off(source, target, np.array(triple))
+        if off is not None and (median := float(np.median(off))) < least:
+            best, least = off, median
+    used = best <= np.median(best)
+    for _ in range(ROUNDS):
+        off = _off(source, target, np.flatnonzero(used))
+        if off is None:
+            break
+        again = off <= FAR * np.median(off)
+        if (again == used).all():
+            break
+        used = again
+    return used
+
+
+def _off(source: Array, target: Array, rows: NDArray[np.intp]) -> Array | None:
+    """How far each point lies from where the similarity of some rows takes it, [N]."""
+    fit = similarity(source[rows], target[rows])
+    if fit is None:
+        return None
+    scale, R, shift = fit
+    return np.linalg.norm(target - (scale * source @ R.T + shift), axis=1)
+
+
+def _ecef(gps: Array) -> Array:
+    """Geocentric metres [..., 3] of degrees north, degrees east and metres of height [..., 3], on WGS84."""
+    north, east, up = np.radians(gps[..., 0]), np.radians(gps[..., 1]), gps[..., 2]
+    normal = _A / np.sqrt(1 - _E2 * np.sin(north) ** 2)
+    flat = (normal + up) * np.cos(north)
+    return np.stack([flat * np.cos(east), flat * np.sin(east), (normal * (1 - _E2) + up) * np.sin(north)], -1)
+
+
+def _axes(start: Array) -> Array:
+    """East, north and up at a place, as rows [3, 3] in the geocentric frame."""
+    north, east = np.radians(start[:2])
+    s, c, se, ce = np.sin(north), np.cos(north), np.sin(east), np.cos(east)
+    return np.array([[-se, ce, 0], [-s * ce, -s * se, c], [c * ce, c * se, s]])
+
+
+def _enu(gps: Array, start: Array) -> Array:
+    """Metres east, north and up of `start`, [N, 3]."""
+    return (_ecef(gps) - _ecef(start)) @ _axes(start).T
+
+
+def _geodetic(enu: Array, start: Array) -> tuple[float, float, float]:
+    """Degrees north and east, and metres of height, of a point [3] in metres from `start`."""
+    x, y, z = _ecef(start) + enu @ _axes(start)
+    flat = math.hypot(x, y)
+    north = math.atan2(z, flat * (1 - _E2))
+    for _ in range(10):  # each takes the error down by some 300 times
+        normal = _A / math.sqrt(1 - _E2 * math.sin(north) ** 2)
+        north = math.atan2(z + _E2 * normal * math.sin(north), flat)
+    normal = _A / math.sqrt(1 - _E2 * math.sin(north) ** 2)
+    up = flat * math.cos(north) + z * math.sin(north) - _A * math.sqrt(1 - _E2 * math.sin(north) ** 2)
+    return math.degrees(north), math.degrees(math.atan2(y, x)), up
