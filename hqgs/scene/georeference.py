@@ -15,7 +15,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 LEAST = 4  # photos with a place
 ROBUST_FROM = 12  # photos; of fewer every one counts
@@ -86,10 +85,12 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     residual = math.sqrt(float(axes.sum()))
     if not spread > SPREAD * residual:
         return None
+    from scipy.special import stdtrit  # here: to read a scene does not need it
+
     turned = (centers[used] - centers[used].mean(0)) @ R.T
     power = float((turned**2).sum())
     error = math.sqrt(float((turned**2 @ axes).sum())) / power
-    sure = float(student.ppf(0.975, 3 * count - 7)) * error
+    sure = float(stdtrit(3 * count - 7, 0.975)) * error
     north, east, above = _geodetic(shift, start)
     return Georeference(
         scale=scale,
