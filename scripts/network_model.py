@@ -10,13 +10,13 @@ one while the harmonics are updated, but for the first message.
 
 from __future__ import annotations
 
-import json
+import csv
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-SPEED = ROOT / "docs" / "results" / "speed.json"
+SPEED = ROOT / "docs" / "results" / "speed.csv"
 BYTES, FIRST = 60, 12  # of a visible Gaussian; of them in the first message
 RATES = 1e9, 10e9, 25e9  # bit/s
 SIZES = 100_000, 1_000_000, 10_000_000
@@ -36,10 +36,9 @@ class Model:
     @staticmethod
     def of(cores: int, smaller: int = 100_000, larger: int = 500_000) -> Model:
         """By what was measured, as if cores shared the work evenly."""
-        report = json.loads(SPEED.read_text(encoding="utf-8"))
-        seconds = {
-            at["gaussians"]: at["seconds"] * report["threads"] for at in report["results"]["rasterizer"]
-        }
+        with SPEED.open(encoding="utf-8", newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["part"] == "rasterizer"]
+        seconds = {int(row["gaussians"]): float(row["seconds"]) * int(row["threads"]) for row in rows}
         each = (seconds[larger] - seconds[smaller]) / (larger - smaller)
         return Model(seconds[smaller] - each * smaller, each, cores)
 

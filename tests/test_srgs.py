@@ -211,16 +211,6 @@ def test_a_wrong_low_photo_is_named(low: NDArray[np.float32], message: str) -> N
         SRGS(SRGSConfig()).prepare(view)
 
 
-def test_two_photos_of_one_name_are_each_their_own_tie() -> None:
-    scene = tiny_scene()
-    white = replace(scene.train[0], image=np.full_like(scene.train[0].image, 255))
-    trainer = Trainer(replace(scene, train=[scene.train[0], white]), tiny_config(method="srgs"))
-    for _ in range(4):
-        step = trainer.step()
-        expected = loss_of(SRGS(SRGSConfig()), step.render, step.view)
-        assert step.loss == expected.item()
-
-
 def test_wrong_values_are_named() -> None:
     with pytest.raises(ValueError, match=r"texture_weight is 1\.5"):
         SRGSConfig(texture_weight=1.5)

@@ -35,10 +35,11 @@ def opacity_decay(draft: Draft) -> Sequence[Choice]:
 
 
 def dropout(draft: Draft) -> Sequence[Choice]:
+    """Not where cameras are learned: shaken photos of the built-in room lose SSIM by it."""
     asked, photos = draft.asked.dropout, draft.facts.photos
     if asked is not None:
         return [Choice(f"up to {asked:.0%} of the Gaussians in a step", "asked for")]
-    if not draft.undegraded or photos > FEWEST:
+    if not draft.facts.as_photographed or not draft.undegraded or photos > FEWEST:
         return []
     why = "no Gaussian may explain a photo alone"
     value = f"up to {DROPOUT:.0%} of the Gaussians in a step"

@@ -78,7 +78,7 @@ def photograph(dtype: type) -> None:
     warps = 1e-3 * rng.normal(size=(3, 3, 4))
     state, photo = _rust.exposure_forward(image, [HEIGHT, WIDTH], nearness, warps, [0.9, 1.0, 1.1])
     look(photo)
-    v_image, v_warps, v_gains = _rust.exposure_backward(state, np.ones_like(photo))
+    v_image, v_warps, v_gains = _rust.exposure_backward(state, np.ones((HEIGHT, WIDTH, 3), dtype))
     look(v_image, v_warps, np.array(v_gains))
 
 
