@@ -14,6 +14,7 @@ from hqgs.base.files import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
 from hqgs.base.stages import OnStage, Stage, untold
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
+from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
@@ -95,6 +96,9 @@ def load_scene(
     views, unreadable = load_views(capture.photos, capture.downscale, optional, told, over)
     if degraded is not None and downscale == 1:
         views = _with_lows(views, degraded, root, optional, unreadable)
+    if capture.source == "transforms" and not len(capture.points):
+        views, turned = with_true_axes(views)
+        notes += [] if turned is None else [turned]
     train = [v for v in views if v.name not in test_names]
     test = [v for v in views if v.name in test_names]
     if not train_names:

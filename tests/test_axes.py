@@ -1,0 +1,55 @@
+"""A transforms.json whose cameras have OpenCV's axes is noticed by matches between its photos."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import hqgs
+from hqgs.scene.axes import TURNED, with_true_axes
+from hqgs.scene.builtin.shading import render_view
+from hqgs.scene.builtin.sparse import sparse_cameras
+from hqgs.scene.scene import View
+
+
+@cache
+def views() -> tuple[View, ...]:
+    """Photos of the room by neighbours on its arc."""
+    cameras = sparse_cameras(200, 150, 25)[9:13]
+    return tuple(View(f"view_{k}.png", camera, render_view(camera)) for k, camera in enumerate(cameras))
+
+
+@pytest.mark.parametrize("opencv", [False, True])
+def test_axes_of_transforms_json(opencv: bool, tmp_path: Path) -> None:
+    frames = []
+    for view in views():
+        Image.fromarray(np.asarray(view.image)).save(tmp_path / view.name)
+        pose = np.linalg.inv(view.camera.viewmat) @ (np.eye(4) if opencv else TURNED)
+        frames.append({"file_path": view.name, "transform_matrix": pose.tolist()})
+    camera = views()[0].camera
+    K = {"fl_x": camera.K[0, 0], "fl_y": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
+    content = {"w": camera.width, "h": camera.height, **K, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    scene = hqgs.load(tmp_path, test_every=0)
+    for view, truth in zip(scene.train, views(), strict=True):
+        np.testing.assert_allclose(view.camera.viewmat, truth.camera.viewmat, atol=1e-9)
+    said = [note for note in scene.notes if "y and z are turned" in note]
+    assert len(said) == opencv
+
+
+def test_photos_that_do_not_match_tell_nothing() -> None:
+    rng = np.random.default_rng(0)
+    noise = [
+        View(view.name, view.camera, rng.integers(0, 256, view.image.shape, dtype=np.uint8))
+        for view in views()
+    ]
+    kept, note = with_true_axes(noise)
+    assert note is None
+    assert kept == noise
+    assert with_true_axes([]) == ([], None)
+    assert with_true_axes(noise[:1])[1] is None
