@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures_scenes import Truth, make_truth, write_colmap
+from fixtures_scenes import Truth, make_truth, write_colmap, write_transforms
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -231,3 +231,15 @@ def test_training_decides_the_same(tmp_path: Path) -> None:
     for count, shown in models[1:]:
         assert count == models[0][0]
         assert (shown - models[0][1]).abs().mean() < 1e-3
+
+
+def test_a_walk_away_from_most_photos_is_no_mistake(tmp_path: Path) -> None:
+    """Without points nothing tells that a camera far off is wrong."""
+    truth = make_truth(9)
+    viewmats = truth.viewmats.copy()
+    viewmats[7:, 2, 3] += 600.0  # of nine cameras four units from the origin
+    write_transforms(replace(truth, viewmats=viewmats), tmp_path)
+    scene = hqgs.load(tmp_path, test_every=0)
+    assert len(scene.train) == 9
+    assert not any("lie far" in note for note in scene.notes)
+    assert scene.extent < 20

@@ -18,7 +18,6 @@ from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
 
 FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
-FAR_ALONE = 50.0  # the same where there are no points
 SHOWN = 0.02  # of a photo's sides, which the points must span at least
 LOOKED_AT = 1000  # points
 BEHIND = (0.0, 0.0, 0.0)  # cut-out photos: what renders have behind everything, unless they are told
@@ -45,22 +44,21 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
     """The capture without cameras that lie far from all others and show nothing; `notes` names them.
 
     A camera over FAR_OFF times as far away as half of them goes if the points are outside of its picture, or
-    a dot in it: its pose is a mistake of the reconstruction. Without points it goes over FAR_ALONE times.
+    a dot in it: its pose is a mistake of the reconstruction. Without points nothing tells a mistake from a
+    walk that leaves a room in which most photos were taken.
     """
-    if len(capture.photos) < 4:
+    if len(capture.photos) < 4 or not len(capture.points):
         return capture
-    centers = _centers(capture)
     points = capture.points[:: max(1, len(capture.points) // LOOKED_AT)].astype(np.float64)
-    far = strays(centers, FAR_OFF if len(points) else FAR_ALONE)
+    far = strays(_centers(capture), FAR_OFF)
     gone = {
         photo.name
         for photo, away in zip(capture.photos, far, strict=True)
-        if away and not (len(points) and _shows(photo, points))
+        if away and not _shows(photo, points)
     }
     if gone:
-        blind = ", show none of the points" if len(points) else ""
         notes.append(
-            f"{len(gone)} of {len(capture.photos)} cameras lie far from all others{blind} "
+            f"{len(gone)} of {len(capture.photos)} cameras lie far from all others, show none of the points "
             f"and were left out: {some(sorted(gone))}"
         )
     return _without(capture, gone)
