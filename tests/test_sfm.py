@@ -267,7 +267,8 @@ def test_a_folder_of_photos_alone_becomes_a_scene(cards: Scene, tmp_path: Path) 
         Image.fromarray(view.image).save(folder / view.name.replace(".jpg", ".png"))
     scene = load_scene(folder, told=heard.append)
     above = f"{tmp_path} holds cameras and points (transforms.json), which are not read: give that folder"
-    assert [stage.note for stage in heard if stage.note] == [f"{above} to train with them"]
+    told = [stage.note for stage in heard if stage.note]
+    assert told == [f"{above} to train with them", "9 photos, no camera in EXIF"]
     assert scene.notes[-1].startswith(above)
     assert [view.name for view in scene.test] == ["photo 0.png", "photo 8.png"]
     assert len(scene.train) == 7
