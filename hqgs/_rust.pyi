@@ -56,7 +56,7 @@ def project_forward(
     height: int,
     options: tuple[float, float, float, float, bool, bool],
     sh_degree: int | None,
-    knobs: tuple[float, float, str, bool, int] | None = None,
+    knobs: tuple[float, float, str, bool] | None = None,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
 def project_backward(
     frame: Frame,

@@ -392,7 +392,7 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         _rust.add_rows([(rows, values)], sums, 0.5)
 
     def add_harmonics(rows: Any, colors: Any, means: Any, high: Any) -> None:
-        _rust.add_harmonics([(rows, colors, (0.0, 0.0, 0.0), 1)], means, high, 0.5)
+        _rust.add_harmonics([(rows, colors, [0.0, 0.0, 0.0], 1)], means, high, 0.5)
 
     def agreed_depths(others: Any, **arguments: Any) -> Any:
         return _rust.agreed_depths(others=[others], **arguments)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def disc(width: int = 96, height: int = 72) -> Image.Image:
     ("suffix", "options"),
     [(".jpg", {"quality": 40}), (".png", {}), (".webp", {"quality": 40}), (".webp", {"lossless": True})],
 )
-def test_masks_show_their_true_share(tmp_path: Path, suffix: str, options: dict[str, object]) -> None:
+def test_masks_show_their_true_share(tmp_path: Path, suffix: str, options: dict[str, Any]) -> None:
     """A lossy file blurs the edge into its blocks: half of white counts there."""
     true = np.asarray(disc()) > 0
     path = tmp_path / f"mask{suffix}"

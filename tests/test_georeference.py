@@ -21,7 +21,7 @@ def draw(seed: int, count: int, noise: float, wrong: int = 0) -> tuple[np.ndarra
     """Camera centres in a turned frame, 20 m to the unit, and their GPS; up in that frame."""
     rng = np.random.default_rng(seed)
     centers = rng.normal(size=(count, 3)) * [1, 1, 0.3]
-    R = Rotation.random(random_state=seed).as_matrix()
+    R = Rotation.random(None, np.random.default_rng(seed)).as_matrix()
     metres = 20 * centers + rng.normal(size=(count, 3)) * np.array([1, 1, 2]) * noise
     metres[:wrong] += rng.normal(size=(wrong, 3)) * 200
     gps = [(NORTH + y / METRES[0], EAST + x / METRES[1], 320 + z) for x, y, z in metres.tolist()]

@@ -182,7 +182,7 @@ def test_sureness_is_what_a_pose_is_off_by_noise(
         mine = tracks.view == k
         inside = images[name].cam_from_world() * tracks.points[tracks.point[mine]]
         where[mine] = images[name].camera.img_from_cam(inside)
-    moved = []
+    moved, noisy = list[float](), model
     for _ in range(10):
         noisy = rebuilt(model, names, replace(tracks, xy=where + sigma * rng.standard_normal(where.shape)))
         options = pycolmap.BundleAdjustmentOptions()

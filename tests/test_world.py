@@ -32,7 +32,7 @@ PLACES = [(1e-3, 0.0), (1e3, 0.0), (1.0, 5e6), (1e-3, 5e6), (1e3, 5e6)]
 
 def placed(truth: Truth, scale: float, shift: np.ndarray, seed: int | None = None) -> Truth:
     """The scene x -> scale R x + shift, R at random (the unit without a seed)."""
-    R = np.eye(3) if seed is None else Rotation.random(random_state=seed).as_matrix()
+    R = np.eye(3) if seed is None else Rotation.random(None, np.random.default_rng(seed)).as_matrix()
     viewmats = truth.viewmats.copy()
     for viewmat in viewmats:
         viewmat[:3, :3] = viewmat[:3, :3] @ R.T
