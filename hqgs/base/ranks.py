@@ -222,16 +222,22 @@ class _Joined(Ranks):
 
     def _swap(self, outs: dict[int, Tensor], ins: dict[int, Tensor]) -> None:
         """Send and receive with each of the others at once."""
-        works = [(k, self._dist.irecv(tensor, src=k)) for k, tensor in ins.items()]
-        works += [(k, self._dist.isend(tensor, dst=k)) for k, tensor in outs.items()]
+        receive, send = self._dist.irecv, self._dist.isend
+        works = [(k, _heard(k, lambda k=k, t=tensor: receive(t, src=k))) for k, tensor in ins.items()]
+        works += [(k, _heard(k, lambda k=k, t=tensor: send(t, dst=k))) for k, tensor in outs.items()]
         self.sent += sum(tensor.nbytes for tensor in outs.values())
         for k, work in works:
             assert work is not None  # this rank is of the group
-            try:
-                work.wait()
-            except RuntimeError as error:
-                silent = f"was silent for {SILENCE:.0f} s" if "imed out" in str(error) else "has gone"
-                raise RankError(f"rank {k} {silent}: it was stopped, or its machine was cut off") from error
+            _heard(k, work.wait)
+
+
+def _heard(rank: int, call: Callable[[], T]) -> T:
+    """What a call that needs another rank gives; RankError where that one has gone."""
+    try:
+        return call()
+    except RuntimeError as error:
+        silent = f"was silent for {SILENCE:.0f} s" if "imed out" in str(error) else "has gone"
+        raise RankError(f"rank {rank} {silent}: it was stopped, or its machine was cut off") from error
 
 
 @contextmanager
