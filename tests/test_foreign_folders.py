@@ -218,3 +218,15 @@ def test_a_split_beside_a_model(tmp_path: Path, file: str, content: str) -> None
     assert split_of(scene) == ([0, 1, 3, 5], [2, 4])
     assert not any("are no photo of the scene" in note for note in scene.notes)
     assert file in next(note for note in scene.notes if "split" in note)
+
+
+def test_names_in_a_text_model_are_text(tmp_path: Path) -> None:
+    truth = make_truth(4)
+    spaced = replace(truth, names=[name.replace("_", "\u202f") for name in truth.names])
+    scene = load_scene(write_colmap(spaced, tmp_path / "spaced", binary=False), test_every=0)
+    assert [view.name for view in scene.train] == sorted(spaced.names)
+    root = write_colmap(truth, tmp_path / "latin", binary=False)
+    file = next(root.rglob("images.txt"))
+    file.write_bytes(file.read_bytes().replace(b"view_01", b"view_\xe9"))
+    with pytest.raises(ValueError, match=r"the name of image \d+ is no text in UTF-8"):
+        load_scene(root)

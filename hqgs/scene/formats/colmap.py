@@ -108,7 +108,10 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     for name, image_id in by_name:
         image = model.images[image_id]
         camera = model.cameras[image.camera_id]
-        viewmat = pose_viewmat(image.cam_from_world(), name)
+        try:
+            viewmat = pose_viewmat(image.cam_from_world(), name)
+        except ValueError as e:
+            raise ValueError(f"{path}: {e}") from e
         file = files.get(name)
         film = None
         if file is not None and file.is_relative_to(folder):
@@ -174,6 +177,8 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
         else:
             model.read_text(folder)
             for image_id, name in whole_names(folder / "images.txt").items():
+                if any("\ud800" <= letter <= "\udfff" for letter in name):
+                    raise ValueError(f"the name of image {image_id} is no text in UTF-8: {name!r}")
                 if image_id in model.images:
                     model.images[image_id].name = name
     except (ValueError, IndexError, RuntimeError) as e:
