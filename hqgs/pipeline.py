@@ -25,7 +25,7 @@ from hqgs.base.interrupt import deferred_interrupt
 from hqgs.base.left_out import LeftOut
 from hqgs.base.machine import give_back_memory, peak_rss_mb
 from hqgs.base.ranks import ALONE, Ranks
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.learned import learned_picture
@@ -90,7 +90,7 @@ def train(
     resume: bool = False,
     overwrite: bool = False,
     progress: OnProgress | None = None,
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
     ranks: Ranks = ALONE,
 ) -> Run:
     """Train a scene on the CPU. Same seed, same bits, for any number of threads, interrupted or not.
@@ -122,7 +122,7 @@ def train(
             where `iterations` is larger, with the schedule of the longer run from there on.
         overwrite: begin anew in a folder that holds a run.
         progress: is called after each step.
-        told: hears what is being done before the first step, and how far it is.
+        on_stage: hears what is being done before the first step, and how far it is.
         ranks: of `hqgs.base.ranks.joined`, where torchrun has started several processes that make the same
             call. The result does not depend on their number; the first one writes and reports.
 
@@ -151,7 +151,7 @@ def train(
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
-    with open_run(scene, config or asked, out, resume, seconds, told, ranks) as trainer:
+    with open_run(scene, config or asked, out, resume, seconds, on_stage, ranks) as trainer:
         return run_to_end(trainer, out, progress)
 
 
@@ -162,7 +162,7 @@ def open_run(
     out: str | Path | None = None,
     resume: bool = False,
     seconds: float | None = None,
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
     ranks: Ranks = ALONE,
 ) -> Iterator[Trainer]:
     """A trainer that holds the folder `out`: fresh, or with `resume` where the checkpoint there ends.
@@ -183,7 +183,7 @@ def open_run(
             for file in (CHECKPOINT, PLY):
                 remove_leftovers(folder / file)
         going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
-        inspector = Inspector(told)
+        inspector = Inspector(on_stage)
         trainer = Trainer(scene, config, inspector, ranks)
         if not going_on:
             fit_to_seconds(trainer)
@@ -199,7 +199,7 @@ def open_run(
             ranks.agree(trainer.plan, "the plan")
         _check_agreement(trainer)
         if ranks.first:
-            told(Stage("planned", 0, 0, essential(trainer.plan)))
+            on_stage(Stage("planned", 0, 0, essential(trainer.plan)))
         if folder is not None:
             asked = {"version": __version__, "scene": scene.origin, "train": config_values(config)}
             write_json(folder / CONFIG, asked)

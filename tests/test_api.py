@@ -64,7 +64,7 @@ def test_train_and_run_config_have_the_same_options() -> None:
         name: (p.annotation, p.default) for name, p in train.items() if name in config
     }
     assert set(train) - set(config) == {
-        "scene", "out", "seconds", "config", "resume", "overwrite", "progress", "told", "ranks"
+        "scene", "out", "seconds", "config", "resume", "overwrite", "progress", "on_stage", "ranks"
     }  # fmt: skip
 
 
@@ -132,7 +132,7 @@ def test_the_preparation_is_told() -> None:
     scene, stages = tiny_scene(), list[Stage]()
     seen = {view.name: np.arange(5) for view in scene.train}
     scene = replace(scene, points=scene.points[:5], point_colors=scene.point_colors[:5], seen=seen)
-    hqgs.train(scene, config=tiny_config(2, method="hqgs"), told=stages.append)
+    hqgs.train(scene, config=tiny_config(2, method="hqgs"), on_stage=stages.append)
     counts = [(stage.what, stage.done, stage.total) for stage in stages]
     assert counts[:5] == [("photos diagnosed", k, 5) for k in range(1, 6)]
     assert counts[5:10] == [("first points, from photos", k, 5) for k in range(1, 6)]
@@ -153,7 +153,7 @@ def test_the_first_ctrl_c_returns_what_there_is() -> None:
 def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, Any]] = []
 
-    def reconstruct(scene: hqgs.Scene, keep: Path | None, told: object) -> hqgs.Scene:
+    def reconstruct(scene: hqgs.Scene, keep: Path | None, on_stage: object) -> hqgs.Scene:
         calls.append(("sfm", keep))
         assert scene.train[0].image.dtype == np.float32  # the photos are degraded by then
         return scene

@@ -149,7 +149,7 @@ def test_the_world_stands_upright_and_every_photo_is_named(photos: list[np.ndarr
     picture(7, (HEIGHT, WIDTH)).save(tmp_path / "foreign.png")
     (tmp_path / "zz.png").write_text("a text")
     stages: list[Stage] = []
-    scene = load_scene(tmp_path, keep_sfm=tmp_path / "kept", told=stages.append)
+    scene = load_scene(tmp_path, keep_sfm=tmp_path / "kept", on_stage=stages.append)
     report = scene.sfm
     assert report is not None
     assert (report.photos, report.not_registered) == (10, ["foreign.png"])
@@ -187,7 +187,7 @@ from hqgs.scene.load import load_scene
 def told(stage):
     if "matched" in stage.what or "checked" in stage.what or "placed" in stage.what:
         print("now", flush=True)
-load_scene(Path({str(folder)!r}), keep_sfm=Path({str(keep)!r}), told=told)
+load_scene(Path({str(folder)!r}), keep_sfm=Path({str(keep)!r}), on_stage=told)
 """
     process = subprocess.Popen(
         [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE

@@ -163,7 +163,7 @@ def test_few_photos_are_large_at_a_time(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(views, "decode", watched)
     stages: list[Stage] = []
-    scene = load_scene(tmp_path, 4.0, told=stages.append)
+    scene = load_scene(tmp_path, 4.0, on_stage=stages.append)
     assert 1 <= most[0] <= views.MAX_WORKERS
     assert [stage.done for stage in stages if stage.what == "photos read"] == list(range(1, 13))
     for view in [*scene.train, *scene.test]:

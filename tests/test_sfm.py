@@ -162,7 +162,7 @@ def test_smoothed_photos_and_patches_place_noisy_ones_on_any_threads(cards: Scen
     try:
         for count in (1, 3):
             hqgs.set_num_threads(count)
-            found.append(sfm_scene(noisy, told=lambda stage: stages.add(stage.what)))
+            found.append(sfm_scene(noisy, on_stage=lambda stage: stages.add(stage.what)))
     finally:
         hqgs.set_num_threads(threads)
     assert any(what.endswith("with smoothed photos") for what in stages)
@@ -265,7 +265,7 @@ def test_a_folder_of_photos_alone_becomes_a_scene(cards: Scene, tmp_path: Path) 
     (tmp_path / "transforms.json").write_text("{}")
     for view in [*cards.train, *cards.test]:
         Image.fromarray(view.image).save(folder / view.name.replace(".jpg", ".png"))
-    scene = load_scene(folder, told=heard.append)
+    scene = load_scene(folder, on_stage=heard.append)
     above = f"{tmp_path} holds cameras and points (transforms.json), which are not read: give that folder"
     told = [stage.note for stage in heard if stage.note]
     assert told == [f"{above} to train with them", "9 photos, no camera in EXIF"]

@@ -19,5 +19,5 @@ class Stage:
 OnStage = Callable[[Stage], None]
 
 
-def untold(stage: Stage) -> None:
+def silent(stage: Stage) -> None:
     """Nobody listens."""

@@ -51,15 +51,17 @@ def run(options: Clean) -> int:
 
         with LoadingScreen() as screen:
             if options.photos is None:
-                scene = load_again(options.source, told=screen.stage)
+                scene = load_again(options.source, on_stage=screen.stage)
             else:
                 factor = 1.0 if options.downscale is None else options.downscale
                 longest = longest_side("standard", options.downscale)
-                scene = load(options.photos, downscale=factor, longest=longest, told=screen.stage)
+                scene = load(options.photos, downscale=factor, longest=longest, on_stage=screen.stage)
             gaussians = Gaussians.load(source)
-            done = clean(gaussians.in_world(scene.world), scene, options.steps or STEPS, told=screen.stage)
+            done = clean(
+                gaussians.in_world(scene.world), scene, options.steps or STEPS, on_stage=screen.stage
+            )
         kept = len(done.gaussians)
-        told = (
+        words = (
             f"{sum(done.before) / len(done.before):.2f} -> {sum(done.after) / len(done.after):.2f} dB on "
             f"{len(done.after)} held-out photos ({done.gain:+.2f} +- {done.scatter:.2f})"
         )
@@ -67,7 +69,7 @@ def run(options: Clean) -> int:
             held = (
                 "" if options.photos is None else " (photos that the scene was trained on cannot show a gain)"
             )
-            return fail(1, f"{source}: cleaning does not pay, and nothing is written: {told}{held}")
+            return fail(1, f"{source}: cleaning does not pay, and nothing is written: {words}{held}")
         done.gaussians.in_world(gaussians.world).save(options.out)  # in the frame of the source
     except BAD_INPUT as error:
         return fail(2, error)
@@ -76,5 +78,5 @@ def run(options: Clean) -> int:
     tell_read(gaussians)
     if gaussians.antialiased and format not in ANTIALIASED:
         print(f"left out: the antialias flag: a .{format} file has no place for it")
-    print(f"{options.out}: {told}; {done.removed:,} of {kept + done.removed:,} Gaussians faded and are gone")
+    print(f"{options.out}: {words}; {done.removed:,} of {kept + done.removed:,} Gaussians faded and are gone")
     return 0

@@ -59,12 +59,12 @@ def run(options: Evaluate) -> int:
 
         with LoadingScreen() as screen:
             if options.scene is None:
-                scene = load_again(options.source, told=screen.stage)
+                scene = load_again(options.source, on_stage=screen.stage)
             else:
                 scene = load(
                     options.scene,
                     downscale=1.0 if options.downscale is None else options.downscale,
-                    told=screen.stage,
+                    on_stage=screen.stage,
                 )
         if not scene.test:
             raise ValueError(f"{scene.name} has no held-out photo to measure with")

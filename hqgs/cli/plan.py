@@ -64,7 +64,7 @@ def run(options: PlanOptions) -> int:
                     downscale=downscale,
                     longest=longest,
                     cache=options.out,
-                    told=screen.stage,
+                    on_stage=screen.stage,
                 )
             else:
                 scene = pictures(options.scene, downscale=downscale, longest=longest)

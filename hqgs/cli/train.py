@@ -267,7 +267,7 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
         if not ranks.first:
             ranks.tell(None)  # what COLMAP finds for the first one, the others read
         scene = hqgs.load(
-            **asked, skip_unreadable="photos" in config.leave_out, cache=options.out, told=screen.stage
+            **asked, skip_unreadable="photos" in config.leave_out, cache=options.out, on_stage=screen.stage
         )
         if ranks.first:
             ranks.tell(None)
@@ -294,7 +294,7 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
             resume=options.resume,
             overwrite=options.overwrite,
             progress=show,
-            told=bar.stage,
+            on_stage=bar.stage,
             ranks=ranks,
         )
     return done, live, screen, bar, loaded

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.diagnosis.constants import (
     COARSE_FILM,
     DIFFERS,
@@ -86,12 +86,12 @@ class Diagnosis:
 class Inspector:
     """Looks at photos, at each once however often it is asked for.
 
-    It holds what it has seen of their pixels: keep it no longer than a run needs to start. `told` hears of
+    It holds what it has seen of their pixels: keep it no longer than a run needs to start. `on_stage` hears
     each photo.
     """
 
-    def __init__(self, told: OnStage = untold) -> None:
-        self.told: OnStage = told
+    def __init__(self, on_stage: OnStage = silent) -> None:
+        self.on_stage: OnStage = on_stage
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
@@ -133,7 +133,7 @@ class Inspector:
                     known = first.enlargement
                     taken += 1
             found.append(self.inspect(view, known))
-            self.told(Stage("photos diagnosed", len(found), len(chosen)))
+            self.on_stage(Stage("photos diagnosed", len(found), len(chosen)))
         key = tuple(map(id, found))
         if key not in self._concluded:
             self._concluded[key] = tuple(conclude(found))
@@ -267,19 +267,19 @@ def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
 
 
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
-    told = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
-    if not told:
+    known = [(photo.noise, photo.noise_limit) for photo in photos if photo.noise is not None]
+    if not known:
         return Finding("noise", False, None, None, None, "the photos are too small or too clipped to tell")
-    level, limit = (float(value) for value in np.median(told, axis=0))
-    spread = None if _pooled(photos) else _spread_of([noise for noise, _ in told])
+    level, limit = (float(value) for value in np.median(known, axis=0))
+    spread = None if _pooled(photos) else _spread_of([noise for noise, _ in known])
     noisy = sum(photo.told_noise is not None for photo in photos)
-    quiet, loud = np.quantile([max(noise, 0.5 * least) for noise, least in told], [0.1, 0.9])
+    quiet, loud = np.quantile([max(noise, 0.5 * least) for noise, least in known], [0.1, 0.9])
     together = _correlation(photos)
     kind, more = "white noise of", ""
     if together > SCENE_WHITE:
         kind = "noise of at least"
         more = f"; neighbouring pixels go together by {together:.2f} at least: not white"
-    if spread is not None and noisy > 0.1 * len(told) and loud >= UNLIKE_NOISE * quiet:
+    if spread is not None and noisy > 0.1 * len(known) and loud >= UNLIKE_NOISE * quiet:
         reason = f"{kind} {quiet:.1f} levels in some photos and {loud:.1f} in others{more}"
         return Finding("noise", True, level, spread, "grain", reason)
     if level >= limit:
@@ -320,8 +320,8 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
 
 def _correlation(photos: Sequence[PhotoDiagnosis]) -> float:
     """Of neighbours in the noise, the median over photos in which noise is told; 0: it is told in none."""
-    told = [p.correlation for p in photos if p.told_noise is not None and p.correlation is not None]
-    return float(np.median(told)) if told else 0.0
+    known = [p.correlation for p in photos if p.told_noise is not None and p.correlation is not None]
+    return float(np.median(known)) if known else 0.0
 
 
 def _pooled(photos: Sequence[PhotoDiagnosis]) -> bool:

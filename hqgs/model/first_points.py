@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement, SmallPhoto
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
@@ -30,7 +30,7 @@ def points_along_edges(
     count: int,
     seed: int,
     agreement: Agreement,
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
 ) -> tuple[Points, Colors]:
     """About `count` points [M, 3] (world) under pixels of the photos, and those pixels' colours [M, 3].
 
@@ -46,13 +46,13 @@ def points_along_edges(
         seed: of the draw. Each view has its own numbers, whatever the others are.
         agreement: of the same views: how they are looked at; it tells the depths, and points that it does
             not find are left out.
-        told: hears of each view.
+        on_stage: hears of each view.
     """
     found, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
     for k, view in enumerate(views):
         share = count * (k + 1) // len(views) - count * k // len(views)
         rows = seen.get(view.name)
-        told(Stage("first points, from photos", k + 1, len(views)))
+        on_stage(Stage("first points, from photos", k + 1, len(views)))
         if rows is None or not share:
             continue
         pixels = _drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import FRAMES, missing_folders, remove_empty, write_json
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 from hqgs.photos.video import pyav
@@ -27,7 +27,7 @@ QUALITY = 95  # of the JPEG files
 
 
 def film_frames(
-    path: Path, folder: Path, count: int | None = None, told: OnStage = untold
+    path: Path, folder: Path, count: int | None = None, on_stage: OnStage = silent
 ) -> tuple[Path, str]:
     """The sharpest frame of each of `count` intervals of a film, as JPEG files, upright.
 
@@ -49,7 +49,7 @@ def film_frames(
         new.mkdir(parents=True)
         try:
             details: dict[str, float] = {}
-            for number, frame in _sharpest(av, path, count, told):
+            for number, frame in _sharpest(av, path, count, on_stage):
                 file = new / f"{number:06d}.jpg"
                 Image.fromarray(frame).save(file, quality=QUALITY, subsampling=0)
                 details[file.name] = fine_detail(frame.astype(np.float64))
@@ -88,7 +88,7 @@ def frame_details(folder: Path) -> dict[str, float]:
 
 
 def _sharpest(
-    av: Any, path: Path, count: int | None, told: OnStage
+    av: Any, path: Path, count: int | None, on_stage: OnStage
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Number and pixels [H, W, 3] of the sharpest frame of each interval, as the film is to be shown."""
     try:
@@ -115,7 +115,7 @@ def _sharpest(
                     best_sharpness = sharpness
                     turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
                     best = number, np.ascontiguousarray(np.rot90(as_photo(frame, curve), turns))
-                told(Stage("frames of the film looked at", number + 1, stream.frames or 0))
+                on_stage(Stage("frames of the film looked at", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
         known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
         why = os.strerror(error.errno or 0) if known else "it is no film, or damaged"

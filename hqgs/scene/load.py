@@ -11,7 +11,7 @@ import pycolmap
 
 from hqgs.base.evenly import evenly
 from hqgs.base.files import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
@@ -44,7 +44,7 @@ def load_scene(
     skip_unreadable: bool = False,
     keep_sfm: Path | None = None,
     longest: int | None = None,
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
     sfm: bool = False,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
@@ -62,8 +62,8 @@ def load_scene(
     at downscale 1, the only one at which they stand for `View.image`.
 
     A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is a
-    folder for that reconstruction, which the next call takes from there. `told` hears what takes long. Half
-    a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
+    folder for that reconstruction, which the next call takes from there. `on_stage` hears what takes long.
+    Half a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
 
     `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
     where all of them would take more than MOST_BYTES of memory. Cameras for small photos are found coarsely.
@@ -81,7 +81,7 @@ def load_scene(
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
     coarse = longest is not None and longest <= COARSE
-    capture = _read(root, downscale, keep_sfm, told, sfm, coarse)
+    capture = _read(root, downscale, keep_sfm, on_stage, sfm, coarse)
     if longest is not None:
         capture = bounded(capture, longest)
     degraded = read_degraded_folder(root)
@@ -93,7 +93,7 @@ def load_scene(
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
     optional = train_names if skip_unreadable else frozenset[str]()
     over = BEHIND if cut_outs(capture, notes) else None
-    views, unreadable = load_views(capture.photos, capture.downscale, optional, told, over)
+    views, unreadable = load_views(capture.photos, capture.downscale, optional, on_stage, over)
     if degraded is not None and downscale == 1:
         views = _with_lows(views, degraded, root, optional, unreadable)
     if capture.source == "transforms" and not len(capture.points):
@@ -180,7 +180,7 @@ def formats_of(root: Path, downscale: float) -> list[str]:
 
 
 def _read(
-    root: Path, downscale: float, keep_sfm: Path | None, told: OnStage, sfm: bool, coarse: bool
+    root: Path, downscale: float, keep_sfm: Path | None, on_stage: OnStage, sfm: bool, coarse: bool
 ) -> Capture:
     formats = formats_of(root, downscale)
     others = [name for name in formats if name != COLMAP]
@@ -201,8 +201,8 @@ def _read(
     if (photos := bare_photos(root, downscale)) is not None:
         above = [] if sfm else _above(root)
         if above:
-            told(Stage("COLMAP", 0, len(photos.names), above[0]))
-        capture = read_photos(root, photos, keep_sfm, told, coarse)
+            on_stage(Stage("COLMAP", 0, len(photos.names), above[0]))
+        capture = read_photos(root, photos, keep_sfm, on_stage, coarse)
         return replace(capture, notes=[*capture.notes, *above])
     raise ValueError(_nothing(root))
 

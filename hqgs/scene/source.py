@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hqgs.base.files import CONFIG, KEPT, is_film, is_room
-from hqgs.base.stages import OnStage, untold
+from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
@@ -41,7 +41,7 @@ def load(
     longest: int | None = None,
     frames: int | None = None,
     distance: Sequence[str | float] | None = None,
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
 ) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
 
@@ -65,7 +65,7 @@ def load(
             would take more than 4 GB of memory.
         frames: how many of a film; None: two a second, 30 to 90.
         distance: (A, B, metres) between the cameras of two photos: what is written is in metres then.
-        told: hears what is being done, and how far it is.
+        on_stage: hears what is being done, and how far it is.
 
     Returns:
         Photos [H, W, 3], sRGB, uint8 (float32 where they were degraded or restored from that); world units
@@ -108,7 +108,7 @@ def load(
             if is_film(path):
                 name = Path(path).stem
                 folder = kept or Path(stack.enter_context(TemporaryDirectory(prefix="hqgs-film-")))
-                path, note = film_frames(Path(path), folder / "frames", frames, told)
+                path, note = film_frames(Path(path), folder / "frames", frames, on_stage)
                 notes.append(note)
             elif apart is not None:
                 check_names(path, downscale, apart)
@@ -119,20 +119,20 @@ def load(
                 skip_unreadable=skip_unreadable,
                 keep_sfm=models,
                 longest=longest,
-                told=told,
+                on_stage=on_stage,
                 sfm=sfm,
             )
             scene = replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
     if degradation.steps:
         scene = degrade_scene(scene, degradation, seed)
     if sfm and (scene.source != "photos" or degradation.steps):
-        scene = sfm_scene(scene, models, told)
+        scene = sfm_scene(scene, models, on_stage)
     scene = scene if restore is None else restore_scene(scene, restore)
     scene = scene if apart is None else in_metres(scene, apart)
     return replace(scene, origin=origin)
 
 
-def load_again(run: str | Path, told: OnStage = untold) -> Scene:
+def load_again(run: str | Path, on_stage: OnStage = silent) -> Scene:
     """The scene that the run in a folder was trained on, from the photos, where they still lie.
 
     ValueError where its config.json does not tell, FileNotFoundError where the photos are gone.
@@ -140,7 +140,7 @@ def load_again(run: str | Path, told: OnStage = untold) -> Scene:
     path = Path(run) / CONFIG
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))["scene"]
-        return load(**origin, cache=run, told=told)
+        return load(**origin, cache=run, on_stage=on_stage)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"the photos of the run {run} are not known: {error}") from error
     except (KeyError, TypeError, json.JSONDecodeError) as error:

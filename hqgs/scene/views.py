@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs.base.machine import give_back_memory, keep_large_arrays_apart
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.resize import Pixels, area_downscale
@@ -47,13 +47,13 @@ def load_views(
     photos: list[Photo],
     downscale: float,
     optional: frozenset[str] = frozenset(),
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
     over: tuple[float, float, float] | None = None,
 ) -> tuple[list[View], dict[str, UnreadableError]]:
     """Decode `photos`, in their order, as pinhole views scaled down by `downscale` (at least 1).
 
     Intrinsics scale with the true ratio of sizes, per axis. The second result tells, by name, why photos of
-    the names in `optional` have no view: they, or their masks, cannot be decoded. `told` hears of each photo.
+    the names in `optional` have no view: they, or their masks, cannot be decoded. `on_stage` hears each.
     No more than MAX_WORKERS photos are in memory at more than the wanted size.
 
     `over`: what shows where photos are transparent, in place of a mask (`decode`).
@@ -98,7 +98,7 @@ def load_views(
             for k, job in enumerate(jobs):
                 if (view := job.result()) is not None:
                     views.append(view)
-                told(Stage("photos read", k + 1, len(photos)))
+                on_stage(Stage("photos read", k + 1, len(photos)))
                 if (k + 1) % GIVEN_BACK == 0 or k + 1 == len(photos):
                     give_back_memory()
         finally:

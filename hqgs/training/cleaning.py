@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from hqgs._rust import ALPHA_MIN
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.held_out import held_out_renders
 from hqgs.evaluation.metrics import psnr
@@ -58,7 +58,7 @@ class Cleaned:
 
 
 def clean(
-    gaussians: Gaussians, scene: Scene, steps: int = STEPS, seed: int = 0, told: OnStage = untold
+    gaussians: Gaussians, scene: Scene, steps: int = STEPS, seed: int = 0, on_stage: OnStage = silent
 ) -> Cleaned:
     """The Gaussians fitted on to the scene's training photos for so many steps.
 
@@ -95,7 +95,7 @@ def clean(
             if gradient_fault(fitted, optimizer, render) is None:
                 optimizer.step()
             decay_opacities(fitted.opacities, DECAY)
-            told(Stage("steps of cleaning", k + 1, steps))
+            on_stage(Stage("steps of cleaning", k + 1, steps))
         fitted = fitted.detached()
         shown = fitted.activated_opacities() >= ALPHA_MIN
         fitted = fitted.rows(shown)

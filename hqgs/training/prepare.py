@@ -45,7 +45,7 @@ class Prepared:
         self.shown_diagnosis: Diagnosis | None = (
             inspector.last
         )  # of more photos, where the method asks for it
-        self._told = inspector.told
+        self._on_stage = inspector.on_stage
         self._points: dict[int, tuple[Points, Colors]] = {}
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
@@ -77,7 +77,7 @@ class Prepared:
         if wanted not in self._points:
             agreement = Agreement(scene.train, scene.seen)
             count, seed = wanted - len(points), self.asked.seed
-            more = points_along_edges(scene.train, points, scene.seen, count, seed, agreement, self._told)
+            more = points_along_edges(scene.train, points, scene.seen, count, seed, agreement, self._on_stage)
             self._points[wanted] = np.concatenate([points, more[0]]), np.concatenate([colors, more[1]])
         return self._points[wanted]
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.files import FRAMES
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import (
@@ -110,11 +110,11 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
     return BarePhotos(folder, left, names, notes=[*notes, *films_beside(folder, names)])
 
 
-def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
+def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     """The photos that can be decoded, with their sizes and EXIF data; the others are in `unreadable`.
 
     Of those that hold the same pixels one is used, but for frames of a film. The first note says in a line
-    what was understood, as `told` hears.
+    what was understood, as `on_stage` hears.
 
     ValueError where HEIC photos lack the extra that reads them, or less than half can be read.
     """
@@ -138,7 +138,7 @@ def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
                 unreadable[name] = found
             else:
                 looked[name] = found
-            told(Stage("photos looked at", k + 1, len(photos.names)))
+            on_stage(Stage("photos looked at", k + 1, len(photos.names)))
     if len(looked) < len(unreadable):
         reasons = some([f"{name} ({why})" for name, why in unreadable.items()])
         raise ValueError(
@@ -155,7 +155,7 @@ def readable(photos: BarePhotos, told: OnStage = untold) -> BarePhotos:
     looked, tags = {name: looked[name] for name in names}, {name: exif[name] for name in names}
     if not film:
         notes.insert(0, understood([*tags.values()], names, len(twice)))
-        told(Stage("photos looked at", len(photos.names), len(photos.names), notes[0]))
+        on_stage(Stage("photos looked at", len(photos.names), len(photos.names), notes[0]))
     return replace(
         photos,
         names=names,

@@ -10,7 +10,7 @@ import pycolmap
 from PIL import Image
 
 from hqgs.base.files import existing_folder, is_film
-from hqgs.base.stages import OnStage, untold
+from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import decode
 from hqgs.scene.film import film_frames, frame_details, write_details
 from hqgs.scene.scene import SfmReport
@@ -19,7 +19,7 @@ from hqgs.scene.sfm.photos_alone import find_cameras
 
 
 def write_colmap_folder(
-    source: str | Path, out: Path, work: Path, frames: int | None = None, told: OnStage = untold
+    source: str | Path, out: Path, work: Path, frames: int | None = None, on_stage: OnStage = silent
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 
@@ -30,12 +30,12 @@ def write_colmap_folder(
     """
     with TemporaryDirectory(prefix="hqgs-film-") as name:
         if is_film(source):
-            source, _ = film_frames(Path(source), Path(name), frames, told)
+            source, _ = film_frames(Path(source), Path(name), frames, on_stage)
         root = existing_folder(source)
         photos = bare_photos(root, 1.0)
         if photos is None:
             raise ValueError(f"{root} holds no photos")
-        found = find_cameras(root, photos, work, told)
+        found = find_cameras(root, photos, work, on_stage)
         images = out / "images"
         details = frame_details(found.photos.folder)
         kept: dict[str, float] = {}

@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hqgs.base.stages import OnStage, untold
+from hqgs.base.stages import OnStage, silent
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
@@ -34,13 +34,13 @@ class FoundCameras:
 
 
 def find_cameras(
-    root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold, coarse: bool = False
+    root: Path, photos: BarePhotos, keep: Path | None = None, on_stage: OnStage = silent, coarse: bool = False
 ) -> FoundCameras:
     """Cameras and points of photos alone, by COLMAP, as `read_photos` has them."""
-    photos = readable(photos, told)
+    photos = readable(photos, on_stage)
     names = photos.colmap_names
     try:
-        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, told, coarse)
+        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, on_stage, coarse)
         poses = ran.poses()
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
@@ -71,7 +71,7 @@ def find_cameras(
 
 
 def read_photos(
-    root: Path, photos: BarePhotos, keep: Path | None = None, told: OnStage = untold, coarse: bool = False
+    root: Path, photos: BarePhotos, keep: Path | None = None, on_stage: OnStage = silent, coarse: bool = False
 ) -> Capture:
     """Cameras and points of a folder of photos, from all of them, by COLMAP.
 
@@ -82,7 +82,7 @@ def read_photos(
     the reconstruction; `coarse`: a first look, for small pictures; see `run_colmap`. ValueError where COLMAP
     cannot make a model of half of the photos.
     """
-    cameras = find_cameras(root, photos, keep, told, coarse)
+    cameras = find_cameras(root, photos, keep, on_stage, coarse)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     details = frame_details(folder)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import KDTree
 
-from hqgs.base.stages import OnStage, untold
+from hqgs.base.stages import OnStage, silent
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import model_points, seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
@@ -20,7 +20,7 @@ from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.tracks import sureness
 
 
-def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) -> Scene:
+def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
 
     COLMAP (SIFT, matching, incremental mapping) sees the training photos alone, clipped and
@@ -29,14 +29,16 @@ def sfm_scene(scene: Scene, keep: Path | None = None, told: OnStage = untold) ->
     held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.
     `Scene.sfm` and `Scene.notes` compare the two. The same photos give the same bits, whatever the number of
     threads. `keep` is a folder for the reconstruction, which the next call with the same photos takes from
-    there; `told` hears what is being done.
+    there; `on_stage` hears what is being done.
 
     ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
     """
     views = {f"{k:05d}.png": view for k, view in enumerate(scene.train)}
     cameras = [view.camera for view in scene.train]
     contents = map(_content, views.values())
-    ran = run_colmap(list(views), contents, cameras, lambda folder: _write_photos(folder, views), keep, told)
+    ran = run_colmap(
+        list(views), contents, cameras, lambda folder: _write_photos(folder, views), keep, on_stage
+    )
     model = ran.found
     poses = ran.poses()
     kept = [views[file] for file in poses]

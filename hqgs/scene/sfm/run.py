@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from hqgs._rust import get_num_threads
 from hqgs.base.files import keep_folder, lock_folder
-from hqgs.base.stages import OnStage, Stage, untold
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import likely
@@ -133,7 +133,7 @@ def run_colmap(
     cameras: Sequence[Camera] | Guess,
     write: Callable[[Path], None],
     keep: Path | None = None,
-    told: OnStage = untold,
+    on_stage: OnStage = silent,
     coarse: bool = False,
 ) -> Model:
     """COLMAP's largest model of photos.
@@ -146,7 +146,7 @@ def run_colmap(
             beside it either no mask, or `NAME.png` for every photo.
         keep: a folder for models: COLMAP does not run again for the same photos, masks, cameras and version,
             and goes on with the features and matches of a call that was interrupted.
-        told: hears what is being done.
+        on_stage: hears what is being done.
         coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
             placed.
 
@@ -175,7 +175,7 @@ def run_colmap(
     sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
     pairs = len(given["pairs"]) if "pairs" in given else None
     if note := expected_time(sizes, pairs, get_num_threads(), coarse):
-        told(Stage("COLMAP", 0, len(names), note))
+        on_stage(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:
         photos = directory / "photos"
         if not photos.is_dir():
@@ -188,7 +188,7 @@ def run_colmap(
             (new / "photos").rename(photos)
         given["photos"] = np.array(str(photos))
         np.savez(directory / "input.npz", **given)  # pyright: ignore[reportArgumentType]
-        _run_program(directory, told)
+        _run_program(directory, on_stage)
         facts = directory / "facts.json"
         if not (directory / "model" / "images.bin").is_file():
             raise ValueError(why_no_model(len(names), _passes(facts)))
@@ -222,7 +222,7 @@ def surroundings() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
-def _run_program(directory: Path, told: OnStage) -> None:
+def _run_program(directory: Path, on_stage: OnStage) -> None:
     """Run `reconstruct` in `directory` to its end. Whatever ends this process ends it too."""
     program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
     with (directory / "log.txt").open("wb") as log:
@@ -240,7 +240,7 @@ def _run_program(directory: Path, told: OnStage) -> None:
                     status = process.wait(LISTEN)
                     break
                 except subprocess.TimeoutExpired:
-                    _tell(directory / "stage.json", told)
+                    _tell(directory / "stage.json", on_stage)
         finally:
             process.kill()
             process.wait()
@@ -252,14 +252,14 @@ def _run_program(directory: Path, told: OnStage) -> None:
         raise ValueError(f"COLMAP ended with status {status} {' '.join(last)}".strip())
 
 
-def _tell(file: Path, told: OnStage) -> None:
+def _tell(file: Path, on_stage: OnStage) -> None:
     try:
         now: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:  # it has only begun
         return
     again = ", second and more tolerant pass" if now["tolerant"] else ""
     again = ", with smoothed photos" if now["smoothed"] else again
-    told(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
+    on_stage(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
 
 
 def _read(folder: Path) -> Model:
