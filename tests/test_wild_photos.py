@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 from itertools import pairwise
 
@@ -31,8 +32,9 @@ from hqgs.photos.shake import (
     shake_kernel,
 )  # fmt: skip
 from hqgs.photos.video import film
+from hqgs.photos.walkers import Figure
 
-NEW = ("shake", "exposure", "chat", "phone", "video", "video265")
+NEW = ("shake", "exposure", "chat", "phone", "video", "video265", "crowd")
 NOT_TOLD = tuple(kind for kind in NEW if kind not in OWN)
 
 
@@ -124,7 +126,7 @@ def test_shake_is_the_mean_of_moved_photos_in_linear_light() -> None:
 
 def test_each_photo_has_a_path_of_its_own() -> None:
     image, extents = picture(), []
-    for seed in range(40):
+    for seed in range(24):
         out = degrade_image(image, parse_degradation("shake:10"), np.random.default_rng(seed))
         (record,) = out.records
         knots = np.array(record["path"])
@@ -221,6 +223,30 @@ def test_the_default_of_chat_is_half_of_the_longest_side() -> None:
 
 
 # --- phone
+
+
+def test_walkers_are_where_they_say() -> None:
+    """Pixels whose middle lies within a limb are painted, and none but them and their neighbours."""
+    clean = np.full((45, 60, 3), 0.5, np.float32)
+    counts = []
+    for seed in range(24):
+        result = degrade_image(clean, parse_degradation("crowd:2"), np.random.default_rng(seed))
+        (record,) = result.records
+        counts.append(len(record["walkers"]))
+        met = np.zeros((45, 60), bool)
+        for who in record["walkers"]:
+            place = [who[name] for name in ("x", "foot", "height")]
+            looks = Figure(**{name: who[name] for name in Figure._fields})
+            for limb in looks.limbs():
+                points = np.linspace(limb.a, limb.b, 50) * place[2] * 45 + [place[0] * 60, place[1] * 45]
+                y, x = np.mgrid[:45, :60] + 0.5
+                near = np.hypot(x[..., None] - points[:, 0], y[..., None] - points[:, 1]).min(-1)
+                met |= near < limb.radius * place[2] * 45
+        changed = (result.image != clean).any(-1)
+        assert (changed >= met).all()
+        assert not changed[np.logical_not(ndimage.binary_dilation(met, np.ones((3, 3))))].any()
+        assert json.loads(json.dumps(record)) == record
+    assert all(count > 3 for count in np.bincount(counts, minlength=3))
 
 
 def test_the_mosaic_is_rggb() -> None:
@@ -425,10 +451,10 @@ def test_bad_text_is_refused(text: str, message: str) -> None:
 def test_defaults() -> None:
     text = "+".join(NEW)
     assert str(parse_degradation(text).for_width(504)) == (
-        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36"
+        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36+crowd:3"
     )
     assert str(parse_degradation(text).for_width(252, 504)) == (
-        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36"
+        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36+crowd:3"
     )
     assert str(parse_degradation("some:shake").for_width(252)) == "some:shake:6"
 

@@ -18,7 +18,16 @@ LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 EMBEDDED, SPARSE, BEYOND = "embedded", "sparse", "beyond"
 # In the place of a scene folder: what is built in. From the third on they may have a value, `true-shake:8`.
-ROOMS = (EMBEDDED, SPARSE, BEYOND, "true-shake", "true-defocus", "true-rolling", "true-exposure")
+ROOMS = (
+    EMBEDDED,
+    SPARSE,
+    BEYOND,
+    "true-shake",
+    "true-defocus",
+    "true-rolling",
+    "true-exposure",
+    "true-crowd",
+)
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"

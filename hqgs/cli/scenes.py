@@ -30,8 +30,8 @@ Apart = Annotated["tuple[str, str, float] | None", tyro.conf.arg(metavar="A B ME
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 KINDS = (
     "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
-    "exposure[:EV], phone[:EV], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), several "
-    "joined by + in their order, mixed, or none"
+    "exposure[:EV], phone[:EV], crowd[:N], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), "
+    "several joined by + in their order, mixed, or none"
 )
 Kind = Annotated[str, tyro.conf.arg(metavar="KIND", help=f"what happens to the training photos: {KINDS}")]
 
@@ -42,7 +42,8 @@ class Photos:
 
     scene: SceneName
     """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
-    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-rolling or true-exposure."""
+    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-rolling,
+    true-exposure or true-crowd."""
     downscale: Factor = None
     """Divide the photos' sides by F."""
 

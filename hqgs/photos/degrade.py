@@ -27,6 +27,7 @@ from hqgs.photos.pixels import Float32, as_floats
 from hqgs.photos.resize import resize
 from hqgs.photos.shake import draw_path, draw_strength, path_length, shake_kernel
 from hqgs.photos.video import film
+from hqgs.photos.walkers import walk_in
 
 JPEG_FILES = ("jpeg", "phone")  # these kinds end in a JPEG file
 
@@ -64,6 +65,7 @@ def degrade_image(
     shake: "extent" and "length" of the path in px, and "path", its four knots [[x, y], ...] in px
     (`hqgs.photos.shake`); the extent is uniform in [0.2, 1] times the value;
     exposure: "gains" of red, green and blue in linear light (`hqgs.photos.camera`);
+    crowd: "walkers", each with place and looks (`hqgs.photos.walkers`);
     chat: "size" of the small photo [width, height] and "quality";
     phone: "electrons" of white;
     video, video265: "frame" (its type: I, P or B) and "bytes" of the compressed frame.
@@ -234,6 +236,11 @@ def _exposure(image: Float32, stops: float, rng: np.random.Generator) -> _Own:
     return expose(image, gains), {"gains": gains.tolist()}
 
 
+def _crowd(image: Float32, most: float, rng: np.random.Generator) -> _Own:
+    photo, walkers = walk_in(image, int(most), rng)
+    return photo, {"walkers": walkers}
+
+
 def _chat(image: Float32, side: float, rng: np.random.Generator) -> _Own:
     quality = int(rng.integers(CHAT_QUALITIES[0], CHAT_QUALITIES[1] + 1))
     height, width = _chat_size(image.shape[0], image.shape[1], int(side))
@@ -247,6 +254,7 @@ _OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], _Own]] = {
     "motion": _motion,
     "shake": _shake,
     "exposure": _exposure,
+    "crowd": _crowd,
     "chat": _chat,
 }
 

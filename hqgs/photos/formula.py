@@ -35,6 +35,7 @@ KINDS = {
     "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
     "video": Kind(0, 51, "a constant rate factor", integer=True, default=36, some=False),
     "video265": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
+    "crowd": Kind(1, 99, "the most walkers in a photo", integer=True, default=3, formation=False),
 }
 NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
@@ -138,6 +139,7 @@ def parse_degradation(text: str) -> Degradation:
     | `blur[:SIGMA]`, `defocus[:R]`, `motion[:LENGTH]` | one kernel, in px, on the values as stored | same |
     | `shake[:PX]` | a curved path of its own in each photo, in linear light | `hqgs.photos.shake` |
     | `exposure[:EV]` | gain and white balance of its own in each photo | `hqgs.photos.camera` |
+    | `crowd[:N]` | 0 to N people walk through each photo | `hqgs.photos.walkers` |
     | `chat[:SIDE]` | a messenger: shrunk, JPEG, enlarged | `hqgs.photos.degrade` |
     | `phone[:EV]` | a phone in low light: mosaic, noise, its processing, JPEG | `hqgs.photos.phone` |
     | `video[:CRF]`, `video265[:CRF]` | H.264 or H.265 over all photos, sorted by name | `hqgs.photos.video` |
@@ -145,8 +147,8 @@ def parse_degradation(text: str) -> Degradation:
     | `some:STEP` | the step in half of the training photos only, at mixed strengths | `hqgs.scene.degrade` |
 
     Without a value, blur, defocus, motion and shake take 2.5, 5, 15 and 12 px for a width of 504 px and scale
-    with the photo's width; chat takes half of the longest side, exposure 1, phone 4 and both videos 36.
-    ValueError names what is wrong and the values there are.
+    with the photo's width; chat takes half of the longest side, exposure 1, crowd 3, phone 4 and both videos
+    36. ValueError names what is wrong and the values there are.
     """
     degradation = _parsed(text)
     for step in degradation.steps:

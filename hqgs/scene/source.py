@@ -48,8 +48,8 @@ def load(
     Args:
         path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
             Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or a scene that is built in
-            (`hqgs.scene.builtin.room`): "embedded", "sparse", "true-shake", "true-defocus", "true-rolling"
-            or "true-exposure".
+            (`hqgs.scene.builtin.room`): "embedded", "sparse", "true-shake", "true-defocus", "true-rolling",
+            "true-exposure" or "true-crowd".
         downscale: divide the photos' sides by this, at least 1.
         test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
@@ -165,9 +165,9 @@ def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
 
     Args:
         kind: jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH] (white
-            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], chat[:SIDE] (each photo in its
-            own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND (half of the
-            photos only); several joined by + in their order, mixed, or none.
+            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], crowd[:N], chat[:SIDE] (each
+            photo in its own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND
+            (half of the photos only); several joined by + in their order, mixed, or none.
         seed: of everything random. Each photo has its own numbers, whatever the others are.
 
     Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,11 +40,13 @@ def render_exposure(
     gains: NDArray[np.float64] | None = None,
     threads: int | None = None,
     gloss: float | None = None,
+    passing: Sequence[Surface] = (),
 ) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
 
     `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
-    in all photos: it rolls off the highlights and encodes sRGB. `threads` and `gloss` as in `render_view`.
+    in all photos: it rolls off the highlights and encodes sRGB. `passing`: what stands in the room beside
+    its own. `threads` and `gloss` as in `render_view`.
     """
     width, height = exposure.size
     image = np.empty((height, width, 3), np.uint8)
@@ -55,7 +58,7 @@ def render_exposure(
             light *= factor
         image[tile.rows, tile.cols] = tile.picture((_encode(light) * 255 + 0.5).astype(np.uint8))
 
-    _each_tile(exposure, np.float32, work, threads, gloss)
+    _each_tile(exposure, np.float32, work, threads, gloss, passing)
     return image
 
 
@@ -86,8 +89,8 @@ def sample_pattern(n: int) -> NDArray[np.float64]:
 class _Tile:
     """The rays of up to TILE x TILE pixels, in B blocks of S samples of n = BLOCK^2 pixels: [B, S, n]."""
 
-    def __init__(self, exposure: Exposure, x: int, y: int, dtype: type, gloss: float | None) -> None:
-        self.scene, self.jitter = studio(gloss), exposure.jitter
+    def __init__(self, exposure: Exposure, x: int, y: int, dtype: type, scene: Studio) -> None:
+        self.scene, self.jitter = scene, exposure.jitter
         width, height = (min(TILE, side - at) for side, at in zip(exposure.size, (x, y), strict=True))
         self.rows, self.cols = slice(y, y + height), slice(x, x + width)
         self.grid = (-(-height // BLOCK), -(-width // BLOCK))  # the last blocks may reach past the picture
@@ -162,6 +165,7 @@ def _each_tile(
     work: Callable[[_Tile], None],
     threads: int | None,
     gloss: float | None = None,
+    passing: Sequence[Surface] = (),
 ) -> None:
     """Run `work` on fixed tiles that cover the picture; the tiles do not depend on the threads."""
     width, height = exposure.size
@@ -173,9 +177,13 @@ def _each_tile(
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
 
+    scene = studio(gloss)
+    if passing:
+        scene = replace(scene, surfaces=(*scene.surfaces, *passing))
+
     def job(corner: tuple[int, int]) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # rays parallel to a side
-            work(_Tile(exposure, *corner, dtype, gloss))
+            work(_Tile(exposure, *corner, dtype, scene))
 
     corners = [(x, y) for y in range(0, height, TILE) for x in range(0, width, TILE)]
     with ThreadPoolExecutor(threads or min(8, os.cpu_count() or 1)) as pool:  # more would wait for Python

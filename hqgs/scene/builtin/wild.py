@@ -14,6 +14,7 @@ from hqgs.photos.camera import draw_gains
 from hqgs.photos.formula import Kind
 from hqgs.photos.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
+from hqgs.scene.builtin.crowd import Walker, draw_walkers
 from hqgs.scene.builtin.exposure import Exposure, rolling, shaken, still, through_lens
 from hqgs.scene.builtin.points import TIME_LIMIT
 from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene
@@ -27,6 +28,7 @@ TRUE_KINDS = {
     "true-defocus": Kind(0.5, 20, "the largest radius in px of a point at infinity", at_504=4.0),
     "true-rolling": Kind(0.5, 100, "the longest way of the picture during the readout in px", at_504=12.0),
     "true-exposure": Kind(0.01, 4, "the most stops to either side", default=1),
+    "true-crowd": Kind(1, 9, "the most walkers in a photo", integer=True, default=3),
 }
 DISTANCE = FOCUS[2]  # at which translations and lenses have the stated effect, world units
 TURNS, MOVES = 0.75, 0.25  # shares of a path's extent: turns up, down and sideways; each other freedom
@@ -47,6 +49,7 @@ class PhotoTruth(NamedTuple):
     aperture: float = 0.0  # radius of the lens, world units
     focus: float = math.inf  # depth in focus, world units
     gains: Floats = np.ones(3)  # of red, green and blue, in linear light
+    walkers: tuple[Walker, ...] = ()
     samples: int = len(STILL)  # rays a pixel
 
     def record(self, kind: str) -> dict[str, Any]:
@@ -58,6 +61,8 @@ class PhotoTruth(NamedTuple):
             facts |= {"aperture": self.aperture, "focus": self.focus}
         if (self.gains != 1).any():
             facts["gains"] = self.gains.tolist()
+        if self.walkers:
+            facts["walkers"] = [walker.record() for walker in self.walkers]
         return facts
 
 
@@ -94,6 +99,8 @@ def wild_room(
       is focused at DISTANCE, r uniform in [0.2, 1] R; the focus of each photo is uniform in 1/z between
       depths of 2.5 and 8.
     - `true-exposure[:EV]` (1): gains as in `exposure` (`draw_gains`), on the light before the camera's curve.
+    - `true-crowd[:N]` (3): 0 to N figures walk through each photo (`draw_walkers`); where they are, and
+      nowhere else, it differs from the clean one.
 
     All is averaged in linear light; the camera's curve (`render_exposure`) comes last, then 8 bits. Each
     photo has a generator of its own from the seed and its place among all names. Points and poses are those
@@ -115,12 +122,7 @@ def wild_room(
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
     kept = None if folder is None else read_kept(folder, made, list(truth))
     if kept is None:
-        photos = {
-            view.name: render_exposure(
-                exposure(name, view.camera, truth[view.name]), truth[view.name].gains, threads
-            )
-            for view in clean.train
-        }
+        photos = {view.name: taken(name, view.camera, truth[view.name], threads) for view in clean.train}
         kept = Kept(photos, {}, "")
         if folder is not None:
             write_kept(folder, made, kept)
@@ -144,7 +146,7 @@ def parse_true_kind(text: str, width: int = WIDTH) -> tuple[str, float]:
         value = float(number)
     except ValueError:
         value = math.nan
-    if not kind.lowest <= value <= kind.highest:
+    if not kind.lowest <= value <= kind.highest or (kind.integer and value % 1):
         raise ValueError(f"{name} is {number}, wanted {kind.unit}, {kind.lowest:g}..{kind.highest:g}")
     return name, value
 
@@ -160,9 +162,17 @@ def exposure(kind: str, camera: Camera, truth: PhotoTruth) -> Exposure:
     return still(camera, STILL)
 
 
+def taken(kind: str, camera: Camera, truth: PhotoTruth, threads: int | None = None) -> NDArray[np.uint8]:
+    """The photo that the truth stands for."""
+    passing = [surface for walker in truth.walkers for surface in walker.surfaces()]
+    return render_exposure(exposure(kind, camera, truth), truth.gains, threads, passing=passing)
+
+
 def _draw(kind: str, value: float, camera: Camera, rng: np.random.Generator) -> PhotoTruth:
     if kind == "true-exposure":
         return PhotoTruth(gains=draw_gains(rng, value))
+    if kind == "true-crowd":
+        return PhotoTruth(walkers=draw_walkers(rng, int(value)))
     strength, focal = value * draw_strength(rng), camera.K[0, 0]
     if kind == "true-defocus":
         aperture = strength * DISTANCE / focal
