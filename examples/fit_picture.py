@@ -58,7 +58,7 @@ def main() -> None:
         loss.backward()
         optimizer.step()
         if (iteration + 1) % max(1, args.iterations // 10) == 0:
-            seen = int((meta["radii"][0] > 0).all(dim=1).sum())
+            seen = len(meta["radii"])
             print(f"iteration {iteration + 1}: {-10 * loss.log10().item():.2f} dB, {seen} Gaussians in view")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     both = torch.cat([target, image.detach().clamp(0, 1)], dim=1)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from hqgs.diagnosis.scene import Diagnosis
     from hqgs.diagnosis.scene import diagnose_scene as diagnose
     from hqgs.model.gaussians import Gaussians
+    from hqgs.model.gsplat_kernels import gsplat_on_cpu
     from hqgs.model.orbit import orbit
     from hqgs.model.rasterization import RasterizationMeta, rasterization
     from hqgs.photos.pixels import picture
@@ -47,6 +48,7 @@ __all__ = [
     "degrade",
     "diagnose",
     "get_num_threads",
+    "gsplat_on_cpu",
     "load",
     "load_cameras",
     "look_at",
@@ -75,6 +77,7 @@ _HOMES = {
     "degrade": "hqgs.scene.source",
     "diagnose": "hqgs.diagnosis.scene:diagnose_scene",
     "get_num_threads": "hqgs._rust",
+    "gsplat_on_cpu": "hqgs.model.gsplat_kernels",
     "load": "hqgs.scene.source",
     "load_cameras": "hqgs.scene.camera_files",
     "look_at": "hqgs.scene.paths",

@@ -227,8 +227,9 @@ def reference_rasterization(
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
     absgrad: bool = False,
+    packed: bool = False,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render in float64: (render [C, H, W, X], alphas [C, H, W, 1], meta).
+    """Render in float64: (render [C, H, W, X], alphas [C, H, W, 1], meta), never packed.
 
     meta: `means2d` [C, N, 2], `depths` [C, N], `conics` [C, N, 3], `opacities` [C, N], all 0 where culled;
     `radii` [C, N, 2] int32; `extents` [C, N, 2], the radii before rounding, also of off-screen Gaussians;
@@ -237,6 +238,7 @@ def reference_rasterization(
     `means2d.absgrad` [C, N, 2].
     """
     assert render_mode in RENDER_MODES
+    assert not packed
     assert rasterize_mode in ("classic", "antialiased")
     f64 = torch.float64
     means, quats, scales, opacities, colors = (v.to(f64) for v in (means, quats, scales, opacities, colors))

@@ -33,7 +33,7 @@ class GaussianScene:
 
     def arguments(self, **changes: Any) -> dict[str, Any]:
         """All arguments by name, for `rasterization(**scene.arguments())`, with `changes` put in."""
-        return {**vars(self), **changes}
+        return {"packed": False, **vars(self), **changes}
 
     def with_grad(self, *names: str) -> GaussianScene:
         """A copy whose tensors are new leaves; those named require a gradient."""

@@ -33,6 +33,7 @@ class RasterPass:
         viewmat, K = (torch.from_numpy(m[None]).float() for m in (inputs.viewmat, inputs.K))
         self.arguments: dict[str, Any] = dict(zip((*LEAVES[:4], "colors"), self.leaves, strict=True))
         self.arguments |= {"viewmats": viewmat, "Ks": K, "width": inputs.width, "height": inputs.height}
+        self.arguments["packed"] = False
         self.arguments |= {"backgrounds": torch.from_numpy(inputs.background[None]).to(dtype), "sh_degree": 3}
         self.v_image = torch.from_numpy(inputs.v_image[None]).to(dtype)
         self.work = (0, 0, 0)  # of the last pass: pairs, blocks, blocks with a change

@@ -64,6 +64,7 @@ def render(s: OracleScene, dtype: str, cotangents: dict[Pixel, Array]) -> Any:
         Ks=tensor(s.K)[None],
         backgrounds=None if s.background is None else tensor(s.background)[None],
         rasterize_mode="antialiased" if s.antialiased else "classic",
+        packed=False,
     )
     full = torch.cat([image, alphas], dim=-1)[0]
     i, j = torch.tensor(list(cotangents)).T

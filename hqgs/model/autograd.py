@@ -26,6 +26,10 @@ def _tensor(array: np.ndarray[Any, Any] | None, *shape: int) -> Tensor | None:
     return None if array is None else torch.from_numpy(array).view(shape)
 
 
+def _packed(tensor: Tensor | None, ids: tuple[Tensor, ...] | None) -> Tensor | None:
+    return tensor if tensor is None or ids is None else tensor[ids]
+
+
 class _First(torch.autograd.Function):
     """Gradients as they are, which say where they are differentiated that there is no more to have.
 
@@ -125,19 +129,20 @@ class _Project(torch.autograd.Function):
 
 
 class _Composite(torch.autograd.Function):
-    """Splats to pixels."""
+    """Splats to pixels. Of `means2d`, [C, N, 2], or [M, 2] of the pairs `ids` (cameras and Gaussians, [M]
+    each), no value is looked at, for the frame has them: it gets the gradient."""
 
     @staticmethod
-    def forward(ctx: Any, frame, means2d, link, alphas_in, colors, backgrounds, absgrad):
+    def forward(ctx: Any, frame, means2d, link, alphas_in, colors, backgrounds, absgrad, ids):
         channels = colors.shape[-1]
         state, image, alphas = _rust.composite_forward(
             frame, _numpy(colors), _optional(backgrounds), channels
         )
-        c = means2d.shape[0]
+        c = link.shape[0]
         width, height = frame.width, frame.height
         image = torch.from_numpy(image).view(c, height, width, channels)
         alphas = torch.from_numpy(alphas).view(c, height, width, 1)
-        ctx.state, ctx.absgrad = state, absgrad
+        ctx.state, ctx.absgrad, ctx.ids, ctx.splats = state, absgrad, ids, link.shape[:2]
         ctx.save_for_backward(means2d, colors, backgrounds)
         ctx.image_shape = image.shape
         ctx.set_materialize_grads(False)
@@ -148,11 +153,11 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *grads):
         v_image, v_alphas, _ = grads
         means2d, colors, backgrounds = ctx.saved_tensors
-        _, need_means2d, need_link, need_alphas, need_colors, need_backgrounds, _ = ctx.needs_input_grad
+        _, need_means2d, need_link, need_alphas, need_colors, need_backgrounds, *_ = ctx.needs_input_grad
         geometry = need_means2d or need_link or need_alphas
         if v_image is None and v_alphas is None:
-            return (None,) * 7
-        c, n, channels = means2d.shape[0], means2d.shape[1], colors.shape[-1]
+            return (None,) * 8
+        (c, n), channels = ctx.splats, colors.shape[-1]
         v_image = means2d.new_zeros(ctx.image_shape) if v_image is None else v_image
         wanted = [geometry, ctx.absgrad, need_colors, need_backgrounds]
         *v_inputs, _ = _rust.composite_backward(
@@ -160,16 +165,17 @@ class _Composite(torch.autograd.Function):
         )
         v_means2d, v_link, v_alphas_in, v_abs, v_colors, v_backgrounds = v_inputs
         if v_abs is not None:
-            means2d.absgrad = _tensor(v_abs, c, n, 2)
+            means2d.absgrad = _packed(_tensor(v_abs, c, n, 2), ctx.ids)
         v_color = _tensor(v_colors, c, n, channels)
         if v_color is not None and colors.dim() == 2:
             v_color = v_color[0] if c == 1 else v_color.sum(0)
         return (
             None,
-            _tensor(v_means2d, c, n, 2),
+            _packed(_tensor(v_means2d, c, n, 2), ctx.ids),
             _tensor(v_link, c, n, 3),
             _tensor(v_alphas_in, c, n),
             v_color,
             _tensor(v_backgrounds, c, channels),
+            None,
             None,
         )

@@ -220,6 +220,7 @@ class Gaussians:
             render_mode=render_mode,
             eps2d=eps2d,
             near_plane=near_plane,
+            packed=False,
             rasterize_mode="antialiased" if self.antialiased else "classic",
         )
 

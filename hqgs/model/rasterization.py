@@ -28,19 +28,26 @@ RASTERIZE_MODES = ("classic", "antialiased")
 
 
 class RasterizationMeta(TypedDict):
-    """What `rasterization` knows beside its images, of N Gaussians in C cameras."""
+    """What `rasterization` knows beside its images, of N Gaussians in C cameras.
+
+    Packed, [C, N] is [M]: the pairs of camera and Gaussian that are not culled, by camera, then Gaussian.
+    """
 
     means2d: Tensor  # [C, N, 2], pixels; call `.retain_grad()` on it to get its gradient
     radii: Tensor  # [C, N, 2], int32, pixels; 0 where culled
     depths: Tensor  # [C, N], world units along the viewing axis
     conics: Tensor  # [C, N, 3], 1/px^2: the inverse 2D covariance's xx, xy, yy
     opacities: Tensor  # [C, N], after the compensation of "antialiased"
+    batch_ids: Tensor | None  # [M], int64, the scene of each pair, all three None where nothing is packed
+    camera_ids: Tensor | None  # [M], the camera
+    gaussian_ids: Tensor | None  # [M], the Gaussian
     width: int
     height: int
     tile_size: int
+    tile_width: int  # tiles in a row of the image
+    tile_height: int
+    n_batches: int
     n_cameras: int
-    camera_ids: None  # gsplat has them where it packs its arrays; nothing is packed here, see `rasterization`
-    gaussian_ids: None
     work: tuple[int, int, int]  # pairs of Gaussian and tile, blocks evaluated, blocks with a change
 
 
@@ -112,13 +119,13 @@ def rasterization(
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
         covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then. As for
             gsplat, the entries on and above the diagonal count, those above it for two, and get the gradient.
-        packed, tile_size, sparse_grad, channel_chunk: hints of other implementations; they change nothing.
-            Arrays are never packed, so that `meta` has no `gaussian_ids` and `camera_ids` (they are None) and
+        packed: whether the meta data hold only what is not culled. Images and gradients are the same.
+        tile_size, sparse_grad, channel_chunk: hints of other implementations; they change no image. There are
             no tile lists (`tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`: a KeyError that
-            says so). A strategy of gsplat works with `packed=False`, its own default, which has these shapes.
+            says so).
 
     Any number of leading batch dimensions, the same for all tensors (but a `backgrounds` [D]), gives as many
-    scenes, one after the other: outputs and the tensors of the meta data have them too.
+    scenes, one after the other: outputs and, unless packed, the tensors of the meta data have them too.
 
     Returns:
         render_colors [C, height, width, X], not clamped; render_alphas [C, height, width, 1]; and
@@ -169,29 +176,44 @@ def rasterization(
     numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
     config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), sh_degree)
     projected = [_project(scene, config) for scene in scenes]
-    joined = projected[0]["means2d"]
-    if batch:  # what is composited are slices of the one tensor that the caller gets, with its gradient
-        joined = torch.stack([splats["means2d"] for splats in projected]).unflatten(0, batch)
-        for splats, means2d in zip(projected, joined.flatten(0, len(batch) - 1).unbind(0), strict=True):
-            splats["means2d"] = means2d
-    pairs = zip(scenes, projected, strict=True)
-    images, alphas, works = zip(*(_composite(a, b, render_mode, absgrad) for a, b in pairs), strict=True)
+    ids = [(s["radii"] > 0).all(-1).nonzero(as_tuple=True) for s in projected] if packed else None
 
     def together(values: Sequence[Tensor]) -> Tensor:
         return torch.stack([*values]).unflatten(0, batch) if batch else values[0]
 
+    def of_splats(name: str) -> Tensor:
+        values = [splats[name] for splats in projected]
+        if ids is None:
+            return together(values)
+        return torch.cat([value[pair] for value, pair in zip(values, ids, strict=True)])
+
+    means2d = of_splats("means2d")
+    parts = [means2d]
+    if ids is not None:
+        parts = means2d.split([len(cameras) for cameras, _ in ids])
+    elif batch:
+        parts = means2d.flatten(0, len(batch) - 1).unbind(0)
+    # What is composited is the one tensor that the caller gets, or a slice of it: so it has its gradient.
+    shots = zip(scenes, projected, parts if batch else [means2d], ids or [None] * len(scenes), strict=True)
+    images, alphas, works = zip(*(_composite(*shot, render_mode, absgrad) for shot in shots), strict=True)
     meta: RasterizationMeta = {
-        "means2d": joined,
-        "radii": together([splats["radii"] for splats in projected]),
-        "depths": together([splats["depths"] for splats in projected]),
-        "conics": together([splats["conics"] for splats in projected]),
-        "opacities": together([splats["opacities"] for splats in projected]),
+        "means2d": means2d,
+        "radii": of_splats("radii"),
+        "depths": of_splats("depths"),
+        "conics": of_splats("conics"),
+        "opacities": of_splats("opacities"),
+        "batch_ids": None
+        if ids is None
+        else torch.cat([torch.full_like(k, b) for b, (k, _) in enumerate(ids)]),
+        "camera_ids": None if ids is None else torch.cat([cameras for cameras, _ in ids]),
+        "gaussian_ids": None if ids is None else torch.cat([gaussians for _, gaussians in ids]),
         "width": int(width),
         "height": int(height),
         "tile_size": tile_size,
+        "tile_width": -(-int(width) // tile_size),
+        "tile_height": -(-int(height) // tile_size),
+        "n_batches": len(scenes),
         "n_cameras": c,
-        "camera_ids": None,
-        "gaussian_ids": None,
         "work": (sum(w[0] for w in works), sum(w[1] for w in works), sum(w[2] for w in works)),
     }
     return together(images), together(alphas), cast(RasterizationMeta, _Meta(meta))
@@ -234,9 +256,14 @@ def _project(scene: dict[str, Tensor], config: tuple[Any, ...]) -> dict[str, Any
 
 
 def _composite(
-    scene: dict[str, Tensor], splats: dict[str, Any], render_mode: str, absgrad: bool
+    scene: dict[str, Tensor],
+    splats: dict[str, Any],
+    means2d: Tensor,
+    ids: tuple[Tensor, ...] | None,
+    render_mode: str,
+    absgrad: bool,
 ) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
-    """Images and alphas of one scene's splats, and the work that it was."""
+    """Images and alphas of one scene's splats, and the work that it was; `means2d` gets the gradient."""
     channels, depths, backgrounds = splats["channels"], splats["depths"], scene.get("backgrounds")
     c = len(depths)
     if backgrounds is not None and backgrounds.shape != (c, channels.shape[-1]):
@@ -252,12 +279,13 @@ def _composite(
             backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
     image, alphas, work = _Composite.apply(
         splats["frame"],
-        splats["means2d"],
+        means2d,
         splats["link"],
         splats["opacities"],
         channels,
         backgrounds,
         absgrad,
+        ids,
     )
     if render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)

@@ -133,6 +133,7 @@ class Activated:
         self._how: dict[str, Any] = {
             "near_plane": g.near_plane(),
             "rasterize_mode": "antialiased" if g.antialiased else "classic",
+            "packed": False,
         }
         self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
 

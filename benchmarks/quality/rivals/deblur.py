@@ -88,6 +88,7 @@ class Deblur(ThreeDGS):
             camera.height,
             sh_degree=sh_degree,
             eps2d=eps2d,
+            packed=False,
             backgrounds=torch.tensor([[*background]] * VIRTUAL, dtype=gaussians.means.dtype),
         )
         # Growth goes by how the loss changes when a Gaussian moves in all renders alike.

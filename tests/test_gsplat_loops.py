@@ -1,0 +1,138 @@
+"""Training loops written for gsplat: packed meta data, and its own strategies from PyPI."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scenes import random_scene
+from torch import Tensor
+
+import hqgs
+from hqgs.model.gsplat_kernels import relocation
+
+F32, F64 = torch.float32, torch.float64
+PER_SPLAT = ("means2d", "radii", "depths", "conics", "opacities")
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_packed_holds_what_is_not_culled(batch: tuple[int, ...]) -> None:
+    scenes = [random_scene(60, 24, 17, 3, seed=seed, dtype=F64).with_grad("means") for seed in range(2)]
+    options: dict[str, Any] = scenes[0].arguments()
+    if batch:
+        for name, value in options.items():
+            if isinstance(value, Tensor):
+                options[name] = torch.stack([getattr(scene, name) for scene in scenes])
+    image, alphas, meta = hqgs.rasterization(**{**options, "packed": True})
+    plain_image, plain_alphas, plain = hqgs.rasterization(**{**options, "packed": False})
+    assert torch.equal(image, plain_image)
+    assert torch.equal(alphas, plain_alphas)
+    seen = (plain["radii"] > 0).all(-1)
+    assert 0 < int(seen.sum()) < seen.numel()
+    for name in PER_SPLAT:
+        assert torch.equal(meta[name], plain[name][seen]), name
+    where = (meta["batch_ids"], meta["camera_ids"], meta["gaussian_ids"])[0 if batch else 1 :]
+    assert torch.equal(torch.stack(where, -1), seen.nonzero())  # pyright: ignore
+    assert (meta["n_batches"], meta["n_cameras"]) == (math.prod(batch), 3)
+    assert (meta["tile_width"], meta["tile_height"]) == (2, 2)
+    for each, picture in ((meta, image), (plain, plain_image)):
+        each["means2d"].retain_grad()
+        picture.square().sum().backward()
+    assert plain["means2d"].grad is not None
+    assert meta["means2d"].grad is not None
+    assert meta["means2d"].grad.abs().max() > 0
+    assert torch.equal(meta["means2d"].grad, plain["means2d"].grad[seen])
+
+
+def test_packed_gradients_and_absgrad_are_those_of_the_plain() -> None:
+    found = []
+    for packed in (True, False):
+        scene = random_scene(60, 24, 17, 3, seed=1, dtype=F64).with_grad("means", "colors")
+        image, _, meta = hqgs.rasterization(**scene.arguments(packed=packed), absgrad=True)
+        image.square().sum().backward()
+        found.append((scene.means.grad, scene.colors.grad, meta["means2d"].absgrad, meta["radii"]))  # pyright: ignore
+    (means, colors, absgrad, _), (plain_means, plain_colors, plain_absgrad, radii) = found
+    assert torch.equal(means, plain_means)
+    assert torch.equal(colors, plain_colors)
+    assert torch.equal(absgrad, plain_absgrad[(radii > 0).all(-1)])
+
+
+@pytest.mark.parametrize(("opacity", "count"), [(0.3, 2), (0.9, 7), (0.999, 51), (0.6, 1)])
+def test_relocation_keeps_alpha_along_a_line(opacity: float, count: int) -> None:
+    """By numerical integration of what is seen of one, and of `count` at one place."""
+    binoms = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)], dtype=F32)
+    arguments = torch.tensor([opacity], dtype=F64), torch.full((1, 3), 0.7, dtype=F64)
+    new, scales = relocation(*arguments, torch.tensor([count], dtype=torch.int32), binoms, 51)
+    x = np.linspace(-20, 20, 20_001)
+    one = opacity * np.exp(-0.5 * (x / 0.7) ** 2)
+    many = 1 - (1 - float(new) * np.exp(-0.5 * (x / float(scales[0, 0])) ** 2)) ** count
+    assert many.max() == pytest.approx(opacity)
+    assert many.sum() == pytest.approx(one.sum(), rel=1e-6)
+
+
+def fit(name: str, packed: bool, steps: int = 240) -> tuple[list[float], list[int], Tensor]:
+    """Losses, numbers of Gaussians and last means of a loop as gsplat's example has it."""
+    gsplat = pytest.importorskip("gsplat")
+    torch.manual_seed(0)
+    y, x = torch.meshgrid(torch.linspace(0, 1, 40), torch.linspace(0, 1, 40), indexing="ij")
+    target = torch.stack([x, y, 0.5 + 0.5 * torch.sin(25 * x) * torch.sin(20 * y)], -1)[None]
+    n, rates = 150, {"means": 5e-3, "scales": 1e-2, "quats": 1e-3, "opacities": 3e-2, "colors": 2e-2}
+    values = {
+        "means": torch.cat([torch.rand(n, 2) - 0.5, 1 + 0.1 * torch.rand(n, 1)], 1),
+        "scales": torch.full((n, 3), math.log(0.05)),
+        "quats": torch.randn(n, 4),
+        "opacities": torch.zeros(n),
+        "colors": torch.rand(n, 3),
+    }
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in values.items()})
+    optimizers = {key: torch.optim.Adam([params[key]], lr=rate, eps=1e-15) for key, rate in rates.items()}
+    every: dict[str, Any] = {"refine_start_iter": 20, "refine_every": 40}
+    if name == "MCMCStrategy":
+        hqgs.gsplat_on_cpu()
+        strategy, how = gsplat.MCMCStrategy(cap_max=220, noise_lr=1.0, **every), {"lr": rates["means"]}
+    else:
+        strategy, how = gsplat.DefaultStrategy(reset_every=150, **every), {"packed": packed}
+    strategy.check_sanity(params, optimizers)
+    state, losses, counts = strategy.initialize_state(), [], []
+    for step in range(steps):
+        image, _, info = hqgs.rasterization(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid(),
+            params["colors"],
+            torch.eye(4)[None],
+            torch.tensor([[[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]]),
+            40,
+            40,
+            packed=packed,
+        )
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = (image - target).square().mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        strategy.step_post_backward(params, optimizers, state, step, info, **how)
+        losses.append(loss.item())
+        counts.append(len(params["means"]))
+    return losses, counts, params["means"].detach()
+
+
+def test_the_default_strategy_of_gsplat_runs_unchanged() -> None:
+    losses, counts, means = fit("DefaultStrategy", packed=False, steps=170)
+    assert np.mean(losses[100:140]) < 0.3 * losses[0]
+    assert max(counts) > 150  # it grows
+    packed_losses, packed_counts, packed_means = fit("DefaultStrategy", packed=True, steps=170)
+    assert (packed_losses, packed_counts) == (losses, counts)
+    assert torch.equal(packed_means, means)
+
+
+def test_the_mcmc_strategy_of_gsplat_runs_unchanged() -> None:
+    losses, counts, means = fit("MCMCStrategy", packed=True)
+    assert np.mean(losses[-40:]) < 0.3 * losses[0]
+    assert counts[-1] == 189  # 5 % more at steps 40, 80, ... 200, each rounded down
+    assert means.isfinite().all()
