@@ -34,6 +34,7 @@ from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord,
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
+from hqgs.scene.photo_files import strangers
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
@@ -128,7 +129,8 @@ def train(
 
     Raises:
         ValueError: a scene or a setting that cannot be trained, a damaged checkpoint, or one of another run.
-        FileExistsError: `out` holds a run, and neither `resume` nor `overwrite` is set.
+        FileExistsError: `out` holds a run, and neither `resume` nor `overwrite` is set; or files of no run
+            that this one would write over.
         FolderBusyError: another run writes into `out`.
         TrainingError: the training cannot go on; the message says at which iteration and why.
         RankError: another of the ranks has failed or gone.
@@ -149,6 +151,8 @@ def train(
     taken = ranks.first and out is not None and (Path(out) / CHECKPOINT).exists()
     if taken and not (resume or overwrite):
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
+    if out is not None and ranks.first and not taken:
+        strangers(Path(out))
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
     with open_run(scene, config or asked, out, resume, seconds, on_stage, ranks) as trainer:

@@ -94,9 +94,9 @@ def test_sfm_replaces_poses_and_points_once(
     monkeypatch.setattr(source, "load_scene", load)
     monkeypatch.setattr(source, "sfm_scene", sfm)
     options = ["--sfm", "--degrade", kind, "--iterations", "2"]
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "a.png").touch()
-    assert call("train", tmp_path / "photos", "--out", tmp_path, *options) == 0
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "a.png").touch()
+    assert call("train", tmp_path / "pictures", "--out", tmp_path, *options) == 0
     written, printed = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     if (form, kind) == ("photos", "none"):
         assert seen == []
@@ -167,6 +167,30 @@ def test_the_folder_of_the_photos_is_no_folder_for_a_run(
     assert call("train", tmp_path, "--out", tmp_path / "." / "") == 2
     assert one_line(capsys) == f"hqgs: --out {tmp_path} is the folder of the photos: name another for the run"
     assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
+
+
+def test_what_lies_in_the_folder_of_a_new_run_is_named_or_kept(
+    asked: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "photos").mkdir()
+    options = ["train", "embedded", "--out", tmp_path, "--iterations", "2"]
+    assert call(*options, "--resume") == 0
+    first, second = capsys.readouterr().out.splitlines()[:2]
+    assert first == f"--resume: {tmp_path} holds no run to go on with; a new one begins"
+    assert second.startswith(f"--out {tmp_path} holds other files too (notes.txt, photos): ")
+    assert call(*options, "--overwrite") == 0  # a run of ours
+    assert "other files" not in capsys.readouterr().out
+    for name in ("config.json", "photos/a.jpg"):
+        others = tmp_path / ("of " + name.replace("/", " "))
+        (others / name).parent.mkdir(parents=True)
+        (others / name).write_text("mine")
+        wanted = f"{others} holds {name.partition('/')[0]}, of no run, which a run would write over"
+        assert call("train", "embedded", "--out", others, "--iterations", "2") == 2
+        assert wanted in one_line(capsys)
+        with pytest.raises(FileExistsError, match="would write over"):
+            hqgs.train(tiny_scene(), out=others, iterations=2)
+        assert [path for path in others.rglob("*") if path.is_file()] == [others / name]
 
 
 @pytest.mark.parametrize(

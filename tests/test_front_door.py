@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from fixtures_scenes import make_truth, write_transforms
 from PIL import Image
 from test_bare_photos import exif, picture
 from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
@@ -15,6 +16,8 @@ from hqgs.photos.exif import read_exif
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
+from hqgs.scene.sfm.folder import write_colmap_folder
+from hqgs.scene.source import load, pictures
 
 
 def looked_at(folder: Path) -> BarePhotos:
@@ -161,3 +164,48 @@ def test_a_screenshot_is_left_out_where_it_has_no_place_and_used_where_it_has(
         "the photos all the same, and is used",
         f"shot.png looks like a screenshot (PNG of {size}, no camera in EXIF): it was left out",
     ]
+
+
+def test_masks_are_looked_at_before_colmap_works(tmp_path: Path) -> None:
+    photos, heard = tmp_path / "set", list[Stage]()
+    (photos / "masks").mkdir(parents=True)
+    for k in range(4):
+        picture(k, (64, 48)).save(photos / f"{k}.png")
+    Image.new("L", (48, 64), 255).save(photos / "masks" / "2.png")
+    with pytest.raises(ValueError, match=r"2\.png is 48 x 64, its photo 64 x 48: another shape"):
+        load_scene(photos, keep_sfm=tmp_path / "sfm", told=heard.append)
+    assert {stage.what for stage in heard} == {"photos looked at"}
+    assert not (tmp_path / "sfm").exists()
+
+
+def test_photos_without_a_mask_are_named_where_others_have_one(tmp_path: Path) -> None:
+    truth = make_truth(4)
+    write_transforms(truth, tmp_path)
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT), 255).save(tmp_path / "masks" / "other.png")
+    notes = load_scene(tmp_path).notes
+    assert "masks are in masks, but none of them has the name of a photo, and none is used" in notes
+    Image.new("L", (48, 36), 255).save(tmp_path / "masks" / truth.names[0])
+    notes = load_scene(tmp_path).notes
+    assert any(
+        note.startswith("masks are in masks, but 3 of 4 photos have none, and count") for note in notes
+    )
+
+
+def test_frames_are_asked_of_films_alone(tmp_path: Path) -> None:
+    picture(0).save(tmp_path / "a.png")
+    for ask in (
+        lambda: load(tmp_path, frames=9),
+        lambda: write_colmap_folder(tmp_path, tmp_path, tmp_path, 9),
+    ):
+        with pytest.raises(ValueError, match=r"frames is for films, and .* is none"):
+            ask()
+    with pytest.raises(ValueError, match="frames is for films"):
+        load("embedded", frames=9)
+
+
+def test_a_look_at_photos_without_poses_is_of_the_size_that_a_run_takes(tmp_path: Path) -> None:
+    for k in range(3):
+        picture(k, (400, 300)).save(tmp_path / f"{k}.png")
+    assert {view.image.shape for view in pictures(tmp_path, longest=200).train} == {(150, 200, 3)}
+    assert {view.image.shape for view in pictures(tmp_path).train} == {(300, 400, 3)}

@@ -18,6 +18,7 @@ from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, PAGE, PLY
 from hqgs.base.left_out import format_left_out
 from hqgs.base.ranks import RankError, Ranks, joined
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.out_folder import check_out
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
@@ -304,15 +305,8 @@ def _checked(options: Train) -> TrainConfig:
     """The configuration of options that can be used."""
     config = options.expert if isinstance(options, Whole) else config_of(options)
     parse_degradation(options.degrade)
-    if (options.out / CHECKPOINT).exists() and not (options.resume or options.overwrite):
-        raise FileExistsError(
-            f"{options.out} holds a run; continue it with --resume, begin anew with --overwrite, or "
-            "choose another --out"
-        )
-    if options.out.is_dir() and Path(options.scene).is_dir() and options.out.samefile(options.scene):
-        raise ValueError(f"--out {options.out} is the folder of the photos: name another for the run")
-    if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"--out {options.out} is a file: name a folder for the run")
+    for line in check_out(options.out, options.scene, options.resume, options.overwrite):
+        print(line, flush=True)
     if options.view:
         check(options.port)
     return config

@@ -157,15 +157,21 @@ def shrunk(stored: int, decoded: int) -> int:
     return next(factor for factor in (1, 2, 4, 8) if -(-stored // factor) <= decoded)
 
 
+def check_mask(path: Path, width: int, height: int) -> tuple[int, int]:
+    """Width and height of a mask file. ValueError where it has another shape than its photo."""
+    w, h = stored_size(path, "mask")
+    if abs(w * height - h * width) > width + height:
+        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
+    return w, h
+
+
 def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     """The mask file as [height, width], True where it counts; the nearest pixel at another size.
 
     What is not zero counts; in a lossy file, which blurs its edges, what is at least half of white. A file
     whose colours are all one, but whose alpha is not, has its mask in alpha, from half on.
     """
-    w, h = stored_size(path, "mask")
-    if abs(w * height - h * width) > width + height:
-        raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
+    w, h = check_mask(path, width, height)
     try:
         with open_photo(path) as file:
             lossy = file.format in _LOSSY or (file.format == "WEBP" and _is_lossy_webp(path))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import FRAMES, missing_folders, remove_empty, write_json
+from hqgs.base.files import FRAMES, is_room, missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
@@ -65,6 +65,12 @@ def film_frames(
             "reference white of 203 cd/m2 is bent to end at white"
         )
     return target, note
+
+
+def check_film(path: str | Path) -> None:
+    """ValueError where a number of frames is asked of something else than a film."""
+    if is_room(path) or Path(path).is_dir():
+        raise ValueError(f"frames is for films, and {path} is none: each of its photos is used")
 
 
 def write_details(folder: Path, details: dict[str, float]) -> None:

@@ -23,7 +23,7 @@ from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.photo_files import is_run
-from hqgs.scene.place import BEHIND, cut_outs, located, placed, without_missing, without_strays
+from hqgs.scene.place import BEHIND, cut_outs, located, masks_told, placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
@@ -87,7 +87,7 @@ def load_scene(
     degraded = read_degraded_folder(root)
     if degraded is not None:
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
-    notes = list(capture.notes)
+    notes = [*capture.notes, *masks_told(root, capture)]
     test_names = held_out_names(root, capture, test_every, notes, degraded)
     capture = placed(without_strays(without_missing(root, capture, notes), notes), notes)
     train_names = frozenset(photo.name for photo in capture.photos) - test_names
@@ -132,11 +132,13 @@ def load_scene(
     )
 
 
-def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> Scene | None:
+def load_pictures(
+    path: str | Path, downscale: float = 1.0, most: int = 16, longest: int | None = None
+) -> Scene | None:
     """Some photos of a folder that holds photos alone, spread over it, as a scene that has no poses.
 
     Each camera is a placeholder: a plausible one at the origin. None where the folder has cameras of its own.
-    ValueError where it holds neither.
+    `longest` bounds all photos of the folder as `load_scene` does. ValueError where it holds neither.
     """
     root = existing_folder(path)
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
@@ -155,7 +157,7 @@ def load_pictures(path: str | Path, downscale: float = 1.0, most: int = 16) -> S
             Photo(name, photos.folder / name, camera, np.eye(4), film=details.get(name))
             for name, camera in zip(names, cameras, strict=True)
         ],
-        photos.downscale,
+        photos.downscale if longest is None else bound(photos.sizes, photos.downscale, longest),
     )
     notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
     nothing = no_points()
@@ -241,15 +243,18 @@ def _nothing(root: Path) -> str:
     )
 
 
+def bound(sizes: list[tuple[int, int]], downscale: float, longest: int) -> float:
+    """What photos of these sizes are scaled down by: `downscale`, or more where `load_scene` bounds them."""
+    pixels = sum(width * height for width, height in sizes)
+    return max(downscale, max(map(max, sizes)) / longest, math.sqrt(3 * pixels / MOST_BYTES))
+
+
 def bounded(capture: Capture, longest: int) -> Capture:
     """The capture with its photos scaled down until no side is longer, and all of them fit into memory."""
     sizes = [stored_size(photo.path) for photo in capture.photos if photo.path.is_file()]
     if not sizes:
         return capture
-    largest = max(sizes, key=max)
-    bounded = max(max(largest) / longest, capture.downscale)
-    pixels = sum(width * height for width, height in sizes)
-    downscale = max(bounded, math.sqrt(3 * pixels / MOST_BYTES))
+    largest, downscale = max(sizes, key=max), bound(sizes, capture.downscale, longest)
     if downscale <= capture.downscale:
         return capture
     width, height = (round(side / downscale) for side in largest)
@@ -260,7 +265,7 @@ def bounded(capture: Capture, longest: int) -> Capture:
         f"{count} photos of {up_to}{largest[0]} x {largest[1]} px are used at {up_to}{width} x {height} px "
         f"(sides divided by {downscale:.3g}{then}); `--downscale 1` takes their full size, and far longer"
     )
-    if downscale > bounded:
+    if downscale > max(max(largest) / longest, capture.downscale):
         note += (
             f". A side may have {longest} px, but so many photos would take more than "
             f"{MOST_BYTES / 1e9:g} GB of memory then"

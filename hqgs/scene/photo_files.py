@@ -14,11 +14,23 @@ from pathlib import Path
 from unicodedata import normalize
 from urllib.parse import unquote
 
-from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, LOCK, PLY
+from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, LOCK, PAGE, PLAN, PLY
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES
 
 MASKS = "masks"
+_FILES = (
+    CHECKPOINT,
+    CONFIG,
+    PAGE,
+    PLAN,
+    PLY,
+    "report.json",
+    "cameras.json",
+    "error_vs_time.png",
+    "learned.png",
+)
+_FOLDERS = ("photos", "comparison")  # a run writes pictures into them
 _Key = tuple[str, ...]
 
 
@@ -26,6 +38,22 @@ def is_run(folder: Path) -> bool:
     """Whether a folder is one that `hqgs train` writes or wrote: its pictures are no photos."""
     wrote = (folder / CONFIG).is_file() and any((folder / name).exists() for name in (PLY, CHECKPOINT))
     return wrote or (folder / LOCK).is_file()
+
+
+def strangers(out: Path) -> list[str]:
+    """What lies in the folder of a new run, sorted; nothing where a run, or its COLMAP, began there before.
+
+    FileExistsError where the run would write over some of it.
+    """
+    if not out.is_dir() or is_run(out) or (out / KEPT).exists():
+        return []
+    names = sorted(path.name for path in out.iterdir() if path.name[0] != ".")
+    taken = [name for name in names if name in _FILES or (name in _FOLDERS and any((out / name).iterdir()))]
+    if taken:
+        raise FileExistsError(
+            f"{out} holds {some(taken)}, of no run, which a run would write over: name another folder"
+        )
+    return names
 
 
 def below(folder: Path, suffixes: Iterable[str]) -> list[Path]:

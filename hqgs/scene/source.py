@@ -17,7 +17,7 @@ from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
 from hqgs.scene.degrade import degrade_scene
-from hqgs.scene.film import film_frames
+from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.load import check_names, load_pictures, load_scene
 from hqgs.scene.metres import distance_of, in_metres
 from hqgs.scene.restore import check_weights, restore_scene
@@ -94,6 +94,8 @@ def load(
         check_weights(restore)
     kept = None if cache is None else Path(cache)
     models = None if kept is None else kept / KEPT
+    if frames is not None:
+        check_film(path)
     if is_room(path):
         if not downscale >= 1:
             raise ValueError(f"downscale must be at least 1, got {downscale}")
@@ -155,7 +157,7 @@ def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = 
     if not is_room(path):
         with TemporaryDirectory(prefix="hqgs-film-") as name:
             source = film_frames(Path(path), Path(name))[0] if is_film(path) else path
-            if (scene := load_pictures(source, downscale)) is not None:
+            if (scene := load_pictures(source, downscale, longest=longest)) is not None:
                 return replace(scene, name=Path(path).stem) if is_film(path) else scene
     return load(path, downscale=downscale, longest=longest, skip_unreadable=False)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import json
 import re
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import pycolmap
 
 from hqgs.scene.sfm.database import known_cameras, new_cameras
 from hqgs.scene.sfm.likely import MANY, likely_pairs
+from hqgs.scene.sfm.matching import extract, match, pipeline_options
 from hqgs.scene.sfm.sharpen import sharpened
 from hqgs.scene.sfm.tracks import usual
 from hqgs.scene.sfm.versions import SIGMAS, join, smoothed_copies
@@ -29,8 +30,6 @@ ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more close
 UNSURE = 0.36  # px of what SIFT sees that sightings are usually off, from where on patches tell more
 SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
 COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
-BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
-LISTED = 64  # blocks of pairs that are listed
 FAR = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
 ROUNDS = 3  # of leaving those out, which makes the median smaller
 EVERY = 0.5  # s between looks into the log
@@ -293,58 +292,3 @@ class Attempt:
         new = self.directory / "stage.new"
         new.write_text(json.dumps(now), encoding="utf-8")
         new.replace(self.directory / "stage.json")
-
-
-@contextmanager
-def _unwatched(stage: str, total: int) -> Iterator[None]:
-    yield
-
-
-def match(
-    directory: Path,
-    photos: Path,
-    names: list[str],
-    extraction: pycolmap.FeatureExtractionOptions,
-    threads: int,
-    database: Path,
-    watched: Callable[[str, int], AbstractContextManager[None]] = _unwatched,
-    wanted: Callable[[], Any] = lambda: None,
-) -> None:
-    """Features, and matches of the pairs [P, 2] that are wanted then, or of all; geometry is not checked."""
-    with watched("features", len(names)):
-        extract(directory, photos, names, extraction, database)
-    pairs = wanted()
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
-    matching.skip_geometric_verification = True
-    if pairs is not None:
-        listed = pycolmap.ImportedPairingOptions()
-        listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // LISTED)
-        listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist()))
-        with watched("matches", len(pairs)):
-            pycolmap.match_image_pairs(
-                database, matching_options=matching, pairing_options=listed, device=pycolmap.Device.cpu
-            )
-        return
-    pairing = pycolmap.ExhaustivePairingOptions()
-    pairing.block_size = max(2, -(-len(names) // BLOCKS))
-    with watched("matches", len(names) * (len(names) - 1) // 2):
-        pycolmap.match_exhaustive(
-            database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
-        )
-
-
-def extract(directory: Path, photos: Path, names: list[str], extraction: Any, database: Path) -> None:
-    """Features of photos that have none yet."""
-    reader = pycolmap.ImageReaderOptions()
-    if (directory / "masks").is_dir():
-        reader.mask_path = directory / "masks"
-    found = {"reader_options": reader, "extraction_options": extraction, "device": pycolmap.Device.cpu}
-    pycolmap.extract_features(database, photos, image_names=names, **found)
-
-
-def pipeline_options() -> pycolmap.IncrementalPipelineOptions:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
-    return options

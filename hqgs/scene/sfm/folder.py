@@ -12,9 +12,9 @@ from PIL import Image
 from hqgs.base.files import existing_folder, is_film
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import decode
-from hqgs.scene.film import film_frames, frame_details, write_details
+from hqgs.scene.film import check_film, film_frames, frame_details, write_details
 from hqgs.scene.scene import SfmReport
-from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos
+from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos, readable
 from hqgs.scene.sfm.photos_alone import find_cameras
 
 
@@ -28,6 +28,8 @@ def write_colmap_folder(
     one is stopped; it is removed at the end. ValueError where there are no photos, or COLMAP finds no scene
     in them.
     """
+    if frames is not None:
+        check_film(source)
     with TemporaryDirectory(prefix="hqgs-film-") as name:
         if is_film(source):
             source, _ = film_frames(Path(source), Path(name), frames, on_stage)
@@ -35,7 +37,7 @@ def write_colmap_folder(
         photos = bare_photos(root, 1.0)
         if photos is None:
             raise ValueError(f"{root} holds no photos")
-        found = find_cameras(root, photos, work, on_stage)
+        found = find_cameras(root, readable(photos, on_stage), work, on_stage)
         images = out / "images"
         details = frame_details(found.photos.folder)
         kept: dict[str, float] = {}

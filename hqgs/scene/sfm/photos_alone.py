@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.stages import OnStage, silent
+from hqgs.photos.files import check_mask
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
@@ -36,8 +37,7 @@ class FoundCameras:
 def find_cameras(
     root: Path, photos: BarePhotos, keep: Path | None = None, on_stage: OnStage = silent, coarse: bool = False
 ) -> FoundCameras:
-    """Cameras and points of photos alone, by COLMAP, as `read_photos` has them."""
-    photos = readable(photos, on_stage)
+    """Cameras and points of photos that are readable, by COLMAP, as `read_photos` has them."""
     names = photos.colmap_names
     try:
         ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, on_stage, coarse)
@@ -82,6 +82,11 @@ def read_photos(
     the reconstruction; `coarse`: a first look, for small pictures; see `run_colmap`. ValueError where COLMAP
     cannot make a model of half of the photos.
     """
+    photos = readable(photos, on_stage)
+    masks = {name: find_mask(root, name) for name in photos.names}
+    for name, size in zip(photos.names, photos.sizes, strict=True):
+        if (mask := masks[name]) is not None:
+            check_mask(mask, *size)
     cameras = find_cameras(root, photos, keep, on_stage, coarse)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
@@ -89,8 +94,7 @@ def read_photos(
     found: list[Photo] = []
     for file, viewmat in registered(model).items():
         name = names[file]
-        mask = find_mask(root, name)
-        found.append(Photo(name, folder / name, of_image[file], viewmat, mask, details.get(name)))
+        found.append(Photo(name, folder / name, of_image[file], viewmat, masks[name], details.get(name)))
     placed = {photo.name for photo in found}
     notes = [str(cameras.report), *cameras.photos.notes, *tell_strays(cameras.photos.strays, placed)]
     points, colors = keep_finite(*model_points(model), notes)

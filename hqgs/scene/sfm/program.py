@@ -33,8 +33,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.attempt import ALMOST, Attempt, match, pipeline_options
+from hqgs.scene.sfm.attempt import ALMOST, Attempt
 from hqgs.scene.sfm.database import known_cameras
+from hqgs.scene.sfm.matching import match, pipeline_options
 
 MAX_FEATURES = 2048  # per photo, of known cameras
 MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many pixels on average

@@ -28,7 +28,15 @@ from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
-IMPORTED = ("attempt", "database", "likely", "sharpen", "tracks", "versions")  # by PROGRAM, of this folder
+IMPORTED = (
+    "attempt",
+    "database",
+    "likely",
+    "matching",
+    "sharpen",
+    "tracks",
+    "versions",
+)  # by PROGRAM, of this folder
 PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED)]
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
