@@ -173,7 +173,7 @@ def test_masks_are_looked_at_before_colmap_works(tmp_path: Path) -> None:
         picture(k, (64, 48)).save(photos / f"{k}.png")
     Image.new("L", (48, 64), 255).save(photos / "masks" / "2.png")
     with pytest.raises(ValueError, match=r"2\.png is 48 x 64, its photo 64 x 48: another shape"):
-        load_scene(photos, keep_sfm=tmp_path / "sfm", told=heard.append)
+        load_scene(photos, keep_sfm=tmp_path / "sfm", on_stage=heard.append)
     assert {stage.what for stage in heard} == {"photos looked at"}
     assert not (tmp_path / "sfm").exists()
 
