@@ -22,14 +22,14 @@ from hqgs import _rust
 from hqgs._rust import ALPHA_MIN, TRANSMITTANCE_MIN
 from hqgs.model import gaussians
 from hqgs.model.rasterization import RasterizationMeta
-from hqgs.training import looks, trainer
+from hqgs.training import forward, trainer
 from hqgs.training.methods import base
 from hqgs.training.trainer import Trainer
 
 Place = tuple[Any, str]  # a module or class, and the name that its users look up there
 
 # Replaced by the switches below.
-RENDER_VIEW: Place = (looks, "render_view")
+RENDER_VIEW: Place = (forward, "render_view")
 RASTERIZATION: Place = (gaussians, "rasterization")
 ONE_TORCH_THREAD: Place = (trainer, "one_torch_thread")
 ADAM: Place = (trainer, "Adam")

@@ -333,7 +333,7 @@ def _report(
         guard=trainer.guard.summary(),
         culled_in_a_view=sum(culled) / len(culled) if culled else None,
         views=views,
-        learned=[learned_record(found) for found in trainer.method.found()],
+        learned=[learned_record(found) for found in trainer.method.learned()],
         photos=[] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
         ranks=ranks,
     )

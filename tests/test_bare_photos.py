@@ -60,7 +60,7 @@ def test_exif_tells_orientation_camera_and_focal_length(tmp_path: Path) -> None:
     for orientation, turn in ((1, 0), (3, 2), (6, 1), (8, 3)):
         picture(0).save(tmp_path / "a.jpg", exif=exif(orientation, 28, "Phone"))
         found = read_exif(tmp_path / "a.jpg")
-        assert found.turn == turn
+        assert found.quarter_turns == turn
         assert found.camera == ("", "Phone", "0 28")
         assert found.focal == pytest.approx(28 / 43.27 * 50, rel=1e-3)  # the photo's diagonal is 50 px
     picture(0).save(tmp_path / "a.jpg", exif=exif(6, 9999))
@@ -68,7 +68,7 @@ def test_exif_tells_orientation_camera_and_focal_length(tmp_path: Path) -> None:
     picture(0).save(tmp_path / "a.png")
     (tmp_path / "b.jpg").write_text("no photo")
     for name in ("a.png", "b.jpg"):
-        assert (read_exif(tmp_path / name).turn, read_exif(tmp_path / name).camera) == (0, ())
+        assert (read_exif(tmp_path / name).quarter_turns, read_exif(tmp_path / name).camera) == (0, ())
 
 
 def test_photos_share_a_camera_by_size_make_and_zoom(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_the_world_stands_upright_and_every_photo_is_named(photos: list[np.ndarr
     assert "foreign.png" in str(report)
     assert "zz.png (no picture)" in str(report)
     views = [*scene.train, *scene.test]
-    assert {view.turn for view in views} == {1}
+    assert {view.quarter_turns for view in views} == {1}
     assert {view.image.shape for view in views} == {views[0].image.shape}
     ups = np.stack([-view.camera.viewmat[0, :3] for view in views])  # of the stored pixels up is to the left
     mean = ups.mean(0) / np.linalg.norm(ups.mean(0))
@@ -400,7 +400,9 @@ def test_few_photos_and_a_colmap_that_fails_are_told(tmp_path: Path, monkeypatch
         load_scene(tmp_path)
 
 
-def test_sightings_that_lie_far_off_do_not_turn_the_cameras(photos: list[np.ndarray], tmp_path: Path) -> None:
+def test_observations_that_lie_far_off_do_not_turn_the_cameras(
+    photos: list[np.ndarray], tmp_path: Path
+) -> None:
     """3 px is near enough to be placed with, and far in photos of this size."""
     import pycolmap
 

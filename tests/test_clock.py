@@ -45,7 +45,7 @@ def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
         state.seconds += step
         state.decisions = clock.turned(schedule, state, step)  # type: ignore[arg-type]
     assert schedule.part(state.iteration, state.decisions) == pytest.approx(1.0)
-    assert schedule.growth_end(state.decisions) == STOP
+    assert schedule.densification_end(state.decisions) == STOP
     return state.decisions.turned, state.iteration
 
 

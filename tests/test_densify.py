@@ -13,7 +13,7 @@ from torch import Tensor
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.config import DensifyConfig
-from hqgs.training.densify import Densifier, Growth, quats_to_matrices
+from hqgs.training.densify import Densification, Densifier, quats_to_matrices
 
 SIZE = 100  # pixels: a gradient of g per pixel counts as 50 g
 CONFIG = DensifyConfig(start=0, stop=1_000, every=10, reset_every=35)
@@ -79,7 +79,7 @@ def test_clone_split_and_keep_with_the_state_row_by_row() -> None:
     before = {name: tensor.detach().clone() for name, tensor in g.named().items()}
     d = densifier(g)
     see(d, [1.5 * THRESHOLD, 1.5 * THRESHOLD, 0.0, 0.5 * THRESHOLD, 0.0])
-    assert d.update(10, g, optimizer) == Growth(cloned=1, split=1)
+    assert d.update(10, g, optimizer) == Densification(cloned=1, split=1)
 
     # Kept rows first, then the clone of row 0, then the two children that replace row 1.
     origin = [0, 2, 3, 4, 0, 1, 1]
@@ -186,7 +186,7 @@ def test_transparent_gaussians_are_pruned_and_the_rest_stays_aligned() -> None:
         g.opacities[torch.tensor([1, 4])] = math.log(0.0049 / 0.9951)
         g.opacities[2] = math.log(0.0051 / 0.9949)
     d = densifier(g)
-    assert d.update(10, g, optimizer) == Growth(pruned=2)
+    assert d.update(10, g, optimizer) == Densification(pruned=2)
     assert identity(g) == [0, 2, 3, 5]
     assert moments(g, optimizer) == [1, 3, 4, 6]
 
@@ -212,7 +212,7 @@ def test_children_are_judged_by_their_own_size() -> None:
     g, optimizer = make([0.15])  # children: 0.094
     d = densifier(g)
     see(d, [1.0])
-    assert d.update(40, g, optimizer) == Growth(split=1)
+    assert d.update(40, g, optimizer) == Densification(split=1)
     assert len(g) == 2
 
 
@@ -231,10 +231,10 @@ def test_the_cap_takes_the_highest_gradients_first() -> None:
     g, optimizer = make([CLONED, SPLIT, CLONED, SPLIT, CLONED])
     d = densifier(g, replace(CONFIG, max_gaussians=7))
     see(d, [3.0, 5.0, 4.0, 2.0, 1.0])
-    assert d.update(10, g, optimizer) == Growth(cloned=1, split=1)
+    assert d.update(10, g, optimizer) == Densification(cloned=1, split=1)
     assert identity(g) == [0, 2, 3, 4, 2, 1, 1]
     see(d, [1.0] * 7)
-    assert d.update(20, g, optimizer) == Growth()
+    assert d.update(20, g, optimizer) == Densification()
     assert len(g) == 7
 
 

@@ -140,7 +140,7 @@ def test_lenses_are_learned_and_the_scene_gets_sharper() -> None:
     room = wild_room("true-defocus:4", 0, None, 112, 84, num_views=12)
     plain, learned = trained(room.scene, "none"), trained(room.scene, "focus")
     true, found = [], []
-    for view, photo in zip(room.scene.train, learned.method.found(), strict=True):
+    for view, photo in zip(room.scene.train, learned.method.learned(), strict=True):
         made = room.truth[view.name]
         disc = view.camera.K[0, 0] * made.aperture  # px, of a point at distance 1 that is focused at infinity
         slope, offset = disc / median_depth(room.scene, view), -disc / made.focus

@@ -152,7 +152,7 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
     state = trainer.state.decisions
     assert trainer.iteration == state.length < 2_000
     assert state.released == pytest.approx(state.length / 1.5, abs=1)
-    assert trainer.schedule.growth_end(state) == pytest.approx(1.25 * state.released, abs=1)
+    assert trainer.schedule.densification_end(state) == pytest.approx(1.25 * state.released, abs=1)
     assert rates[-1] == pytest.approx(trainer.scene.extent * 1e-9)
     assert all(b <= a for a, b in pairwise(rates))
     item = trainer.frugality.left_out()[0]

@@ -1,4 +1,4 @@
-"""The floor plan stays what docs/architecture.md draws: few rooms, small files, a sentence at each door."""
+"""The floor plan stays what docs/architecture.md draws: few layers, small files, a sentence at each door."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ FOLDERS = ("benchmarks", "examples", "hqgs", "scripts")
 FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
 PACKAGES = [path for path in FILES if path.name == "__init__.py"]
 OF_PYTHON = {"__init__.py", "__main__.py", "__pycache__", "_rust.abi3.so", "_rust.pyi", "py.typed"}
-MOST_ROOMS, MOST_LINES = 12, 350
+MOST_LAYERS, MOST_LINES = 12, 350
 
 
 def relative(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def test_a_newcomer_sees_few_rooms_and_the_map_has_each() -> None:
+def test_a_newcomer_sees_few_layers_and_the_map_has_each() -> None:
     """Beside the files that Python itself wants in a package."""
-    rooms = {path.name for path in (ROOT / "hqgs").iterdir()} - OF_PYTHON
+    layers = {path.name for path in (ROOT / "hqgs").iterdir()} - OF_PYTHON
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    assert len(rooms) <= MOST_ROOMS
-    assert [room for room in sorted(rooms) if f"| `hqgs/{room}" not in page] == []
+    assert len(layers) <= MOST_LAYERS
+    assert [layer for layer in sorted(layers) if f"| `hqgs/{layer}" not in page] == []
 
 
 def test_no_file_is_long() -> None:

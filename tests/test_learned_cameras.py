@@ -170,7 +170,7 @@ def test_gains_are_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = with_gains(scene, np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3)))
     trainer = Trainer(scene, learned_config("auto", leave_out=()), Inspector())
     (logs,) = found
-    begun = [camera.gains for camera in trainer.method.found()]
+    begun = [camera.gains for camera in trainer.method.learned()]
     np.testing.assert_allclose(begun, np.exp(logs))
 
 
@@ -303,7 +303,7 @@ def test_gains_keep_their_mean_and_come_near_the_truth() -> None:
     scene = tiny_scene()
     logs = np.linspace(-0.5, 0.5, len(scene.train))[[0, 3, 1, 4, 2], None] * np.ones(3)
     trainer = run(with_gains(scene, logs), "exposure", iterations=400)
-    found = np.log([photo.gains for photo in trainer.method.found()])
+    found = np.log([photo.gains for photo in trainer.method.learned()])
     assert np.abs(found.mean(0)).max() < 1e-9
     assert np.corrcoef(found.ravel(), logs.ravel())[0, 1] > 0.9
 
@@ -340,11 +340,11 @@ def test_ways_are_learned_and_the_scene_gets_sharper() -> None:
         trained(clean, "shake"),
     )
     cosines = []
-    for photo, way in zip(learned.method.found(), ways, strict=True):
+    for photo, way in zip(learned.method.learned(), ways, strict=True):
         along = photo.trajectory[-1] - photo.trajectory[0]
         cosines.append(abs(along @ way) / (np.linalg.norm(along) * 8 + 1e-9))
     assert np.median(cosines) > 0.9
-    moved, rested = ([photo.extent for photo in t.method.found()] for t in (learned, still))
+    moved, rested = ([photo.extent for photo in t.method.learned()] for t in (learned, still))
     assert np.median(rested) < 0.3 * np.median(moved)
     for trainer in (plain, learned):
         trainer.evaluate()
@@ -358,7 +358,7 @@ def test_other_steps_come_after_the_camera(formation: str) -> None:
     trainer = run(degraded, formation, iterations=20)
     assert trainer.guard.skipped == 0
     assert trainer.config.hqgs.formation == formation
-    assert len(trainer.method.found()) == len(scene.train)
+    assert len(trainer.method.learned()) == len(scene.train)
 
 
 def test_without_photos_to_hold_back_a_run_has_a_length() -> None:

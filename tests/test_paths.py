@@ -80,7 +80,7 @@ def test_up_follows_photos_that_were_held_on_their_side(tmp_path: Path) -> None:
     assert np.abs(world_up(stored) - [0, 0, 1]).max() > 0.5
     np.testing.assert_allclose(world_up(stored[1:2], turns[1:2]), -cameras[1].viewmat[1, :3], atol=1e-9)
     photo = np.zeros((8, 8, 3), np.uint8)
-    views = [View(str(k), camera, photo, turn=turns[k]) for k, camera in enumerate(stored)]
+    views = [View(str(k), camera, photo, quarter_turns=turns[k]) for k, camera in enumerate(stored)]
     scene = Scene("a", views, [], np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), "photos")
     save_cameras(tmp_path, scene)
     up = load_cameras(tmp_path).up

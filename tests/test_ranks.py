@@ -31,8 +31,8 @@ from hqgs.cli.main import main
 from hqgs.training.adam import Adam
 from hqgs.training.batch import ROW_BYTES, Part, Rest, give_harmonics, give_others, part_of, to_rasterize
 from hqgs.training.config import TrainConfig
+from hqgs.training.forward import TrainingViews
 from hqgs.training.guard import Fault
-from hqgs.training.looks import Looks
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.trainer import Trainer
 
@@ -201,14 +201,14 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     plans = trainer.schedule.batch(26, trainer.state.decisions)
     assert len(plans) == 4
     assert plans[0].degree == 3
-    looks = Looks(scene.train, ThreeDGS(), config.background)
+    training = TrainingViews(scene.train, ThreeDGS(), config.background)
     parts, rests = list[Part](), list[Rest]()
     for plan in plans:
-        look = looks.at(plan, to_rasterize(gaussians, gaussians))
+        forward = training.at(plan, to_rasterize(gaussians, gaussians))
         optimizer.zero_grad()
-        assert look.backward(gaussians, optimizer) is None
+        assert forward.backward(gaussians, optimizer) is None
         assert gaussians.shN.grad is None  # it is made of sh0's
-        part, rest = part_of(look, None, gaussians, optimizer)
+        part, rest = part_of(forward, None, gaussians, optimizer)
         m, bits = len(part.rows), len(gaussians) / 8
         assert len(part.packed()) == pytest.approx(ROW_BYTES[0] * m + bits, abs=500)
         assert len(rest().packed()) == pytest.approx(ROW_BYTES[1] * m, abs=500)
@@ -219,7 +219,7 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
     assert set(give_others(parts, rests, gaussians, optimizer).values()) == {4}
     ours = {name: tensor.grad for name, tensor in gaussians.named().items()}
     optimizer.zero_grad()
-    torch.stack([looks.at(plan, gaussians).loss for plan in plans]).mean().backward()
+    torch.stack([training.at(plan, gaussians).loss for plan in plans]).mean().backward()
     for name, tensor in gaussians.named().items():
         expected, got = tensor.grad, ours[name]
         assert expected is not None
@@ -266,7 +266,7 @@ def test_steps_take_each_view_of_the_schedule_once() -> None:
         assert [plan.iteration for plan in plans] == list(range(done + 1, done + 1 + len(plans)))
         assert len({plan.view for plan in plans}) == len(plans) <= 3
         assert not any(plan.resets for plan in plans[1:])
-        assert not any(plan.grows for plan in plans[:-1])
+        assert not any(plan.densifies for plan in plans[:-1])
         done = plans[-1].iteration
         steps.append(plans)
     assert done == config.iterations

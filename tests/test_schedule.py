@@ -19,7 +19,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene.scene import Camera, View
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
-from hqgs.training.schedule import FINEST, Decisions, Plan, Schedule, learning_rates, low_pass
+from hqgs.training.schedule import FINEST, Decisions, Schedule, StepPlan, learning_rates, low_pass
 from hqgs.training.trainer import Trainer
 
 DENSIFY = DensifyConfig(start=20, stop=61, every=10, reset_every=25)
@@ -33,14 +33,14 @@ def schedule(config: TrainConfig, count: int = 5) -> Schedule:
     return schedule_of(config, views(count))
 
 
-def plans(schedule: Schedule, decisions: Decisions | None = None, count: int = 99) -> list[Plan]:
+def plans(schedule: Schedule, decisions: Decisions | None = None, count: int = 99) -> list[StepPlan]:
     decisions = decisions or schedule.start()
     return [schedule.plan(iteration, decisions) for iteration in range(1, count + 1)]
 
 
 def test_growth_and_resets() -> None:
     made = plans(schedule(tiny_config(100, densify=DENSIFY)))
-    assert [plan.iteration for plan in made if plan.grows] == [30, 40, 50, 60]
+    assert [plan.iteration for plan in made if plan.densifies] == [30, 40, 50, 60]
     assert [plan.iteration for plan in made if plan.resets] == [26, 51]  # before the step after 25 and 50
     assert [plan.iteration for plan in made if plan.observes] == list(range(1, 61))
     assert {plan.finest for plan in made} == {None}

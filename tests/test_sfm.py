@@ -94,8 +94,8 @@ def test_it_tells_which_photos_show_which_points(found: Scene) -> None:
     assert found.seen is not None
     assert found.sfm is not None
     assert set(found.seen) == {view.name for view in found.train}
-    sightings = sum(map(len, found.seen.values()))
-    assert sightings == pytest.approx(found.sfm.track_length * len(found.points), rel=0.01)
+    observations = sum(map(len, found.seen.values()))
+    assert observations == pytest.approx(found.sfm.track_length * len(found.points), rel=0.01)
     shown, colors = [], []
     for view in found.train:
         rows, camera = found.seen[view.name], view.camera

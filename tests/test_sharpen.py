@@ -1,4 +1,4 @@
-"""Sightings moved to where photos agree, and smoothed versions of photos beside each other."""
+"""Observations moved to where photos agree, and smoothed versions of photos beside each other."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def photo_of(pose: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def made(tmp_path: Path) -> tuple[pycolmap.Reconstruction, list[np.ndarray], Path]:
-    """A model whose sightings and poses are off, its true poses, and the folder of its noisy photos."""
+    """A model whose observations and poses are off, its true poses, and the folder of its noisy photos."""
     rng = np.random.default_rng(4)
     true, folder = [], tmp_path / "photos"
     folder.mkdir()
@@ -97,7 +97,7 @@ def turned(model: pycolmap.Reconstruction, true: list[np.ndarray]) -> float:
     return float(np.rad2deg(np.median(found)))
 
 
-def test_patches_make_poses_and_sightings_more_precise(
+def test_patches_make_poses_and_observations_more_precise(
     made: tuple[pycolmap.Reconstruction, list[np.ndarray], Path],
 ) -> None:
     model, true, folder = made
@@ -140,7 +140,7 @@ def test_photos_that_do_not_fit_change_nothing(
     assert sharpened(model, folder, adjust) is model
 
 
-def test_a_photo_unlike_the_others_keeps_its_sightings(
+def test_a_photo_unlike_the_others_keeps_its_observations(
     made: tuple[pycolmap.Reconstruction, list[np.ndarray], Path],
 ) -> None:
     model, true, folder = made
@@ -172,7 +172,7 @@ def test_tracks_are_read_and_written(made: tuple[pycolmap.Reconstruction, list[n
 def test_sureness_is_what_a_pose_is_off_by_noise(
     made: tuple[pycolmap.Reconstruction, list[np.ndarray], Path],
 ) -> None:
-    """Where the points are known: the poses are fitted to sightings that scatter by 0.7 px."""
+    """Where the points are known: the poses are fitted to observations that scatter by 0.7 px."""
     model, _, _ = made
     names, tracks = read_tracks(model)
     rng, sigma = np.random.default_rng(2), 0.7

@@ -25,7 +25,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
 from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.scene import Scene, View
-from hqgs.training import looks
+from hqgs.training import forward
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method
 from hqgs.training.methods.base import Target, ThreeDGS, photo_tensors
 from hqgs.training.trainer import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
@@ -135,13 +135,13 @@ def test_the_learning_rates_of_3dgs() -> None:
 
 def test_the_sh_degree_rises_by_one_per_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     degrees = []
-    real = looks.render_view
+    real = forward.render_view
 
     def spy(gaussians: Gaussians, camera: Any, sh_degree: int, *more: Any) -> Any:
         degrees.append(sh_degree)
         return real(gaussians, camera, sh_degree, *more)
 
-    monkeypatch.setattr(looks, "render_view", spy)
+    monkeypatch.setattr(forward, "render_view", spy)
     trainer = Trainer(tiny_scene(), tiny_config(sh_interval=4, sh_degree=2, densify=ONLY_TRAIN))
     steps(trainer, 14)
     assert degrees == [0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 2, 2, 2]

@@ -1,1 +1,1 @@
-"""What every room stands on: files, threads, processes, machine, values, text. It imports nothing of hqgs."""
+"""What all layers stand on: files, threads, processes, machine, values, text. It imports nothing of hqgs."""

@@ -97,7 +97,7 @@ def _photos(path: Path) -> list[str]:
         f"{root}: {len(photos.names)} photos of {', '.join(f'{w} x {h}' for w, h in sizes[:4])} px"
         + (" and other sizes" if len(sizes) > 4 else ""),
         f"cameras: {len(guess.sizes)}; EXIF tells the focal length of {focal} photos, and that "
-        f"{sum(exif.turn > 0 for exif in photos.exif)} lie on their side",
+        f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} lie on their side",
         f"poses: {poses}",
     ]
     lines += photos.notes

@@ -35,7 +35,7 @@ class RenderedView:
     render: NDArray[np.float32]  # [H, W, 3], clamped to [0, 1] by the report, never rounded for the metrics
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts
     culled: int | None = None  # Gaussians that this view does not show
-    turn: int = 0  # quarter turns clockwise that show it upright
+    quarter_turns: int = 0  # clockwise, that show it upright
 
 
 class HeldOutViews(Sequence[RenderedView]):
@@ -87,7 +87,9 @@ class HeldOutViews(Sequence[RenderedView]):
         with one_torch_thread(), torch.no_grad():
             render, meta = render_view(self._gaussians, view.camera, self._sh_degree, self._background)
             self._culled[number] = int((meta["radii"][0] == 0).any(dim=1).sum())
-        return RenderedView(view.name, view.image, render.numpy(), view.mask, self._culled[number], view.turn)
+        return RenderedView(
+            view.name, view.image, render.numpy(), view.mask, self._culled[number], view.quarter_turns
+        )
 
 
 def held_out_renders(

@@ -172,7 +172,7 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     numbers += [] if metrics.ssim is None else [f"SSIM {metrics.ssim:.3f}"]
     captions = [f"photo  {printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]
 
-    panels = [np.ascontiguousarray(np.rot90(panel, -view.turn)) for panel in panels]
+    panels = [np.ascontiguousarray(np.rot90(panel, -view.quarter_turns)) for panel in panels]
     return sheet([list(zip(captions, panels, strict=True))])
 
 

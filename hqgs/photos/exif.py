@@ -23,7 +23,7 @@ _SHORTEST, _LONGEST = 0.2, 20.0  # focal length in longer sides; what lies beyon
 class Exif:
     """Of a photo. What nothing is known of is 0, or empty."""
 
-    turn: int = 0  # quarter turns clockwise that show the stored pixels upright: 0..3
+    quarter_turns: int = 0  # clockwise, that show the stored pixels upright: 0..3
     camera: tuple[str, ...] = ()  # make, model and focal length: photos with the same ones share a camera
     focal: float = 0.0  # px of the stored photo
     gps: tuple[float, float, float] | None = None  # degrees north and east, m up; nan: no altitude

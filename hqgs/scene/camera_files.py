@@ -75,7 +75,7 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
                 "photo": photo,
             }
         )
-    up = world_up([view.camera for view in scene.train], [view.turn for view in scene.train])
+    up = world_up([view.camera for view in scene.train], [view.quarter_turns for view in scene.train])
     frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
     content = {"frame": frame, "up": up.tolist(), "views": entries}
     write_json(folder / CAMERAS, content | ({} if scene.world.ordinary else {"world": scene.world.json()}))

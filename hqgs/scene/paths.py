@@ -83,7 +83,7 @@ def world_up(cameras: Sequence[Camera], turns: Sequence[int] | None = None) -> _
 
     It is orthogonal to the upright pictures' x axes as far as that says anything (photos that look down do
     not tilt it then), and the mean of their upward directions where not. `turns`: the quarter turns clockwise
-    that show each camera's picture upright (`View.turn`); None: they are upright.
+    that show each camera's picture upright (`View.quarter_turns`); None: they are upright.
     """
     R = np.stack([camera.viewmat[:3, :3] for camera in cameras])
     quarters = np.zeros(len(R), int) if turns is None else np.asarray(turns) % 4

@@ -44,7 +44,7 @@ class View:
     image: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3] sRGB, the camera's size
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts; None: everywhere
     low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
-    turn: int = 0  # quarter turns clockwise that show `image` upright, as the photo's EXIF has it: 0..3
+    quarter_turns: int = 0  # clockwise, that show `image` upright, as the photo's EXIF has it: 0..3
     film: float | None = None  # `fine_detail` of the film's frame that `image` is, before it was stored
 
 

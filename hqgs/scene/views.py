@@ -149,7 +149,9 @@ def _load_view(
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
     film = photo.film if downscale <= FILM else None
-    return View(photo.name, camera_now, image, mask, turn=read_exif(photo.path).turn, film=film)
+    return View(
+        photo.name, camera_now, image, mask, quarter_turns=read_exif(photo.path).quarter_turns, film=film
+    )
 
 
 @dataclass(frozen=True)

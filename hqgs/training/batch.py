@@ -25,8 +25,8 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.training import checkpoint
 from hqgs.training.adam import Adam
 from hqgs.training.densify import Densifier, gradient_norms
+from hqgs.training.forward import ForwardPass
 from hqgs.training.guard import Fault
-from hqgs.training.looks import Look
 
 Answer = Callable[[], list[bytes]]
 WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}  # of a row of the rest, in its order
@@ -111,16 +111,16 @@ def to_rasterize(trained: Gaussians, modulated: Gaussians) -> Gaussians:
 
 
 def part_of(
-    look: Look, fault: Fault | None, trained: Gaussians, optimizer: Adam
+    forward: ForwardPass, fault: Fault | None, trained: Gaussians, optimizer: Adam
 ) -> tuple[Part, Callable[[], Rest]]:
     """What a look gives after its backward pass, which left its gradients in the trained tensors; the rest
     is to be had as long as they are there."""
     n = len(trained)
-    center = torch.from_numpy(look.camera.center.copy()).double()
+    center = torch.from_numpy(forward.camera.center.copy()).double()
     part = Part(
-        loss=float(look.loss.detach()),
-        degree=look.plan.degree,
-        measured=look.measured,
+        loss=float(forward.loss.detach()),
+        degree=forward.plan.degree,
+        measured=forward.measured,
         fault=fault,
         center=center,
         shown=torch.zeros(n, dtype=torch.bool),
@@ -133,7 +133,7 @@ def part_of(
         for name, tensor in trained.named().items()
         if name != "shN"
     }
-    radii, camera = look.meta["radii"][0], look.view.camera
+    radii, camera = forward.meta["radii"][0], forward.view.camera
     visible = (radii > 0).all(dim=1)
     shown = visible.clone()
     for gradient in gradients.values():
@@ -141,7 +141,7 @@ def part_of(
     part = replace(part, shown=shown, colors=gradients["sh0"].reshape(n, 3)[shown])
 
     def rest() -> Rest:
-        means2d, higher = look.meta["means2d"].grad, trained.shN.grad
+        means2d, higher = forward.meta["means2d"].grad, trained.shN.grad
         assert means2d is not None  # the backward pass was sound
         norms = torch.where(visible, gradient_norms(means2d[0], camera.width, camera.height), UNSEEN)
         columns = [gradients[name].reshape(n, width) for name, width in WIDTHS.items()]

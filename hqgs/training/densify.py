@@ -23,7 +23,7 @@ SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN  # a child's scales are its parent's over th
 
 
 @dataclass(frozen=True)
-class Growth:
+class Densification:
     """What one call of `Densifier.update` did."""
 
     cloned: int = 0
@@ -73,17 +73,17 @@ class Densifier:
         gaussians: Gaussians,
         optimizer: Optimizer,
         finest: Tensor | None = None,
-    ) -> Growth:
-        """One round of growth and pruning after this iteration (1, 2, ...).
+    ) -> Densification:
+        """One round of densification after this iteration (1, 2, ...).
 
         `gaussians` and `optimizer` get new tensors in place of the old ones. `finest` [N], world units:
         Gaussians whose largest scale is at most that are too fine to be cloned or split.
         """
-        growth = self._grow(iteration, gaussians, optimizer, finest)
-        growth = self._prune(iteration, gaussians, optimizer, growth)
+        densified = self._clone_and_split(iteration, gaussians, optimizer, finest)
+        densified = self._prune(iteration, gaussians, optimizer, densified)
         self.grad_sum = torch.zeros(len(gaussians))
         self.count = torch.zeros(len(gaussians))
-        return growth
+        return densified
 
     def remove(self, bad: Tensor, gaussians: Gaussians, optimizer: Optimizer) -> Tensor:
         """Remove the Gaussians where `bad`, bool [N], out of turn; the statistics of the others stay.
@@ -101,9 +101,9 @@ class Densifier:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.grad_sum, self.count = state["grad_sum"], state["count"]
 
-    def _grow(
+    def _clone_and_split(
         self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, finest: Tensor | None
-    ) -> Growth:
+    ) -> Densification:
         """Clone the small and split the large among those with a high mean gradient."""
         n = len(gaussians)
         grad = self.grad_sum / self.count.clamp(min=1)
@@ -132,20 +132,22 @@ class Densifier:
             gaussians.means[children] += (rotation @ (scales * normal)[:, :, None])[:, :, 0]
             gaussians.scales[children] -= math.log(SPLIT_SHRINK)
         grown = len(cloned) or len(split)
-        return Growth(len(cloned), len(split), 0, refused, parents if grown else None)
+        return Densification(len(cloned), len(split), 0, refused, parents if grown else None)
 
-    def _prune(self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, growth: Growth) -> Growth:
+    def _prune(
+        self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, densified: Densification
+    ) -> Densification:
         with torch.no_grad():
             bad = gaussians.activated_opacities() < self.config.prune_opacity
             if iteration > self.config.reset_every:
                 bad |= _largest_scale(gaussians) > self.config.prune_scale * self.reach
         pruned = int(bad.sum())
         if not pruned:
-            return growth
+            return densified
         kept = torch.nonzero(~bad)[:, 0]
         select_rows(gaussians, optimizer, kept, old=len(kept))
-        parents = kept if growth.parents is None else growth.parents[kept]
-        return replace(growth, pruned=pruned, parents=parents)
+        parents = kept if densified.parents is None else densified.parents[kept]
+        return replace(densified, pruned=pruned, parents=parents)
 
 
 def gradient_norms(means2d_grad: Tensor, width: int, height: int) -> Tensor:

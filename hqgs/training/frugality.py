@@ -108,7 +108,9 @@ class Frugality:
         started = time.perf_counter()
         if self.schedule.holds(state.decisions):
             verdict = self._of_held_photos(state)
-        if "weight" in self.schedule.items and state.iteration == self.schedule.growth_end(state.decisions):
+        if "weight" in self.schedule.items and state.iteration == self.schedule.densification_end(
+            state.decisions
+        ):
             verdict = replace(verdict, faint=self._faint(state))
         self.memory.seconds += time.perf_counter() - started
         return verdict

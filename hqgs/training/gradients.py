@@ -14,9 +14,9 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
 from hqgs.training.batch import Part, Rest, descend, exchanged, note_views, part_of, to_rasterize
 from hqgs.training.few_photos import with_dropout
+from hqgs.training.forward import ForwardPass, TrainingViews
 from hqgs.training.guard import Fault
-from hqgs.training.looks import Look, Looks
-from hqgs.training.schedule import Plan
+from hqgs.training.schedule import StepPlan
 from hqgs.training.state import TrainState
 
 
@@ -54,32 +54,34 @@ class Gradients(Protocol):
 
 
 def gradients_of(
-    plans: Sequence[Plan], looks: Looks, state: TrainState, ranks: Ranks, alone: bool
+    plans: Sequence[StepPlan], training: TrainingViews, state: TrainState, ranks: Ranks, alone: bool
 ) -> Gradients:
     """The gradients of the views that these plans take; `alone`: each step of the run takes one.
 
     A single view's gradients stay where they came to be. Those of several are added up as rows, so that the
     bits do not depend on which process rendered what.
     """
-    return _OfOne(plans[0], looks, state) if alone else _OfSeveral(plans, looks, state, ranks)
+    return _OfOne(plans[0], training, state) if alone else _OfSeveral(plans, training, state, ranks)
 
 
 class _OfOne:
-    def __init__(self, plan: Plan, looks: Looks, state: TrainState) -> None:
-        self._look: Look = looks.at(plan, _of_step(looks.method.modulate(state.gaussians), plan, state))
+    def __init__(self, plan: StepPlan, training: TrainingViews, state: TrainState) -> None:
+        self._forward: ForwardPass = training.at(
+            plan, _of_step(training.method.modulate(state.gaussians), plan, state)
+        )
         state.optimizer.zero_grad()
-        self.faults: list[Fault | None] = [self._look.backward(state.gaussians, state.optimizer)]
-        self.loss: float = float(self._look.loss.detach())
-        self.photo: Tensor = self._look.photo.detach()
-        self.view: View = self._look.view
-        self.measured: list[Tensor] = [self._look.measured]
+        self.faults: list[Fault | None] = [self._forward.backward(state.gaussians, state.optimizer)]
+        self.loss: float = float(self._forward.loss.detach())
+        self.photo: Tensor = self._forward.photo.detach()
+        self.view: View = self._forward.view
+        self.measured: list[Tensor] = [self._forward.measured]
 
     def apply(self, state: TrainState) -> None:
-        look = self._look
-        radii, gradient = look.meta["radii"][0], look.meta["means2d"].grad
-        if look.plan.observes:
+        forward = self._forward
+        radii, gradient = forward.meta["radii"][0], forward.meta["means2d"].grad
+        if forward.plan.observes:
             assert gradient is not None  # the backward pass was sound
-            camera = look.view.camera
+            camera = forward.view.camera
             state.densifier.observe(gradient[0], radii, camera.width, camera.height)
         state.optimizer.step()
 
@@ -94,21 +96,25 @@ class _Rendered:
 
 
 class _OfSeveral:
-    def __init__(self, plans: Sequence[Plan], looks: Looks, state: TrainState, ranks: Ranks) -> None:
-        self._plans, self._method = plans, looks.method
+    def __init__(
+        self, plans: Sequence[StepPlan], training: TrainingViews, state: TrainState, ranks: Ranks
+    ) -> None:
+        self._plans, self._method = plans, training.method
         rendered: list[_Rendered] = []
 
         def make(k: int) -> tuple[Part, Callable[[], Rest]]:
-            modulated = looks.method.modulate(state.gaussians)
-            look = looks.at(plans[k], _of_step(to_rasterize(state.gaussians, modulated), plans[k], state))
+            modulated = training.method.modulate(state.gaussians)
+            forward = training.at(
+                plans[k], _of_step(to_rasterize(state.gaussians, modulated), plans[k], state)
+            )
             state.optimizer.zero_grad()
-            fault = look.backward(state.gaussians, state.optimizer)
+            fault = forward.backward(state.gaussians, state.optimizer)
             if not rendered:
-                rendered.append(_Rendered(float(look.loss.detach()), look.photo.detach(), look.view))
-            return part_of(look, fault, state.gaussians, state.optimizer)
+                rendered.append(_Rendered(float(forward.loss.detach()), forward.photo.detach(), forward.view))
+            return part_of(forward, fault, state.gaussians, state.optimizer)
 
         self._parts, self._others = exchanged(ranks, len(plans), make)
-        none = _Rendered(self._parts[0].loss, torch.zeros(0, 0, 3), looks.views[plans[0].view])
+        none = _Rendered(self._parts[0].loss, torch.zeros(0, 0, 3), training.views[plans[0].view])
         first = rendered[0] if rendered else none
         self.loss, self.photo, self.view = first.loss, first.photo, first.view
         self.faults: list[Fault | None] = [part.fault for part in self._parts]
@@ -121,6 +127,6 @@ class _OfSeveral:
         note_views(self._parts, rests, [plan.observes for plan in self._plans], state.densifier)
 
 
-def _of_step(gaussians: Gaussians, plan: Plan, state: TrainState) -> Gaussians:
+def _of_step(gaussians: Gaussians, plan: StepPlan, state: TrainState) -> Gaussians:
     """Those of `gaussians` that a view is rendered of."""
     return with_dropout(gaussians, plan.dropout, state.densifier.seed, plan.iteration)

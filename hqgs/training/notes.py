@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hqgs.evaluation.records import LearnedRecord
-from hqgs.training.methods.cameras import Found
+from hqgs.training.methods.cameras import LearnedCamera
 from hqgs.training.trainer import Trainer
 
 
@@ -34,7 +34,7 @@ def run_notes(trainer: Trainer) -> list[str]:
     if left < 1:
         why = "pixels held back from the noisy photos showed no gain any more"
         notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
-    if found := trainer.method.found():
+    if found := trainer.method.learned():
         lengths = sorted(photo.extent for photo in found)
         if moved := sum(length > 0 for length in lengths):
             notes.append(
@@ -55,13 +55,13 @@ def run_notes(trainer: Trainer) -> list[str]:
     return notes
 
 
-def learned_record(found: Found) -> LearnedRecord:
+def learned_record(learned: LearnedCamera) -> LearnedRecord:
     """What was learned of a photo's camera, for the report."""
     return {
-        "name": found.name,
-        "shake_px": found.extent,
-        "trajectory_px": found.trajectory.tolist(),
-        "defocus_px": found.defocus,
-        "focus": found.focus,
-        "gains": found.gains.tolist(),
+        "name": learned.name,
+        "shake_px": learned.extent,
+        "trajectory_px": learned.trajectory.tolist(),
+        "defocus_px": learned.defocus,
+        "focus": learned.focus,
+        "gains": learned.gains.tolist(),
     }

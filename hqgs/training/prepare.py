@@ -17,7 +17,7 @@ from hqgs.model.first_points import Colors, Points, points_along_edges
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
-from hqgs.training.looks import Looks
+from hqgs.training.forward import TrainingViews
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, plan_by
@@ -40,8 +40,8 @@ class Prepared:
         self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
         settings = plan_run(facts, self.diagnosis, asked).settings
         self.method: Method[Any] = make_method(scene, settings, inspector)
-        self.looks: Looks = Looks(scene.train, self.method, asked.background)
-        self.facts: Facts = self.method.facts(facts, self.looks.targets)
+        self.training_views: TrainingViews = TrainingViews(scene.train, self.method, asked.background)
+        self.facts: Facts = self.method.facts(facts, self.training_views.targets)
         self.shown_diagnosis: Diagnosis | None = (
             inspector.last
         )  # of more photos, where the method asks for it

@@ -40,7 +40,7 @@ class Decisions:
 
 
 @dataclass(frozen=True)
-class Plan:
+class StepPlan:
     """What one step does, in its order."""
 
     iteration: int  # 1, 2, ...
@@ -51,7 +51,7 @@ class Plan:
     degree: int  # of the harmonics that are trained
     dropout: float  # share of the Gaussians that are left out of it
     observes: bool  # its gradients count for growth
-    grows: bool  # Gaussians are added and removed after it
+    densifies: bool  # Gaussians are added and removed after it
     finest: float | None  # px of the photo that sees a Gaussian best: finer ones do not grow; None: any may
 
 
@@ -81,12 +81,12 @@ class Schedule:
         """Before the first step."""
         return Decisions(self.config.iterations, released=0, turned=0)
 
-    def plan(self, iteration: int, decisions: Decisions) -> Plan:
+    def plan(self, iteration: int, decisions: Decisions) -> StepPlan:
         """What step number `iteration` (1, 2, ...) does."""
-        densify, stop = self.config.densify, self.growth_end(decisions)
+        densify, stop = self.config.densify, self.densification_end(decisions)
         before = iteration - 1
         smaller_part = self.is_coarse(iteration)
-        return Plan(
+        return StepPlan(
             iteration=iteration,
             # Not after the step that it is due at: what is looked at or written in between is the scene
             # before its opacities are cut, and a run that ends there keeps it.
@@ -97,11 +97,11 @@ class Schedule:
             degree=self.degree(iteration),
             dropout=(self.config.dropout or 0.0) * self.part(iteration, decisions),
             observes=iteration < stop,
-            grows=densify.start < iteration < stop and iteration % densify.every == 0,
+            densifies=densify.start < iteration < stop and iteration % densify.every == 0,
             finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,
         )
 
-    def batch(self, iteration: int, decisions: Decisions) -> list[Plan]:
+    def batch(self, iteration: int, decisions: Decisions) -> list[StepPlan]:
         """The plans of the views that one step takes together, from number `iteration` on.
 
         As many as the configuration says, and fewer where something is due between two of them, or where a
@@ -115,18 +115,18 @@ class Schedule:
             plans.append(following)
         return plans
 
-    def _pauses(self, plan: Plan, decisions: Decisions) -> bool:
+    def _pauses(self, plan: StepPlan, decisions: Decisions) -> bool:
         """Whether something is due, or may be decided, after this plan's view."""
-        iteration, growth_end = plan.iteration, self.growth_end(decisions)
-        due = {decisions.length, growth_end, self.config.densify.stop, self.coarse_end}
+        iteration, densification_end = plan.iteration, self.densification_end(decisions)
+        due = {decisions.length, densification_end, self.config.densify.stop, self.coarse_end}
         due.add(self.turn_at(decisions))
-        return plan.grows or iteration in due or ("iterations" in self.items and iteration % CHECKS == 0)
+        return plan.densifies or iteration in due or ("iterations" in self.items and iteration % CHECKS == 0)
 
     def turn_at(self, decisions: Decisions) -> int:
         """The iteration after which the clock may give the run another length."""
         if self.config.turn is not None:
             return self.config.turn[0]
-        end = self.growth_end(decisions)
+        end = self.densification_end(decisions)
         return end + min(TAIL, max(1, int(TAIL_PART * (self.config.iterations - end))))
 
     def holds(self, decisions: Decisions) -> bool:
@@ -158,7 +158,7 @@ class Schedule:
             interval = min(interval, max(1, int(BAND_INTERVAL * self.config.iterations)))
         return min(self.config.sh_degree, iteration // interval)
 
-    def growth_end(self, decisions: Decisions) -> int:
+    def densification_end(self, decisions: Decisions) -> int:
         """The iteration from which on nothing grows; a shortened run ends growth sooner."""
         stop = self.config.densify.stop
         if decisions.length == self.config.iterations or decisions.turned:

@@ -24,7 +24,7 @@ from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
-from hqgs.training.densify import Densifier, Growth
+from hqgs.training.densify import Densification, Densifier
 from hqgs.training.few_photos import decay_opacities
 from hqgs.training.frugality import Frugality
 from hqgs.training.gradients import gradients_of
@@ -32,7 +32,7 @@ from hqgs.training.guard import Fault, Guard, parameter_fault
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import PlanRow, RunPlan, left_out_of
 from hqgs.training.prepare import Prepared
-from hqgs.training.schedule import Decisions, Plan, Schedule, learning_rates, on_the_way
+from hqgs.training.schedule import Decisions, Schedule, StepPlan, learning_rates, on_the_way
 from hqgs.training.settings import config_values
 from hqgs.training.state import TrainState
 
@@ -139,14 +139,16 @@ class Trainer:
 
         with one_torch_thread():
             step, seen = self._train_on(plans)
-            growth = self._grow(last) if last.grows else Growth()
-            self._cull(step.view, parameter_fault(state.gaussians, growth.parents is not None))
+            densified = self._densify(last) if last.densifies else Densification()
+            self._cull(step.view, parameter_fault(state.gaussians, densified.parents is not None))
             if not len(state.gaussians):
                 raise TrainingError(state.none_left())
             for plan, noted in zip(plans, seen, strict=True):
                 state.iteration = plan.iteration
-                method.after_step(state, self.prepared.looks.target(plan.view, plan.coarse)[0], noted)
-            self._leave_out(growth, (time.perf_counter() - started) / len(plans))
+                method.after_step(
+                    state, self.prepared.training_views.target(plan.view, plan.coarse)[0], noted
+                )
+            self._leave_out(densified, (time.perf_counter() - started) / len(plans))
 
         state.seconds += time.perf_counter() - started
         state.decisions = self._turned()
@@ -236,7 +238,7 @@ class Trainer:
         own = [group | {"own": True} for group in self.method.param_groups()]
         return Adam(groups + own, lr=0.0, eps=self.config.adam_eps)
 
-    def _set_rates(self, plan: Plan) -> None:
+    def _set_rates(self, plan: StepPlan) -> None:
         """As far as the method leaves them; harmonics above the degree in use never had a gradient."""
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
         extent, reach = self.state.densifier.extent, self.state.densifier.reach
@@ -247,31 +249,31 @@ class Trainer:
             groups[name]["lr"] = rate
         groups["shN"]["used"] = (plan.degree + 1) ** 2 - 1
 
-    def _train_on(self, plans: Sequence[Plan]) -> tuple[Step, list[Tensor]]:
+    def _train_on(self, plans: Sequence[StepPlan]) -> tuple[Step, list[Tensor]]:
         """Train on these views together; what the method goes by after the step, of each."""
-        state, looks = self.state, self.prepared.looks
-        found = gradients_of(plans, looks, state, self.ranks, alone=self.config.batch == 1)
+        state, training = self.state, self.prepared.training_views
+        found = gradients_of(plans, training, state, self.ranks, alone=self.config.batch == 1)
         step = Step(found.loss, found.photo, found.view)
-        if self._sound([looks.views[plan.view] for plan in plans], found.faults, step):
+        if self._sound([training.views[plan.view] for plan in plans], found.faults, step):
             found.apply(state)
             if decay := self.config.opacity_decay:
                 decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
         return step, found.measured
 
-    def _grow(self, plan: Plan) -> Growth:
+    def _densify(self, plan: StepPlan) -> Densification:
         """Add and remove Gaussians."""
         state, finest = self.state, None
         if plan.finest is not None:
             finest = (plan.finest * photo_pixels(state.gaussians.means, self.scene.train)).float()
-        growth = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest)
-        if growth.parents is not None:
-            self.method.rows_changed(state, growth.parents)
-        return growth
+        densified = state.densifier.update(plan.iteration, state.gaussians, state.optimizer, finest)
+        if densified.parents is not None:
+            self.method.rows_changed(state, densified.parents)
+        return densified
 
-    def _leave_out(self, growth: Growth, seconds: float) -> None:
+    def _leave_out(self, densified: Densification, seconds: float) -> None:
         """Do without what the frugality finds to be of no use."""
         state = self.state
-        verdict = self.frugality.after_step(state, growth.refused, seconds)
+        verdict = self.frugality.after_step(state, densified.refused, seconds)
         state.decisions = verdict.decisions
         if verdict.faint is not None:
             self._remove(verdict.faint)
@@ -299,7 +301,7 @@ class Trainer:
         """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize."""
         iteration = self.state.iteration
         degree = self.schedule.degree(iteration)
-        return self.prepared.looks.psnr(
+        return self.prepared.training_views.psnr(
             gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks
         )
 

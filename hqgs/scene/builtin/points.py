@@ -27,7 +27,7 @@ class SparsePoints(NamedTuple):
 
     points: NDArray[np.float32]  # [P, 3], world, ascending by x, y, z
     colors: NDArray[np.uint8]  # [P, 3]
-    photos: NDArray[np.intp]  # [O], of each sighting the number of the view
+    photos: NDArray[np.intp]  # [O], of each observation the number of the view
     rows: NDArray[np.intp]  # [O], and that of the point
     note: str  # for the report
 

@@ -27,7 +27,7 @@ from hqgs.scene.sfm.versions import SIGMAS, join, smoothed_copies
 LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
 PROBED, RICH = 8, 1000  # photos that tell whether coarse features are enough, and how many they need (median)
 ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
-UNSURE = 0.36  # px of what SIFT sees that sightings are usually off, from where on patches tell more
+UNSURE = 0.36  # px of what SIFT sees that observations are usually off, from where on patches tell more
 SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
 COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
 FAR = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
@@ -74,7 +74,7 @@ class Attempt:
 
     @staticmethod
     def _off(model: pycolmap.Reconstruction) -> float:
-        """What sightings are usually off, px of what SIFT sees."""
+        """What observations are usually off, px of what SIFT sees."""
         sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
         return usual(model) * min(1, LARGEST / float(np.median(sides)))
 
@@ -120,7 +120,7 @@ class Attempt:
             self._settle(self.model, fixed)
 
     def sharpen(self) -> None:
-        """Move the sightings to where the photos agree, and adjust again, where that is more precise."""
+        """Move the observations to where the photos agree, and adjust again, where that is more precise."""
         if self.model is None or self._off(self.model) <= UNSURE:
             return
         self._tell("sharpen", 0)
@@ -234,10 +234,10 @@ class Attempt:
         return options
 
     def _settle(self, model: pycolmap.Reconstruction, fixed: bool) -> None:
-        """Poses and points without the sightings that lie far off.
+        """Poses and points without the observations that lie far off.
 
-        While photos are placed a sighting may be 4 px off. That is much in small photos, where false matches
-        so near turn the cameras: without them rotations are off 0.3 to 0.85 times as far.
+        While photos are placed an observation may be 4 px off. In small photos false matches so near turn the
+        cameras: without them rotations are off 0.3 to 0.85 times as far.
         """
         mapping = self._mapping(fixed)
         for _ in range(ROUNDS):

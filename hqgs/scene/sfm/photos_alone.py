@@ -45,7 +45,7 @@ def find_cameras(
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
     model = ran.found
-    turns = {name: exif.turn for name, exif in zip(photos.names, photos.exif, strict=True)}
+    turns = {name: exif.quarter_turns for name, exif in zip(photos.names, photos.exif, strict=True)}
     upright = _upright(np.stack(list(poses.values())), [turns[names[name]] for name in poses])
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
     report = SfmReport(

@@ -1,6 +1,6 @@
-"""Sightings moved to sub-pixel agreement by normalised patches over all photos of a point.
+"""Observations moved to sub-pixel agreement by normalised patches over all photos of a point.
 
-SIFT finds each sighting alone, a pixel off where photos are noisy. A point's patch averaged over the photos
+SIFT finds each of them alone, a pixel off where photos are noisy. A point's patch averaged over the photos
 that see it is cleaner than any of them, and each photo is laid against the mean of the others (Gauss-Newton
 on pixels, two unknowns). It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's
 process.
@@ -28,19 +28,19 @@ WINDOW = 3.5  # nodes, sigma of the weights over a patch
 SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
 SIDE = 1000  # px, of these photos
 STEPS = 5  # of Gauss-Newton
-REACH = 3.0  # px that a sighting may move
-SURE = 0.6  # correlation with the other photos' mean, of a sighting that stays
-UNLIKE = 0.3  # of a photo's sightings that are sure: with fewer, patches tell nothing of it
+REACH = 3.0  # px that an observation may move
+SURE = 0.6  # correlation with the other photos' mean, of an observation that stays
+UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it
 NEW = 0.7  # the same, of one that no feature told of
 PHOTOS = 12  # that a point is looked for in, beside those whose features show it
-ENOUGH = 150  # sightings of a photo, of the points whose patches are laid
+ENOUGH = 150  # observations of a photo, of the points whose patches are laid
 CELL = 2.0  # px, where points are the same
 ROUNDS = 3  # of patches and adjustment
-FAR = 3.0  # times the usual error; sightings farther off are left out
+FAR = 3.0  # times the usual error; observations farther off are left out
 ANGLE = 1.5  # degrees between two rays, least, of a point
 FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
-GROWN = 1.1  # times: patches that leave the sightings farther off than they were do not fit these photos
+GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
 
 
 def sharpened(
@@ -191,7 +191,7 @@ _WEIGHTS = (_WEIGHTS / _WEIGHTS.sum()).astype(np.float32)
 
 
 def _laid(views: list[_View], tracks: Tracks, axes: Floats) -> tuple[Floats, Floats]:
-    """In px of the cameras, a node of each sighting's patch [O, 2, 2] and where its point is [O, 2]."""
+    """In px of the cameras, a node of each observation's patch [O, 2, 2] and where its point is [O, 2]."""
     turns, middles = np.zeros((len(tracks.view), 2, 2)), np.zeros((len(tracks.view), 2))
     for k, view in enumerate(views):
         mine = np.flatnonzero(tracks.view == k)
@@ -217,14 +217,14 @@ def _normalised(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _inside(views: list[_View], tracks: Tracks, turns: Floats, at: Floats) -> NDArray[np.bool_]:
-    """Whether the middle half of each sighting's patch lies in its photo, [O]; the rest counts little."""
+    """Whether the middle half of each observation's patch lies in its photo, [O]; the rest counts little."""
     sizes = np.array([view.size for view in views])[tracks.view]
     reach = HALF / 2 * np.abs(turns).sum(axis=2)
     return ((at - reach >= 0) & (at + reach <= sizes)).all(axis=1)
 
 
 def _means(patches: NDArray[np.float32], tracks: Tracks, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """For each sighting the mean patch [O, N] of the point's other photos that are counted, normalised."""
+    """For each observation the mean patch [O, N] of the point's other photos that are counted, normalised."""
     own = patches * counted[:, None]
     total = np.zeros((len(tracks.points), patches.shape[1]), np.float32)
     np.add.at(total, tracks.point, own)
@@ -234,9 +234,9 @@ def _means(patches: NDArray[np.float32], tracks: Tracks, counted: NDArray[np.boo
 def _aligned(
     views: list[_View], tracks: Tracks, new: NDArray[np.bool_]
 ) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Sightings moved to where their patches agree with the others, and which of them are sure [O].
+    """Observations moved to where their patches agree with the others, and which of them are sure [O].
 
-    New ones do not count in the means. A photo of which few are sure looks unlike the others: its sightings
+    New ones do not count in the means. A photo of which few are sure looks unlike the others: its own
     stay where features had them. Also returns which photos do [V].
     """
     turns, middles = _laid(views, tracks, _axes(views, tracks))
@@ -267,7 +267,7 @@ def _aligned(
 
 
 def _widened(views: list[_View], tracks: Tracks) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Also the sightings that photos should have of points, PHOTOS of each; and which are new [O]."""
+    """Also the observations that photos should have of points, PHOTOS of each; and which are new [O]."""
     axes = _axes(views, tracks)
     normals = np.cross(axes[:, :, 0], axes[:, :, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

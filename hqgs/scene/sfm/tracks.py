@@ -1,4 +1,4 @@
-"""A COLMAP model's points and sightings as arrays, and the model that they make.
+"""A COLMAP model's points and observations as arrays, and the model that they make.
 
 It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
 """
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-LEAST = 4  # sightings of a photo that tell a pose and more
+LEAST = 4  # observations of a photo that tell a pose and more
 RAYLEIGH = 1.1774  # median distance of points in a plane that scatter by 1 in each direction
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points [P, 3] and their sightings: photo `view[k]` has point `point[k]` at `xy[k]`; sorted by both."""
+    """Points [P, 3] and their observations: `view[k]` has point `point[k]` at `xy[k]`; sorted."""
 
     points: Floats
     colors: NDArray[np.uint8]
@@ -29,7 +29,7 @@ class Tracks:
     xy: Floats
 
     def chosen(self, keep: NDArray[np.bool_]) -> Tracks:
-        """Without the other sightings, and without points that fewer than two see."""
+        """Without the other observations, and without points that fewer than two see."""
         keep = keep & (np.bincount(self.point[keep], minlength=len(self.points)) >= 2)[self.point]
         rows, point = np.unique(self.point[keep], return_inverse=True)
         return Tracks(self.points[rows], self.colors[rows], self.view[keep], point, self.xy[keep])
@@ -46,7 +46,7 @@ class Tracks:
 
 
 def read_tracks(model: pycolmap.Reconstruction) -> tuple[list[str], Tracks]:
-    """The photos' names, sorted, and the model's points with their sightings."""
+    """The photos' names, sorted, and the model's points with their observations."""
     images = sorted((model.images[k] for k in model.reg_image_ids()), key=lambda image: image.name)
     keys = sorted(model.points3D)
     row = {key: k for k, key in enumerate(keys)}
@@ -66,7 +66,7 @@ def read_tracks(model: pycolmap.Reconstruction) -> tuple[list[str], Tracks]:
 
 
 def errors(model: pycolmap.Reconstruction) -> Floats:
-    """Distances [O] in px between the sightings of `read_tracks` and where their photos should have them."""
+    """Distances [O] in px between the observations of `read_tracks` and where they should be."""
     names, tracks = read_tracks(model)
     images = {image.name: image for image in model.images.values()}
     found = np.zeros(len(tracks.view))
@@ -81,7 +81,7 @@ def errors(model: pycolmap.Reconstruction) -> Floats:
 
 
 def usual(model: pycolmap.Reconstruction) -> float:
-    """What a sighting is off, px: the median of the errors, each as if its point were known.
+    """What an observation is off, px: the median of the errors, each as if its point were known.
 
     A point between two photos fits both nearly: its errors are made as large as those of a long track.
     """
@@ -93,9 +93,9 @@ def usual(model: pycolmap.Reconstruction) -> float:
 def sureness(model: pycolmap.Reconstruction) -> dict[str, float]:
     """How far off a photo may see its points by its pose alone, px (root of the mean square), by photo.
 
-    A pose has six freedoms and each sighting tells two: least squares leave 3 / n of the variance of the n
-    sightings in each direction. The points are taken as known, so that this is a lower limit. Photos
-    with too few sightings to tell are not in it.
+    A pose has six freedoms and each observation tells two: least squares leave 3 / n of the variance of the n
+    observations in each direction. The points are taken as known, so that this is a lower limit. Photos
+    with too few observations to tell are not in it.
     """
     names, tracks = read_tracks(model)
     off, common, sure = errors(model), usual(model), dict[str, float]()
@@ -108,7 +108,7 @@ def sureness(model: pycolmap.Reconstruction) -> dict[str, float]:
 
 
 def rebuilt(model: pycolmap.Reconstruction, names: list[str], tracks: Tracks) -> pycolmap.Reconstruction:
-    """The cameras and photos of a model with these points and sightings."""
+    """The cameras and photos of a model with these points and observations."""
     made = pycolmap.Reconstruction()
     old = {image.name: image for image in model.images.values()}
     for key in sorted({old[name].camera_id for name in names}):

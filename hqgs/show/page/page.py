@@ -167,7 +167,7 @@ def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
         "data": packed.data,
         "head": packed.head,
         "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
-        "up": world_up([v.camera for v in scene.train], [v.turn for v in scene.train]).tolist(),
+        "up": world_up([v.camera for v in scene.train], [v.quarter_turns for v in scene.train]).tolist(),
         "aspect": f"{first.width} / {first.height}",
         "note": note,
     }

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
-from hqgs.training.methods.cameras import Found, Shot, no_shot
+from hqgs.training.methods.cameras import LearnedCamera, Shot, no_shot
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
@@ -102,7 +102,7 @@ class Method(Protocol[T]):
         """What ages, and what is decided for the next step; for each view of the step, in their order."""
         ...
 
-    def found(self) -> list[Found]:
+    def learned(self) -> list[LearnedCamera]:
         """What was learned of each training photo's camera; empty where nothing is learned of any."""
         ...
 
@@ -164,7 +164,7 @@ class Plain:
     def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
         pass
 
-    def found(self) -> list[Found]:
+    def learned(self) -> list[LearnedCamera]:
         return []
 
     def param_groups(self) -> list[dict[str, Any]]:

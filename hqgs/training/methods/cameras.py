@@ -52,7 +52,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Found:
+class LearnedCamera:
     """What was found of a photo's camera."""
 
     name: str
@@ -171,10 +171,10 @@ class LearnedCameras:
                 if not self._blurs(k):
                     self._nearness[k] = None
 
-    def found(self) -> list[Found]:
+    def learned(self) -> list[LearnedCamera]:
         """For each training photo."""
         return [
-            Found(
+            LearnedCamera(
                 name,
                 np.zeros((TRAJECTORY_POINTS, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),

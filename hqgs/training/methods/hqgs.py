@@ -20,7 +20,7 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
 from hqgs.training.methods.base import Plain
-from hqgs.training.methods.cameras import Found, LearnedCameras, Shot, no_shot
+from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
@@ -154,8 +154,8 @@ class HQGS(Plain):
         if self._cameras is not None:
             self._cameras.after_step(state.iteration, view, self.modulate(state.gaussians))
 
-    def found(self) -> list[Found]:
-        return [] if self._cameras is None else self._cameras.found()
+    def learned(self) -> list[LearnedCamera]:
+        return [] if self._cameras is None else self._cameras.learned()
 
     def param_groups(self) -> list[dict[str, Any]]:
         return [] if self._cameras is None else self._cameras.param_groups()

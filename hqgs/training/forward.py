@@ -1,4 +1,4 @@
-"""What a step sees: the render of a training view, and how far it is from the photo."""
+"""The forward pass of a step: the render of a training view, and how far it is from the photo."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from hqgs.scene.scene import Camera, View
 from hqgs.training.adam import Adam
 from hqgs.training.guard import Fault, bad_values, gradient_fault
 from hqgs.training.methods.base import Method, Target
-from hqgs.training.schedule import Plan, low_pass, smaller
+from hqgs.training.schedule import StepPlan, low_pass, smaller
 
 
 @dataclass(frozen=True)
-class Look:
-    """At one training view."""
+class ForwardPass:
+    """The forward pass at one training view."""
 
-    plan: Plan
+    plan: StepPlan
     view: View
     camera: Camera  # that was rasterized for
     render: Tensor  # [H, W, 3]
@@ -49,8 +49,8 @@ class Look:
         return Fault("photo" if count else "loss", [], none, count)
 
 
-class Looks:
-    """At the training views of a run, as its method judges them."""
+class TrainingViews:
+    """The training views of a run, as its method judges renders of them."""
 
     def __init__(
         self, views: Sequence[View], method: Method[Any], background: tuple[float, float, float]
@@ -72,8 +72,8 @@ class Looks:
             self._small[number] = small, self.method.prepare(small)
         return self._small[number]
 
-    def at(self, plan: Plan, gaussians: Gaussians) -> Look:
-        """The look that a plan asks for, at the Gaussians to rasterize; its loss can be differentiated."""
+    def at(self, plan: StepPlan, gaussians: Gaussians) -> ForwardPass:
+        """The forward pass that a plan asks for, of the Gaussians to rasterize, with a gradient history."""
         method, (view, target) = self.method, self.target(plan.view, plan.coarse)
         shot = method.shot(view, target)
         eps2d = low_pass(plan.coarse)
@@ -82,7 +82,7 @@ class Looks:
         photo = shot.develop(render)
         image = method.compare(photo, target)
         loss = method.loss(image, target)
-        return Look(
+        return ForwardPass(
             plan, view, shot.camera, render, meta, photo, loss, method.measured(image.detach(), target)
         )
 
