@@ -11,6 +11,7 @@ from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from hqgs.model.formats.gltf import read_gltf, write_gltf
 from hqgs.model.formats.ksplat import read_ksplat
+from hqgs.model.formats.nerfstudio import in_data_frame
 from hqgs.model.formats.ply import read_ply, write_ply
 from hqgs.model.formats.sog import read_sog
 from hqgs.model.formats.splat import read_splat, write_splat
@@ -24,7 +25,7 @@ ANTIALIASED = ("ply", "full.ply", "spz")  # formats that are written with that f
 
 def read_scene(path: Path, format: str) -> Arrays:
     """What a scene file holds, with the frame that stands beside it, if one does."""
-    arrays = READERS[format](path)
+    arrays = in_data_frame(path, READERS[format](path))
     if "world" not in arrays and not (world := read_world(path)).ordinary:
         arrays["world"] = world
     return arrays
