@@ -43,7 +43,7 @@ def in_data_frame(path: Path, arrays: Arrays) -> Arrays:
             matrix = matrix @ np.linalg.inv(_matrix(cameras, applied, "applied_transform"))
         if "applied_scale" in applied:
             scale /= _number(cameras, applied, "applied_scale")
-    back = np.linalg.inv(matrix)
+    back = np.asarray(np.linalg.inv(matrix), np.float64)
     turned = mapped(arrays, back[:3, :3] / scale, back[:3, 3])
     finite = turned["means"][np.isfinite(turned["means"]).all(1)]
     world = World(1.0, world_for(finite, finite).shift if len(finite) else (0.0, 0.0, 0.0))
