@@ -27,7 +27,7 @@ from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.align import rotation_angles
 from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
-from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
+from hqgs.scene.sfm.failure import Pass, what_to_take, why_few, why_lost, why_no_model
 from hqgs.scene.sfm.likely import likely_pairs
 from hqgs.scene.sfm.run import LARGEST, expected_time, film_pairs
 
@@ -154,7 +154,10 @@ def test_the_world_stands_upright_and_every_photo_is_named(photos: list[np.ndarr
     assert report is not None
     assert (report.photos, report.not_registered) == (10, ["foreign.png"])
     assert report.unreadable == {"zz.png": "no picture"}
-    assert "foreign.png" in str(report)
+    assert set(report.lost) == {"foreign.png"}
+    assert f"foreign.png ({report.lost['foreign.png']})" in str(report)
+    assert report.advice is not None
+    assert report.advice.endswith("Take sharp, bright photos again where these were taken: foreign.png")
     assert "zz.png (no picture)" in str(report)
     views = [*scene.train, *scene.test]
     assert {view.quarter_turns for view in views} == {1}
@@ -235,6 +238,47 @@ def test_frames_of_a_film_are_matched_with_their_neighbours_and_a_few_others() -
     assert all(i < j for i, j in pairs)
 
 
+def test_each_lost_photo_is_told_why_and_what_to_take() -> None:
+    features = {"a": 900, "b": 40, "c": 800, "d": 700, "e": 900, "f": 1000, "g": 950, "h": 900}
+    best = {
+        "b": [3, 0, 0],
+        "c": [14, 0, 0],
+        "d": [60, 9, 0],
+        "e": [99, 80, 0],
+        "f": [99, 80, 3],
+        "h": [99, 50, 40],
+    }
+    one = Pass(False, 9, features, [], [], best, apart=[["e", "x", "y"]])
+    lost = {name: why_lost(name, one) for name in "bcdefh"}
+    assert lost == {
+        "b": "blurred, dark or bare: 40 features, half of the photos have 900",
+        "c": "alone: it matches no other photo",
+        "d": "no two photos agree: 60 matches at best, 9 of them bear each other out",
+        "e": "fits 2 photos that have no place either",
+        "f": "fits only photos that have no place either",
+        "h": "few matches agree: 40 with a photo that has a place",
+    }
+    assert what_to_take({name: lost[name] for name in "bch"}, "abcdefgh", []) == (
+        "take sharp, bright photos again where these were taken: b; take photos between a and c, g and h"
+    )
+    assert what_to_take({"e": lost["e"]}, "abcdefgh", one.apart).startswith("1 photos fit each other but not")
+    assert what_to_take({}, "abc", []) == ""
+
+
+def test_two_captures_in_one_folder_are_told_apart(photos: list[np.ndarray], tmp_path: Path) -> None:
+    """The second one is the first in a mirror, which no feature recognises."""
+    for k, image in enumerate(photos[:5]):
+        Image.fromarray(image).save(tmp_path / f"a{k}.png")
+        if k < 3:
+            Image.fromarray(np.ascontiguousarray(image[:, ::-1])).save(tmp_path / f"b{k}.png")
+    report = load_scene(tmp_path, test_every=3).sfm
+    assert report is not None
+    assert report.not_registered == ["b0.png", "b1.png", "b2.png"]
+    assert set(report.lost.values()) == {"fits 2 photos that have no place either"}
+    assert report.advice is not None
+    assert "3 photos fit each other but not the rest (b0.png, b1.png, b2.png)" in report.advice
+
+
 def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
     def told(
         count: int, width: int, height: int, threads: int = 2, pairs: int | None = None, coarse: bool = False
@@ -251,6 +295,8 @@ def test_the_time_that_colmap_takes_is_told_before_it_begins(capsys: pytest.Capt
     assert told(128, 1200, 900, coarse=True)[1] < 8
     assert told(128, 1200, 900)[1] > 10
     text = expected_time(np.tile([4000, 3000], (200, 1)), None, 2)
+    _, last, all_passes = map(int, re.findall(r"(\d+)(?: minutes| to)", text))
+    assert all_passes == 4 * last
     assert text.startswith("200 photos of 12.0 megapixels, which COLMAP sees at 1.9: ")
     assert text.endswith("; 100 photos are plenty for most scenes")
     with LoadingScreen() as screen:

@@ -63,6 +63,8 @@ def facts_of_photos(report: Mapping[str, Any]) -> dict[str, dict[str, str]]:
         found.setdefault(record["name"], {}).update(photo_words(record))
     for record in report.get("learned", []):
         found.setdefault(record["name"], {}).update(learned_words(record))
+    for name, px in ((report.get("sfm") or {}).get("sure_px") or {}).items():
+        found.setdefault(name, {})["pose sure to"] = f"{px:.2f} px"
     for view in report["metrics"]["views"]:
         values = {name.upper(): view.get(name) for name in ("psnr", "ssim", "haarpsi")}
         told = {name: f"{value:.3f}" for name, value in values.items() if value is not None}

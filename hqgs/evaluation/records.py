@@ -100,6 +100,7 @@ class SfmRecord(TypedDict):
     unreadable: dict[str, str]
     first_pass: int | None
     advice: str | None
+    lost: dict[str, str]
     sure_px: dict[str, float]
     auc: dict[str, float] | None
 

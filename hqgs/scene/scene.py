@@ -159,6 +159,7 @@ class SfmReport:
     unreadable: dict[str, str] = field(default_factory=dict)  # files that were left out before, and why
     first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do
+    lost: dict[str, str] = field(default_factory=dict)  # photos without a place, and why
     sure_px: dict[str, float] = field(default_factory=dict)  # of each photo with a place; see `sureness`
     auc: dict[str, float] | None = None  # of pairs' pose errors up to "1", "3", "5" degrees; see `pose_auc`
 
@@ -169,9 +170,8 @@ class SfmReport:
                 f"; a first pass had registered {self.first_pass}, a second and more tolerant one the rest"
             )
         if self.not_registered:
-            text += (
-                f"; {len(self.not_registered)} left out, as COLMAP found no place for them: "
-                f"{', '.join(self.not_registered)}"
+            text += f"; {len(self.not_registered)} left out, as COLMAP found no place for them: " + ", ".join(
+                name + (f" ({self.lost[name]})" * (name in self.lost)) for name in self.not_registered
             )
         if self.sure_px:
             name, least = max(self.sure_px.items(), key=lambda item: item[1])

@@ -32,6 +32,7 @@ SELDOM = 1.3  # times the photos or points: until then, no adjustment of all tha
 COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
 FAR = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
 ROUNDS = 3  # of leaving those out, which makes the median smaller
+SMALLEST = 3  # photos of a model
 EVERY = 0.5  # s between looks into the log
 BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 
@@ -66,6 +67,7 @@ class Attempt:
         self.database: Path = [*named, self.versions[0] if smoothed else self.plain][0]
         self.names: list[str] = given["names"].tolist()
         self.model: pycolmap.Reconstruction | None = None
+        self.apart: list[list[str]] = []  # photos that fit each other, and not those of the model
         self._tell("features", 0)
 
     @property
@@ -115,8 +117,9 @@ class Attempt:
             next_image_callback=lambda: self._place(1),
         )
         if models:
-            best = max(sorted(models), key=lambda k: (models[k].num_reg_images(), models[k].num_points3D()))
-            self.model = models[best]
+            order = sorted(models, key=lambda k: (-models[k].num_reg_images(), -models[k].num_points3D(), k))
+            self.model = models[order[0]]
+            self.apart = apart([placed_names(models[k]) for k in order])
             self._settle(self.model, fixed)
 
     def sharpen(self) -> None:
@@ -196,18 +199,34 @@ class Attempt:
             return likely_pairs(db, len(self.names))
 
     def facts(self) -> dict[str, Any]:
-        """Features of each photo, matches and those that a geometry bears out of each pair, both sorted."""
+        """Features of each photo, matches and those that a geometry bears out of each pair, both sorted.
+
+        Of each photo also its best pair's, and how many one with a photo that has a place bears out; and the
+        photos that fit each other alone.
+        """
+        placed = set() if self.model is None else placed_names(self.model)
         with pycolmap.Database.open(self.database) as db:
             images = {image.image_id: image.name for image in db.read_all_images()}
             features = {name: int(db.num_keypoints_for_image(k)) for k, name in images.items()}
-            _, matches = db.read_num_matches()
-            _, inliers = db.read_two_view_geometry_num_inliers()
+            matches = _by_pair(images, *db.read_num_matches())
+            inliers = _by_pair(images, *db.read_two_view_geometry_num_inliers())
+        best = {name: [0, 0, 0] for name in features}
+        for column, counts in enumerate((matches, inliers)):
+            for pair, count in counts.items():
+                for name in pair:
+                    best[name][column] = max(best[name][column], count)
+        for (a, b), count in inliers.items():
+            for one, other in ((a, b), (b, a)):
+                if other in placed:
+                    best[one][2] = max(best[one][2], count)
         return {
             "tolerant": self.tolerant,
             "registered": self.registered,
             "features": features,
-            "matches": sorted(matches, reverse=True),
-            "inliers": sorted(inliers, reverse=True),
+            "matches": sorted(matches.values(), reverse=True),
+            "inliers": sorted(inliers.values(), reverse=True),
+            "best": best,
+            "apart": self.apart,
         }
 
     def _geometry(self) -> pycolmap.TwoViewGeometryOptions:
@@ -219,7 +238,7 @@ class Attempt:
 
     def _mapping(self, fixed: bool) -> pycolmap.IncrementalPipelineOptions:
         options = pipeline_options()
-        options.min_model_size = 3
+        options.min_model_size = SMALLEST
         mapper = options.mapper
         if self.coarse:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM
@@ -292,3 +311,24 @@ class Attempt:
         new = self.directory / "stage.new"
         new.write_text(json.dumps(now), encoding="utf-8")
         new.replace(self.directory / "stage.json")
+
+
+def placed_names(model: pycolmap.Reconstruction) -> set[str]:
+    """The photos that have a place in a model."""
+    return {model.images[k].name for k in model.reg_image_ids()}
+
+
+def apart(models: list[set[str]]) -> list[list[str]]:
+    """Photos of each model but the first that no model before it has, sorted; of three and more."""
+    found, known = list[list[str]](), set[str]()
+    for names in models:
+        if known and len(names - known) >= SMALLEST:
+            found.append(sorted(names - known))
+        known |= names
+    return found
+
+
+def _by_pair(images: dict[int, str], pairs: Any, counts: Any) -> dict[tuple[str, str], int]:
+    """Counts by the names of two photos."""
+    ids = (pycolmap.pair_id_to_image_pair(pair) for pair in pairs)
+    return {(images[a], images[b]): int(count) for (a, b), count in zip(ids, counts, strict=True)}

@@ -1,13 +1,17 @@
-"""Why COLMAP found no scene in photos, told from what it saw in them."""
+"""Why COLMAP found no scene in photos, or no place for some, told from what it saw in them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from hqgs.base.text import some
+
 FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
+POOR = 0.25  # of the features of the others: the same
+AGREE = 15  # matches that agree, which COLMAP asks of a pair
 ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
 
 
@@ -20,13 +24,16 @@ class Pass:
     features: dict[str, int]  # of each photo
     matches: list[int]  # of each pair that has any, sorted
     inliers: list[int]  # of them, those that one geometry bears out, sorted
+    best: dict[str, list[int]] = field(default_factory=dict)  # of each photo's best pairs: matches, of them
+    # those that a geometry bears out, and the same with a photo that has a place
+    apart: list[list[str]] = field(default_factory=list)  # photos that fit each other, and no others
 
 
 def why_no_model(photos: int, passes: Sequence[Pass]) -> str:
     """Why no model could be started, with counts, and what to do; a sentence or two for the user."""
-    counts = _counts(photos, passes)
+    found = counts(photos, passes)
     last = passes[-1]
-    told = f"COLMAP could start from no two of the {photos} photos. {counts}. "
+    told = f"COLMAP could start from no two of the {photos} photos. {found}. "
     if _is_poor(passes[0]):
         return told + (
             "So few features mean blurred or dark photos, or bare surfaces: take sharp photos of things with "
@@ -55,10 +62,50 @@ def why_few(photos: int, passes: Sequence[Pass]) -> str:
         advice = f"{len(poor)} photos show few features (blurred, dark or bare surfaces)"
     else:
         advice = "the others overlap too little with these: take more photos in between"
-    return f"{_counts(photos, passes)}; {advice}"
+    return f"{counts(photos, passes)}; {advice}"
 
 
-def _counts(photos: int, passes: Sequence[Pass]) -> str:
+def why_lost(name: str, one: Pass) -> str:
+    """Why a pass found no place for a photo, in words with numbers."""
+    features, usual = one.features[name], float(np.median(list(one.features.values())))
+    matches, inliers, with_placed = one.best[name]
+    if features < max(FEW_FEATURES, POOR * usual):
+        return f"blurred, dark or bare: {features:,} features, half of the photos have {usual:,.0f}"
+    if matches < AGREE:
+        return "alone: it matches no other photo"
+    if inliers < AGREE:
+        return f"no two photos agree: {matches} matches at best, {inliers} of them bear each other out"
+    if group := next((group for group in one.apart if name in group), None):
+        return f"fits {len(group) - 1} photos that have no place either"
+    if with_placed < AGREE:
+        return "fits only photos that have no place either"
+    return f"few matches agree: {with_placed} with a photo that has a place"
+
+
+def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[Sequence[str]]) -> str:
+    """What to photograph so that the lost photos, by `why_lost`, find a place; `names`: of all, sorted."""
+    captures = [[name for name in group if name in lost] for group in apart]
+    said = [
+        f"{len(group)} photos fit each other but not the rest ({some(group)}): another scene belongs into a "
+        "folder of its own, the same scene needs photos in between"
+        for group in captures
+        if group
+    ]
+    others = [name for name in lost if not any(name in group for group in captures)]
+    if blurred := [name for name in others if lost[name].startswith("blurred")]:
+        said.append(f"take sharp, bright photos again where these were taken: {some(blurred)}")
+    if loose := [name for name in others if name not in blurred]:
+        between = []
+        for name in loose:
+            k = names.index(name)
+            near = [*reversed(names[:k]), *names[k + 1 :]] if k else names[1:]
+            between += [f"{other} and {name}" for other in near if other not in lost][:1]
+        said.append(f"take photos between {some(between)}")
+    return "; ".join(said)
+
+
+def counts(photos: int, passes: Sequence[Pass]) -> str:
+    """What was found, in numbers."""
     first, pairs = passes[0], photos * (photos - 1) // 2
     features = list(first.features.values()) or [0]
     found = (

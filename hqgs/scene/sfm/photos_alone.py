@@ -40,7 +40,9 @@ def find_cameras(
     """Cameras and points of photos that are readable, by COLMAP, as `read_photos` has them."""
     names = photos.colmap_names
     try:
-        ran = run_colmap(list(names), photos.contents(), photos.guess(), photos.write, keep, on_stage, coarse)
+        ran = run_colmap(
+            list(names), photos.contents(), photos.guess(), photos.write, keep, on_stage, coarse, names
+        )
         poses = ran.poses()
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
@@ -65,6 +67,7 @@ def find_cameras(
         unreadable=photos.unreadable,
         first_pass=ran.first_pass,
         advice=ran.advice(),
+        lost=ran.lost(),
         sure_px={names[file]: px for file, px in sureness(model).items()},
     )
     return FoundCameras(photos, model, report)

@@ -37,7 +37,13 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
     cameras = [view.camera for view in scene.train]
     contents = map(_content, views.values())
     ran = run_colmap(
-        list(views), contents, cameras, lambda folder: _write_photos(folder, views), keep, on_stage
+        list(views),
+        contents,
+        cameras,
+        lambda folder: _write_photos(folder, views),
+        keep,
+        on_stage,
+        called={file: view.name for file, view in views.items()},
     )
     model = ran.found
     poses = ran.poses()
@@ -73,6 +79,7 @@ def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent
         own_track_length=None if scene.tracks is None else scene.tracks.length,
         own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
         first_pass=ran.first_pass,
+        lost=ran.lost(),
         sure_px={views[file].name: px for file, px in sureness(model).items()},
         auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),
     )

@@ -9,9 +9,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import likely
-from hqgs.scene.sfm.failure import Pass, why_few, why_no_model
+from hqgs.scene.sfm.failure import Pass, counts, what_to_take, why_few, why_lost, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
 IMPORTED = (
@@ -43,6 +43,7 @@ LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 LARGEST = 1600  # px a side of what COLMAP looks at, as `attempt.py` has it
 LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
+AGAIN = 4  # times the first pass, that all passes take at most
 LISTEN = 0.25  # s between looks at what COLMAP is doing
 STAGES = {
     "features": "COLMAP: features",
@@ -69,6 +70,7 @@ class Model:
 
     found: pycolmap.Reconstruction
     passes: list[Pass]
+    called: Mapping[str, str] = field(default_factory=dict)  # what the user calls photos, by COLMAP's names
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few photos have one."""
@@ -76,14 +78,34 @@ class Model:
         if len(poses) < max(LEAST_PHOTOS, LEAST_SHARE * photos):
             raise ValueError(
                 f"COLMAP registered only {len(poses)} of {photos} photos, wanted at least {LEAST_PHOTOS} and "
-                f"{LEAST_SHARE:.0%}. {why_few(photos, self.passes)}"
+                f"{LEAST_SHARE:.0%}. {why_few(photos, self.passes)}. {self._to_take()}".strip()
             )
         return poses
 
+    @property
+    def _chosen(self) -> Pass:
+        """The pass whose model it is."""
+        return max(self.passes, key=lambda one: (one.registered, -one.tolerant))
+
+    def lost(self) -> dict[str, str]:
+        """Photos that have no place, sorted, and why."""
+        placed, one = registered(self.found), self._chosen
+        lost = {self._name(name): why_lost(name, one) for name in one.features if name not in placed}
+        return dict(sorted(lost.items()))
+
     def advice(self) -> str | None:
         """What to do about photos that have no place; None: there is none."""
-        photos = len(self.passes[0].features)
-        return why_few(photos, self.passes) if len(registered(self.found)) < photos else None
+        told = self._to_take()
+        return f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else None
+
+    def _to_take(self) -> str:
+        names = sorted(map(self._name, self._chosen.features))
+        apart = [sorted(map(self._name, group)) for group in self._chosen.apart]
+        told = what_to_take(self.lost(), names, apart)
+        return told[:1].upper() + told[1:]
+
+    def _name(self, name: str) -> str:
+        return self.called.get(name, name)
 
     @property
     def first_pass(self) -> int | None:
@@ -110,7 +132,7 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
 
     `sizes` [V, 2] of the photos, px; `pairs` that are matched, None: all, or of many photos the likely ones.
     The range is that of photos with little and with much detail, measured on two threads of an AMD EPYC,
-    where the first pass places enough of them: of the others (`program.py`) the sentence has no number.
+    where the first pass places enough of them; the other passes (`program.py`) are as long each.
     """
     count = len(sizes)
     if pairs is None:
@@ -130,8 +152,8 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
     return (
         f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
         f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} threads, more the "
-        f"more detail they show; where photos find no place, smoothed copies are looked at as well, which "
-        f"takes several times as long{advice}"
+        f"more detail they show; where photos find no place, smoothed copies are looked at as well: up to "
+        f"{AGAIN * max(2, round(most / 60))} minutes in all{advice}"
     )
 
 
@@ -143,6 +165,7 @@ def run_colmap(
     keep: Path | None = None,
     on_stage: OnStage = silent,
     coarse: bool = False,
+    called: Mapping[str, str] | None = None,
 ) -> Model:
     """COLMAP's largest model of photos.
 
@@ -157,6 +180,7 @@ def run_colmap(
         on_stage: hears what is being done.
         coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
             placed.
+        called: what the user calls the photos of those names.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
@@ -179,7 +203,7 @@ def run_colmap(
         given["coarse"] = np.array(True)
     kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
-        return _read(kept)
+        return _read(kept, called or {})
     sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
     pairs = len(given["pairs"]) if "pairs" in given else None
     if note := expected_time(sizes, pairs, get_num_threads(), coarse):
@@ -202,7 +226,7 @@ def run_colmap(
             raise ValueError(why_no_model(len(names), _passes(facts)))
         if kept is not None:
             keep_folder(directory / "model", kept)
-        return _read(directory / "model")
+        return _read(directory / "model", called or {})
 
 
 @contextmanager
@@ -270,8 +294,8 @@ def _tell(file: Path, on_stage: OnStage) -> None:
     on_stage(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
 
 
-def _read(folder: Path) -> Model:
-    return Model(pycolmap.Reconstruction(folder), _passes(folder / "facts.json"))
+def _read(folder: Path, called: Mapping[str, str]) -> Model:
+    return Model(pycolmap.Reconstruction(folder), _passes(folder / "facts.json"), called)
 
 
 def _passes(facts: Path) -> list[Pass]:
