@@ -70,11 +70,18 @@ def psnr_aligned(
     light is nearly a factor of the sRGB values. Never below `psnr`.
     """
     x, y = _pair(render, photo, mask)
-    told = (x, y) if mask is None else (x[mask], y[mask])
+    factors = color_factors(x, y, mask)
+    return psnr(factors * x, y, mask)
+
+
+def color_factors(
+    render: NDArray[np.float64], photo: NDArray[np.float64], mask: NDArray[np.bool_] | None
+) -> NDArray[np.float64]:
+    """The factor of each channel [3] that brings a render nearest to its photo, both [H, W, 3] in [0, 1]."""
+    told = (render, photo) if mask is None else (render[mask], photo[mask])
     first, second = (image.reshape(-1, 3) for image in told)
     squares, products = (first**2).sum(0), (first * second).sum(0)
-    factors = np.divide(products, squares, out=np.ones(3), where=squares > 0)
-    return psnr(factors * x, y, mask)
+    return np.divide(products, squares, out=np.ones(3), where=squares > 0)
 
 
 def ssim(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:

@@ -37,6 +37,7 @@ from hqgs.evaluation.records import (
     alike,
 )
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.pixels import upright
 from hqgs.photos.sheet import printable, sheet
 
 if TYPE_CHECKING:
@@ -172,7 +173,7 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     numbers += [] if metrics.ssim is None else [f"SSIM {metrics.ssim:.3f}"]
     captions = [f"photo  {printable(Path(view.name).stem)}", "  ".join(["render", *numbers]), amplified]
 
-    panels = [np.ascontiguousarray(np.rot90(panel, -view.quarter_turns)) for panel in panels]
+    panels = [upright(panel, view.quarter_turns) for panel in panels]
     return sheet([list(zip(captions, panels, strict=True))])
 
 

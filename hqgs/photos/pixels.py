@@ -30,6 +30,11 @@ def floats(photo: Tensor) -> Tensor:
     return photo if photo.is_floating_point() else photo / 255
 
 
+def upright(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
+    """[H, W, 3] after so many quarter turns clockwise; see `View.quarter_turns`."""
+    return np.ascontiguousarray(np.rot90(image, -turn))
+
+
 def to_levels(image: NDArray[np.uint8] | NDArray[np.float32], what: str) -> Floats:
     """A photo [H, W, 3], uint8 or float32 with white at 1, in levels of 1/255.
 

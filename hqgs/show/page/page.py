@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
 from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.gaussians import Gaussians
-from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.paths import focus, world_up
 from hqgs.scene.scene import Camera, Scene
 from hqgs.show.page.charts import line_chart
@@ -79,9 +79,9 @@ def summary_html(report: Report, views: Sequence[RenderedView]) -> str:
         )
     ]
     for view in views[:1]:
-        pair = _pair(view, None)
+        both = pair(view, None)
         shown = Markup('<img src="{}" alt="photo" width="45%"> <img src="{}" alt="render" width="45%">')
-        parts.append(shown.format(pair["photo"], pair["render"]))
+        parts.append(shown.format(both["photo"], both["render"]))
     return str(Markup("").join(parts))
 
 
@@ -92,11 +92,6 @@ def write_page(path: str | Path, page: Page) -> None:
 
 def page_text(page: Page) -> str:
     """The page as HTML. Names from files are escaped; nothing in it is loaded from elsewhere."""
-    from jinja2 import Environment, FileSystemLoader  # here: only the page needs it
-
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
     report, history = page.report, page.report["history"]
     measured = {view["name"]: view for view in report["metrics"]["views"]}
     chosen = _chosen(page.views, measured)
@@ -106,14 +101,15 @@ def page_text(page: Page) -> str:
     ]
     measured_some = [h["views"] for h in history if "views" in h]
     diagnosis = page.diagnosis
-    return environment.get_template("report.html.j2").render(
+    return rendered(
+        "report.html.j2",
         title=f"{report['scene']}, {report['method']}",
         verdict=told_verdict(report),
         facts=_facts(report, page.scene),
         report=report,
         scene=None if page.gaussians is None else _scene(page.scene, page.gaussians),
         splats=Markup("\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)),
-        pairs=[_pair(view, measured.get(view.name)) for view in chosen],
+        pairs=[pair(view, measured.get(view.name)) for view in chosen],
         pairs_left=len(page.views) - len(chosen),
         charts=charts,
         measured_on=max(measured_some, default=0),
@@ -122,13 +118,22 @@ def page_text(page: Page) -> str:
         if diagnosis is None
         else [_row(p.name, photo_words(photo_record(p))) for p in diagnosis.photos],
         learned=[_row(record["name"], learned_words(record)) for record in report["learned"]],
-        learned_picture=None if page.learned is None else _jpeg(page.learned, LEARNED_SIDE),
+        learned_picture=None if page.learned is None else jpeg(page.learned, LEARNED_SIDE),
         left_out=[_left_out(dict(item)) for item in report["left_out"]],
         plan=[_plan_row(row) for row in report.get("plan", [])],
         notes=report["notes"],
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
+
+
+def rendered(template: str, **values: Any) -> str:
+    """A template of a page, filled; values are escaped."""
+    from jinja2 import Environment, FileSystemLoader  # here: only a page needs it
+
+    loader = FileSystemLoader(TEMPLATES)
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.get_template(template).render(**values)
 
 
 def _line(history: Sequence[HistoryEntry], key: str) -> list[tuple[float, float]]:
@@ -200,7 +205,7 @@ def _chosen(views: Sequence[RenderedView], measured: dict[str, ViewMetricValues]
     return [views[ordered[k]] for k in places]
 
 
-def _pair(view: RenderedView, metrics: ViewMetricValues | None) -> dict[str, str]:
+def pair(view: RenderedView, metrics: Mapping[str, Any] | None) -> dict[str, str]:
     numbers = []
     if metrics is not None:
         numbers += [] if metrics["psnr"] is None else [f"{metrics['psnr']:.2f} dB"]
@@ -208,12 +213,12 @@ def _pair(view: RenderedView, metrics: ViewMetricValues | None) -> dict[str, str
     return {
         "name": view.name,
         "numbers": ", ".join(numbers),
-        "photo": _jpeg(Image.fromarray(to_uint8(as_floats(view.photo)))),
-        "render": _jpeg(Image.fromarray(to_uint8(view.render))),
+        "photo": jpeg(Image.fromarray(upright(to_uint8(as_floats(view.photo)), view.quarter_turns))),
+        "render": jpeg(Image.fromarray(upright(to_uint8(view.render), view.quarter_turns))),
     }
 
 
-def _jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
+def jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
     picture, file = picture.copy(), io.BytesIO()
     picture.thumbnail((side, side), Image.Resampling.LANCZOS)
     picture.save(file, "JPEG", quality=QUALITY)

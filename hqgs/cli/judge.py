@@ -1,0 +1,175 @@
+"""`hqgs judge SCENE_FILE --photos SCENE`: how good a scene of any program is, how sure that is, and why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from hqgs import __version__
+from hqgs.base.files import CONFIG, is_film, is_room, write_json
+from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.progress import LoadingScreen
+from hqgs.cli.scenes import Factor, Number, ready
+from hqgs.evaluation.judge_words import told
+from hqgs.model.formats.files import format_of, scene_file
+from hqgs.training.settings import longest_side
+
+if TYPE_CHECKING:
+    from hqgs.evaluation.judge import Judged
+    from hqgs.scene.scene import Scene, View
+
+NUMBERS, PAGE = "judge.json", "judge.html"
+META = "meta.json"  # of a SOG scene that was unpacked
+TEST_EVERY = 8  # as everywhere
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judge:
+    """Options of `hqgs judge`."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """A scene file of this or another program, or the folder of a run."""
+    photos: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
+    """The photos with their cameras, in the frame of the scene file (those that the run was trained on)."""
+    against: Annotated[Path | None, tyro.conf.arg(metavar="OTHER", help_behavior_hint="")] = None
+    """Another scene of the same photos, or the judge.json of one, to compare with."""
+    views: Annotated[str, tyro.conf.arg(metavar="WHICH")] = "test"
+    """The photos to measure on: test (held out), train, all, or names with commas."""
+    test_every: Number = None
+    """Hold out every N-th photo (8, unless the scene has a split)."""
+    downscale: Factor = None
+    """Divide the sides of the photos by F (a longer side of at most 1600 px)."""
+    background: Annotated[
+        tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B", help_behavior_hint="")
+    ] = None
+    """Behind everything; 1 is white (that of the run, or black)."""
+    fit_cameras: bool = False
+    """Also measure with each camera fitted to the scene, some 10 s a photo: what poses cost is set aside."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
+    """Also write judge.json and judge.html, a page with photos against renders, into this folder."""
+
+
+OPTIONS = Judge
+
+
+def run(options: Judge) -> int:
+    """Measure and say how good it is; return the exit code (0 done, 1 failed, 2 bad input)."""
+    try:
+        source, other, known = check_source(options.source, options.photos), None, None
+        from hqgs.evaluation.judge import compared
+        from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
+
+        if (
+            options.against is not None
+            and options.against.suffix.lower() == ".json"
+            and options.against.is_file()
+        ):
+            known = read_judgement(options.against)
+        elif options.against is not None:
+            other = scene_file(options.against)
+        with LoadingScreen() as screen:
+            scene = read_photos(options.source, options.photos, options.downscale, options.test_every, screen)
+            views = chosen_views(scene, options.views)
+            background = background_of(options.source) if options.background is None else options.background
+            protocol = protocol_of(scene, options.views, views, background)
+            if known is not None:
+                check_comparable(protocol, known["protocol"], str(options.against))
+            judged = [
+                judge_file(file, scene, views, background, screen, fit=options.fit_cameras)
+                for file in [source, other]
+                if file is not None
+            ]
+        found: dict[str, Any] = {"hqgs": __version__, "protocol": protocol, "scene": judged[0].json()}
+        if known is not None or other is not None:
+            found["against"] = known["scene"] if known is not None else judged[1].json()
+            found["difference"] = compared(found["scene"], found["against"])
+        if options.out is not None:
+            from hqgs.show.page.judge_page import write_judge_page
+
+            write_json(options.out / NUMBERS, found)
+            write_judge_page(options.out / PAGE, found, judged)
+    except BAD_INPUT as error:
+        return fail(2, error)
+    except OSError as error:
+        return fail(1, f"{options.out or options.source}: {error}")
+    print(told(found))
+    if options.out is not None:
+        print(f"\n{options.out / PAGE}: photos against renders, and where the errors are")
+    return 0
+
+
+def check_source(source: Path, photos: str | None, option: str = "--photos") -> Path:
+    """The scene file that is meant, before anything that takes seconds. BAD_INPUT errors."""
+    file = scene_file(source)
+    format_of(file)
+    if photos is None and not (source.is_dir() and (source / CONFIG).is_file()):
+        raise ValueError(
+            f"{source} is no folder of a run: {option} names the photos to measure it with, in a folder with "
+            "their cameras (COLMAP, nerfstudio, ...)"
+        )
+    if photos is not None:
+        ready(photos)
+    return file
+
+
+def read_photos(
+    source: Path, photos: str | None, downscale: float | None, test_every: int | None, screen: LoadingScreen
+) -> Scene:
+    """The photos with their cameras: those of --photos, or those that the run was trained on."""
+    from hqgs.scene.load import formats_of  # here: they load torch
+    from hqgs.scene.source import load, load_again
+
+    if photos is None:
+        return load_again(source, on_stage=screen.stage)
+    run = source if source.is_dir() else source.parent
+    run = run if (run / CONFIG).is_file() else None
+    bare = is_film(photos) or not (is_room(photos) or formats_of(Path(photos).resolve(), downscale or 1.0))
+    if bare and run is None:
+        raise ValueError(
+            f"{photos} has no cameras: those that would be found anew are in another frame than {source}; "
+            "give the COLMAP or nerfstudio folder that it was trained on"
+        )
+    return load(
+        photos,
+        downscale=1.0 if downscale is None else downscale,
+        longest=longest_side("standard", downscale),
+        test_every=TEST_EVERY if test_every is None else test_every,
+        skip_unreadable=False,
+        cache=run,
+        on_stage=screen.stage,
+    )
+
+
+def background_of(source: Path) -> tuple[float, float, float]:
+    """What a run was trained on, or black."""
+    from hqgs.model.constants import BACKGROUND
+
+    path = source / CONFIG
+    asked = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return tuple(asked.get("train", {}).get("background", BACKGROUND))
+
+
+def judge_file(
+    file: Path,
+    scene: Scene,
+    views: Sequence[View],
+    background: tuple[float, float, float],
+    screen: LoadingScreen,
+    fit: bool = False,
+    look: bool = True,
+) -> Judged:
+    """A scene file, measured; what its reading left out is told."""
+    from hqgs.evaluation.judge import judge
+    from hqgs.model.gaussians import Gaussians
+
+    gaussians = Gaussians.load(file)
+    for note in gaussians.notes:
+        screen.say(f"read: {note}")
+    parts = [file] if file.name != META else [path for path in file.parent.iterdir() if path.is_file()]
+    size, held = sum(path.stat().st_size for path in parts), gaussians.in_world(scene.world)
+    return judge(str(file), size, held, scene, views, background, fit, look, screen.stage)

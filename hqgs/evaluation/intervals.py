@@ -1,0 +1,60 @@
+"""How sure a mean over photos is, and a difference of two scenes on the same photos.
+
+A scene is photographed from a few of the places from which it could be: another draw of held-out photos gives
+another mean. The interval holds the mean over all such photos in CONFIDENCE of the draws. It is Student's,
+of the photos' own values, photos being what is drawn: patches drawn within drawn photos count what differs
+within a photo twice, and cover 98 % and more (`tests/test_intervals.py` and docs/log.md have the figures).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+CONFIDENCE = 0.9  # of every interval that the project prints
+
+
+def half_width(values: Sequence[float | None]) -> float | None:
+    """Half the interval of the mean of photos' values; None of fewer than two, or where one is None."""
+    known = [value for value in values if value is not None]
+    if len(known) < max(2, len(values)):
+        return None
+    from scipy.special import stdtrit  # here: the command line waits for no scipy
+
+    quantile = float(stdtrit(len(known) - 1, (1 + CONFIDENCE) / 2))
+    return quantile * float(np.std(known, ddof=1)) / math.sqrt(len(known))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Of a metric between two scenes on the same photos, photo by photo."""
+
+    mean: float  # the one's less the other's
+    half_width: float | None  # None of a single photo
+
+    @property
+    def sure(self) -> bool:
+        """Whether the interval leaves 0 out."""
+        return self.half_width is not None and abs(self.mean) > self.half_width
+
+
+def difference(one: Sequence[float | None], other: Sequence[float | None]) -> Difference | None:
+    """Paired: narrower than two intervals, as hard photos are hard for both. None where a value is None."""
+    pairs = [(a, b) for a, b in zip(one, other, strict=True) if a is not None and b is not None]
+    if not pairs or len(pairs) < len(one):
+        return None
+    apart = [a - b for a, b in pairs]
+    return Difference(float(np.mean(apart)), half_width(apart))
+
+
+def half_widths(views: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, float | None]:
+    """`half_width` of each metric of these names."""
+    return {name: half_width([view[name] for view in views]) for name in names}
+
+
+def with_half(value: float, half: float | None, form: str) -> str:
+    """`28.31 ± 0.42`, or the value alone."""
+    return format(value, form) + ("" if half is None else f" ± {half:{form.lstrip('+')}}")

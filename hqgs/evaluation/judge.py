@@ -1,0 +1,196 @@
+"""A scene measured on photos, as `hqgs judge` and `hqgs eval` do: the numbers, how sure they are, and why."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from statistics import median
+from typing import Any
+
+import torch
+
+from hqgs._rust import get_num_threads
+from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.threads import one_torch_thread
+from hqgs.evaluation.causes import Causes, causes, json_of, noise_of, pixel_maps, shares, shown_by
+from hqgs.evaluation.fit_cameras import Fitted, fit_cameras
+from hqgs.evaluation.held_out import HeldOutViews, RenderedView, held_out_renders, measured
+from hqgs.evaluation.intervals import CONFIDENCE, difference, half_widths
+from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
+from hqgs.model.constants import BACKGROUND
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import render_view
+from hqgs.scene.scene import Scene, View
+
+Background = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A scene on photos."""
+
+    name: str  # of the scene file
+    bytes: int
+    gaussians: int
+    sh_degree: int
+    antialiased: bool
+    views: Sequence[RenderedView] = field(repr=False)  # rendered when they are asked for
+    each: list[ViewMetrics]
+    fits: list[Fitted]  # empty where cameras were not fitted
+    again: list[ViewMetrics]  # with fitted cameras
+    causes: list[Causes | None]  # of each photo, None: its mask leaves no pixel; empty where not asked for
+    render_seconds: float | None  # of a photo, median, on all threads
+
+    @property
+    def names(self) -> list[str]:
+        """Of the photos."""
+        return [view.name for view in self.views]
+
+    @property
+    def mean(self) -> ViewMetrics:
+        """Over the photos."""
+        return mean_metrics(self.each)
+
+    def json(self) -> dict[str, Any]:
+        """What the JSON file holds of it."""
+        known: dict[str, Any] = {
+            "name": self.name,
+            "bytes": self.bytes,
+            "gaussians": self.gaussians,
+            "sh_degree": self.sh_degree,
+            "antialiased": self.antialiased,
+            **numbers(self.names, self.each),
+        }
+        if self.render_seconds is not None:
+            known |= {"render_seconds": self.render_seconds, "threads": get_num_threads()}
+        if self.fits:
+            moved = [{"rotation_deg": fit.rotation_deg, "moved_px": fit.pixels} for fit in self.fits]
+            known["fitted"] = numbers(self.names, self.again, moved)
+        if self.causes:
+            known["causes"] = shares([one for one in self.causes if one is not None])
+            for name, one in zip(self.names, self.causes, strict=True):
+                known["views"][name]["causes"] = None if one is None else json_of(one)
+        return known
+
+
+def judge(
+    name: str,
+    size: int,
+    gaussians: Gaussians,
+    scene: Scene,
+    views: Sequence[View],
+    background: Background = BACKGROUND,
+    fit: bool = False,
+    look: bool = True,
+    on_stage: OnStage = silent,
+) -> Judged:
+    """Measure Gaussians, held in the frame of the scene's cameras, on some of its photos.
+
+    Args:
+        name, size: of the scene file; bytes.
+        gaussians: in `scene.world`.
+        scene: its training cameras tell where the capture ends.
+        views: the photos to measure on.
+        background: behind everything, R, G, B.
+        fit: also with each camera fitted to the scene.
+        look: also where the errors are, what they come from, and the time of a render.
+
+    Raises:
+        ValueError: no Gaussian shows from any of the cameras; or a photo and its mask do not fit.
+    """
+    judged_scene = replace(scene, test=[*views])
+    renders = held_out_renders(judged_scene, gaussians, background=background)
+    on_stage(Stage("photos measured", 0, len(views)))
+    each = measured(renders)
+    if views and min(renders.culled()) == len(gaussians):
+        raise ValueError(
+            f"{name}: none of its {len(gaussians):,} Gaussians lies before any camera of {scene.name}: the "
+            "photos' cameras are in another frame than the scene file"
+        )
+    fits: list[Fitted] = []
+    if fit:
+        degree = gaussians.sh_degree
+        fits = fit_cameras(
+            views,
+            gaussians,
+            degree,
+            background,
+            lambda done: on_stage(Stage("held-out cameras fitted", done, len(views))),
+        )
+    fitted = held_out_renders(
+        replace(scene, test=[one.view for one in fits]), gaussians, background=background
+    )
+    found, seconds = list[Causes | None](), list[float]()
+    if look:
+        shown = shown_by(gaussians, [view.camera for view in scene.train])
+        for k, view in enumerate(views):
+            seconds.append(_seconds(gaussians, view, background))
+            found.append(_causes(renders, fitted, k, gaussians, view, shown))
+            on_stage(Stage("errors sorted by their causes", k + 1, len(views)))
+    return Judged(
+        name=name,
+        bytes=size,
+        gaussians=len(gaussians),
+        sh_degree=gaussians.sh_degree,
+        antialiased=gaussians.antialiased,
+        views=renders,
+        each=each,
+        fits=fits,
+        again=measured(fitted),
+        causes=found,
+        render_seconds=median(seconds) if seconds else None,
+    )
+
+
+def numbers(
+    names: Sequence[str], each: Sequence[ViewMetrics], more: Sequence[dict[str, Any]] = ()
+) -> dict[str, Any]:
+    """Metrics as JSON values: their means, half the interval of each, and those of each photo."""
+    mean = asdict(mean_metrics([*each]))
+    reasons = mean.pop("reasons")
+    rows = [{key: value for key, value in asdict(one).items() if key in METRICS} for one in each]
+    extra = more or [{} for _ in rows]
+    views = {name: row | also for name, row, also in zip(names, rows, extra, strict=True)}
+    return {
+        "mean": mean,
+        "interval": half_widths(rows, METRICS),
+        "confidence": CONFIDENCE,
+        "reasons": reasons,
+        "views": views,
+    }
+
+
+def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Each metric of one scene less that of another on the same photos, both of `Judged.json`."""
+    found: dict[str, Any] = {}
+    for metric in METRICS:
+        values = [[view[metric] for view in of["views"].values()] for of in (one, other)]
+        apart = difference(*values)
+        known = (
+            None if apart is None else {"mean": apart.mean, "interval": apart.half_width, "sure": apart.sure}
+        )
+        found[metric] = known
+    return found
+
+
+def _seconds(gaussians: Gaussians, view: View, background: Background) -> float:
+    with one_torch_thread(), torch.no_grad():
+        started = time.perf_counter()
+        render_view(gaussians, view.camera, gaussians.sh_degree, background)
+        return time.perf_counter() - started
+
+
+def _causes(
+    renders: HeldOutViews,
+    fitted: HeldOutViews,
+    number: int,
+    gaussians: Gaussians,
+    view: View,
+    shown: torch.Tensor,
+) -> Causes | None:
+    if view.mask is not None and not view.mask.any():
+        return None
+    with one_torch_thread():
+        maps = pixel_maps(gaussians, view.camera, shown)
+    return causes(renders[number], maps, noise_of(view), fitted[number] if len(fitted) else None)

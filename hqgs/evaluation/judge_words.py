@@ -1,0 +1,131 @@
+"""A judgement in words, for the screen and the page; `found` is what judge.json holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hqgs.base.text import markdown_table
+from hqgs.evaluation.intervals import with_half
+from hqgs.evaluation.verdict import verdict
+
+WORST, LEAST = 3, 0.005  # photos that the screen names; share of the error that is named
+LABELS = {
+    "psnr": "PSNR (dB)",
+    "psnr_aligned": "colours aligned (dB)",
+    "ssim": "SSIM",
+    "haarpsi": "HaarPSI",
+    "lpips": "LPIPS",
+    "lpips_vgg": "LPIPS (VGG)",
+}
+FORMS = dict.fromkeys(LABELS, ".4f") | {"psnr": ".2f", "psnr_aligned": ".2f"}
+DOWN = ("lpips", "lpips_vgg")  # less is better
+CAUSES = {
+    "color": ("colour", "what one factor for each channel of each photo sets right"),
+    "pose": ("pose", "what fitting each camera sets right; without --fit-cameras it counts as detail"),
+    "edge": ("edge of the capture", "pixels whose Gaussians fewer than 3 training photos have in view"),
+    "fog": ("fog", "pixels with a tenth or more of their colour from far before the surface"),
+    "noise": ("noise of the photos", "in no scene, where it can be told from texture"),
+    "detail": ("missing detail", "what is finer than some 4 px"),
+    "broad": ("shape and shading", "the rest: broad errors"),
+}
+
+
+def told(found: dict[str, Any]) -> str:
+    """What the screen says."""
+    one, against = found["scene"], found.get("against")
+    count, which = found["protocol"]["photos"], found["protocol"]["which"]
+    title = f"{one['name']} on {count} photo{'s' * (count > 1)}: {which}"
+    shown = [name for name in LABELS if one["mean"][name] is not None]
+    lines = [markdown_table(title, ["", *(LABELS[name] for name in shown)], table_rows(found, shown)), ""]
+    lines += [interval_words(one)] if count > 1 else []
+    lines.append(scene_words(one) + ("" if against is None else f"; against {scene_words(against)}"))
+    lines += [f"the error comes from: {cause_words(one['causes'])}", *worst(one)]
+    word, why = verdict(one["mean"]["psnr"])
+    return "\n".join([*lines, f"quality: {word} ({why})"])
+
+
+def table_rows(found: dict[str, Any], shown: Sequence[str]) -> list[list[str]]:
+    """A line for the scene, for fitted cameras, for the other scene and for their difference."""
+    one, against = found["scene"], found.get("against")
+    rows = [["as they are", *_cells(one, shown)]]
+    if "fitted" in one:
+        rows.append(["cameras fitted", *_cells(one["fitted"], shown)])
+    if against is not None:
+        rows += [
+            [f"against {Path(against['name']).name}", *_cells(against, shown)],
+            difference_row(found, shown),
+        ]
+    return rows
+
+
+def interval_words(one: dict[str, Any]) -> str:
+    """What ± is."""
+    return (
+        f"± half the {one['confidence']:.0%} interval of the mean over such photos; of a difference, by photo"
+    )
+
+
+def photo_table(title: str, of: dict[str, Any]) -> str:
+    """The metrics of each photo, and at last their means."""
+    shown = [name for name in LABELS if of["mean"][name] is not None]
+    rows = [
+        [name, *("-" if view[metric] is None else format(view[metric], FORMS[metric]) for metric in shown)]
+        for name, view in of["views"].items()
+    ]
+    return markdown_table(
+        title, ["photo", *(LABELS[name] for name in shown)], [*rows, ["mean", *_cells(of, shown)]]
+    )
+
+
+def difference_row(found: dict[str, Any], shown: Sequence[str]) -> list[str]:
+    """What the scene has over the other one; what is within its interval is no difference."""
+    cells = []
+    for name in shown:
+        apart = found["difference"][name]
+        if apart is None:
+            cells.append("-")
+            continue
+        text = with_half(apart["mean"], apart["interval"], "+" + FORMS[name])
+        cells.append(f"{text} ({word_for(name, apart)})")
+    return ["difference", *cells]
+
+
+def scene_words(one: dict[str, Any]) -> str:
+    """Size and cost of a scene."""
+    words = f"{one['gaussians']:,} Gaussians, {one['bytes'] / 1e6:.3g} MB"
+    if "render_seconds" in one:
+        threads = one["threads"]
+        words += f", {1000 * one['render_seconds']:.0f} ms a render on {threads} thread{'s' * (threads > 1)}"
+    return words
+
+
+def cause_words(causes: dict[str, float]) -> str:
+    """The parts of the error, the largest first."""
+    parts = sorted(causes.items(), key=lambda item: -item[1])
+    return ", ".join(f"{CAUSES[name][0]} {share:.0%}" for name, share in parts if share >= LEAST)
+
+
+def worst(one: dict[str, Any]) -> list[str]:
+    """The photos with the lowest PSNR, and what it comes from there."""
+    known = [(view["psnr"], name, view["causes"]) for name, view in one["views"].items() if view["psnr"]]
+    lines = []
+    for psnr, name, causes in sorted(known, key=lambda item: item[:2])[:WORST]:
+        parts = {part: causes[part] / causes["mse"] for part in CAUSES}
+        lines.append(f"  {name}: {psnr:.2f} dB; {cause_words(parts)}")
+    return ["worst photos:", *lines] if len(known) > 1 else []
+
+
+def _cells(of: dict[str, Any], shown: Sequence[str]) -> list[str]:
+    return [
+        "-" if of["mean"][name] is None else with_half(of["mean"][name], of["interval"][name], FORMS[name])
+        for name in shown
+    ]
+
+
+def word_for(metric: str, apart: dict[str, Any]) -> str:
+    """Whether a difference is one: better, worse, or within its interval."""
+    if not apart["sure"]:
+        return "not sure"
+    return "better" if (apart["mean"] > 0) != (metric in DOWN) else "worse"

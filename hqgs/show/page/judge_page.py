@@ -1,0 +1,119 @@
+"""judge.html: a judgement in one file that needs no network."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.files import write_text
+from hqgs.evaluation.causes import PATCH
+from hqgs.evaluation.judge import Judged
+from hqgs.evaluation.judge_words import (
+    CAUSES,
+    FORMS,
+    LABELS,
+    cause_words,
+    interval_words,
+    scene_words,
+    table_rows,
+)
+from hqgs.evaluation.verdict import verdict
+from hqgs.photos.pixels import upright
+from hqgs.show.page.page import pair, rendered
+
+PAIRS = 12  # photos with pictures: the worst ones
+WHITE = 64.0  # levels: the map's brightest
+APART = 16.0  # levels of difference between two scenes: the deepest blue and red
+COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
+
+
+def write_judge_page(path: Path, found: dict[str, Any], judged: Sequence[Judged]) -> None:
+    """Write the page atomically: `found` is what judge.json holds, `judged` the scene, and the other one."""
+    write_text(path, judge_page(found, judged))
+
+
+def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
+    """The page as HTML. Names from files are escaped; nothing in it is loaded from elsewhere."""
+    one, against, protocol = found["scene"], found.get("against"), found["protocol"]
+    shown = [name for name in LABELS if one["mean"][name] is not None]
+    psnr = one["mean"]["psnr"]
+    word, why = verdict(psnr)
+    order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
+    chosen = [judged[0].names.index(name) for name in order[:PAIRS]]
+    return rendered(
+        "judge.html.j2",
+        title=f"{Path(one['name']).name} on {protocol['photos']} photos",
+        verdict=f"Quality: {word}. {why[0].upper()}{why[1:]}.",
+        heads=["", *(LABELS[name] for name in shown)],
+        rows=table_rows(found, shown),
+        sure=interval_words(one),
+        sizes=[f"{of['name']}: {scene_words(of)}" for of in (one, against) if of is not None],
+        parts=[
+            {
+                "name": CAUSES[part][0],
+                "what": CAUSES[part][1],
+                "percent": round(100 * share, 1),
+                "color": color,
+            }
+            for (part, share), color in zip(one["causes"].items(), COLORS, strict=True)
+        ],
+        patch=PATCH,
+        white=int(WHITE),
+        one=Path(one["name"]).name,
+        other=None if against is None else Path(against["name"]).name,
+        pairs=[_pair(judged, number, one["views"], against) for number in chosen],
+        pairs_left=len(order) - len(chosen),
+        photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "the error comes from"],
+        photos=[_row(name, one["views"][name], shown) for name in order],
+        protocol=[
+            (key, value)
+            for key, value in (protocol | protocol["rules"]).items()
+            if key not in ("rules", "names")
+        ],
+    )
+
+
+def _row(name: str, view: dict[str, Any], shown: Sequence[str]) -> list[str]:
+    values = ["-" if view[metric] is None else format(view[metric], FORMS[metric]) for metric in shown]
+    causes = view["causes"]
+    if causes is None or not causes["mse"]:
+        return [name, *values, "-", "-"]
+    contrast = "-" if causes["contrast"] is None else f"{causes['contrast']:.0%}"
+    return [name, *values, contrast, cause_words({part: causes[part] / causes["mse"] for part in CAUSES})]
+
+
+def _pair(
+    judged: Sequence[Judged], number: int, views: dict[str, Any], against: dict[str, Any] | None
+) -> dict[str, Any]:
+    view = judged[0].views[number]
+    measured = views[view.name]
+    maps, causes = list[str](), measured["causes"]
+    if causes is not None:
+        levels = _levels(causes)
+        grey = np.rint(255 * np.clip(levels / WHITE, 0, 1))
+        maps.append(_png(np.repeat(grey[..., None], 3, 2), view.quarter_turns))
+        other = None if against is None else against["views"][view.name]["causes"]
+        if other is not None:
+            apart = np.clip((_levels(other) - levels) / APART, -1, 1)[..., None]  # above 0: the one is nearer
+            tint = np.where(apart > 0, np.array([47, 127, 196]), np.array([200, 60, 50]))
+            maps.append(_png(255 + np.abs(apart) * (tint - 255), view.quarter_turns))
+    height, width = view.photo.shape[:2][:: 1 - 2 * (view.quarter_turns % 2)]
+    return {**pair(view, measured), "maps": maps, "aspect": f"{width} / {height}"}
+
+
+def _levels(causes: dict[str, Any]) -> NDArray[np.float64]:
+    """The map of errors; 0 where masked."""
+    return np.array([[0.0 if v is None else v for v in row] for row in causes["levels"]])
+
+
+def _png(pixels: NDArray[np.float64], turn: int) -> str:
+    file = io.BytesIO()
+    Image.fromarray(upright(np.rint(pixels).astype(np.uint8), turn)).save(file, "PNG")
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()

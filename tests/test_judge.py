@@ -1,0 +1,249 @@
+"""`hqgs judge`: our own runs bit for bit, scenes of others, what errors come from, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fixtures_scenes import make_truth, write_colmap
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from tiny_scene import tiny_config, tiny_scene
+
+import hqgs
+from hqgs.cli.main import main
+from hqgs.evaluation.causes import PARTS, Maps, causes, pixel_maps, shares, shown_by
+from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.metrics import METRICS
+from hqgs.model.gaussians import Gaussians
+from hqgs.photos.pixels import to_uint8
+from hqgs.scene import source as scene_source
+from hqgs.scene.scene import Camera, Scene
+
+SIZE = 64
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a scene with three held-out photos, one of them masked."""
+    out = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_source, "room", lambda *_: held_out_scene())
+        scene = hqgs.load("embedded")
+        hqgs.train(scene, out=out, config=tiny_config(40))
+    return out
+
+
+def held_out_scene() -> Scene:
+    made = tiny_scene(9, 60)
+    views = [*made.test, *made.train]
+    mask = np.ones(views[1].image.shape[:2], bool)
+    mask[:, :5] = False
+    return replace(made, train=views[3:], test=[views[0], replace(views[1], mask=mask), views[2]])
+
+
+@pytest.fixture(autouse=True)
+def photos_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_source, "room", lambda *_: held_out_scene())
+
+
+def judge(*arguments: object) -> int:
+    return main(["judge", *map(str, arguments)])
+
+
+def test_our_own_runs_bit_for_bit(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = json.loads((run / "report.json").read_text())
+    assert judge(run, "--out", tmp_path) == 0
+    told = capsys.readouterr().out
+    assert judge(run / "scene.ply", "--photos", "embedded", "--out", tmp_path / "file") == 0
+    assert main(["eval", str(run), "--out", str(tmp_path / "eval.json")]) == 0
+    found = [json.loads((tmp_path / name / "judge.json").read_text())["scene"] for name in ("", "file")]
+    for one in [*found, json.loads((tmp_path / "eval.json").read_text())]:
+        assert one["mean"] == report["metrics"]["mean"]
+        for view in report["metrics"]["views"]:
+            known = {metric: view[metric] for metric in METRICS}
+            assert {metric: one["views"][view["name"]][metric] for metric in METRICS} == known
+    assert found[0]["gaussians"] == report["gaussians"]
+    assert found[0]["bytes"] == report["scene_bytes"]
+    assert f"{found[0]['mean']['psnr']:.2f} ± {found[0]['interval']['psnr']:.2f}" in told
+    for view in found[0]["views"].values():
+        parts = sum(view["causes"][part] for part in PARTS)
+        assert parts == pytest.approx(view["causes"]["mse"], rel=1e-9)
+    assert sum(found[0]["causes"].values()) == pytest.approx(1)
+
+
+def test_two_scenes_are_compared_photo_by_photo(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    worse = Gaussians.load(run)
+    replace(worse, sh0=worse.sh0 * 0.9).save(tmp_path / "worse.spz")
+    assert judge(run, "--against", tmp_path / "worse.spz", "--out", tmp_path / "both") == 0
+    told = capsys.readouterr().out
+    assert "(better)" in told
+    found = json.loads((tmp_path / "both" / "judge.json").read_text())
+    apart = [
+        found["scene"]["views"][name]["psnr"] - found["against"]["views"][name]["psnr"]
+        for name in found["protocol"]["names"]
+    ]
+    assert found["difference"]["psnr"]["mean"] == pytest.approx(np.mean(apart))
+    assert found["difference"]["psnr"]["sure"]
+    assert judge(run, "--out", tmp_path / "one") == 0
+    assert judge(run, "--against", tmp_path / "one" / "judge.json", "--out", tmp_path / "same") == 0
+    same = json.loads((tmp_path / "same" / "judge.json").read_text())["difference"]
+    assert same["psnr"] == {"mean": 0.0, "interval": 0.0, "sure": False}
+    assert "(not sure)" in capsys.readouterr().out
+
+
+def test_the_page_is_one_file(run: Path, tmp_path: Path) -> None:
+    assert judge(run, "--against", run / "scene.ply", "--out", tmp_path) == 0
+    page = (tmp_path / "judge.html").read_text()
+    assert len(page) < 100_000
+    assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+    assert page.count('type="range"') == 3
+    assert page.count('class="map"') == 6
+    for word in ("What the error comes from", "How it was measured", "held out", "Student"):
+        assert word in page
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"names": ["a.png"]}, "the photos differ, 3 here and 1 there"),
+        ({"sizes": [[24, 16], [9, 9], [24, 16]]}, "the sizes of the photos differ, [24, 16] here and [9, 9]"),
+        ({"pixels": "0"}, "the photos' pixels or masks (their digest) differ"),
+        ({"background": [1.0, 1.0, 1.0]}, "the backgrounds differ, 0.0 here and 1.0 there"),
+        ({"rules": {"psnr": "other"}}, "the rules of measuring differ"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_by_name(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], words: str
+) -> None:
+    assert judge(run, "--out", tmp_path) == 0
+    known = json.loads((tmp_path / "judge.json").read_text())
+    known["protocol"] |= change
+    (tmp_path / "other.json").write_text(json.dumps(known))
+    capsys.readouterr()
+    assert judge(run, "--against", tmp_path / "other.json") == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+
+
+def test_mistakes_get_a_sentence(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "no.json").write_text("{}")
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "foreign.ply").write_bytes((run / "scene.ply").read_bytes())
+    away = Gaussians.load(run)
+    replace(away, means=away.means - 1000.0).save(tmp_path / "away.ply")
+    truth = make_truth(4)
+    for k, photo in enumerate(truth.photos):
+        Image.fromarray(photo).save(tmp_path / "bare" / f"{k}.png")
+    foreign, photos = tmp_path / "foreign.ply", ["--photos", "embedded"]
+    cases = [
+        ([tmp_path / "missing.ply", *photos], "there is no"),
+        ([foreign], "is no folder of a run: --photos names the photos"),
+        ([foreign, "--photos", tmp_path / "nowhere"], "there is no scene folder"),
+        ([foreign, "--photos", tmp_path / "bare"], "has no cameras"),
+        ([foreign, *photos, "--views", "x.png"], "has no photo 'x.png'"),
+        ([foreign, *photos, "--against", tmp_path / "no.json"], "is no judge.json"),
+        ([tmp_path / "away.ply", *photos], "none of its"),
+    ]
+    for arguments, words in cases:
+        assert judge(*arguments) == 2, arguments
+        told = capsys.readouterr().err
+        assert words in told, told
+        assert told.splitlines()[-1].startswith("hqgs: ")
+
+
+def test_a_foreign_file_and_a_folder_with_cameras(tmp_path: Path) -> None:
+    truth = make_truth(9)
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1.5, 1.5, (150, 3)).astype(np.float32)
+    model = Gaussians.from_points(points, rng.integers(0, 255, (150, 3)).astype(np.uint8), 0)
+    model = replace(model, opacities=model.opacities + 4)
+    photos = []
+    for viewmat in truth.viewmats:
+        with torch.no_grad():
+            seen = model.render(Camera(truth.width, truth.height, truth.K, viewmat))
+        photos.append(to_uint8(seen.clamp(0, 1).numpy()))
+    root = write_colmap(replace(truth, photos=photos), tmp_path / "scene", binary=False)
+    model.save(tmp_path / "foreign.ply")
+    found = {}
+    for which in ("test", "train", "all"):
+        out = tmp_path / which
+        assert judge(tmp_path / "foreign.ply", "--photos", root, "--views", which, "--out", out) == 0
+        found[which] = json.loads((out / "judge.json").read_text())
+        assert found[which]["scene"]["mean"]["psnr"] > 45  # 8 bits alone are between
+    names = [found[which]["protocol"]["names"] for which in ("train", "test", "all")]
+    assert sorted(names[0] + names[1]) == names[2]
+    one = found["test"]["protocol"]["names"][0]
+    assert judge(tmp_path / "foreign.ply", "--photos", root, "--views", one, "--out", tmp_path / "one") == 0
+    single = json.loads((tmp_path / "one" / "judge.json").read_text())
+    assert single["protocol"]["names"] == [one]
+    assert single["scene"]["interval"]["psnr"] is None
+
+
+def picture(seed: int = 0) -> np.ndarray:
+    """Fine and broad structure."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    broad = np.stack([0.4 + 0.2 * np.sin(3 * x + k) * np.cos(2 * y) for k in range(3)], -1)
+    return broad + rng.uniform(-0.1, 0.1, (SIZE, SIZE, 1))
+
+
+def sorted_error(
+    render: np.ndarray, fog: float = 0.0, photos: float = 9.0, noise: float = 0.0
+) -> dict[str, float]:
+    photo = picture().astype(np.float32)
+    maps = Maps(np.full((SIZE, SIZE), fog), np.full((SIZE, SIZE), photos))
+    return shares([causes(RenderedView("a", photo, render.astype(np.float32)), maps, noise)])
+
+
+def test_errors_go_to_their_causes() -> None:
+    photo = picture()
+    broad = photo + 0.1 * np.sin(np.linspace(0, 6, SIZE))[:, None, None]
+    blurred = gaussian_filter(photo, (1.5, 1.5, 0))
+    noisy = photo + np.random.default_rng(1).normal(0, 0.03, photo.shape)
+    assert sorted_error(0.8 * photo)["color"] == pytest.approx(1, abs=0.01)
+    assert sorted_error(blurred)["detail"] > 0.9
+    assert sorted_error(broad)["broad"] > 0.8
+    assert sorted_error(broad, fog=0.5)["fog"] > 0.8
+    assert sorted_error(broad, fog=0.5, photos=1.0)["edge"] > 0.8
+    assert sorted_error(noisy, noise=0.03)["noise"] > 0.85
+    assert sorted_error(photo) == dict.fromkeys(PARTS, 0.0)
+
+
+def test_a_fitted_camera_shows_what_the_pose_costs() -> None:
+    photo = picture().astype(np.float32)
+    maps = Maps(np.zeros((SIZE, SIZE)), np.full((SIZE, SIZE), 9.0))
+    beside = RenderedView("a", photo, np.roll(photo, 1, axis=1))
+    right = RenderedView("a", photo, photo + np.float32(0.001))
+    found = shares([causes(beside, maps, 0.0, right)])
+    assert found["pose"] > 0.95
+    assert sum(found.values()) == pytest.approx(1)
+
+
+def test_fog_and_the_edge_of_the_capture_are_found() -> None:
+    """An opaque wall at depth 4; a faint blob before its left half; photos that see its upper half alone."""
+    K = np.array([[40.0, 0, 32], [0, 40, 32], [0, 0, 1]])
+    camera = Camera(SIZE, SIZE, K, np.eye(4))
+    grid = np.stack(np.meshgrid(np.linspace(-4, 4, 33), np.linspace(-4, 4, 33)), -1).reshape(-1, 2)
+    wall = np.concatenate([grid, np.full((len(grid), 1), 4.0)], 1)
+    points = np.concatenate([wall, [[-0.6, 0.0, 1.5]]]).astype(np.float32)
+    made = Gaussians.from_points(points, np.full(points.shape, 128, np.uint8), 0)
+    scales, opacities = torch.full((len(points), 3), np.log(0.2)), torch.full((len(points),), 4.0)
+    scales[-1], opacities[-1] = np.log(0.25), -0.5
+    made = replace(made, scales=scales, opacities=opacities)
+    upper = np.eye(4)
+    upper[1, 3] = 3.2  # a camera that is as much higher: y points down
+    maps = pixel_maps(made, camera, shown_by(made, [Camera(SIZE, SIZE, K, upper)] * 3))
+    assert maps.fog[32, 16] > 0.3
+    assert maps.fog[:, 40:].max() < 0.01
+    assert maps.photos[2, 50] == pytest.approx(3, abs=0.1)
+    assert maps.photos[60, 50] == pytest.approx(0, abs=0.1)
