@@ -1,9 +1,9 @@
 """Where in a photo a render is wrong, and what it comes from: parts of its squared error that add up to it.
 
 Each part is what is left after those before it: colour (what a factor for each channel sets right), pose
-(what fitting the camera sets right), then the pixels at the edge of the capture, those behind fog, and of the rest
-the fine detail, less the photo's own noise, and broad errors of shape and shading. Without fitted cameras a
-wrong pose counts as detail. It is a sorting, not a proof: fog before a wrong surface counts as fog.
+(what fitting the camera sets right), then the pixels at the edge of the capture, those behind fog, and of the
+rest the fine detail, less the photo's own noise, and broad errors of shape and shading. Without fitted
+cameras a wrong pose counts as detail. It is a sorting, not a proof: fog before a wrong surface counts as fog.
 """
 
 from __future__ import annotations
