@@ -370,7 +370,7 @@ def test_a_resumed_run_has_the_scene_that_it_had(tmp_path: Path, monkeypatch: py
     assert call(*command, *options) == 0
     assert (calls[0]["longest"], calls[0]["test_every"]) == (480, 5)
     assert call(*command, "--resume") == 0
-    assert {**calls[1], "told": None} == {**calls[0], "told": None}
+    assert {**calls[1], "on_stage": None} == {**calls[0], "on_stage": None}
     assert call(*command, "--resume", "--iterations", "5") == 0
     assert json.loads((tmp_path / "run" / "report.json").read_text())["iterations"] == 5
     assert call(*command, "--resume", "--downscale", "2") == 0
