@@ -32,7 +32,6 @@ else:
 
 T = TypeVar("T")
 EMBEDDED = Path("embedded")  # stands for the built-in scene
-BUILT_IN = {EMBEDDED: None, Path("embedded-matte"): 0.0, Path("embedded-glossy"): 1.0}  # gloss
 SMALLEST = 8  # pixels: the sides of the built-in scenes' photos
 VALIDATE_EVERY = 7  # every 7th training photo
 
@@ -170,13 +169,13 @@ def load_scenes(sources: Sequence[Path], protocol: Protocol, cache: Path, valida
         raise ValueError(f"two scenes are called {twice[0]!r}; the tables could not tell them apart")
     scenes, downscale, embedded = [], protocol.downscale, protocol.embedded
     for source in sources:
-        if source in BUILT_IN:
+        if source == EMBEDDED:
             width, height = (round(size / downscale) for size in embedded[:2])
             if min(width, height) < SMALLEST:
                 most = min(embedded[:2]) / SMALLEST
                 raise ValueError(f"downscale must be in 1..{most:g} for {source}, got {downscale}")
             folder = cache / f"{source}_{width}x{height}_{embedded[2]}"
-            made = embedded_scene(folder, width, height, num_views=embedded[2], gloss=BUILT_IN[source])
+            made = embedded_scene(folder, width, height, num_views=embedded[2])
             scene = replace(made, name=str(source))
         elif is_room(source):
             scene = replace(room(source, cache / f"{source}_x{downscale:g}", downscale), name=str(source))
@@ -265,10 +264,9 @@ def add_options(parser: argparse.ArgumentParser, protocol: Protocol) -> None:
     """The options that narrow a protocol, and those about finished runs."""
     parser.set_defaults(validate=False, sfm=False)
     add: Any = parser.add_argument
-    built_in = ", ".join(map(str, BUILT_IN))
     add(
         "--scenes", nargs="+", type=Path, default=[EMBEDDED], metavar="SCENE",
-        help=f"folders, or of {built_in}, which are built in (%(default)s)",
+        help="folders, or names of built-in scenes (%(default)s)",
     )  # fmt: skip
     listed = ", ".join(protocol.labels).replace("%", "%%")
     add("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed}")

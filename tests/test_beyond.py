@@ -12,8 +12,7 @@ import pytest
 import hqgs
 from benchmarks.protocol import fewer_photos
 from benchmarks.quality.cell import fall
-from hqgs.scene.builtin.beyond import BETWEEN, BEYOND, arc_cameras, between_and_beyond
-from hqgs.scene.builtin.sparse import TABLE
+from hqgs.scene.builtin.sparse import BETWEEN, BEYOND, TABLE, between_and_beyond, sparse_cameras
 from hqgs.scene.scene import Scene, View
 
 
@@ -21,7 +20,7 @@ def test_held_out_cameras_stand_between_and_beyond() -> None:
     def angle(center: np.ndarray) -> float:
         return math.degrees(math.atan2(center[0] - TABLE[0], TABLE[2] - center[2]))
 
-    train = [angle(camera.center) for camera in arc_cameras(12)]
+    train = [angle(camera.center) for camera in sparse_cameras(num_views=12, seed=7)]
     held = between_and_beyond()
     between = [angle(camera.center) for camera in held[:BETWEEN]]
     assert len(held) == BETWEEN + BEYOND
@@ -48,7 +47,7 @@ def test_the_room_beyond_its_cameras(tmp_path: Path) -> None:
 
 
 def test_the_split_of_few_photos() -> None:
-    camera, photo = arc_cameras(2, 8, 6)[0], np.zeros((6, 8, 3), np.uint8)
+    camera, photo = sparse_cameras(8, 6, 2)[0], np.zeros((6, 8, 3), np.uint8)
     views = [View(f"view_{k:02d}.png", camera, photo) for k in range(16)]
     names = [view.name for view in views[2:]]
     seen = {name: np.arange(k, k + 4) for k, name in enumerate(names)}

@@ -185,7 +185,7 @@ def test_culling_changes_nothing(kind: str, monkeypatch: pytest.MonkeyPatch) -> 
     loose = replace(studio())
     bound = np.full((len(loose.casters), 3), np.inf)
     loose.__dict__["lamp_boxes"] = (-bound, bound)
-    monkeypatch.setattr(shading, "studio", lambda gloss: loose)
+    monkeypatch.setattr(shading, "studio", lambda: loose)
     np.testing.assert_array_equal(render_exposure(made[kind]), photo)
 
 
@@ -204,7 +204,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     rendered: list[int] = []
     real = shading.render_exposure
 
-    def cast(views: list[View], _: float) -> SparsePoints:
+    def cast(views: list[View]) -> SparsePoints:
         return surface_points(views, 300)._replace(note="cast")
 
     def counting(*args: object, **named: object) -> NDArray[np.uint8]:

@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from hqgs.base.files import BEYOND, EMBEDDED, SPARSE
-from hqgs.scene.builtin.beyond import PHOTOS, beyond_room
 from hqgs.scene.builtin.scene import embedded_scene
-from hqgs.scene.builtin.sparse import sparse_room
+from hqgs.scene.builtin.sparse import PHOTOS, beyond_room, sparse_room
 from hqgs.scene.builtin.wild import parse_true_kind, wild_room
 from hqgs.scene.scene import Scene
 

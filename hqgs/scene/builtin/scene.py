@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene import paths
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
-from hqgs.scene.builtin.points import TIME_LIMIT, SparsePoints, sfm_points
+from hqgs.scene.builtin.points import SparsePoints, sfm_points
 from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.scene import Camera, Scene, View
 
@@ -26,39 +27,25 @@ def embedded_scene(
     width: int = WIDTH,
     height: int = HEIGHT,
     num_views: int = 24,
-    time_limit: float = TIME_LIMIT,
-    threads: int | None = None,
-    gloss: float | None = None,
 ) -> Scene:
     """A room, ray-cast from `num_views` forward-facing cameras; every 8th view is a test view.
 
     The photos are exact and clean, the cameras known, and no Gaussian is involved. Points come from the
-    training photos alone (see `sfm_points`, which takes at most `time_limit` seconds before it falls back);
-    `Scene.notes` says how. `gloss` (0 and above) gives every surface that strength of highlight, and a mirror
-    that goes with it, in place of its own: 0 is a matte room, where only the lamp shades depend on the view.
+    training photos alone (`sfm_points`); `Scene.notes` says how.
 
     With `cache`, photos and points are kept in that folder and read back next time; a cache that is damaged
-    or made by another version is made anew. Raises ValueError if the size is below 1 x 1, `num_views` below 2
-    or `gloss` below 0, OSError if `cache` cannot be a folder.
+    or made by another version is made anew. Raises ValueError if the size is below 1 x 1 or `num_views` below
+    2, OSError if `cache` cannot be a folder.
     """
-    if width < 1 or height < 1:
-        raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if num_views < 2:
         raise ValueError(f"num_views must be at least 2 (one to train, one to test), got {num_views}")
-    if gloss is not None and not 0 <= gloss < math.inf:
-        raise ValueError(f"gloss must be at least 0 and finite, got {gloss}")
-    return assemble(
-        "embedded", embedded_cameras(width, height, num_views), cache, time_limit, threads, gloss, {}
-    )
+    return assemble("embedded", embedded_cameras(width, height, num_views), cache, {})
 
 
 def assemble(
     name: str,
     cameras: list[Camera],
     cache: Path | None,
-    time_limit: float,
-    threads: int | None,
-    gloss: float | None,
     made: dict[str, Any],
     thin: Callable[[SparsePoints], SparsePoints] = lambda points: points,
     held_out: Mapping[int, str] | None = None,
@@ -67,28 +54,22 @@ def assemble(
 
     The points pass through `thin`. `made` says what cameras and `thin` depend on beside the photos' size and
     number, in JSON values, for the key of the cache. `held_out`: numbers of the test views, and what they are
-    called; None: every 8th.
+    called; None: every 8th. ValueError for cameras below 1 x 1.
     """
+    width, height = cameras[0].width, cameras[0].height
+    if width < 1 or height < 1:
+        raise ValueError(f"width and height must be at least 1, got {width} x {height}")
     if held_out is None:
         held_out = dict.fromkeys(range(0, len(cameras), TEST_EVERY), "view")
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
     names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
-    made = {
-        "width": cameras[0].width,
-        "height": cameras[0].height,
-        "num_views": len(cameras),
-        "gloss": gloss,
-        **made,
-    }
+    made = {"width": width, "height": height, "num_views": len(cameras), **made}
     kept = None if cache is None else read_kept(cache, made, names)
     if kept is None:
-        photos = {
-            name: render_view(camera, threads=threads, gloss=gloss)
-            for name, camera in zip(names, cameras, strict=True)
-        }
+        photos = {name: render_view(camera) for name, camera in zip(names, cameras, strict=True)}
         views = [View(name, camera, photos[name]) for name, camera in zip(names, cameras, strict=True)]
-        points = thin(sfm_points([v for k, v in enumerate(views) if k not in held_out], time_limit))
+        points = thin(sfm_points([v for k, v in enumerate(views) if k not in held_out]))
         if cache is not None:
             arrays = {key: value for key, value in points._asdict().items() if key != "note"}
             write_kept(cache, made, Kept(photos, arrays, points.note))
@@ -111,8 +92,6 @@ def assemble(
 def embedded_cameras(width: int = WIDTH, height: int = HEIGHT, num_views: int = 24) -> list[Camera]:
     """The cameras of the embedded scene: a jittered sunflower spiral, all but upright, towards one focus."""
     rng = np.random.default_rng(2025)
-    fx, fy = FOCAL * width / WIDTH, FOCAL * height / HEIGHT
-    K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
     cameras = []
     for k in range(num_views):
         radius, angle = math.sqrt((k + 0.5) / num_views), k * math.pi * (3 - math.sqrt(5))
@@ -121,8 +100,15 @@ def embedded_cameras(width: int = WIDTH, height: int = HEIGHT, num_views: int = 
         y = math.sin(angle) * radius + 0.08 * jitter[1]
         center = np.array([0, -0.15, 0]) + np.array([x, y, jitter[2]]) * REACH
         roll = math.radians(1.5 * jitter[3])
-        cameras.append(Camera(width, height, K, look_at(center, np.array(FOCUS), roll)))
+        viewmat = look_at(center, np.array(FOCUS), roll)
+        cameras.append(Camera(width, height, intrinsics(width, height), viewmat))
     return cameras
+
+
+def intrinsics(width: int, height: int) -> NDArray[np.float64]:
+    """K [3, 3] of the room's cameras at another size than 504 x 378 px."""
+    fx, fy = FOCAL * width / WIDTH, FOCAL * height / HEIGHT
+    return np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
 
 
 def look_at(
@@ -132,13 +118,6 @@ def look_at(
 
     `roll` (radians) turns the camera about its axis. Raises ValueError if it would look straight up or down.
     """
-    z = target - center
-    x = np.cross([0.0, 1.0, 0.0], z)
-    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(z) or not z.any():
-        raise ValueError(f"target must not lie above, below or at the center, got {target} from {center}")
-    z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
-    y = np.cross(z, x)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = [math.cos(roll) * x + math.sin(roll) * y, math.cos(roll) * y - math.sin(roll) * x, z]
-    viewmat[:3, 3] = -viewmat[:3, :3] @ center
-    return viewmat
+    x, y, z = paths.look_at(center, target).viewmat[:3, :3]
+    axes = [math.cos(roll) * x + math.sin(roll) * y, math.cos(roll) * y - math.sin(roll) * x, z]
+    return paths.view_matrix(np.array(axes), center)

@@ -20,33 +20,29 @@ from hqgs.scene.scene import Camera
 TILE, BLOCK = 64, 8  # pixels: a tile is one job; each surface is tried on the blocks that it may cover
 
 
-def render_view(
-    camera: Camera, samples: int = 3, threads: int | None = None, gloss: float | None = None
-) -> NDArray[np.uint8]:
+def render_view(camera: Camera, samples: int = 3, threads: int | None = None) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB.
 
     A pixel is the mean of `samples`^2 rays in linear light, spread evenly over its square; use more when the
-    picture is much smaller than 504 x 378. `threads` (default: the cores at hand) never changes a bit.
-    For `gloss` see `embedded_scene`. Raises ValueError if the camera's size, `samples` or `threads` is below
-    1 or K has a skew.
+    picture is much smaller than 504 x 378. `threads` (default: the cores at hand) never changes a bit. Raises
+    ValueError if the camera's size, `samples` or `threads` is below 1 or K has a skew.
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    return render_exposure(still(camera, sample_pattern(samples)), threads=threads, gloss=gloss)
+    return render_exposure(still(camera, sample_pattern(samples)), threads=threads)
 
 
 def render_exposure(
     exposure: Exposure,
     gains: NDArray[np.float64] | None = None,
     threads: int | None = None,
-    gloss: float | None = None,
     passing: Sequence[Surface] = (),
 ) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
 
     `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
     in all photos: it rolls off the highlights and encodes sRGB. `passing`: what stands in the room beside
-    its own. `threads` and `gloss` as in `render_view`.
+    its own. `threads` as in `render_view`.
     """
     width, height = exposure.size
     image = np.empty((height, width, 3), np.uint8)
@@ -58,7 +54,7 @@ def render_exposure(
             light *= factor
         image[tile.rows, tile.cols] = tile.picture((_encode(light) * 255 + 0.5).astype(np.uint8))
 
-    _each_tile(exposure, np.float32, work, threads, gloss, passing)
+    _each_tile(exposure, np.float32, work, threads, passing)
     return image
 
 
@@ -164,7 +160,6 @@ def _each_tile(
     dtype: type,
     work: Callable[[_Tile], None],
     threads: int | None,
-    gloss: float | None = None,
     passing: Sequence[Surface] = (),
 ) -> None:
     """Run `work` on fixed tiles that cover the picture; the tiles do not depend on the threads."""
@@ -177,7 +172,7 @@ def _each_tile(
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
 
-    scene = studio(gloss)
+    scene = studio()
     if passing:
         scene = replace(scene, surfaces=(*scene.surfaces, *passing))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
 
@@ -20,7 +20,6 @@ from hqgs.scene.builtin.raycast import Box, Cylinder, Ellipsoid, Material, Panel
 Point = tuple[float, float, float]
 
 FLOOR, CEILING, BACK, SIDE, TABLE = 1.5, -3.0, 8.0, 3.5, 0.75
-MIRROR = 0.25  # mirror of a surface of gloss 1, where one gloss holds for all
 
 
 @dataclass(frozen=True)
@@ -276,14 +275,10 @@ def _plant() -> Iterator[Surface]:
 
 
 @cache
-def studio(gloss: float | None = None) -> Studio:
-    """The scene; built once (about a second), always the same. For `gloss` see `embedded_scene`."""
+def studio() -> Studio:
+    """The scene; built once (about a second), always the same."""
     parts = (_room(), _walls_hangings(), _table(), _cage(), _cords(), _plant())
     surfaces = tuple(surface for part in parts for surface in part)
-    if gloss is not None:
-        surfaces = tuple(
-            replace(s, material=replace(s.material, gloss=gloss, mirror=gloss * MIRROR)) for s in surfaces
-        )
     towards = np.array([-0.50, -0.85, -0.52])
     towards /= np.linalg.norm(towards)
     across = np.cross(towards, [0.0, 1.0, 0.0])

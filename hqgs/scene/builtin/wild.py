@@ -16,7 +16,6 @@ from hqgs.photos.shake import draw_path, draw_strength, knots_mean, path_extent,
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.crowd import Walker, draw_walkers
 from hqgs.scene.builtin.exposure import Exposure, rolling, shaken, still, through_lens
-from hqgs.scene.builtin.points import TIME_LIMIT
 from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene
 from hqgs.scene.builtin.shading import render_exposure, sample_pattern
 from hqgs.scene.scene import Camera, Scene
@@ -81,8 +80,6 @@ def wild_room(
     width: int = WIDTH,
     height: int = HEIGHT,
     num_views: int = 24,
-    time_limit: float = TIME_LIMIT,
-    threads: int | None = None,
 ) -> WildRoom:
     """`embedded_scene` with training photos that a camera has truly taken so, by ray casting.
 
@@ -110,9 +107,7 @@ def wild_room(
     name, value = parse_true_kind(kind, width)
     if seed < 0:
         raise ValueError(f"seed is {seed}, wanted at least 0")
-    clean = embedded_scene(
-        None if cache is None else cache / "clean", width, height, num_views, time_limit, threads
-    )
+    clean = embedded_scene(None if cache is None else cache / "clean", width, height, num_views)
     names = sorted(view.name for view in (*clean.train, *clean.test))
     truth = {
         view.name: _draw(name, value, view.camera, np.random.default_rng([seed, names.index(view.name)]))
@@ -122,7 +117,7 @@ def wild_room(
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
     kept = None if folder is None else read_kept(folder, made, list(truth))
     if kept is None:
-        photos = {view.name: taken(name, view.camera, truth[view.name], threads) for view in clean.train}
+        photos = {view.name: taken(name, view.camera, truth[view.name]) for view in clean.train}
         kept = Kept(photos, {}, "")
         if folder is not None:
             write_kept(folder, made, kept)
@@ -162,10 +157,10 @@ def exposure(kind: str, camera: Camera, truth: PhotoTruth) -> Exposure:
     return still(camera, STILL)
 
 
-def taken(kind: str, camera: Camera, truth: PhotoTruth, threads: int | None = None) -> NDArray[np.uint8]:
+def taken(kind: str, camera: Camera, truth: PhotoTruth) -> NDArray[np.uint8]:
     """The photo that the truth stands for."""
     passing = [surface for walker in truth.walkers for surface in walker.surfaces()]
-    return render_exposure(exposure(kind, camera, truth), truth.gains, threads, passing=passing)
+    return render_exposure(exposure(kind, camera, truth), truth.gains, passing=passing)
 
 
 def _draw(kind: str, value: float, camera: Camera, rng: np.random.Generator) -> PhotoTruth:
