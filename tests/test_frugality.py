@@ -155,10 +155,7 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
     assert trainer.schedule.densification_end(state) == pytest.approx(1.25 * state.released, abs=1)
     assert rates[-1] == pytest.approx(trainer.scene.extent * 1e-9)
     assert all(b <= a for a, b in pairwise(rates))
-    item = trainer.frugality.left_out()[0]
-    assert item.what == f"iterations {state.length + 1} to 3000"
-    assert item.seconds is not None
-    assert item.seconds > 0.1 * trainer.seconds  # more iterations than were done
+    assert trainer.frugality.left_out()[0].what == f"iterations {state.length + 1} to 3000"
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,9 +186,9 @@ def test_the_report_tells_what_was_left_out(tmp_path: Path) -> None:
 
 def test_the_table() -> None:
     assert format_left_out([]) == ""
-    items = [LeftOut("a", "not needed", seconds=1.6, bytes=2_500_000, cost_db=0.01), LeftOut("bcd", "no use")]
+    items = [LeftOut("a", "not needed", bytes=2_500_000, cost_db=0.01), LeftOut("bcd", "no use")]
     assert format_left_out(items) == (
-        "left out:\n  a    2 s, 2.5 MB, -0.01 dB  not needed\n  bcd                         no use"
+        "left out:\n  a    2.5 MB, -0.01 dB  not needed\n  bcd                    no use"
     )
     table = format_left_out([LeftOut(f"{CORRECTION}blur", "sharp"), *items, LeftOut(f"{CORRECTION}jpeg", "")])
     first, *rest = table.splitlines()[1:]

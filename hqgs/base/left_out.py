@@ -18,8 +18,6 @@ class LeftOutRecord(_Named, total=False):
     """`LeftOut` as JSON: what is not known is not there."""
 
     evidence: str
-    seconds: float
-    memory_mb: float
     bytes: int
     cost_db: float
 
@@ -31,8 +29,6 @@ class LeftOut:
     what: str
     why: str
     evidence: str | None = None  # what was measured to decide it
-    seconds: float | None = None  # of run time saved, an estimate
-    memory_mb: float | None = None  # saved
     bytes: int | None = None  # of the scene file saved
     cost_db: float | None = None  # lost in PSNR on training photos that were held back; below 0: gained
 
@@ -56,8 +52,7 @@ def format_left_out(items: Sequence[LeftOut]) -> str:
     for item in items:
         if item.what.startswith(CORRECTION):
             continue
-        saved = [] if item.seconds is None else [f"{item.seconds:.0f} s"]
-        saved += [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
+        saved = [] if item.bytes is None else [f"{item.bytes / 1e6:.1f} MB"]
         saved += [] if item.cost_db is None else [f"{-item.cost_db:+.2f} dB"]
         rows.append((item.what, ", ".join(saved), item.why))
     if not rows:

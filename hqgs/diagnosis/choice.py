@@ -91,10 +91,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     if not drops and not notes:
         return scene, []
     train = [view for view in scene.train if not any(view is drop.view for drop in drops)]
-    left_out = [
-        LeftOut(f"training photo {d.view.name}", d.why, d.evidence, memory_mb=d.view.image.nbytes / 1e6)
-        for d in drops
-    ]
+    left_out = [LeftOut(f"training photo {d.view.name}", d.why, d.evidence) for d in drops]
     return replace(scene, train=train, notes=[*scene.notes, *notes]), left_out
 
 

@@ -53,6 +53,13 @@ def check_method(name: str) -> None:
         raise ValueError(f"unknown method {name!r}; the methods are: {', '.join(METHODS)}")
 
 
+def _at_least(config: object, least: int, *names: str) -> None:
+    """ValueError for the first of these fields that is below `least`, or no number."""
+    for name in names:
+        if not getattr(config, name) >= least:
+            raise ValueError(f"{name} is {getattr(config, name)}, wanted at least {least}")
+
+
 @dataclass(frozen=True)
 class DensifyConfig:
     """When and how densely Gaussians are added and removed. The defaults are those of 3DGS at 30,000.
@@ -75,12 +82,8 @@ class DensifyConfig:
     max_gaussians: int = 1_000_000  # growth stops here, the highest gradients go first; bounds the memory
 
     def __post_init__(self) -> None:
-        for name in ("every", "reset_every", "max_gaussians"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
-        for name in ("start", "stop", "grad_threshold", "percent_dense", "prune_scale"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        _at_least(self, 1, "every", "reset_every", "max_gaussians")
+        _at_least(self, 0, "start", "stop", "grad_threshold", "percent_dense", "prune_scale")
         for name in ("prune_opacity", "reset_opacity"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, wanted a value between 0 and 1")
@@ -110,8 +113,7 @@ class SRGSConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.texture_weight <= 1:
             raise ValueError(f"texture_weight is {self.texture_weight}, wanted 0..1")
-        if self.own_factor < 1:
-            raise ValueError(f"own_factor is {self.own_factor}, wanted at least 1")
+        _at_least(self, 1, "own_factor")
 
 
 @dataclass(frozen=True)
@@ -189,9 +191,7 @@ class HQGSConfig:
             raise ValueError(f"guidance is {self.guidance!r}, wanted one of: {', '.join(GUIDANCES)}")
         if self.formation != AUTO:
             parse_formation(self.formation)
-        for name in ("jpeg_pixels", "smallest", "gaussians_per_pixel"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
+        _at_least(self, 0, "jpeg_pixels", "smallest", "gaussians_per_pixel")
         if not 0 <= self.first_points <= 1:
             raise ValueError(f"first_points is {self.first_points}, wanted 0 to 1")
 
@@ -237,16 +237,12 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_method(self.method)
         check_items(set(self.leave_out))
-        for name in ("iterations", "batch", "sh_interval", "eval_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        _at_least(self, 1, "iterations", "batch", "sh_interval", "eval_every", "checkpoint_every")
+        _at_least(self, 0, "seed", "start_points")
         if self.seconds is not None and not 0 < self.seconds < math.inf:
             raise ValueError(f"seconds is {self.seconds}, wanted a positive number")
         if self.turn is not None and not (len(self.turn) == 2 and 0 < self.turn[0] < self.turn[1]):
             raise ValueError(f"turn is {self.turn}, wanted an iteration and a larger length")
-        for name in ("seed", "start_points"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, wanted at least 0")
         for name in ("opacity_decay", "dropout"):
             if (share := getattr(self, name)) is not None and not 0 <= share < 1:
                 raise ValueError(f"{name} is {share}, wanted at least 0 and below 1")

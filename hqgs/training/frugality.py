@@ -19,6 +19,7 @@ from torch import Tensor
 
 from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import largest_weights
 from hqgs.scene.scene import View
 from hqgs.training.plan import PlanRow
 from hqgs.training.schedule import (
@@ -37,11 +38,11 @@ from hqgs.training.schedule import (
     spread,
 )
 from hqgs.training.state import TrainState
-from hqgs.training.trials import TOLERANCE, WEIGHTS, fewest_gaussians
 
-TRIED = 8  # training photos, at most, on which it is tried to leave Gaussians out
+TOLERANCE = 0.02  # dB that leaving Gaussians out may cost
+WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
+TRIED = 8  # training photos, at most, on which it is tried
 BETTER, PATIENCE = 0.05, 2_000  # dB, iterations: when a run has stopped improving
-WINDOW = 50  # steps before and after a decision that tell what it saves
 RULES: dict[str, object] = {  # what a result depends on beside the configuration
     "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
     "tolerance": (TOLERANCE, TRIED),
@@ -91,8 +92,7 @@ class Frugality:
         self.views: Sequence[View] = views
         self.memory: Memory = Memory()
         self._shown, self._psnr = shown, psnr
-        self._seconds: deque[float] = deque(maxlen=WINDOW)  # of the last steps
-        self._open: list[tuple[int, int, float]] = []  # records that wait for what they saved
+        self._seconds: deque[float] = deque(maxlen=50)  # of the last steps
 
     def after_step(self, state: TrainState, refused: int, seconds: float) -> Verdict:
         """Note what the step did, and decide what is due at this iteration.
@@ -100,7 +100,6 @@ class Frugality:
         `refused`: Gaussians that were too fine to grow. `seconds`: of the step.
         """
         self._seconds.append(seconds)
-        self._close(state)
         self.memory.refused += refused
         verdict = Verdict(state.decisions)
         if not self.schedule.items:
@@ -134,7 +133,6 @@ class Frugality:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.memory = Memory(**state)
-        self._open = []
 
     def forget_end(self) -> None:
         """The run goes on after its end: no iterations are left out."""
@@ -167,7 +165,6 @@ class Frugality:
             f"iterations {length + 1} to {total}",
             "the held-back photos stopped improving",
             f"best {memory.best:.2f} dB at iteration {memory.best_at}, {now:.2f} dB at {iteration}",
-            seconds=self.step_seconds * (total - length),
         )
         self._note("iterations", "length", f"{length:,} iterations", left, state)
         return length
@@ -184,7 +181,6 @@ class Frugality:
             f"{count} of {total} Gaussians",
             f"no photo shows them with a blending weight of {fewer.limit:g}",
             f"on {len(tried)} photos {fewer.evidence}",
-            memory_mb=4 * 4e-6 * row * count,
             bytes=4 * row * count,
             cost_db=fewer.cost,
         )
@@ -196,13 +192,34 @@ class Frugality:
         self.memory.records.append(asdict(left) | {"item": item})
         row = PlanRow(what, value, left.why, left.evidence or "", item, state.iteration)
         state.rows.append(row)
-        if len(self._seconds) == WINDOW and left.seconds is None:
-            opened = len(self.memory.records) - 1, state.iteration, self.step_seconds
-            self._open.append(opened)
 
-    def _close(self, state: TrainState) -> None:
-        """Fill in what the decisions WINDOW steps ago saved, if things stay as they are."""
-        while self._open and state.iteration >= self._open[0][1] + WINDOW:
-            index, start, before = self._open.pop(0)
-            saved = max(before - self.step_seconds, 0.0)
-            self.memory.records[index]["seconds"] = saved * (state.decisions.length - start)
+
+@dataclass
+class FewerGaussians:
+    """A scene with less in it: the PSNR on the photos before, in dB, and what leaving out costs."""
+
+    whole: float
+    cost: float
+    limit: float  # of the largest blending weight
+    faint: Tensor  # bool [N]: those below it
+
+    @property
+    def evidence(self) -> str:
+        return f"{self.whole:.2f} dB with them, {self.whole - self.cost:.2f} dB without"
+
+
+def fewest_gaussians(
+    shown: Gaussians, views: Sequence[View], psnr: Callable[[Gaussians], float]
+) -> FewerGaussians | None:
+    """Without those below the highest of WEIGHTS that loses no more than TOLERANCE; None: there are none."""
+    weights = largest_weights(shown, views)
+    whole = psnr(shown)
+    for limit in WEIGHTS:
+        faint = weights < limit
+        if not 0 < int(faint.sum()) < len(shown):
+            continue
+        rest = shown.rows(~faint)
+        cost = whole - psnr(rest)
+        if cost <= TOLERANCE:
+            return FewerGaussians(whole, cost, limit, faint)
+    return None

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -20,37 +18,18 @@ from hqgs.training.schedule import StepPlan
 from hqgs.training.state import TrainState
 
 
-class Gradients(Protocol):
+class Gradients:
     """Of one step."""
 
-    @property
-    def loss(self) -> float:
-        """Of a view that this process has rendered."""
-        ...
-
-    @property
-    def photo(self) -> Tensor:
-        """The developed render of that view, [H, W, 3], detached; of size 0 where there is none."""
-        ...
-
-    @property
-    def view(self) -> View:
-        """That view, of the size at which it was rendered; without one the step's first view."""
-        ...
-
-    @property
-    def faults(self) -> list[Fault | None]:
-        """What was not finite, of each view."""
-        ...
-
-    @property
-    def measured(self) -> list[Tensor]:
-        """What the method goes by after the step, of each view."""
-        ...
+    loss: float  # of a view that this process has rendered
+    photo: Tensor  # the developed render of that view, [H, W, 3], detached; of size 0 where there is none
+    view: View  # that view, of the size at which it was rendered; without one the step's first view
+    faults: list[Fault | None]  # what was not finite, of each view
+    measured: list[Tensor]  # what the method goes by after the step, of each view
 
     def apply(self, state: TrainState) -> None:
         """Move the Gaussians, and note what growth goes by."""
-        ...
+        raise NotImplementedError
 
 
 def gradients_of(
@@ -64,17 +43,17 @@ def gradients_of(
     return _OfOne(plans[0], training, state) if alone else _OfSeveral(plans, training, state, ranks)
 
 
-class _OfOne:
+class _OfOne(Gradients):
     def __init__(self, plan: StepPlan, training: TrainingViews, state: TrainState) -> None:
         self._forward: ForwardPass = training.at(
             plan, _of_step(training.method.modulate(state.gaussians), plan, state)
         )
         state.optimizer.zero_grad()
-        self.faults: list[Fault | None] = [self._forward.backward(state.gaussians, state.optimizer)]
-        self.loss: float = float(self._forward.loss.detach())
-        self.photo: Tensor = self._forward.photo.detach()
-        self.view: View = self._forward.view
-        self.measured: list[Tensor] = [self._forward.measured]
+        self.faults = [self._forward.backward(state.gaussians, state.optimizer)]
+        self.loss = float(self._forward.loss.detach())
+        self.photo = self._forward.photo.detach()
+        self.view = self._forward.view
+        self.measured = [self._forward.measured]
 
     def apply(self, state: TrainState) -> None:
         forward = self._forward
@@ -86,21 +65,12 @@ class _OfOne:
         state.optimizer.step()
 
 
-@dataclass(frozen=True)
-class _Rendered:
-    """A view that this process has rendered."""
-
-    loss: float
-    photo: Tensor
-    view: View
-
-
-class _OfSeveral:
+class _OfSeveral(Gradients):
     def __init__(
         self, plans: Sequence[StepPlan], training: TrainingViews, state: TrainState, ranks: Ranks
     ) -> None:
         self._plans, self._method = plans, training.method
-        rendered: list[_Rendered] = []
+        rendered: list[tuple[float, Tensor, View]] = []
 
         def make(k: int) -> tuple[Part, Callable[[], Rest]]:
             modulated = training.method.modulate(state.gaussians)
@@ -110,15 +80,14 @@ class _OfSeveral:
             state.optimizer.zero_grad()
             fault = forward.backward(state.gaussians, state.optimizer)
             if not rendered:
-                rendered.append(_Rendered(float(forward.loss.detach()), forward.photo.detach(), forward.view))
+                rendered.append((float(forward.loss.detach()), forward.photo.detach(), forward.view))
             return part_of(forward, fault, state.gaussians, state.optimizer)
 
         self._parts, self._others = exchanged(ranks, len(plans), make)
-        none = _Rendered(self._parts[0].loss, torch.zeros(0, 0, 3), training.views[plans[0].view])
-        first = rendered[0] if rendered else none
-        self.loss, self.photo, self.view = first.loss, first.photo, first.view
-        self.faults: list[Fault | None] = [part.fault for part in self._parts]
-        self.measured: list[Tensor] = [part.measured for part in self._parts]
+        none = self._parts[0].loss, torch.zeros(0, 0, 3), training.views[plans[0].view]
+        self.loss, self.photo, self.view = rendered[0] if rendered else none
+        self.faults = [part.fault for part in self._parts]
+        self.measured = [part.measured for part in self._parts]
 
     def apply(self, state: TrainState) -> None:
         with torch.no_grad():

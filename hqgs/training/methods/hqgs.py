@@ -19,7 +19,7 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
-from hqgs.training.methods.base import Plain
+from hqgs.training.methods.base import Method
 from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import HeldPixels, Plateau
@@ -27,13 +27,12 @@ from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
 
-LAMBDA_DSSIM = 0.2
 KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
 STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
 REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
-class HQGS(Plain):
+class HQGS(Method[FormedTarget]):
     """The image formation in the loss.
 
     - Blur of any kind and low resolution: the render is blurred and shrunk as the photo was, and compared
@@ -130,7 +129,7 @@ class HQGS(Plain):
         photo, mask = target.photo, target.mask
         if target.cells is None or target.centres is None:
             if not target.noise:
-                return photometric_loss(image, photo, mask, LAMBDA_DSSIM)
+                return photometric_loss(image, photo, mask)
             return STEEPER * photometric_loss(image, photo, mask, 0.0, KNEE * target.noise)
         pixels = photometric_loss(image, photo, mask, 0.0)
         if mask is not None:

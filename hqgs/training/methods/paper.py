@@ -14,9 +14,9 @@ from hqgs.photos.edges import edge_magnitude
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import ESFGConfig, PaperConfig
-from hqgs.training.methods.base import Plain, Target, ThreeDGS, photo_tensors
+from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.methods.photometric import LAMBDA_DSSIM, photometric_loss
 from hqgs.training.methods.scs import ScsWeights, weighted_scs_loss
 from hqgs.training.state import TrainState
 
@@ -40,7 +40,7 @@ class ScsTarget(Target):
     weights: ScsWeights | None  # None: they are not kept, or there is no such loss
 
 
-class PaperHQGS(Plain):
+class PaperHQGS(Method[ScsTarget]):
     """HQGS (ICLR 2025) from its equations; where its released code differs, the paper holds.
 
     A modulated mean is about 1.5 times as far from the frame's origin as the trained one, so the cloud that
@@ -84,7 +84,7 @@ class PaperHQGS(Plain):
         return replace(gaussians, means=self.esfg.modulate(gaussians.means, self.rows))
 
     def loss(self, image: Tensor, target: ScsTarget) -> Tensor:
-        dssim = ThreeDGS.LAMBDA_DSSIM if self.config.loss == "l1+dssim" else 0.0
+        dssim = LAMBDA_DSSIM if self.config.loss == "l1+dssim" else 0.0
         loss = photometric_loss(image, target.photo, target.mask, dssim)
         if self.config.loss == "l1+scs":
             weights = target.weights or _scs_weights(target.photo, target.mask)

@@ -12,9 +12,15 @@ from torch.autograd.function import once_differentiable
 
 from hqgs import _rust
 
+LAMBDA_DSSIM = 0.2  # weight of D-SSIM beside L1 (Kerbl et al. 2023, equation 7)
+
 
 def photometric_loss(
-    render: Tensor, target: Tensor, mask: Tensor | None = None, lambda_dssim: float = 0.2, knee: float = 0.0
+    render: Tensor,
+    target: Tensor,
+    mask: Tensor | None = None,
+    lambda_dssim: float = LAMBDA_DSSIM,
+    knee: float = 0.0,
 ) -> Tensor:
     """(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM) of a render against a photo, a scalar.
 

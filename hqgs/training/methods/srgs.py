@@ -15,7 +15,7 @@ from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import resize, resize_matrix
 from hqgs.scene.scene import View
 from hqgs.training.config import SRGSConfig
-from hqgs.training.methods.base import Plain, Target, photo_tensors
+from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
 
 
@@ -28,7 +28,7 @@ class TiedTarget(Target):
     down: Separable | None  # [H, W] to [h, w]; None: the photo itself is the tie
 
 
-class SRGS(Plain):
+class SRGS(Method[TiedTarget]):
     """Super-Resolution 3D Gaussian Splatting (Feng et al. 2024, arXiv 2404.10318), without its network.
 
         loss = (1 - texture_weight) P(down(render), low) + texture_weight P(render, image)
@@ -53,7 +53,6 @@ class SRGS(Plain):
     """
 
     name = "srgs"
-    LAMBDA_DSSIM = 0.2
 
     def __init__(self, config: SRGSConfig) -> None:
         self.config = config
@@ -80,11 +79,11 @@ class SRGS(Plain):
         return TiedTarget(photo, mask, low_photo, low_mask, down)
 
     def loss(self, image: Tensor, target: TiedTarget) -> Tensor:
-        texture = photometric_loss(image, target.photo, target.mask, self.LAMBDA_DSSIM)
+        texture = photometric_loss(image, target.photo, target.mask)
         if target.down is None:
             return texture
         low = target.down(image)
-        subpixel = photometric_loss(low, target.low.to(low.dtype), target.low_mask, self.LAMBDA_DSSIM)
+        subpixel = photometric_loss(low, target.low.to(low.dtype), target.low_mask)
         weight = self.config.texture_weight
         return (1 - weight) * subpixel + weight * texture
 
