@@ -327,7 +327,7 @@ def _report(
         scene_bytes=None if out is None else (out / PLY).stat().st_size,
         config=asdict(config),
         plan=rows,
-        world=cast(WorldRecord, {"metres": None} | scene.world.json()),
+        world=cast(WorldRecord, {"metres": None} | replace(scene.world, place=None).json()),
         place=None if scene.place is None else asdict(scene.place),
         sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
         guard=trainer.guard.summary(),

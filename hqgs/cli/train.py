@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 EXPERT = "--config."
 # Options that shape the scene.
-LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "distance")
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "distance", "tag_size")
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
@@ -84,6 +84,8 @@ class Train(Photos):
     """Frames to take from a film (two a second, 30 to 90)."""
     distance: Apart = None
     """Metres between the cameras of the photos A and B: the scene is written in metres."""
+    tag_size: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
+    """Width of printed tags (AprilTag 36h11, ArUco) in the scene: it is written in metres, upright."""
     degrade: Kind = "none"
     restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="")] = None
     """Send the training photos through this restoration network first."""

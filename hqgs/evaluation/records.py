@@ -154,8 +154,13 @@ class PlanRowRecord(_Decided, total=False):
     iteration: int  # after which it was decided; none: before the first step
 
 
-class WorldRecord(TypedDict):
-    """The frame of what the run wrote: `World`."""
+class _WorldTold(TypedDict, total=False):
+    error: float  # of metres, half of the 95 % interval, as a share
+    up: list[float]
+
+
+class WorldRecord(_WorldTold):
+    """The frame of what the run wrote: `World`, but for its place."""
 
     unit: float  # of coordinates in memory, in those that were written
     shift: list[float]

@@ -105,7 +105,7 @@ class Gaussians:
 
     def in_world(self, world: World) -> Gaussians:
         """The same scene, held in another frame, such as that of its photos' cameras (`Scene.world`)."""
-        if self.world == world:
+        if self.world.frame == world.frame:
             return self
         ratio = self.world.unlike(world)  # 1, unless one of them is in metres
         means = world.into(ratio * self.world.out(self.means.detach().double().numpy()))
@@ -139,7 +139,7 @@ class Gaussians:
             "sh0": self.sh0.detach().numpy(),
             "shN": self.shN.detach().numpy(),
         }
-        if not self.world.ordinary:
+        if self.world != World():
             arrays["world"] = self.world
         if self.antialiased:
             arrays["antialiased"] = True

@@ -15,7 +15,7 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, write_json
 from hqgs.photos.pixels import to_uint8
-from hqgs.scene.paths import view_matrix, world_up
+from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.world import World
 
@@ -75,10 +75,10 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
                 "photo": photo,
             }
         )
-    up = world_up([view.camera for view in scene.train], [view.quarter_turns for view in scene.train])
+    up = scene_up(scene)
     frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
     content = {"frame": frame, "up": up.tolist(), "views": entries}
-    write_json(folder / CAMERAS, content | ({} if scene.world.ordinary else {"world": scene.world.json()}))
+    write_json(folder / CAMERAS, content | ({} if scene.world == World() else {"world": scene.world.json()}))
 
 
 def small_photo(view: View, most: int = MAX_SIDE) -> Image.Image:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -43,6 +43,11 @@ class Georeference:
     used: int  # of them
     residual: float  # m, root of the mean square of what is left over
     spread: float  # m, root of the mean square distance of the photos' places from their middle
+
+    def of_units(self, metres: float) -> Georeference:
+        """The same place, of a frame whose unit is so many of this one's metres."""
+        scale, interval = self.scale / metres, [value / metres for value in self.interval]
+        return replace(self, scale=scale, interval=interval)
 
     def __str__(self) -> str:
         north, east, *above = self.origin

@@ -127,8 +127,7 @@ def load_scene(
         tracks,
         capture.seen,
         capture.sfm,
-        world=capture.world,
-        place=place,
+        world=replace(capture.world, place=place),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hqgs.base.evenly import evenly
-from hqgs.scene.scene import Camera
+from hqgs.scene.scene import Camera, Scene
 
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
 SIZE = (504, 378)
@@ -95,6 +95,13 @@ def world_up(cameras: Sequence[Camera], turns: Sequence[int] | None = None) -> _
         mean = level
     norm = np.linalg.norm(mean)
     return mean / norm if norm > 1e-6 else np.array(UP)
+
+
+def scene_up(scene: Scene) -> _Array:
+    """Up in a scene, unit [3]: as was told of its world, else as its photos were held (`world_up`)."""
+    if scene.world.up is not None:
+        return np.array(scene.world.up)
+    return world_up([view.camera for view in scene.train], [view.quarter_turns for view in scene.train])
 
 
 def focus(cameras: Sequence[Camera]) -> _Array:

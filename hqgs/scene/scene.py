@@ -74,7 +74,11 @@ class Scene:
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
     world: World = field(default_factory=World)  # the frame of its files, where that is another
-    place: Georeference | None = None  # on Earth, of the files' frame; None: nothing tells
+
+    @property
+    def place(self) -> Georeference | None:
+        """Where on Earth what is written of it is; None: nothing tells."""
+        return self.world.place
 
     def check_trainable(self) -> None:
         """ValueError where it cannot be trained on."""

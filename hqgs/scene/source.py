@@ -23,6 +23,7 @@ from hqgs.scene.metres import distance_of, in_metres
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
+from hqgs.scene.tags import by_tags, check_tag_size
 
 ROOM_TEST_EVERY = 8
 
@@ -41,6 +42,7 @@ def load(
     longest: int | None = None,
     frames: int | None = None,
     distance: Sequence[str | float] | None = None,
+    tag_size: float | None = None,
     on_stage: OnStage = silent,
 ) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
@@ -65,6 +67,8 @@ def load(
             would take more than 4 GB of memory.
         frames: how many of a film; None: two a second, 30 to 90.
         distance: (A, B, metres) between the cameras of two photos: what is written is in metres then.
+        tag_size: metres; the width of the black square of printed tags (AprilTag 36h11, ArUco) that photos
+            show: what is written is in metres then, and upright where a tag lies (the extra `tags`).
         on_stage: hears what is being done, and how far it is.
 
     Returns:
@@ -87,8 +91,11 @@ def load(
         "longest": longest,
         "frames": frames,
         "distance": None if distance is None else [*distance],
+        "tag_size": tag_size,
     }
     apart = None if distance is None else distance_of(distance)
+    if tag_size is not None:
+        check_tag_size(tag_size, distance)
     degradation = parse_degradation(degrade)
     if restore is not None:
         check_weights(restore)
@@ -131,6 +138,7 @@ def load(
         scene = sfm_scene(scene, models, on_stage)
     scene = scene if restore is None else restore_scene(scene, restore)
     scene = scene if apart is None else in_metres(scene, apart)
+    scene = scene if tag_size is None else by_tags(scene, tag_size)
     return replace(scene, origin=origin)
 
 

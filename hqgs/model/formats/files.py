@@ -26,7 +26,7 @@ ANTIALIASED = ("ply", "full.ply", "spz")  # formats that are written with that f
 def read_scene(path: Path, format: str) -> Arrays:
     """What a scene file holds, with the frame that stands beside it, if one does."""
     arrays = in_data_frame(path, READERS[format](path))
-    if "world" not in arrays and not (world := read_world(path)).ordinary:
+    if "world" not in arrays and (world := read_world(path)) != World():
         arrays["world"] = world
     return arrays
 

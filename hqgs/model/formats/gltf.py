@@ -13,7 +13,7 @@ import json
 import math
 import struct
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from hqgs.model.formats.rows import finite_rows, pick, to_logits, to_opacities
 from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH
 from hqgs.model.formats.turned import mapped
 from hqgs.scene.world import World, world_for
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 NAME = "KHR_gaussian_splatting"
 FLOAT, POINTS = 5126, 0
@@ -72,8 +75,10 @@ def write_gltf(path: str | Path, arrays: Arrays) -> int:
     }
     world, node = arrays.get("world", World()), dict[str, Any](mesh=0)
     asset: dict[str, Any] = {"version": "2.0", "generator": "hqgs"}
-    if not world.ordinary:  # the node places it, and what is read again is held as it was
-        node |= {"translation": (FLIP_MEANS * world.shift).tolist(), "scale": [world.unit] * 3}
+    if world != World():  # the node places it upright, and what is read again is held as it was
+        shift, turn = FLIP_MEANS * world.shift, upright(world.up)
+        node |= {"translation": turn.apply(shift).tolist(), "rotation": turn.as_quat().tolist()}
+        node |= {"scale": [world.unit] * 3}
         asset["extras"] = {"hqgs_world": world.json()}
     content = {
         "asset": asset,
@@ -133,9 +138,21 @@ def read_gltf(path: str | Path) -> Arrays:
         "sh0": np.concatenate([part["sh0"] for part in parts]).astype(np.float32),
         "shN": np.concatenate([_widened(part["shN"], most) for part in parts]),
     }
-    if not world.ordinary:
+    if world != World():
         found["world"] = world
     return found
+
+
+def upright(up: tuple[float, float, float] | None) -> Rotation:
+    """The least turn that brings up of a scene, with glTF's axes, to their y; none where it is not known."""
+    from scipy.spatial.transform import Rotation  # here: to read a scene does not need it
+
+    if up is None:
+        return Rotation.identity()
+    x, y, z = FLIP_MEANS * up
+    if y < -1 + 1e-9:
+        return Rotation.from_quat([1.0, 0, 0, 0])
+    return Rotation.from_quat([-z, 0.0, x, 1 + y])
 
 
 def _widened(harmonics: Floats, most: int) -> NDArray[np.float32]:

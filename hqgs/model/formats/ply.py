@@ -78,7 +78,7 @@ def write_ply(path: str | Path, arrays: Arrays, *, full: bool = False) -> int:
     else:
         vertices = np.ascontiguousarray(rows[finite]).view(kinds)[:, 0]
     says = []
-    if not world.ordinary:
+    if world != World():
         says.append(f"{_WORLD}{json.dumps(world.json())}")
     if arrays.get("antialiased"):
         says.append(_ANTIALIASED)
@@ -160,7 +160,7 @@ def read_ply(path: str | Path) -> Arrays:
             notes.append(f"{count} {what} became the nearest that there is")
     if more:
         notes.append(f"{more} bytes after its last row were passed by")
-    if not world.ordinary:
+    if world != World():
         arrays["world"] = world
     if _ANTIALIASED in comments:
         arrays["antialiased"] = True

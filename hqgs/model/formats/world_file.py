@@ -14,7 +14,7 @@ SUFFIX = ".world.json"
 def keep_world(path: Path, world: World) -> None:
     """Write the frame of the scene file at `path` beside it, or remove an old one where it is its own."""
     beside = path.with_name(path.name + SUFFIX)
-    if world.ordinary:
+    if world == World():
         beside.unlink(missing_ok=True)
     else:
         whose = "file coordinates of the photos' cameras" if world.metres is None else "metres"

@@ -24,7 +24,7 @@ from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMet
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
-from hqgs.scene.paths import focus, world_up
+from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
@@ -172,7 +172,7 @@ def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
         "data": packed.data,
         "head": packed.head,
         "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
-        "up": world_up([v.camera for v in scene.train], [v.quarter_turns for v in scene.train]).tolist(),
+        "up": scene_up(scene).tolist(),
         "aspect": f"{first.width} / {first.height}",
         "note": note,
     }
