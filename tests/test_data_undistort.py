@@ -206,11 +206,3 @@ def test_a_camera_that_sees_nothing_is_refused(tmp_path: Path) -> None:
     truth = replace(make_truth(1), model="OPENCV", params=[40, 40, 40_000, 18, -0.1, 0, 0, 0])
     with pytest.raises(ValueError, match=r"view_00\.png' cannot be undistorted: .*nothing of the photo"):
         load_scene(write_colmap(truth, tmp_path), test_every=0)
-
-
-def test_a_panorama_is_refused(tmp_path: Path) -> None:
-    if "EQUIRECTANGULAR" not in pycolmap.CameraModelId.__members__:
-        pytest.skip("this pycolmap has no panoramas")
-    truth = replace(make_truth(1), model="EQUIRECTANGULAR", params=[WIDTH, HEIGHT])
-    with pytest.raises(ValueError, match=r"view_00\.png': a EQUIRECTANGULAR camera has no pinhole view"):
-        load_scene(write_colmap(truth, tmp_path), test_every=0)

@@ -16,11 +16,12 @@ from filelock import FileLock, Timeout
 
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
-EMBEDDED, SPARSE, BEYOND = "embedded", "sparse", "beyond"
-# In the place of a scene folder: what is built in. From the third on they may have a value, `true-shake:8`.
+EMBEDDED, SPARSE, BEYOND, PANORAMA = "embedded", "sparse", "beyond", "true-panorama"
+# In the place of a scene folder: what is built in. From the fourth on they may have a value, `true-shake:8`.
 ROOMS = (
     EMBEDDED,
     SPARSE,
+    PANORAMA,
     BEYOND,
     "true-shake",
     "true-defocus",

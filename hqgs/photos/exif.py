@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from hqgs.photos.files import DECODE_ERRORS, open_photo
 
 _ORIENTATION, _MAKE, _MODEL, _MORE = 274, 271, 272, 0x8769  # tags; the last one is a table of its own:
 _FOCAL, _FOCAL_35MM, _WIDTH, _X_RESOLUTION, _RESOLUTION_UNIT = 37386, 41989, 40962, 41486, 41488
+_XMP = ("xmp", "XML:com.adobe.xmp")  # what Pillow calls it in JPEG, WebP and HEIC, and in PNG
+_PANORAMA = re.compile(rb"GPano:ProjectionType\W{1,3}equirectangular\b")  # an attribute, or an element
 _GPS = 0x8825  # another such table, with these:
 _NORTH_OR_SOUTH, _LATITUDE, _EAST_OR_WEST, _LONGITUDE, _BELOW_SEA, _ALTITUDE = range(1, 7)
 _MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
@@ -27,6 +30,7 @@ class Exif:
     camera: tuple[str, ...] = ()  # make, model and focal length: photos with the same ones share a camera
     focal: float = 0.0  # px of the stored photo
     gps: tuple[float, float, float] | None = None  # degrees north and east, m up; nan: no altitude
+    panorama: bool = False  # its XMP data (GPano) say that it is equirectangular
 
 
 def read_exif(path: Path) -> Exif:
@@ -37,6 +41,7 @@ def read_exif(path: Path) -> Exif:
             found = photo.getexif()
             more = found.get_ifd(_MORE)
             gps = _position(found.get_ifd(_GPS))
+            xmp = next((photo.info[key] for key in _XMP if key in photo.info), b"")
     except DECODE_ERRORS:
         return Exif()
     turn = _TURNS.get(found.get(_ORIENTATION, 1), 0)
@@ -46,7 +51,8 @@ def read_exif(path: Path) -> Exif:
     names = tuple(str(found.get(tag, "")).strip("\0 ") for tag in (_MAKE, _MODEL))
     lens = f"{_number(more, _FOCAL):g} {_number(more, _FOCAL_35MM):g}"
     known = any(names) or focal > 0
-    return Exif(turn, (*names, lens) if known else (), focal, gps)
+    xmp = xmp.encode(errors="replace") if isinstance(xmp, str) else bytes(xmp)
+    return Exif(turn, (*names, lens) if known else (), focal, gps, _PANORAMA.search(xmp) is not None)
 
 
 def _focal(more: dict[int, Any], width: int, height: int) -> float:

@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.scene.faces import Face
 from hqgs.scene.photo_files import MASKS, Named, below
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.world import World
@@ -29,6 +30,7 @@ class Photo:
     viewmat: NDArray[np.float64]  # [4, 4], world to camera, OpenCV frame
     mask_path: Path | None = None
     film: float | None = None  # as `View.film`
+    face: Face | None = None  # the part of it that is meant; its pose is `viewmat`
 
 
 @dataclass(frozen=True)

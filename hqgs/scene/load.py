@@ -16,6 +16,7 @@ from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
+from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
@@ -29,6 +30,7 @@ from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
 from hqgs.scene.views import load_views
+from hqgs.scene.wide import with_faces
 
 COLMAP = "colmap"
 MOST_BYTES = (
@@ -81,7 +83,7 @@ def load_scene(
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
     coarse = longest is not None and longest <= COARSE
-    capture = _read(root, downscale, keep_sfm, on_stage, sfm, coarse)
+    capture = with_faces(_read(root, downscale, keep_sfm, on_stage, sfm, coarse))
     if longest is not None:
         capture = bounded(capture, longest)
     degraded = read_degraded_folder(root)
@@ -143,21 +145,22 @@ def load_pictures(
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
-    chosen = evenly(len(photos.names), most)
-    cameras = [
-        pycolmap.Camera.create_from_model_name(
-            1, "SIMPLE_PINHOLE", 1.2 * max(photos.sizes[k]), *photos.sizes[k]
+    names, details = photos.names, frame_details(photos.folder)
+    chosen = []
+    for k in evenly(len(names), most // len(CUBE) if photos.around else most):
+        size = photos.sizes[k]
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.2 * max(size), *size)
+        camera = around(*size) if photos.around else camera
+        chosen.append(
+            Photo(names[k], photos.folder / names[k], camera, np.eye(4), film=details.get(names[k]))
         )
-        for k in chosen
-    ]
-    names, details = [photos.names[k] for k in chosen], frame_details(photos.folder)
-    views, _ = load_views(
-        [
-            Photo(name, photos.folder / name, camera, np.eye(4), film=details.get(name))
-            for name, camera in zip(names, cameras, strict=True)
-        ],
-        photos.downscale if longest is None else bound(photos.sizes, photos.downscale, longest),
-    )
+    shown = with_faces(Capture("photos", chosen, photos.downscale, *no_points()))
+    if longest is not None:
+        sizes = photos.sizes
+        if photos.around:
+            sizes = [(face.width, face.height) for size in sizes for face in faces_of(around(*size))]
+        shown = replace(shown, downscale=bound(sizes, photos.downscale, longest))
+    views, _ = load_views(shown.photos, shown.downscale)
     notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
     nothing = no_points()
     points, colors = nothing[0].astype(np.float32), nothing[1]
@@ -250,7 +253,7 @@ def bound(sizes: list[tuple[int, int]], downscale: float, longest: int) -> float
 
 def bounded(capture: Capture, longest: int) -> Capture:
     """The capture with its photos scaled down until no side is longer, and all of them fit into memory."""
-    sizes = [stored_size(photo.path) for photo in capture.photos if photo.path.is_file()]
+    sizes = [_size(photo) for photo in capture.photos if photo.path.is_file()]
     if not sizes:
         return capture
     largest, downscale = max(sizes, key=max), bound(sizes, capture.downscale, longest)
@@ -270,6 +273,14 @@ def bounded(capture: Capture, longest: int) -> Capture:
             f"{MOST_BYTES / 1e9:g} GB of memory then"
         )
     return replace(capture, downscale=downscale, notes=[*capture.notes, note])
+
+
+def _size(photo: Photo) -> tuple[int, int]:
+    """Width and height of a photo as it is stored; of the face of one, what it shows of that."""
+    width, height = stored_size(photo.path)
+    if (face := photo.face) is None:
+        return width, height
+    return round(face.width * width / photo.camera.width), round(face.height * height / photo.camera.height)
 
 
 def _with_lows(
@@ -301,7 +312,7 @@ def _tracks(capture: Capture, views: list[View]) -> TrackStatistics | None:
     """Those of the capture, in px of the views."""
     if capture.tracks is None:
         return None
-    widths = {photo.name: photo.camera.width for photo in capture.photos}
+    widths = {photo.name: (photo.face or photo.camera).width for photo in capture.photos}
     scales = [view.camera.width / widths[view.name] for view in views]
     return replace(capture.tracks, error=capture.tracks.error * float(np.mean(scales)))
 
@@ -321,4 +332,6 @@ def held_out_names(
         held = {capture.folder / name for name in list_photos(capture.folder)[::hold]}
         notes.append(f"hold={hold}: every {hold}th photo is held out, the others are degraded")
         return frozenset(p.name for p in capture.photos if p.path in held)
-    return frozenset([p.name for p in capture.photos][::test_every]) if test_every else frozenset()
+    files = list(dict.fromkeys(p.path for p in capture.photos))
+    held = set(files[::test_every]) if test_every else set[Path]()
+    return frozenset(p.name for p in capture.photos if p.path in held)

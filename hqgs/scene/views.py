@@ -26,6 +26,7 @@ from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.resize import Pixels, area_downscale
 from hqgs.scene.capture import MAX_SIDE, Photo
+from hqgs.scene.faces import AROUND, Face, faces_of, lit, projected
 from hqgs.scene.scene import Camera, View
 
 STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is not resampled
@@ -40,7 +41,8 @@ FAR = 1.25  # pixels of the photo between samples; where they are farther apart,
 DENSE = 1.75  # the same, at which it may be decoded: 6000 px go to 1600 by way of 3000
 FILM = 1.5  # until a frame is so much smaller it shows as much of the film's codec as at its own size
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
-_CameraKey = tuple[str, tuple[float, ...], int, int, int, int]
+SEAM = 2  # columns repeated beyond both ends of a photo of all around, as bicubic interpolation reads them
+_CameraKey = tuple[str, tuple[float, ...], int, int, int, int, str]
 
 
 def load_views(
@@ -70,9 +72,10 @@ def load_views(
 
     @lru_cache(maxsize=_CAMERAS_KEPT)
     def made(key: _CameraKey) -> Pinhole:
-        model, params, camera_width, camera_height, width, height = key
+        model, params, camera_width, camera_height, width, height, name = key
         camera = pycolmap.Camera(model=model, params=params, width=camera_width, height=camera_height)
-        return to_pinhole(camera, width, height, max(downscale / DENSER, 1.0))
+        face = next((face for face in faces_of(camera) if face.name == name), None)
+        return to_pinhole(camera, width, height, max(downscale / DENSER, 1.0), face)
 
     locks: defaultdict[_CameraKey, Lock] = defaultdict(Lock)
 
@@ -123,8 +126,11 @@ def _load_view(
         counts = decode_mask(photo.mask_path, width, height)
         mask = counts if mask is None else mask & counts
     size = stored[0] / shrunk(stored[0], width), stored[1] / shrunk(stored[1], height)
+    if photo.face is not None and camera.model.name != AROUND and not (light := lit(image)).all():
+        mask = light if mask is None else mask & light
 
-    key = (camera.model.name, tuple(camera.params), camera.width, camera.height, *stored)
+    face = "" if photo.face is None else photo.face.name
+    key = (camera.model.name, tuple(camera.params), camera.width, camera.height, *stored, face)
     try:
         flat = pinhole(key)
     except ValueError as e:  # from pycolmap: the message does not say which camera
@@ -163,6 +169,7 @@ class Pinhole:
     K: NDArray[np.float64]  # [3, 3]
     grid: torch.Tensor | None  # [1, h, w, 2] float32, sampling positions; None: keep the photo
     inside: NDArray[np.bool_] | None  # [h, w], True where the position lies in the photo
+    around: bool = False  # the photo's last column goes on in its first
 
     def picture(self, image: Pixels, size: tuple[float, float] | None = None) -> Pixels:
         """Resample `image` [H, W, C] by bicubic interpolation, clamped at the border; [h, w, C], uint8 again.
@@ -176,6 +183,9 @@ class Pinhole:
         if size is not None and size != (width, height):
             grid = (grid + 1) * torch.tensor([size[0] / width, size[1] / height]) - 1
         channels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+        if self.around:
+            channels = torch.nn.functional.pad(channels, (SEAM, SEAM, 0, 0), mode="circular")
+            grid = grid * torch.tensor([width / (width + 2 * SEAM), 1.0])
         out = torch.nn.functional.grid_sample(
             channels, grid, mode="bicubic", padding_mode="border", align_corners=False
         )
@@ -200,6 +210,8 @@ def check_camera(camera: pycolmap.Camera, name: str) -> None:
     """Raise ValueError, naming the photo, when the camera's size or parameters cannot be a camera's."""
     if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
         raise ValueError(f"the camera of photo {name!r} has the size {camera.width} x {camera.height}")
+    if camera.model.name == AROUND:
+        return
     focals = camera.params[camera.focal_length_idxs()]
     if len(focals) == 0:
         raise ValueError(f"photo {name!r}: a {camera.model.name} camera has no pinhole view")
@@ -224,7 +236,9 @@ def check_size(camera: pycolmap.Camera, width: int, height: int, name: str) -> N
         )
 
 
-def to_pinhole(camera: pycolmap.Camera, width: int, height: int, coarser: float = 1.0) -> Pinhole:
+def to_pinhole(
+    camera: pycolmap.Camera, width: int, height: int, coarser: float = 1.0, face: Face | None = None
+) -> Pinhole:
     """The pinhole view of a photo of `width` x `height` taken with `camera`, whatever size that declares.
 
     The new camera is pycolmap's `undistort_camera` with no blank pixels (focal lengths kept, size chosen so
@@ -234,50 +248,66 @@ def to_pinhole(camera: pycolmap.Camera, width: int, height: int, coarser: float 
     pycolmap cannot undistort the camera.
     """
     sx, sy = width / camera.width, height / camera.height
-    K = camera.calibration_matrix()
-    if _is_straight(camera, K):
-        return Pinhole(width, height, np.diag([sx, sy, 1.0]) @ K, None, None)
-    flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(blank_pixels=0.0), camera)
-    if not (1 <= flat.width <= 4 * camera.width and 1 <= flat.height <= 4 * camera.height):
-        raise ValueError(f"{camera.model.name} camera undistorts to {flat.width} x {flat.height} pixels")
+    if face is None:
+        K = camera.calibration_matrix()
+        if _is_straight(camera, K):
+            return Pinhole(width, height, np.diag([sx, sy, 1.0]) @ K, None, None)
+        flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(blank_pixels=0.0), camera)
+        if not (1 <= flat.width <= 4 * camera.width and 1 <= flat.height <= 4 * camera.height):
+            raise ValueError(f"{camera.model.name} camera undistorts to {flat.width} x {flat.height} pixels")
+        K = flat.calibration_matrix()
+    else:
+        flat, K = face, face.K
     w, h = max(1, round(flat.width * sx)), max(1, round(flat.height * sy))
-    K = np.diag([w / flat.width, h / flat.height, 1.0]) @ flat.calibration_matrix()
+    K = np.diag([w / flat.width, h / flat.height, 1.0]) @ K
 
     rows, columns = max(1, round(h / coarser)), max(1, round(w / coarser))
     ys, xs = (np.arange(rows) + 0.5) * (h / rows), (np.arange(columns) + 0.5) * (w / columns)
-    guessed = _interpolated(camera, K, xs, ys) if coarser > 1 else None
+    guessed = _interpolated(camera, K, xs, ys, face) if coarser > 1 else None
     grid = np.empty((rows, columns, 2), np.float32)
     inside = np.empty((rows, columns), np.bool_)
     step = max(1, BAND // columns)
     for top in range(0, rows, step):
         band = slice(top, top + step)
-        at = _shares(camera, K, xs, ys[band]) if guessed is None else guessed[band]
+        at = _shares(camera, K, xs, ys[band], face) if guessed is None else guessed[band]
         inside[band] = ((at >= 0) & (at <= 1)).all(-1)
         grid[band] = 2 * np.nan_to_num(at, nan=0.5, posinf=2, neginf=-1).clip(-1, 2) - 1
     if not inside.any():
         raise ValueError(
             f"{camera.model.name} with parameters {camera.params.tolist()} shows nothing of the photo"
         )
-    return Pinhole(w, h, K, torch.from_numpy(grid)[None], inside)
+    return Pinhole(w, h, K, torch.from_numpy(grid)[None], inside, camera.model.name == AROUND)
 
 
 def _shares(
-    camera: pycolmap.Camera, K: NDArray[np.float64], xs: NDArray[np.floating], ys: NDArray[np.floating]
+    camera: pycolmap.Camera,
+    K: NDArray[np.float64],
+    xs: NDArray[np.floating],
+    ys: NDArray[np.floating],
+    face: Face | None,
 ) -> NDArray[np.float64]:
     """Where the pixels of the pinhole camera `K` at columns `xs` and rows `ys` lie in the stored photo,
     [rows, columns, 2], as shares of its size, so that the declared size drops out."""
-    pixels = np.stack(np.meshgrid(xs, ys), -1)
-    return _project(camera, (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]) / (camera.width, camera.height)
+    rays = _rays(K, np.stack(np.meshgrid(xs, ys), -1))
+    if face is not None:
+        rays = rays @ face.rotation
+        far = np.arctan2(np.linalg.norm(rays[..., :2], axis=-1), rays[..., 2]) > face.limit
+        rays[far] = np.nan
+    return projected(camera, rays) / (camera.width, camera.height)
 
 
 def _interpolated(
-    camera: pycolmap.Camera, K: NDArray[np.float64], xs: NDArray[np.floating], ys: NDArray[np.floating]
+    camera: pycolmap.Camera,
+    K: NDArray[np.float64],
+    xs: NDArray[np.floating],
+    ys: NDArray[np.floating],
+    face: Face | None,
 ) -> NDArray[np.float32] | None:
     """The same from every LATTICE-th column and row, bilinear between them; None where that is not exact to
     EXACT px of the grid in the middle of each cell."""
     x, y = (np.linspace(side[0], side[-1], math.ceil(len(side) / LATTICE) + 1) for side in (xs, ys))
-    known = _shares(camera, K, x, y)
-    true = _shares(camera, K, x[:-1] + np.diff(x) / 2, y[:-1] + np.diff(y) / 2)
+    known = _shares(camera, K, x, y, face)
+    true = _shares(camera, K, x[:-1] + np.diff(x) / 2, y[:-1] + np.diff(y) / 2, face)
     middle = (known[1:, 1:] + known[1:, :-1] + known[:-1, 1:] + known[:-1, :-1]) / 4
     if not (np.abs(middle - true) * (len(xs), len(ys)) < EXACT).all():
         return None
@@ -290,10 +320,10 @@ def _interpolated(
     )
 
 
-def _project(camera: pycolmap.Camera, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixel positions [..., 2] of the viewing directions (x/z, y/z) [..., 2]; NaN where there is none."""
-    rays = np.concatenate([directions, np.ones_like(directions[..., :1])], -1)
-    return np.asarray(camera.img_from_cam(rays.reshape(-1, 3))).reshape(directions.shape)
+def _rays(K: NDArray[np.float64], pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Viewing directions [..., 3] of pixel positions [..., 2]; their z is 1."""
+    directions = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+    return np.concatenate([directions, np.ones_like(directions[..., :1])], -1)
 
 
 def _is_straight(camera: pycolmap.Camera, K: NDArray[np.float64]) -> bool:
@@ -304,5 +334,5 @@ def _is_straight(camera: pycolmap.Camera, K: NDArray[np.float64]) -> bool:
     xs = np.linspace(0, camera.width, 33)
     ys = np.linspace(0, camera.height, 33)
     pixels = np.stack(np.meshgrid(xs, ys), -1)
-    moved = _project(camera, (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]) - pixels
+    moved = projected(camera, _rays(K, pixels)) - pixels
     return bool(np.abs(moved).max() < STRAIGHT)

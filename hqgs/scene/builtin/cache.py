@@ -16,6 +16,7 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, write_json
 from hqgs.photos import camera, light, shake, walkers
+from hqgs.scene import faces
 from hqgs.scene.sfm.run import PARTS
 
 POINTS = "points.npz"
@@ -32,7 +33,7 @@ class Kept(NamedTuple):
 @cache
 def source() -> str:
     """A digest of the code that makes the built-in scenes: what it changes must be made anew."""
-    used = [*PARTS, *(Path(str(module.__file__)) for module in (camera, light, shake, walkers))]
+    used = [*PARTS, *(Path(str(module.__file__)) for module in (camera, light, shake, walkers, faces))]
     files = [*sorted(Path(__file__).parent.glob("*.py")), *used]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 

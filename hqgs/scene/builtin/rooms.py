@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hqgs.base.files import BEYOND, EMBEDDED, SPARSE
+from hqgs.base.files import BEYOND, EMBEDDED, PANORAMA, SPARSE
+from hqgs.scene.builtin.panorama import WIDTH, panorama_room
 from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.builtin.sparse import PHOTOS, beyond_room, sparse_room
 from hqgs.scene.builtin.wild import parse_true_kind, wild_room
@@ -18,10 +19,11 @@ def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, se
     """A built-in scene with photos of 504 x 378 px, divided by `downscale`.
 
     "embedded": `embedded_scene`; "sparse": few photos from far apart (`sparse_room`); "beyond[:N]": N
-    photos (12), judged between and beyond their cameras (`beyond_room`); "true-shake[:PX]",
-    "true-defocus[:R]", "true-rolling[:PX]", "true-exposure[:EV]", "true-crowd[:N]": training photos that a
-    camera has truly taken so, held-out ones clean (`wild_room`, with `seed`). `cache` keeps what was made.
-    ValueError for an unknown name or a value out of range.
+    photos (12), judged between and beyond their cameras (`beyond_room`); "true-panorama": faces of panoramas
+    of 1008 px (`panorama_room`); "true-shake[:PX]", "true-defocus[:R]", "true-rolling[:PX]",
+    "true-exposure[:EV]", "true-crowd[:N]": training photos that a camera has truly taken so, held-out ones
+    clean (`wild_room`, with `seed`). `cache` keeps what was made. ValueError for an unknown name or a value
+    out of range.
     """
     text = str(name)
     width, height = (round(side / downscale) for side in SIZE)
@@ -29,6 +31,8 @@ def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, se
         return embedded_scene(cache, width, height)
     if text == SPARSE:
         return sparse_room(cache, width, height)
+    if text == PANORAMA:
+        return panorama_room(cache, 2 * round(WIDTH / downscale / 2)).scene
     kind, _, value = text.partition(":")
     if kind == BEYOND:
         if value and not value.isdecimal():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +49,14 @@ def assemble(
     made: dict[str, Any],
     thin: Callable[[SparsePoints], SparsePoints] = lambda points: points,
     held_out: Mapping[int, str] | None = None,
+    names: Sequence[str] | None = None,
 ) -> Scene:
     """A scene of clean photos of the room by these cameras; points from those that are trained on.
 
     The points pass through `thin`. `made` says what cameras and `thin` depend on beside the photos' size and
     number, in JSON values, for the key of the cache. `held_out`: numbers of the test views, and what they are
-    called; None: every 8th. ValueError for cameras below 1 x 1.
+    called; None: every 8th. `names`: of all views, in place of `view_NN.png` and such. ValueError for
+    cameras below 1 x 1.
     """
     width, height = cameras[0].width, cameras[0].height
     if width < 1 or height < 1:
@@ -63,7 +65,8 @@ def assemble(
         held_out = dict.fromkeys(range(0, len(cameras), TEST_EVERY), "view")
     if cache is not None:
         cache.mkdir(parents=True, exist_ok=True)  # an unusable place shows before the work
-    names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
+    if names is None:
+        names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
     made = {"width": width, "height": height, "num_views": len(cameras), **made}
     kept = None if cache is None else read_kept(cache, made, names)
     if kept is None:

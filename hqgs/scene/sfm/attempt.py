@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.database import known_cameras, new_cameras
-from hqgs.scene.sfm.likely import MANY, likely_pairs
+from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
+from hqgs.scene.sfm.likely import MANY, likely_pairs, pairs_of_faces
 from hqgs.scene.sfm.matching import extract, match, pipeline_options
 from hqgs.scene.sfm.sharpen import sharpened
 from hqgs.scene.sfm.tracks import usual
@@ -66,6 +66,8 @@ class Attempt:
         named = [directory / name for name, on in names.items() if on]
         self.database: Path = [*named, self.versions[0] if smoothed else self.plain][0]
         self.names: list[str] = given["names"].tolist()
+        self.faces: int = len(given.get("rotations", [0]))  # of a photo
+        self.fixed: bool = "Ks" in given or self.faces > 1
         self.model: pycolmap.Reconstruction | None = None
         self.apart: list[list[str]] = []  # photos that fit each other, and not those of the model
         self._tell("features", 0)
@@ -85,11 +87,11 @@ class Attempt:
         if not database.exists():
             new = database.with_suffix(".new")
             new.unlink(missing_ok=True)
-            known_cameras(self.given, new) if "Ks" in self.given else new_cameras(self.given, new)
+            known = known_cameras if "Ks" in self.given else rigs
+            (known if self.fixed else new_cameras)(self.given, new)
             new.rename(database)
 
     def run(self) -> None:
-        fixed = "Ks" in self.given
         if not self.smoothed:
             self._begin(self.database)
         extraction = pycolmap.FeatureExtractionOptions()
@@ -112,7 +114,7 @@ class Attempt:
             self.database,
             photos,
             self.directory / f"models_{self.database.stem}",
-            options=self._mapping(fixed),
+            options=self._mapping(),
             initial_image_pair_callback=lambda: self._place(2),
             next_image_callback=lambda: self._place(1),
         )
@@ -120,14 +122,14 @@ class Attempt:
             order = sorted(models, key=lambda k: (-models[k].num_reg_images(), -models[k].num_points3D(), k))
             self.model = models[order[0]]
             self.apart = apart([placed_names(models[k]) for k in order])
-            self._settle(self.model, fixed)
+            self._settle(self.model)
 
     def sharpen(self) -> None:
         """Move the observations to where the photos agree, and adjust again, where that is more precise."""
-        if self.model is None or self._off(self.model) <= UNSURE:
+        if self.model is None or self.faces > 1 or self._off(self.model) <= UNSURE:
             return
         self._tell("sharpen", 0)
-        mapping = self._mapping("Ks" in self.given)
+        mapping = self._mapping()
 
         def adjust(model: pycolmap.Reconstruction, scale: float, move: bool) -> None:
             options = mapping.get_global_bundle_adjustment()
@@ -188,15 +190,14 @@ class Attempt:
 
     def _pairs(self, database: Path) -> Any:
         """Pairs [P, 2] of photos that are to be matched by their features in `database`; None: all."""
-        if self.tolerant:
-            return None
-        if "pairs" in self.given:
+        if "pairs" in self.given and not self.tolerant:
             return self.given["pairs"]
-        if len(self.names) <= MANY:
-            return None
-        self._tell("matches", 0)
-        with pycolmap.Database.open(database) as db:
-            return likely_pairs(db, len(self.names))
+        pairs = None
+        if len(self.names) > MANY and not self.tolerant:
+            self._tell("matches", 0)
+            with pycolmap.Database.open(database) as db:
+                pairs = likely_pairs(db, len(self.names))
+        return pairs if self.faces == 1 else pairs_of_faces(len(self.names), self.faces, pairs)
 
     def facts(self) -> dict[str, Any]:
         """Features of each photo, matches and those that a geometry bears out of each pair, both sorted.
@@ -236,7 +237,7 @@ class Attempt:
             geometry.min_num_inliers = 10
         return geometry
 
-    def _mapping(self, fixed: bool) -> pycolmap.IncrementalPipelineOptions:
+    def _mapping(self) -> pycolmap.IncrementalPipelineOptions:
         options = pipeline_options()
         options.min_model_size = SMALLEST
         mapper = options.mapper
@@ -247,18 +248,19 @@ class Attempt:
             options.min_num_matches = 10
             mapper.init_min_num_inliers, mapper.init_min_tri_angle = 50, 6.0
             mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = 15, 0.15
-        if fixed:
+        options.ba_refine_sensor_from_rig = False
+        if self.fixed:
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
         return options
 
-    def _settle(self, model: pycolmap.Reconstruction, fixed: bool) -> None:
+    def _settle(self, model: pycolmap.Reconstruction) -> None:
         """Poses and points without the observations that lie far off.
 
         While photos are placed an observation may be 4 px off. In small photos false matches so near turn the
         cameras: without them rotations are off 0.3 to 0.85 times as far.
         """
-        mapping = self._mapping(fixed)
+        mapping = self._mapping()
         for _ in range(ROUNDS):
             far = FAR * float(np.median([point.error for point in model.points3D.values()]))
             seen = pycolmap.ObservationManager(model)

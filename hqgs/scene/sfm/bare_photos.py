@@ -25,8 +25,10 @@ from hqgs.photos.files import (
     needs_heic,
 )
 from hqgs.scene.capture import photo_folder
+from hqgs.scene.faces import CUBE, around, face_name, faces_of
 from hqgs.scene.photo_files import MASKS, is_run
 from hqgs.scene.sfm.front_door import copies, films_beside, photos_below, strays, understood
+from hqgs.scene.sfm.panoramas import all_around, write_faces
 from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
@@ -48,19 +50,36 @@ class BarePhotos:
     notes: list[str] = field(default_factory=list)
     strays: dict[str, str] = field(default_factory=dict)  # what seems not to be of their camera, and why
     others: frozenset[str] = frozenset()  # whose files hold what COLMAP does not read, whatever their suffix
+    around: bool = False  # each shows 360 x 180 degrees, and is given to COLMAP as the faces of a cube
 
     @property
     def colmap_names(self) -> dict[str, str]:
-        """Each photo's name by the one that COLMAP sees."""
+        """Each photo's name by the one that COLMAP sees; of panoramas by that of each face, "front" first."""
+        if self.around:
+            return {f"{face_name(name, face)}.jpg": name for name in self.names for face in CUBE}
         read = {n: n.lower().endswith(FOR_COLMAP) and n not in self.others for n in self.names}
         return {n if read[n] else f"{n}.jpg": n for n in self.names}
 
     def contents(self) -> Iterator[bytes]:
-        """The files' bytes."""
-        return ((self.folder / name).read_bytes() for name in self.names)
+        """The files' bytes; of panoramas those of the other faces are empty."""
+        faces = len(CUBE) if self.around else 1
+        return (b"" if k else (self.folder / name).read_bytes() for name in self.names for k in range(faces))
 
     def guess(self) -> Guess:
-        """Photos of one size by the same make, model and zoom share a camera; EXIF gives its focal length."""
+        """Photos of one size by the same make, model and zoom share a camera; EXIF gives its focal length.
+
+        Panoramas of one size share the cameras of their faces, all of which are known.
+        """
+        if self.around:
+            sizes = list(dict.fromkeys(self.sizes))
+            front = [faces_of(around(*size))[0] for size in sizes]
+            of_photo = [sizes.index(size) for size in self.sizes for _ in CUBE]
+            return Guess(
+                [(face.width, face.height) for face in front],
+                [float(face.K[0, 0]) for face in front],
+                of_photo,
+                rotations=np.stack([*CUBE.values()]),
+            )
         keys = [(*size, *exif.camera) for size, exif in zip(self.sizes, self.exif, strict=True)]
         cameras = list(dict.fromkeys(keys))
         first = [keys.index(camera) for camera in cameras]
@@ -73,6 +92,11 @@ class BarePhotos:
 
     def write(self, folder: Path) -> None:
         """The photos under COLMAP's names into a folder, as links where COLMAP can read them."""
+        if self.around:
+            targets = [folder / target for target in self.colmap_names]
+            for k, name in enumerate(self.names):
+                write_faces(self.folder / name, targets[k * len(CUBE) : (k + 1) * len(CUBE)], QUALITY)
+            return
         for target, name in self.colmap_names.items():
             path = folder / target
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -153,8 +177,9 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         notes.append(f"{len(twice)} of {len(looked)} photos are copies of others and were left out: {pairs}")
     names = [name for name in looked if name not in twice]
     looked, tags = {name: looked[name] for name in names}, {name: exif[name] for name in names}
-    if not film:
-        notes.insert(0, understood([*tags.values()], names, len(twice)))
+    sphere = all_around(photos.folder, looked, tags)
+    if not film or sphere:
+        notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
         on_stage(Stage("photos looked at", len(photos.names), len(photos.names), notes[0]))
     return replace(
         photos,
@@ -163,8 +188,9 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         exif=[*tags.values()],
         unreadable=unreadable,
         notes=notes,
-        strays={} if film else strays(looked, tags),
+        strays={} if film or sphere else strays(looked, tags),
         others=frozenset(name for name, seen in looked.items() if seen.format not in COLMAP_FORMATS),
+        around=sphere,
     )
 
 

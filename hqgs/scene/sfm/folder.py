@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,10 +24,10 @@ def write_colmap_folder(
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 
-    `images` has every photo with a place: those of WebP or HEIC as JPEG, the others as they are; of a film
-    also what its frames had of fine details. `work` is a folder for what the next call goes on with if this
-    one is stopped; it is removed at the end. ValueError where there are no photos, or COLMAP finds no scene
-    in them.
+    `images` has every photo with a place: those of WebP or HEIC as JPEG, the others as they are; of panoramas
+    their faces, of a film also what its frames had of fine details. `work` is a folder for what the next call
+    goes on with if this one is stopped; it is removed at the end. ValueError where there are no photos, or
+    COLMAP finds no scene in them.
     """
     if frames is not None:
         check_film(source)
@@ -41,7 +42,10 @@ def write_colmap_folder(
         images = out / "images"
         details = frame_details(found.photos.folder)
         kept: dict[str, float] = {}
-        for image in found.model.images.values():
+        if found.photos.around:
+            placed = {found.photos.colmap_names[image.name] for image in found.model.images.values()}
+            replace(found.photos, names=sorted(placed)).write(images)
+        for image in [] if found.photos.around else found.model.images.values():
             original = found.photos.colmap_names[image.name]
             target = images / image.name
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -82,11 +82,11 @@ def tell_strays(strays: dict[str, str], placed: set[str]) -> list[str]:
     ]
 
 
-def understood(exif: Sequence[Exif], names: Sequence[str], left_out: int) -> str:
+def understood(exif: Sequence[Exif], names: Sequence[str], left_out: int, around: bool) -> str:
     """One line: how many photos of how many cameras, and what else their names and EXIF data tell."""
     cameras = {tags.camera[:2] for tags in exif if any(tags.camera[:2])}
     known = sum(any(tags.camera[:2]) for tags in exif)
-    text = _count(len(names), "photo")
+    text = _count(len(names), "panorama" if around else "photo") + (" of 360 x 180 degrees" if around else "")
     if known == len(names):
         text += f" of {_count(len(cameras), 'camera')}"
     else:

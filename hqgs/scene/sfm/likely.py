@@ -45,6 +45,18 @@ def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
     return np.stack([first[wanted], second[wanted]], axis=1)
 
 
+def pairs_of_faces(count: int, faces: int, some: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+    """Pairs [P, 2] of `count` faces of photos, `faces` in a row of each: all, or `some` and each with those
+    of its direction in the 4 next photos. Never two of one photo, which share nothing."""
+    pairs = np.stack(np.triu_indices(count, 1), axis=1)
+    if some is not None:
+        steps = pairs[:, 1] - pairs[:, 0]
+        near = (steps % faces == 0) & (steps <= NEXT * faces)
+        pairs = np.unique(np.concatenate([some, pairs[near]]), axis=0)
+    photos = pairs // faces
+    return pairs[photos[:, 0] != photos[:, 1]]
+
+
 def _largest(db: pycolmap.Database, number: int) -> NDArray[np.float32]:
     """Descriptors [N, 128] of a photo's largest features."""
     if not db.exists_keypoints(number):

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import check_mask
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
+from hqgs.scene.faces import around
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, TrackStatistics
@@ -39,20 +40,21 @@ def find_cameras(
 ) -> FoundCameras:
     """Cameras and points of photos that are readable, by COLMAP, as `read_photos` has them."""
     names = photos.colmap_names
+    files = {name: file for file, name in reversed(names.items())}  # of a panorama its first face
     try:
         ran = run_colmap(
             list(names), photos.contents(), photos.guess(), photos.write, keep, on_stage, coarse, names
         )
-        poses = ran.poses()
+        poses = {names[file]: viewmat for file, viewmat in ran.poses().items() if file in files.values()}
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
     model = ran.found
     turns = {name: exif.quarter_turns for name, exif in zip(photos.names, photos.exif, strict=True)}
-    upright = _upright(np.stack(list(poses.values())), [turns[names[name]] for name in poses])
+    upright = _upright(np.stack(list(poses.values())), [turns[name] for name in poses])
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
     report = SfmReport(
-        photos=len(names),
-        not_registered=[name for own, name in names.items() if own not in poses],
+        photos=len(files),
+        not_registered=[name for name in photos.names if name not in poses],
         outliers=[],
         rotation_error_deg=None,
         translation_error=None,
@@ -68,7 +70,7 @@ def find_cameras(
         first_pass=ran.first_pass,
         advice=ran.advice(),
         lost=ran.lost(),
-        sure_px={names[file]: px for file, px in sureness(model).items()},
+        sure_px=_together(sureness(model), names),
     )
     return FoundCameras(photos, model, report)
 
@@ -93,20 +95,27 @@ def read_photos(
     cameras = find_cameras(root, photos, keep, on_stage, coarse)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    sizes = dict(zip(cameras.photos.names, cameras.photos.sizes, strict=True))
     details = frame_details(folder)
-    found: list[Photo] = []
+    found: dict[str, Photo] = {}
+    files = {name: file for file, name in reversed(names.items())}
     for file, viewmat in registered(model).items():
         name = names[file]
-        found.append(Photo(name, folder / name, of_image[file], viewmat, masks[name], details.get(name)))
-    placed = {photo.name for photo in found}
+        if file == files[name]:
+            camera = around(*sizes[name]) if cameras.photos.around else of_image[file]
+            found[name] = Photo(name, folder / name, camera, viewmat, masks[name], details.get(name))
+    placed = set(found)
     notes = [str(cameras.report), *cameras.photos.notes, *tell_strays(cameras.photos.strays, placed)]
     points, colors = keep_finite(*model_points(model), notes)
     seen = None
     if len(points) == model.num_points3D():
-        seen = {names[name]: rows for name, rows in seen_points(model).items()}
+        parts: dict[str, list[NDArray[np.intp]]] = {}
+        for file, rows in seen_points(model).items():
+            parts.setdefault(names[file], []).append(rows)
+        seen = {name: np.unique(np.concatenate(rows)) for name, rows in parts.items()}
     return Capture(
         "photos",
-        found,
+        [photo for _, photo in sorted(found.items())],
         cameras.photos.downscale,
         points,
         colors,
@@ -116,6 +125,17 @@ def read_photos(
         seen=seen,
         sfm=cameras.report,
     )
+
+
+def _together(sure: dict[str, float], names: dict[str, str]) -> dict[str, float]:
+    """`sureness` by photo from that by file: what the faces of a panorama tell of its pose adds up."""
+    told: dict[str, list[float]] = {}
+    for file, px in sure.items():
+        told.setdefault(names[file], []).append(px)
+    return {
+        name: float(np.square(np.reciprocal(px)).sum() ** -0.5) if len(px) > 1 else px[0]
+        for name, px in told.items()
+    }
 
 
 def _upright(viewmats: NDArray[np.float64], turns: list[int]) -> NDArray[np.float64]:

@@ -8,17 +8,19 @@ folder `masks`, each photo has a mask `NAME.png` there. COLMAP's files and the a
 `triangulate`: points for known cameras and poses, `points.npz` (points [P, 3] float32, colors [P, 3] uint8,
 and of each observation the numbers of the photo and of the point: photos [O], rows [O]).
 
-`reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is
-no model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes
-[C, 2], focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera,
-camera_of [V]. The first pass matches the pairs [P, 2], numbers of photos, where it has some; else all, or of
-many photos those that are alike. Where it has `coarse`, photos rich in detail are looked at coarsely, and
-again finely where too few find a place. Where too few do then, smoothed versions of the photos are looked at,
-first one and then all together. Where few photos have a place yet, another, more tolerant pass follows, with
-every pair; the better of the two counts. In the end observations are moved to where the photos agree.
-`facts.json` says what both came to, `stage.json` what is being done now, which is read from COLMAP's log: the
-caller sends the output to `log.txt`. A second call in the same DIRECTORY goes on with the features and
-matches that the first one left. The program ends when its standard input does.
+`reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is no
+model. Known cameras stay as they are. Of unknown ones, which are SIMPLE_RADIAL, `input.npz` has sizes [C, 2],
+focal lengths in px, focals [C], 0 where nothing is known, and the number of each photo's camera, camera_of
+[V]; where photos are faces of panoramas, the known focal lengths, and the rotations [F, 3, 3] of the F faces
+that each panorama has in `names`, one after the other. The first pass matches the pairs [P, 2], numbers of
+photos, where it has some; else all, or of many photos those that are alike. Where it has `coarse`, photos
+rich in detail are looked at coarsely, and again finely where too few find a place. Where too few do then,
+smoothed versions of the photos are looked at, first one and then all together. Where few photos have a place
+yet, another, more tolerant pass follows, with every pair; the better of the two counts. In the end
+observations are moved to where the photos agree. `facts.json` says what both came to, `stage.json` what is
+being done now, which is read from COLMAP's log: the caller sends the output to `log.txt`. A second call in
+the same DIRECTORY goes on with the features and matches that the first one left. The program ends when its
+standard input does.
 """
 
 from __future__ import annotations

@@ -62,6 +62,8 @@ class Guess:
     focals: list[float]  # px; 0: not known
     camera_of: list[int]  # of each photo, the number of its camera
     ordered: bool = False  # frames of a film: photos see what those before and after them see
+    rotations: NDArray[np.float64] | None = None  # [F, 3, 3]: of each photo come F faces, whose cameras are
+    # known but for their pose; maps the first one's frame into theirs
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,8 @@ def run_colmap(
         given["sizes"] = np.array(cameras.sizes)
         given["focals"] = np.array(cameras.focals, np.float64)
         given["camera_of"] = np.array(cameras.camera_of)
+        if cameras.rotations is not None:
+            given["rotations"] = cameras.rotations
         if cameras.ordered:
             given["pairs"] = film_pairs(len(names))
     else:
@@ -309,7 +313,7 @@ def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArr
         digest.update(part.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
-    for part in ("sizes", "Ks", "focals", "camera_of", "pairs"):
+    for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations"):
         if part in given:
             digest.update(given[part].tobytes())
     return digest.hexdigest()[:16]

@@ -1,0 +1,85 @@
+"""Photos of 360 x 180 degrees: how they are told from others, and the faces of them that COLMAP sees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from hqgs.base.evenly import evenly
+from hqgs.base.text import some
+from hqgs.photos.exif import Exif
+from hqgs.photos.files import Glance, UnreadableError, decode
+from hqgs.scene.faces import around, faces_of
+from hqgs.scene.views import to_pinhole
+
+LEAST = 3  # photos of a scene: one alone shows no depth
+LOOKED_AT = 8  # photos of which the files do not tell
+SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of a panorama are neighbours
+POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
+PLAIN = 0.25  # the same: a border with less shows nothing
+
+
+def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> bool:
+    """Whether the photos are panoramas of the whole sphere (equirectangular).
+
+    Their files say so (GPano), or they are twice as wide as high, end on the right where they begin on the
+    left, and show one point along their upper and lower borders. Where files do not say so, some of the
+    photos of that shape, spread over them, stand for the others.
+
+    ValueError where panoramas are mixed with other photos, are parts of a sphere, or are too few.
+    """
+    tagged = [name for name, tags in exif.items() if tags.panorama]
+    whole = [name for name, seen in looked.items() if seen.size[0] == 2 * seen.size[1]]
+    found = [name for name in whole if name in set(tagged)]
+    untold = [name for name in whole if name not in set(tagged)]
+    picks = [untold[k] for k in evenly(len(untold), LOOKED_AT)] if 2 * len(untold) > len(looked) else []
+    if 2 * sum(_closes(folder / name) for name in picks) > len(picks):
+        found = whole
+    if not found:
+        if 2 * len(tagged) <= len(looked):
+            return False
+        name = tagged[0]
+        width, height = looked[name].size
+        raise ValueError(
+            f"{folder}: {len(tagged)} of {len(looked)} photos say that they are panoramas, but are not twice "
+            f"as wide as high ({name}: {width} x {height} px): export the whole sphere, 360 x 180 degrees"
+        )
+    if others := [name for name in looked if name not in set(found)]:
+        raise ValueError(
+            f"{folder}: {len(found)} of {len(looked)} photos are panoramas of 360 x 180 degrees, others are "
+            f"not ({some(others)}): put each kind into a folder of its own"
+        )
+    if len(found) < LEAST:
+        raise ValueError(
+            f"{folder}: {len(found)} panorama{'s' * (len(found) > 1)} of 360 x 180 degrees ({some(found)}) "
+            f"show no depth, wanted at least {LEAST}: take 10 to 50, a step apart"
+        )
+    return True
+
+
+def _closes(path: Path) -> bool:
+    """Whether a picture looks like a panorama of the whole sphere."""
+    try:
+        pixels = decode(path)[0].astype(np.float32)
+    except UnreadableError:
+        return False
+    contrast = pixels.std((0, 1)).mean()
+    apart = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
+    seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
+    poles, border = pixels[[0, -1]].std(1).mean(1), pixels[:, 0].std(0).mean()
+    return bool(
+        seam <= SEAM * np.median(apart) and (poles <= POLE * contrast).all() and border > PLAIN * contrast
+    )
+
+
+def write_faces(path: Path, targets: list[Path], quality: int) -> None:
+    """The faces of a panorama as JPEG files, in the order of `faces_of`."""
+    pixels, _ = decode(path)
+    height, width = pixels.shape[:2]
+    camera = around(width, height)
+    for face, target in zip(faces_of(camera), targets, strict=True):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        view = to_pinhole(camera, width, height, face=face)
+        Image.fromarray(view.picture(pixels)).save(target, quality=quality, subsampling=0)

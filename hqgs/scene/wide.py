@@ -1,0 +1,55 @@
+"""Captures whose photos see more than a flat picture holds: each photo becomes faces of a cube."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.scene.capture import Capture, Photo
+from hqgs.scene.faces import CUBE, WIDE, Face, face_name, faces_of
+
+
+def with_faces(capture: Capture) -> Capture:
+    """The capture with the faces of its wide photos in their place."""
+    faces = {photo.name: faces_of(photo.camera) for photo in capture.photos}
+    wide = [name for name, found in faces.items() if found]
+    if not wide:
+        return capture
+    called = {name: [face_name(name, face.name) for face in found] or [name] for name, found in faces.items()}
+    photos, seen = list[Photo](), dict[str, NDArray[np.intp]]()
+    for photo in capture.photos:
+        rows = None if capture.seen is None else capture.seen.get(photo.name)
+        if not faces[photo.name]:
+            photos.append(photo)
+            if rows is not None:
+                seen[photo.name] = rows
+        for name, face in zip(called[photo.name], faces[photo.name], strict=False):
+            viewmat = np.eye(4)
+            viewmat[:3] = face.rotation @ photo.viewmat[:3]
+            photos.append(replace(photo, name=name, viewmat=viewmat, face=face, film=None))
+            if rows is not None:
+                seen[name] = rows[_shown(face, viewmat, capture.points[rows])]
+    tests = capture.test_names
+    most = max(len(found) for found in faces.values())
+    note = (
+        f"{len(wide)} photos see {'all around' if most == len(CUBE) else f'{WIDE:g} degrees and more'}: each "
+        f"is used as {most} faces of a cube, called {', '.join(called[wide[0]][:2])} and so on"
+    )
+    return replace(
+        capture,
+        photos=sorted(photos, key=lambda photo: photo.name),
+        seen=None if capture.seen is None else seen,
+        test_names=None if tests is None else frozenset(own for name in tests for own in called[name]),
+        near_far={own: depths for name, depths in capture.near_far.items() for own in called[name]},
+        notes=[*capture.notes, note],
+    )
+
+
+def _shown(face: Face, viewmat: NDArray[np.float64], points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points [P, 3] lie before a face and within its picture."""
+    pixels = (points @ viewmat[:3, :3].T + viewmat[:3, 3]) @ face.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = pixels[:, :2] / pixels[:, 2:]
+    return (pixels[:, 2] > 0) & ((at >= 0) & (at <= (face.width, face.height))).all(-1)
