@@ -421,9 +421,9 @@ def test_the_second_pass_takes_more() -> None:
     """A few photos of the first pass lead to a second one, whose thresholds are all lower."""
     first, second = (Attempt.__new__(Attempt) for _ in range(2))
     first.tolerant, second.tolerant = False, True
-    first.coarse = second.coarse = False
+    first.coarse = second.coarse = first.fixed = second.fixed = False
     assert second._geometry().min_num_inliers < first._geometry().min_num_inliers
-    mild, strict = second._mapping(False), first._mapping(False)
+    mild, strict = second._mapping(), first._mapping()
     assert mild.min_num_matches < strict.min_num_matches
     for name in ("init_min_num_inliers", "init_min_tri_angle", "abs_pose_min_num_inliers"):
         assert getattr(mild.mapper, name) < getattr(strict.mapper, name)

@@ -256,7 +256,7 @@ def test_faces_of_one_photo_are_no_pair() -> None:
 
 def test_the_room_as_panoramas() -> None:
     """What goes over a panorama is what a pinhole sees, but for what its pixels are too coarse for."""
-    room = panorama_room(width=96, places=2)
+    room = panorama_room(width=64, places=2)
     assert [view.name for view in room.scene.test] == [
         f"panorama_00.{face}.png" for face in CUBE if face != "back"
     ]
