@@ -460,10 +460,10 @@ def test_observations_that_lie_far_off_do_not_turn_the_cameras(
     for image in one.model.images.values():
         for point in list(image.points2D)[::10]:
             point.xy = np.add(point.xy, (3.0, 0.0))
-    pycolmap.bundle_adjustment(one.model, one._mapping(False).get_global_bundle_adjustment())
+    pycolmap.bundle_adjustment(one.model, one._mapping().get_global_bundle_adjustment())
     one.model.update_point_3d_errors()
     turned = rotation_angles(rotations(one.model) @ right.swapaxes(1, 2))
-    one._settle(one.model, False)
+    one._settle(one.model)
     settled = rotation_angles(rotations(one.model) @ right.swapaxes(1, 2))
     assert np.median(settled) < 0.3 * np.median(turned)
 

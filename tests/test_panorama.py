@@ -21,7 +21,7 @@ from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Camera, View
 from hqgs.scene.sfm.align import align, rotation_angles
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
-from hqgs.scene.sfm.likely import apart
+from hqgs.scene.sfm.likely import pairs_of_faces
 
 Floats = NDArray[np.float64]
 HALF = np.array([3.0, 1.5, 4.0])  # of a box-shaped room around the origin
@@ -245,11 +245,11 @@ def test_what_is_no_walk_of_panoramas_is_refused_by_name(tmp_path: Path) -> None
 
 
 def test_faces_of_one_photo_are_no_pair() -> None:
-    pairs = apart(12, 6)
+    pairs = pairs_of_faces(12, 6)
     assert len(pairs) == 36
     assert (pairs[:, 0] // 6 == 0).all()
     assert (pairs[:, 1] // 6 == 1).all()
-    some = apart(18, 6, np.array([[0, 1], [0, 13]]))
+    some = pairs_of_faces(18, 6, np.array([[0, 1], [0, 13]]))
     alike = {(k, k + 6 * n) for k in range(18) for n in (1, 2) if k + 6 * n < 18}
     assert {(a, b) for a, b in some.tolist()} == alike | {(0, 13)}
 

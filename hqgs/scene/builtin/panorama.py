@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
-from hqgs.scene.builtin.points import TIME_LIMIT
 from hqgs.scene.builtin.scene import assemble
 from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.builtin.wild import WildRoom
@@ -59,8 +58,6 @@ def panorama_room(
     cache: Path | None = None,
     width: int = WIDTH,
     places: int = PLACES,
-    time_limit: float = TIME_LIMIT,
-    threads: int | None = None,
 ) -> WildRoom:
     """The room by a camera that sees all around: ray-cast panoramas of `width` px, cut into faces of cubes.
 
@@ -87,9 +84,6 @@ def panorama_room(
         "true-panorama",
         list(cameras.values()),
         None if cache is None else cache / "clean",
-        time_limit,
-        threads,
-        None,
         {"cameras": "panorama", "places": places},
         held_out=held_out,
         names=list(cameras),
@@ -99,7 +93,7 @@ def panorama_room(
     names = {k: f"panorama_{k:02d}.png" for k in range(places) if k % TEST_EVERY}
     kept = None if folder is None else read_kept(folder, made, list(names.values()))
     if kept is None:
-        kept = Kept({name: render_panorama(poses[k], width, threads) for k, name in names.items()}, {}, "")
+        kept = Kept({name: render_panorama(poses[k], width) for k, name in names.items()}, {}, "")
         if folder is not None:
             write_kept(folder, made, kept)
     camera = around(width, width // 2)
@@ -114,9 +108,7 @@ def panorama_room(
     return WildRoom(replace(clean, train=train, notes=[*clean.notes, note]), clean, {})
 
 
-def render_panorama(
-    viewmat: NDArray[np.float64], width: int = WIDTH, threads: int | None = None
-) -> NDArray[np.uint8]:
+def render_panorama(viewmat: NDArray[np.float64], width: int = WIDTH) -> NDArray[np.uint8]:
     """The panorama [width / 2, width, 3] at a pose, sRGB.
 
     The room is ray-cast on the faces of a cube, FINER times as densely, with a border that hides their
@@ -141,7 +133,7 @@ def render_panorama(
     for k, rotation in enumerate(CUBE.values()):
         pose = np.eye(4)
         pose[:3] = rotation @ viewmat[:3]
-        picture = to_linear(render_view(Camera(2 * half, 2 * half, K, pose), 2, threads) / np.float32(255))
+        picture = to_linear(render_view(Camera(2 * half, 2 * half, K, pose), 2) / np.float32(255))
         mine = nearest == k
         seen = rays[mine] @ rotation.T
         at = focal * seen[:, 1::-1] / seen[:, 2:] + half - 0.5  # rows and columns of pixel centres

@@ -92,7 +92,8 @@ class Model:
     def lost(self) -> dict[str, str]:
         """Photos that have no place, sorted, and why."""
         placed, one = registered(self.found), self._chosen
-        lost = {self._name(name): why_lost(name, one) for name in one.features if name not in placed}
+        rich = sorted(one.features, key=lambda name: one.features[name])  # of faces the last one tells
+        lost = {self._name(name): why_lost(name, one) for name in rich if name not in placed}
         return dict(sorted(lost.items()))
 
     def advice(self) -> str | None:
@@ -101,7 +102,7 @@ class Model:
         return f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else None
 
     def _to_take(self) -> str:
-        names = sorted(map(self._name, self._chosen.features))
+        names = sorted(set(map(self._name, self._chosen.features)))
         apart = [sorted(map(self._name, group)) for group in self._chosen.apart]
         told = what_to_take(self.lost(), names, apart)
         return told[:1].upper() + told[1:]
