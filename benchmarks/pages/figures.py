@@ -1,7 +1,7 @@
 """What the pages compute of the tables: means, gains with their scatter, tables, where runs are from.
 
 A gain is the mean of differences between two rows in runs that share scene, photos, seed and length. Its
-scatter is the standard error of that mean; a difference of less than SURE of them is not called a gain.
+scatter is half its interval (`hqgs.evaluation.intervals`); a difference within it is not called a gain.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from pandas import DataFrame
 
 from benchmarks.rows import RUN
+from hqgs.evaluation.intervals import half_width
 
 NOTHING = "–"  # in the place of a number that there is not
-SURE = 2.0  # standard errors
 MANY = 12  # commits are counted, not listed
 NONE = "none"  # the degradation of photos that are as they were
 GROUP = [name for name in RUN if name != "row"]  # what runs share that are compared
@@ -59,12 +58,12 @@ class Gain:
 
     @cached_property
     def error(self) -> float | None:
-        """Standard error of the mean; None of a single run."""
-        return float(self.runs["gain"].std(ddof=1) / np.sqrt(self.count)) if self.count > 1 else None
+        """Half the interval of the mean over runs; None of a single run."""
+        return half_width(self.runs["gain"].tolist())
 
     @property
     def sure(self) -> bool:
-        return self.error is not None and abs(self.mean) > SURE * self.error
+        return self.error is not None and abs(self.mean) > self.error
 
     def text(self, form: str = "+.2f") -> str:
         """`+1.99 ± 0.36`."""
@@ -242,7 +241,7 @@ def beside(
         whole = gain(part, row, base)
         cells = [gain(part, row, base, scene=scene) for scene in scenes]
         means = [mean(part.loc[part["row"] == name]) for name in (base, row)]
-        means += [format(one.mean, "+.2f") if one.count else NOTHING for one in cells]
+        means += [one.text() for one in cells]
         body.append(
             [str(label), *means, whole.text(), format(whole.worst, "+.2f") if whole.count else NOTHING]
         )

@@ -57,7 +57,7 @@ def unbeaten_default(accuracy: DataFrame) -> str:
 
 
 def features_table(runs: DataFrame) -> str:
-    """What each feature costs, with the standard error, and by how much a step is faster with it."""
+    """What each feature costs, with half its interval, and by how much a step is faster with it."""
     body = []
     for row in dict.fromkeys(runs["row"]):
         if row == "default":
@@ -77,7 +77,7 @@ def _cost(found: Gain) -> str:
 def passes(whole: Gain, grown: Gain) -> bool:
     """Whether a feature may be on: whole runs fail it only where they are sure to be over the limit, the
     Gaussians that were grown once, which scatter little, where they are."""
-    sure = -whole.mean - 2.0 * (whole.error or 0.0)
+    sure = -whole.mean - (whole.error or 0.0)
     return max(sure, -grown.mean if grown.count else -np.inf) <= LIMIT_DB
 
 

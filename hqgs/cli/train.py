@@ -24,7 +24,7 @@ from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
 from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
-from hqgs.evaluation.verdict import judged_by, verdict
+from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
@@ -332,8 +332,8 @@ def _asked(options: Train, config: TrainConfig) -> dict[str, Any]:
 def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     out, last = options.out, done.history[-1]
     numbers = [f"{done.iterations} iterations", f"{len(done.model)} Gaussians", f"{done.seconds:.0f} s"]
-    numbers += [] if last["psnr"] is None else [f"PSNR {last['psnr']:.2f} dB"]
-    numbers += [] if last["ssim"] is None else [f"SSIM {last['ssim']:.4f}"]
+    found, ssim = (told(done.report, *form) for form in (("psnr", ".2f"), ("ssim", ".4f")))
+    numbers += ([f"PSNR {found} dB"] if found else []) + ([f"SSIM {ssim}"] if ssim else [])
     print(f"{out}: {', '.join(numbers)}")
     if table := format_left_out(done.left_out):
         print(table)

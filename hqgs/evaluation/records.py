@@ -57,6 +57,8 @@ class MetricsRecord(TypedDict):
     """The held-out views of a run, measured."""
 
     mean: MetricValues
+    interval: MetricValues  # half of that of each mean; older runs do not tell
+    confidence: float  # of the intervals
     views: list[ViewMetricValues]
     reasons: dict[str, str]  # metric -> why the mean is None
 

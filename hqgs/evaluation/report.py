@@ -19,6 +19,7 @@ from hqgs.base.files import atomic_path, write_json
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
+from hqgs.evaluation.intervals import CONFIDENCE, half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.evaluation.records import (
     GuardRecord,
@@ -228,6 +229,8 @@ def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | No
     pictures = [None] * len(metrics) if files is None else [f"{PICTURES}/{file}" for file in files]
     measured: MetricsRecord = {
         "mean": _values(mean),
+        "interval": cast(MetricValues, half_widths([vars(m) for m in metrics], METRICS)),
+        "confidence": CONFIDENCE,
         "views": [
             {"name": name, **_values(m), "picture": picture}
             for name, m, picture in zip(names_of(result.views), metrics, pictures, strict=True)

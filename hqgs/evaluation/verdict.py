@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from hqgs.evaluation.intervals import with_half
+
 _LEVELS = (
     (
         20.0,
@@ -35,3 +37,10 @@ def judged_by(report: Mapping[str, Any]) -> tuple[float | None, str]:
     if exposed and mean.get("psnr_aligned") is not None:
         return mean["psnr_aligned"], "PSNR with each photo's brightness and tint set aside"
     return mean["psnr"], "PSNR"
+
+
+def told(report: Mapping[str, Any], metric: str, form: str) -> str | None:
+    """`28.31 ± 0.42`: a mean with half its interval, where the report tells one; None without a value."""
+    measured = report["metrics"]
+    value, half = (measured.get(of, {}).get(metric) for of in ("mean", "interval"))
+    return None if value is None else with_half(value, half, form)

@@ -21,7 +21,7 @@ from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
 from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMetricValues, alike
-from hqgs.evaluation.verdict import judged_by, verdict
+from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.paths import focus, scene_up
@@ -64,7 +64,8 @@ def told_verdict(report: Report) -> str:
     if psnr is None:
         return text
     count = len(report["metrics"]["views"])
-    return f"{text} Measured on {count} held-out photo{'s' * (count > 1)}: {psnr:.1f} dB {name}."
+    value = told(report, "psnr" if psnr == report["metrics"]["mean"]["psnr"] else "psnr_aligned", ".1f")
+    return f"{text} Measured on {count} held-out photo{'s' * (count > 1)}: {value} dB {name}."
 
 
 def summary_html(report: Report, views: Sequence[RenderedView]) -> str:
@@ -141,10 +142,10 @@ def _line(history: Sequence[HistoryEntry], key: str) -> list[tuple[float, float]
 
 
 def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
-    mean = report["metrics"]["mean"]
+    psnr = told(report, "psnr", ".2f")
     facts = [
-        ("PSNR, held out", "-" if mean["psnr"] is None else f"{mean['psnr']:.2f} dB"),
-        ("SSIM, held out", "-" if mean["ssim"] is None else f"{mean['ssim']:.3f}"),
+        ("PSNR, held out", "-" if psnr is None else f"{psnr} dB"),
+        ("SSIM, held out", told(report, "ssim", ".3f") or "-"),
         ("Gaussians", f"{report['gaussians']:,}"),
         ("training", _time(report["seconds"])),
         ("photos trained on", f"{len(scene.train)}"),
