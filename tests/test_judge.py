@@ -66,12 +66,15 @@ def test_our_own_runs_bit_for_bit(run: Path, tmp_path: Path, capsys: pytest.Capt
     found = [json.loads((tmp_path / name / "judge.json").read_text())["scene"] for name in ("", "file")]
     for one in [*found, json.loads((tmp_path / "eval.json").read_text())]:
         assert one["mean"] == report["metrics"]["mean"]
+        assert one["interval"] == report["metrics"]["interval"]
         for view in report["metrics"]["views"]:
             known = {metric: view[metric] for metric in METRICS}
             assert {metric: one["views"][view["name"]][metric] for metric in METRICS} == known
+    sure = f"{found[0]['mean']['psnr']:.2f} ± {found[0]['interval']['psnr']:.2f}"
+    assert f"{sure} dB" in (run / "report.html").read_text()
+    assert sure in told
     assert found[0]["gaussians"] == report["gaussians"]
     assert found[0]["bytes"] == report["scene_bytes"]
-    assert f"{found[0]['mean']['psnr']:.2f} ± {found[0]['interval']['psnr']:.2f}" in told
     for view in found[0]["views"].values():
         parts = sum(view["causes"][part] for part in PARTS)
         assert parts == pytest.approx(view["causes"]["mse"], rel=1e-9)
