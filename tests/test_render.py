@@ -15,6 +15,7 @@ import hqgs
 from hqgs.cli import main as cli
 from hqgs.scene.camera_files import load_cameras, save_path
 from hqgs.scene.paths import resized
+from hqgs.show.frames import _along_a_curve
 
 
 @pytest.fixture(scope="module")
@@ -169,3 +170,14 @@ def test_films_of_mixed_sizes_and_unknown_kinds(folder: Path, tmp_path: Path) ->
     with pytest.raises(ValueError, match=r"a\.mov is no folder; films are \.mp4 or \.gif, a single picture"):
         hqgs.render_frames(model, [small], tmp_path / "a.mov")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_neighbours_come_together_whatever_lies_far_out() -> None:
+    torch.manual_seed(0)
+    points = torch.rand(4096, 3)
+    points[7], points[8] = 1e6, torch.nan
+    order = _along_a_curve(points)
+    assert torch.equal(order.sort().values, torch.arange(4096))
+    steps = points[order].diff(dim=0).norm(dim=1).nanmedian()
+    assert steps < 0.2 * points.diff(dim=0).norm(dim=1).nanmedian()  # 4,096 fill a cube at a spacing of 1/16
+    assert not len(_along_a_curve(torch.zeros(0, 3)))

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from torch import Tensor
 
 from hqgs.base.evenly import evenly
 from hqgs.base.files import FILM_SUFFIXES, atomic_path
@@ -31,6 +32,11 @@ CRF = "18"  # of x264: no difference that an eye finds
 SAMPLES = 8  # frames that say which depths a film shows
 OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
 DEPTHS = (2, 98)  # percentiles of the depths that get the ends of the colour scale
+SAMPLED, BOUNDS, BITS = (
+    100_000,
+    (0.02, 0.98),
+    10,
+)  # points, quantiles and bits of an axis that make the curve's cells
 Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], None]
 
@@ -123,11 +129,29 @@ def frames(
         yield from (depth_picture(*prepared.depth(camera), low_high) for camera in cameras)
 
 
+def _along_a_curve(means: Tensor) -> Tensor:
+    """Indices of points in the order of a curve that visits together what lies together (Morton 1966)."""
+    points = means.double().nan_to_num()
+    few = points[:: max(len(points) // SAMPLED, 1)]
+    if not len(few):
+        return torch.arange(0)
+    low, high = torch.quantile(few, torch.tensor(BOUNDS, dtype=torch.float64), dim=0)
+    cells = ((points - low) / (high - low).clamp(min=1e-12)).clamp(0, 1).mul(2**BITS - 1).long()
+    code = torch.zeros(len(points), dtype=torch.long)
+    for bit in range(BITS):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << 3 * bit + axis
+    return code.argsort(stable=True)
+
+
 class Activated:
-    """Gaussians that are rendered many times: activated once, without a gradient history."""
+    """Gaussians that are rendered many times: activated once, without a gradient history, and neighbours
+    together, so that a camera passes over whole groups that it does not see."""
 
     def __init__(self, gaussians: Gaussians) -> None:
         g = gaussians.detached()
+        with one_torch_thread():
+            g = g.rows(_along_a_curve(g.means))
         self.degree: int = g.sh_degree
         colors = (g.sh0, g.shN) if g.sh_degree else g.sh0
         self._how: dict[str, Any] = {
