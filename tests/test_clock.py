@@ -22,11 +22,10 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, plan_length
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config
+from hqgs.training.constants import ENOUGH, FOR_EACH_PHOTO, GROWS_FROM, PIXELS
 from hqgs.training.notes import run_notes
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
-from hqgs.training.plan_budget import PIXELS
-from hqgs.training.plan_rules import ENOUGH, FOR_EACH_PHOTO, GROWS_FROM
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import plan_values, with_iterations, with_plan
 from hqgs.training.trainer import Trainer
@@ -67,12 +66,14 @@ def test_as_many_iterations_as_fit() -> None:
         return round(0.6 * iterations)
 
     fits = plan_length.fitting(60.0, steps, 1.0, half_until)
-    assert (0.6 * 0.02 + 0.4 * 0.1) * plan_length.GROWTH * fits == pytest.approx(60.0, rel=2e-2)
+    assert (0.6 * 0.02 + 0.4 * 0.1) * plan_length.SLOWER * fits == pytest.approx(60.0, rel=2e-2)
     dense = plan_length.fitting(60.0, steps, 3.0, half_until)
-    assert dense == pytest.approx(fits * plan_length.GROWTH / plan_length.GROWTH_DENSE, abs=2)
+    assert dense == pytest.approx(fits * plan_length.SLOWER / plan_length.SLOWER_DENSE, abs=2)
     assert plan_length.fitting(60.0, steps, 1.0, half_until, most=100) == 100
-    assert plan_length.fitting(1e-3, steps, 1.0, half_until) == plan_length.FEWEST
-    assert plan_length.fitting(1e9, steps, 1.0, half_until) == pytest.approx(plan_length.MOST, abs=1)
+    assert plan_length.fitting(1e-3, steps, 1.0, half_until) == plan_length.FEWEST_ITERATIONS
+    assert plan_length.fitting(1e9, steps, 1.0, half_until) == pytest.approx(
+        plan_length.MOST_ITERATIONS, abs=1
+    )
 
 
 @pytest.mark.parametrize("formation", ["none", "exposure", "noise:12"])
@@ -90,8 +91,8 @@ def test_steps_that_are_timed_leave_nothing_behind(formation: str, tmp_path: Pat
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan_length, "FEWEST", 30)
-    monkeypatch.setattr(plan_length, "MOST", 31)
+    monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 30)
+    monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
     run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
     plan = json.loads((tmp_path / "a" / PLAN).read_text())
@@ -112,8 +113,8 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although it is prepared twice: to be timed, and to be trained."""
     seen = inspected(monkeypatch)
-    monkeypatch.setattr(plan_length, "FEWEST", 5)
-    monkeypatch.setattr(plan_length, "MOST", 6)
+    monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 5)
+    monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 6)
     scene = tiny_scene()
     hqgs.train(scene, seconds=0.1)
     assert sorted(seen) == sorted(view.name for view in scene.train)
@@ -204,7 +205,7 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     assert (long.config.iterations, long.plan.follows_clock) == (1_050, False)
     assert any("more looks at the same photos do not pay" in note for note in run_notes(long))
     short_of = timed(1e-3)
-    assert (short_of.config.iterations, short_of.plan.follows_clock) == (plan_length.FEWEST, True)
+    assert (short_of.config.iterations, short_of.plan.follows_clock) == (plan_length.FEWEST_ITERATIONS, True)
 
 
 def test_a_run_without_a_number_can_be_made_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,10 @@ from hqgs.pipeline import open_run, run_to_end
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import DensifyConfig, ESFGConfig, PaperConfig
+from hqgs.training.constants import SCS_CACHE_BYTES
 from hqgs.training.densify import Densifier
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.paper import CACHE_BYTES, VARIANTS, PaperHQGS
+from hqgs.training.methods.paper import VARIANTS, PaperHQGS
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.methods.scs import scs_loss
 from hqgs.training.trainer import Trainer
@@ -463,8 +464,8 @@ def test_views_of_one_name_are_not_confused() -> None:
 
 def test_weights_beyond_the_memory_for_them_are_computed_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
-    for room in (CACHE_BYTES, 0):
-        monkeypatch.setattr("hqgs.training.methods.paper.CACHE_BYTES", room)
+    for room in (SCS_CACHE_BYTES, 0):
+        monkeypatch.setattr("hqgs.training.methods.paper.SCS_CACHE_BYTES", room)
         found.append(bits(run("V7", 8)))
     assert found[0] == found[1]
 

@@ -17,7 +17,8 @@ from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
 from hqgs.training import plan_rules
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig, parse_leave_out
-from hqgs.training.schedule import COARSE_PART, smaller
+from hqgs.training.constants import COARSE_PART
+from hqgs.training.schedule import smaller
 from hqgs.training.trainer import Trainer
 
 VIEWS = 13  # one is a test view; of twelve, one is held back

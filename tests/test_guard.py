@@ -19,7 +19,8 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import train
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
-from hqgs.training.guard import KEPT, LISTED, bad_rows, is_sound
+from hqgs.training.constants import EVENTS_KEPT, GAUSSIANS_LISTED
+from hqgs.training.guard import bad_rows, is_sound
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.trainer import Trainer
 
@@ -225,15 +226,17 @@ def test_a_method_s_own_gradient_is_named_and_costs_no_gaussian(faulty: Faulty) 
 def test_many_events_are_counted_and_the_first_kept(faulty: Faulty) -> None:
     faulty.tensor, faulty.rows = "means", list(range(15))
     trainer = Trainer(tiny_scene(num_points=800), tiny_config(60, method="faulty", densify=ONLY_TRAIN))
-    for k in range(KEPT + 5):
+    for k in range(EVENTS_KEPT + 5):
         faulty.steps, faulty.at = 0, 1
         trainer.step()
         faulty.at = 0
         trainer.step()
         assert trainer.guard.culled == 15 * (k + 1)
-    assert trainer.guard.num_events == KEPT + 5
-    assert [e["iteration"] for e in trainer.guard.events] == list(range(1, 2 * KEPT, 2))
-    assert all(e["gaussians"] == list(range(LISTED)) and e["count"] == 15 for e in trainer.guard.events)
+    assert trainer.guard.num_events == EVENTS_KEPT + 5
+    assert [e["iteration"] for e in trainer.guard.events] == list(range(1, 2 * EVENTS_KEPT, 2))
+    assert all(
+        e["gaussians"] == list(range(GAUSSIANS_LISTED)) and e["count"] == 15 for e in trainer.guard.events
+    )
 
 
 def test_what_the_guard_knows_outlives_a_checkpoint(faulty: Faulty, tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import run_to_end
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import View
-from hqgs.training.methods.held_pixels import FACTOR, LEAST, SHARE, STEPS, HeldPixels, Plateau
+from hqgs.training.constants import HELD_PIXELS, PLATEAU_FACTOR, PLATEAU_LEAST, PLATEAU_STEPS
+from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.hqgs import HQGS
 from hqgs.training.trainer import Trainer
 
@@ -53,7 +54,7 @@ class Held:
 def look(held: Held, given: Photos, offset: float) -> None:
     """As many steps as lie between two looks, with renders that are `offset` off."""
     names = list(given)
-    for k in range(len(names) * -(-STEPS // len(names))):
+    for k in range(len(names) * -(-PLATEAU_STEPS // len(names))):
         name = names[k % len(names)]
         held.see(name, given[name][0] + offset)
 
@@ -64,10 +65,10 @@ def test_a_fiftieth_of_the_pixels_that_count_is_held_back() -> None:
     given = photos(2) | {"mask.png": (photos()["0.png"][0], mask)}
     masks = Held(given).masks
     assert {name: int((~m).sum()) for name, m in masks.items() if name != "mask.png"} == {
-        "0.png": SHARE * 600,
-        "1.png": SHARE * 600,
+        "0.png": 600 / HELD_PIXELS,
+        "1.png": 600 / HELD_PIXELS,
     }
-    assert int(masks["mask.png"].sum()) == 200 - SHARE * 200
+    assert int(masks["mask.png"].sum()) == 200 - 200 // HELD_PIXELS
     assert not masks["mask.png"][~mask].any()
     assert int(mask.sum()) == 200  # the given one is as it was
     assert not torch.equal(masks["0.png"], masks["1.png"])
@@ -93,10 +94,18 @@ def test_rates_are_halved_at_each_look_without_a_gain() -> None:
     for offset in (0.5, 0.4, 0.4, 0.41, 0.39, 0.395, 0.3):
         look(held, given, offset)
         rates.append(held.rate_left)
-    assert rates == [1, 1, FACTOR, FACTOR**2, FACTOR**2, FACTOR**3, FACTOR**3]
+    assert rates == [
+        1,
+        1,
+        PLATEAU_FACTOR,
+        PLATEAU_FACTOR**2,
+        PLATEAU_FACTOR**2,
+        PLATEAU_FACTOR**3,
+        PLATEAU_FACTOR**3,
+    ]
     for _ in range(25):
         look(held, given, 0.6)
-    assert held.rate_left == LEAST > 0
+    assert held.rate_left == PLATEAU_LEAST > 0
 
 
 def test_photos_are_compared_with_themselves() -> None:
@@ -123,9 +132,9 @@ def test_what_is_not_finite_is_passed_over() -> None:
     held.see("0.png", torch.full((*SIZE, 3), torch.nan))
     look(held, given, 0.4)
     look(held, given, 0.4)
-    assert held.rate_left == FACTOR
+    assert held.rate_left == PLATEAU_FACTOR
     look(held, given, torch.nan)
-    assert held.rate_left == FACTOR
+    assert held.rate_left == PLATEAU_FACTOR
 
 
 def test_its_state_goes_on_where_it_was() -> None:
@@ -139,7 +148,7 @@ def test_its_state_goes_on_where_it_was() -> None:
     for held in (one, other):
         for k in range(100, 201):
             held.see(f"{k % 3}.png", given[f"{k % 3}.png"][0] + 0.4)
-    assert one.rate_left == other.rate_left == FACTOR**2
+    assert one.rate_left == other.rate_left == PLATEAU_FACTOR**2
     ends = one.plateau.state_dict(), other.plateau.state_dict()
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
     with pytest.raises(ValueError, match=r"sums is \[3\], wanted \[2\]"):
@@ -164,7 +173,7 @@ def test_a_scene_that_learns_the_noise_is_found_out(tmp_path: Path) -> None:
         trainer.step()
         if trainer.iteration == 700:
             trainer.save(tmp_path / "c")
-    assert trainer.method.rate_left <= FACTOR**2
+    assert trainer.method.rate_left <= PLATEAU_FACTOR**2
     errors = [error_of_grey(t, scene.train) for t in (trainer, constant)]
     assert errors[0] < 0.97 * errors[1]
     run_to_end(trainer, tmp_path / "out")  # which only writes

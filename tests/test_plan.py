@@ -93,8 +93,8 @@ def test_seconds_are_a_fact_of_the_machine() -> None:
     config = replace(run_config(method="3dgs"), seconds=60.0)
     facts = replace(facts_of(tiny_scene()), as_photographed=True)
     slow, fast = (plan_run(replace(facts, seconds=StepSeconds(s, s / 4)), None, config) for s in (0.1, 0.01))
-    assert slow.settings.iterations == pytest.approx(60 / (0.1 * plan_length.GROWTH), rel=0.01)
-    assert fast.settings.iterations == pytest.approx(60 / (0.01 * plan_length.GROWTH), rel=0.01)
+    assert slow.settings.iterations == pytest.approx(60 / (0.1 * plan_length.SLOWER), rel=0.01)
+    assert fast.settings.iterations == pytest.approx(60 / (0.01 * plan_length.SLOWER), rel=0.01)
     assert slow.follows_clock
     assert not planned(config, tiny_scene().train).follows_clock
 
@@ -117,8 +117,8 @@ def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_pat
 
 def test_a_run_of_seconds_resumes_by_the_same_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped in the middle, and at its end: its length is the one that was planned, not 30,000."""
-    monkeypatch.setattr(plan_length, "FEWEST", 40)
-    monkeypatch.setattr(plan_length, "MOST", 41)
+    monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 40)
+    monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 41)
 
     config = replace(run_config(leave_out="none", method="3dgs"), seconds=1e3)
 

@@ -27,8 +27,9 @@ from hqgs.scene.builtin import embedded_scene
 from hqgs.scene.scene import Scene, View
 from hqgs.training import forward
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method
+from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.methods.base import Target, ThreeDGS, photo_tensors
-from hqgs.training.trainer import MAX_SKIPPED_IN_A_ROW, Trainer, TrainingError
+from hqgs.training.trainer import Trainer, TrainingError
 
 ONLY_TRAIN = DensifyConfig(stop=0)
 

@@ -47,7 +47,8 @@ def run(options: Clean) -> int:
             ready(options.photos)
         from hqgs.model.gaussians import Gaussians  # here: they load torch
         from hqgs.scene.source import load, load_again
-        from hqgs.training.cleaning import STEPS, clean
+        from hqgs.training.cleaning import clean
+        from hqgs.training.constants import CLEANING_STEPS
 
         with LoadingScreen() as screen:
             if options.photos is None:
@@ -58,7 +59,7 @@ def run(options: Clean) -> int:
                 scene = load(options.photos, downscale=factor, longest=longest, on_stage=screen.stage)
             gaussians = Gaussians.load(source)
             done = clean(
-                gaussians.in_world(scene.world), scene, options.steps or STEPS, on_stage=screen.stage
+                gaussians.in_world(scene.world), scene, options.steps or CLEANING_STEPS, on_stage=screen.stage
             )
         kept = len(done.gaussians)
         words = (

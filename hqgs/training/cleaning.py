@@ -23,12 +23,10 @@ from hqgs.model.render import render_view
 from hqgs.scene.scene import Scene
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
+from hqgs.training.constants import CLEANING_DECAY, CLEANING_DROPOUT, CLEANING_STEPS
 from hqgs.training.few_photos import decay_opacities, with_dropout
 from hqgs.training.guard import gradient_fault
 from hqgs.training.methods.base import ThreeDGS
-
-STEPS = 600  # 300 gain 1.0 dB on the room of 8 photos, 600 gain 1.2
-DECAY, DROPOUT = 0.01, 0.2  # shares, as in few_photos.py; half the decay takes twice the steps
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class Cleaned:
 
 
 def clean(
-    gaussians: Gaussians, scene: Scene, steps: int = STEPS, seed: int = 0, on_stage: OnStage = silent
+    gaussians: Gaussians, scene: Scene, steps: int = CLEANING_STEPS, seed: int = 0, on_stage: OnStage = silent
 ) -> Cleaned:
     """The Gaussians fitted on to the scene's training photos for so many steps.
 
@@ -86,7 +84,7 @@ def clean(
     with one_torch_thread():
         targets = [method.prepare(view) for view in scene.train]
         for k, number in enumerate(order.tolist()):
-            some = with_dropout(fitted, DROPOUT, seed, k + 1)
+            some = with_dropout(fitted, CLEANING_DROPOUT, seed, k + 1)
             camera = scene.train[number].camera
             render, _ = render_view(some, camera, fitted.sh_degree, config.background)
             render.retain_grad()
@@ -94,7 +92,7 @@ def clean(
             method.loss(render, targets[number]).backward()
             if gradient_fault(fitted, optimizer, render) is None:
                 optimizer.step()
-            decay_opacities(fitted.opacities, DECAY)
+            decay_opacities(fitted.opacities, CLEANING_DECAY)
             on_stage(Stage("steps of cleaning", k + 1, steps))
         fitted = fitted.detached()
         shown = fitted.activated_opacities() >= ALPHA_MIN

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE
 from hqgs.photos.formula import parse_formation
+from hqgs.training.constants import EVALUATIONS_APART
 
 AUTO, NONE = "auto", "none"
 METHODS = {
@@ -26,7 +27,6 @@ ITEMS = {
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
-CLOSEST = 50  # iterations between evaluations, unless asked for: each one takes as long as some steps
 Loss = Literal["l1", "l1+dssim", "l1+scs"]
 
 
@@ -282,8 +282,8 @@ def run_config(
 ) -> TrainConfig:
     """The configuration of a run as users ask for it: these are the options of `hqgs.train`.
 
-    The schedule is fitted to the length; without `eval_every` evaluations are at least CLOSEST iterations
-    apart. ValueError for a name that there is not, or a number out of range.
+    The schedule is fitted to the length; without `eval_every` evaluations are at least EVALUATIONS_APART
+    iterations apart. ValueError for a name that there is not, or a number out of range.
     """
     items = parse_leave_out(leave_out)
     if iterations is None and leave_out == AUTO:
@@ -297,4 +297,6 @@ def run_config(
         densify=DensifyConfig(max_gaussians=max_gaussians),
         hqgs=HQGSConfig(guidance=guidance, formation=formation),
     ).scaled()
-    return replace(config, eval_every=max(config.eval_every, CLOSEST) if eval_every is None else eval_every)
+    return replace(
+        config, eval_every=max(config.eval_every, EVALUATIONS_APART) if eval_every is None else eval_every
+    )

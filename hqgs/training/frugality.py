@@ -21,8 +21,8 @@ from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import largest_weights
 from hqgs.scene.scene import View
-from hqgs.training.plan import PlanRow
-from hqgs.training.schedule import (
+from hqgs.training.constants import (
+    BETTER,
     CHECKS,
     COARSE_FACTOR,
     COARSE_MOST,
@@ -31,18 +31,17 @@ from hqgs.training.schedule import (
     FINEST,
     HELD_SHARE,
     MOST_HELD,
+    PATIENCE,
     REST,
     SMALLEST_SIDE,
-    Decisions,
-    Schedule,
-    spread,
+    TOLERANCE,
+    TRIED,
+    WEIGHTS,
 )
+from hqgs.training.plan import PlanRow
+from hqgs.training.schedule import Decisions, Schedule, spread
 from hqgs.training.state import TrainState
 
-TOLERANCE = 0.02  # dB that leaving Gaussians out may cost
-WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
-TRIED = 8  # training photos, at most, on which it is tried
-BETTER, PATIENCE = 0.05, 2_000  # dB, iterations: when a run has stopped improving
 RULES: dict[str, object] = {  # what a result depends on beside the configuration
     "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
     "tolerance": (TOLERANCE, TRIED),

@@ -13,10 +13,7 @@ from torch.optim import Optimizer
 from hqgs.evaluation.records import GuardEvent, GuardRecord
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
-
-LIMIT = 1e18  # larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits
-LISTED = 10  # Gaussians that an event names, the first ones
-KEPT = 20  # events that are kept, the first ones; all are counted
+from hqgs.training.constants import EVENTS_KEPT, GAUSSIANS_LISTED, GUARD_LIMIT
 
 
 @dataclass
@@ -32,7 +29,7 @@ class Guard:
     def note(self, iteration: int, view: View, fault: Fault) -> None:
         """Add what one look has found."""
         self.num_events += 1
-        if len(self.events) == KEPT:
+        if len(self.events) == EVENTS_KEPT:
             return
         indices = torch.nonzero(fault.rows)[:, 0]
         event: GuardEvent = {
@@ -41,7 +38,7 @@ class Guard:
             "what": fault.what,
             "tensors": fault.tensors,
             "count": fault.values + len(indices),
-            "gaussians": indices[:LISTED].tolist(),
+            "gaussians": indices[:GAUSSIANS_LISTED].tolist(),
         }
         self.events.append(event)
 
@@ -104,20 +101,20 @@ def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
 
 
 def is_sound(tensor: Tensor) -> bool:
-    """Whether no value can be NaN, Inf or beyond LIMIT. One pass; False may be a false alarm.
+    """Whether no value can be NaN, Inf or beyond GUARD_LIMIT. One pass; False may be a false alarm.
 
     The sum of squares has no term that another one could cancel.
     """
     values = tensor.detach().reshape(-1)
-    return float(torch.dot(values, values)) < LIMIT**2
+    return float(torch.dot(values, values)) < GUARD_LIMIT**2
 
 
 def bad_rows(tensors: Mapping[str, Tensor]) -> tuple[list[str], Tensor]:
-    """The names of the tensors [N, ...] with a value that is not finite or beyond LIMIT, and which rows
+    """The names of the tensors [N, ...] with a value that is not finite or beyond GUARD_LIMIT, and which rows
     have one in any tensor, bool [N]."""
     names, rows = [], torch.zeros(len(next(iter(tensors.values()))), dtype=torch.bool)
     for name, tensor in tensors.items():
-        bad = ~(tensor.detach().abs() < LIMIT).reshape(len(rows), -1).all(dim=1)
+        bad = ~(tensor.detach().abs() < GUARD_LIMIT).reshape(len(rows), -1).all(dim=1)
         if bad.any():
             names.append(name)
             rows |= bad

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from hqgs.training.constants import TIMED, WARM
 from hqgs.training.plan import StepSeconds
 from hqgs.training.trainer import Trainer
-
-WARM, TIMED = 3, 7  # steps of each size before the run: the first ones start threads and fill caches
 
 
 def fit_to_seconds(trainer: Trainer) -> None:

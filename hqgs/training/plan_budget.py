@@ -6,12 +6,8 @@ import math
 
 from hqgs.photos.formula import Degradation
 from hqgs.training.config import DensifyConfig
+from hqgs.training.constants import DETERMINED, NOISE_HALVING, PIXELS, TIMES_OWN_POINTS
 from hqgs.training.plan import Facts
-
-PIXELS = 100  # of the photos, for each point to start from where they are as photographed
-BESIDE = 1.5  # times the scene's own points, at least
-HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
-DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 
 
 def first_points_wanted(facts: Facts, most: int) -> int:
@@ -20,7 +16,7 @@ def first_points_wanted(facts: Facts, most: int) -> int:
     More than the scene's own always: those lie at corners alone, and a run from points all over the photos
     costs less.
     """
-    return min(most, max(facts.pixels // PIXELS, int(BESIDE * facts.points)))
+    return min(most, max(facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))
 
 
 def gaussians_determined(facts: Facts, formation: Degradation, per_pixel: float) -> int:
@@ -74,11 +70,11 @@ def _sharp_pixels(height: int, width: int, formation: Degradation, noise: float)
     """Of one photo, of its size as it was taken.
 
     A blur of sigma px spreads a point over 4 pi sigma^2 pixels, a disc or a line over its own. Noise (its
-    standard deviation, where 1 is white) of s levels asks for the mean of (s / HALVING)^2 more pixels
+    standard deviation, where 1 is white) of s levels asks for the mean of (s / NOISE_HALVING)^2 more pixels
     until it is below what one pixel may be off.
     """
     factor = next((int(step.value or 1) for step in formation.steps if step.kind == "lowres"), 1)
-    share = 1.0 + (255 * noise / HALVING) ** 2
+    share = 1.0 + (255 * noise / NOISE_HALVING) ** 2
     for step in formation.for_width(width * factor).steps:
         value_in_photo = (step.value or 0.0) / factor
         if step.kind == "blur":

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from hqgs.training.constants import DENSE, FEWEST_ITERATIONS, MOST_ITERATIONS, SLOWER, SLOWER_DENSE
 from hqgs.training.plan import StepSeconds
-
-# A mean step of a run over one at its start. One that starts from points all over the photos grows little,
-# and its Gaussians hide more of each other as they become opaque.
-GROWTH, GROWTH_DENSE = 2.0, 1.0
-DENSE = 2  # times the scene's own points
-FEWEST, MOST = 50, 30_000  # iterations of a run that has a number of seconds
 
 
 def fitting(
@@ -23,13 +18,13 @@ def fitting(
         first: its Gaussians at the start, in times of the scene's points.
         half_until: the last iteration at half size of a run of so many.
     """
-    growth = GROWTH_DENSE if first > DENSE else GROWTH
+    growth = SLOWER_DENSE if first > DENSE else SLOWER
 
     def needed(iterations: int) -> float:
         half = half_until(iterations)
         return growth * (half * step.half + (iterations - half) * step.full)
 
-    few, many = FEWEST, MOST if most is None else max(most, FEWEST) + 1
+    few, many = FEWEST_ITERATIONS, MOST_ITERATIONS if most is None else max(most, FEWEST_ITERATIONS) + 1
     while many - few > 1:
         middle = (few + many) // 2
         few, many = (middle, many) if needed(middle) <= seconds else (few, middle)

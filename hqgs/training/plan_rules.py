@@ -14,26 +14,25 @@ from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.photos.formula import LEARNED, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, TrainConfig
+from hqgs.training.constants import (
+    COARSE_FACTOR,
+    ENOUGH,
+    FEWEST_VIEWS,
+    FINEST,
+    FOR_EACH_PHOTO,
+    GROWS_FROM,
+    HELD_PIXELS,
+    HELD_SHARE,
+    MOST_HELD,
+    SMALLEST_SIDE,
+)
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import first_points_wanted, gaussians_determined, kept_gradient, sharp_pixels
 from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
 from hqgs.training.plan_length import fitting
-from hqgs.training.schedule import (
-    COARSE_FACTOR,
-    FEWEST_VIEWS,
-    FINEST,
-    HELD_SHARE,
-    MOST_HELD,
-    SMALLEST_SIDE,
-    half_size_end,
-)
+from hqgs.training.schedule import half_size_end
 from hqgs.training.settings import with_iterations
 
-# So many are enough where cameras are learned or photos are as photographed; of the latter also so many for
-# each photo. More would learn what no other photo shows: fox at stored size loses 0.5 dB in 2,250 more.
-ENOUGH, FOR_EACH_PHOTO = 7_000, 150
-GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
-HELD_PIXELS = 50  # one of so many is held back under noise
 LINEAR = ("blur", "defocus", "motion", "lowres")
 CHOSEN = "measured on held-back photos of fern, fox and horns at half size"
 

@@ -13,21 +13,24 @@ from hqgs._rust import EPS2D
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
+from hqgs.training.constants import (
+    BAND_INTERVAL,
+    CHECKS,
+    COARSE_FACTOR,
+    COARSE_MOST,
+    COARSE_PART,
+    EVALUATED,
+    FASTER,
+    FINEST,
+    LAST_OF_FIRST,
+    REST,
+    SHORT,
+    TAIL,
+    TAIL_PART,
+)
 from hqgs.training.plan import RunPlan
 
 T = TypeVar("T")
-
-COARSE_PART, COARSE_FACTOR, SMALLEST_SIDE = 0.6, 2, 32  # of the run; of the sides; px that are left
-COARSE_MOST = 1_500  # iterations
-HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
-FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
-BAND_INTERVAL = 1 / 20  # of a run of more than SHORT iterations, at most, until the next degree is trained
-SHORT = 3_000
-EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
-CHECKS = 500  # iterations from one look at whether the run still improves to the next
-TAIL, TAIL_PART = 50, 1 / 3  # steps after the end of growth that tell what the rest costs; of that rest
-FASTER, LAST_OF_FIRST = 2.0, 1 / 3  # at most, of the rates of short runs
-REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 
 
 @dataclass(frozen=True)

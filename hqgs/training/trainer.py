@@ -24,6 +24,7 @@ from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
+from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.densify import Densification, Densifier
 from hqgs.training.few_photos import decay_opacities
 from hqgs.training.frugality import Frugality
@@ -35,8 +36,6 @@ from hqgs.training.prepare import Prepared
 from hqgs.training.schedule import Decisions, Schedule, StepPlan, learning_rates, on_the_way
 from hqgs.training.settings import config_values
 from hqgs.training.state import TrainState
-
-MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
 
 class TrainingError(RuntimeError):

@@ -22,25 +22,26 @@ from hqgs.model.render import nearness_map
 from hqgs.photos.exposure import take_photo
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.methods.lens import SMALLEST, first_lens, lens_warps, samples, sharp_at, widest
-
-BEGIN = 0.1  # of the run: before, trajectories would only hide what the scene does not show yet
-LOOKS = (0.5, 0.75)  # of the run: when short trajectories are given up
-SHORTEST = 0.7  # px, of the trajectory of the picture's middle: less than that a photo stands still
-FIRST = 1e-3  # of the photo's width, standard deviation: from 0 a trajectory has no direction to grow in
-PATH_RATE, GAIN_RATE = 8e-4, 0.005  # learning rates: of the photo's width, and of the log gains
-LENS_RATE = 4e-4  # the same for lenses, of the photo's width
-NARROW = 200  # px: narrower photos count as that wide
-LAST = 0.1  # of the rates, at the end of the run
-TRAJECTORY_POINTS = 9  # that stand for a trajectory
-SPACING, MOST = (
-    1.5,
-    17,
-)  # px of a trajectory from one sample of the exposure to the next, and the most samples
-MOST_MARGIN = 48  # px around a render
-REFRESH = 8  # visits of a photo until its depths are looked at again
-COARSER = 4  # times the photo's pixels: of the map of depths
-SATURATED = 254  # levels of 1/255
+from hqgs.training.constants import (
+    CAMERA_RATES_LEFT,
+    CAMERAS_BEGIN,
+    DEPTHS_COARSER,
+    DEPTHS_REFRESH,
+    FIRST_TRAJECTORY,
+    GAIN_RATE,
+    GIVE_UP_AT,
+    LENS_RATE,
+    MOST_MARGIN,
+    MOST_WARPS,
+    NARROW,
+    SATURATED,
+    SHORTEST_TRAJECTORY,
+    SMALLEST_RADIUS,
+    TRAJECTORY_POINTS,
+    TRAJECTORY_RATE,
+    WARP_SPACING,
+)
+from hqgs.training.methods.lens import first_lens, lens_warps, samples, sharp_at, widest
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class LearnedCameras:
         self._widths = [max(view.camera.width, NARROW) for view in views]
         self._sizes = [(view.camera.height, view.camera.width) for view in views]
         rng, count = np.random.default_rng([seed, 6]), len(views)
-        first = FIRST * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
+        first = FIRST_TRAJECTORY * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
         self._paths = [
             torch.from_numpy(path * width).requires_grad_()
             for path, width in zip(first if shake else [], self._widths, strict=False)
@@ -117,8 +118,8 @@ class LearnedCameras:
 
     def schedule(self, iterations: int) -> None:
         """Of a run of this length."""
-        self._begin = round(BEGIN * iterations)
-        self._looks = (round(LOOKS[0] * iterations), round(LOOKS[1] * iterations))
+        self._begin = round(CAMERAS_BEGIN * iterations)
+        self._looks = (round(GIVE_UP_AT[0] * iterations), round(GIVE_UP_AT[1] * iterations))
 
     def shot(self, view: View, photo: Tensor) -> Shot:
         """Of a training view."""
@@ -158,15 +159,15 @@ class LearnedCameras:
         if not self._active:
             return
         if self._blurs(number):
-            if self._visits[number] % REFRESH == 0:
-                near = nearness_map(gaussians, view.camera, COARSER) * self._depths[number]
+            if self._visits[number] % DEPTHS_REFRESH == 0:
+                near = nearness_map(gaussians, view.camera, DEPTHS_COARSER) * self._depths[number]
                 self._nearness[number] = near.clamp(0.05, 10).to(torch.float16)
             self._visits[number] += 1
         if iteration in self._looks:
             for k, path in enumerate(self._paths):
-                self._still[k] |= _longest(_middle(path)) < SHORTEST
+                self._still[k] |= _longest(_middle(path)) < SHORTEST_TRAJECTORY
             for k, lens in enumerate(self._lenses):
-                self._sharp[k] |= widest(*lens.tolist()) < SMALLEST
+                self._sharp[k] |= widest(*lens.tolist()) < SMALLEST_RADIUS
             for k in range(len(self._nearness)):
                 if not self._blurs(k):
                     self._nearness[k] = None
@@ -197,11 +198,11 @@ class LearnedCameras:
         """Learning rates after this part of the run."""
         rates = {}
         if self._paths:
-            rates["paths"] = PATH_RATE * float(np.mean(self._widths)) * LAST**part
+            rates["paths"] = TRAJECTORY_RATE * float(np.mean(self._widths)) * CAMERA_RATES_LEFT**part
         if self._lenses:
-            rates["lenses"] = LENS_RATE * float(np.mean(self._widths)) * LAST**part
+            rates["lenses"] = LENS_RATE * float(np.mean(self._widths)) * CAMERA_RATES_LEFT**part
         if self._gains:
-            rates["gains"] = GAIN_RATE * LAST**part
+            rates["gains"] = GAIN_RATE * CAMERA_RATES_LEFT**part
         return rates
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -237,7 +238,7 @@ class LearnedCameras:
                 whole = _trajectory_warps(self._paths[number], camera, TRAJECTORY_POINTS)
                 moved = _moved(whole, camera, nearness=1.0)
             extent = max(_longest(moved[:, k]) for k in range(moved.shape[1]))
-            count = min(max(3, math.ceil(extent / SPACING) + 1), MOST)
+            count = min(max(3, math.ceil(extent / WARP_SPACING) + 1), MOST_WARPS)
         if not sharp:
             count = max(count, samples(self._lenses[number]))
         warps = torch.zeros(count, 3, 4, dtype=torch.float64)

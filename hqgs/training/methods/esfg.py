@@ -15,9 +15,9 @@ from hqgs.photos.edges import edge_aware_map
 from hqgs.photos.pixels import floats
 from hqgs.scene.scene import View
 from hqgs.training.config import ESFGConfig
+from hqgs.training.constants import ESFG_HIDDEN
 from hqgs.training.methods.base import photo_tensors
 
-HIDDEN = 64  # units of the one hidden layer of an MLP; the paper names no size
 XYZ = 3  # F' feeds the sigmoid directly, so every feature has one number for each coordinate
 
 
@@ -55,9 +55,13 @@ class ESFG(nn.Module):
             for name, tokens in zip(("photo", "edge"), _tokens(views, count, config.downscale), strict=True):
                 self.register_buffer(f"{name}_tokens", tokens, persistent=False)
         if config.saf:
-            self.saf: nn.Sequential = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
+            self.saf: nn.Sequential = nn.Sequential(
+                _linear(XYZ, ESFG_HIDDEN), nn.ReLU(), _linear(ESFG_HIDDEN, XYZ)
+            )
         if config.eaf:
-            self.eaf: nn.Sequential = nn.Sequential(_linear(XYZ, HIDDEN), nn.ReLU(), _linear(HIDDEN, XYZ))
+            self.eaf: nn.Sequential = nn.Sequential(
+                _linear(XYZ, ESFG_HIDDEN), nn.ReLU(), _linear(ESFG_HIDDEN, XYZ)
+            )
         if config.cross_attention:
             self.query: nn.Linear = _linear(XYZ, XYZ, bias=False)
             self.key: nn.Linear = _linear(XYZ, XYZ, bias=False)

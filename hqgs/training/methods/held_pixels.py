@@ -11,11 +11,7 @@ import torch
 from torch import Tensor
 
 from hqgs.photos.pixels import as_floats
-
-SHARE = 1 / 50  # of the pixels of each photo
-STEPS = 200  # at least, from one look to the next
-FACTOR = 0.5  # what is left of the learning rates after a look without a gain
-LEAST = FACTOR**20  # share of the rates below which nothing moves any more
+from hqgs.training.constants import HELD_PIXELS, PLATEAU_FACTOR, PLATEAU_LEAST, PLATEAU_STEPS
 
 
 @dataclass(frozen=True)
@@ -28,13 +24,15 @@ class HeldPixels:
 
     @classmethod
     def draw(cls, number: int, photo: Tensor, mask: Tensor | None) -> tuple[HeldPixels, Tensor]:
-        """`SHARE` of the pixels [H, W, 3] that count, and the mask, bool [H, W], of the others.
+        """One of HELD_PIXELS pixels [H, W, 3] that count, and the mask, bool [H, W], of the others.
 
         The draw follows from the photo's number alone.
         """
         counts = torch.ones(photo.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
         places = torch.nonzero(counts.ravel())[:, 0].numpy()
-        drawn = np.random.default_rng(number).choice(places, math.ceil(SHARE * len(places)), replace=False)
+        drawn = np.random.default_rng(number).choice(
+            places, math.ceil(1 / HELD_PIXELS * len(places)), replace=False
+        )
         held = torch.from_numpy(drawn)
         counts.view(-1)[held] = False
         colors = torch.from_numpy(as_floats(photo.reshape(-1, 3)[held].numpy()))
@@ -49,14 +47,15 @@ class Plateau:
     """The learning rates that the held pixels ask for.
 
     White noise in a pixel tells nothing of the noise beside it, so a render comes nearer to these pixels only
-    where it comes nearer to the scene. Every `STEPS` steps, rounded up to whole epochs, their mean squared
-    error is looked at. They are the same pixels each time, so their noise is in each error alike. Where it is
-    not smaller than at the best look, the rates are halved, as on a plateau of any held-back error.
+    where it comes nearer to the scene. Every PLATEAU_STEPS steps, rounded up to whole epochs, their mean
+    squared error is looked at. They are the same pixels each time, so their noise is in each error alike.
+    Where it is not smaller than at the best look, the rates are halved, as on a plateau of any held-back
+    error.
     """
 
     def __init__(self, num_photos: int) -> None:
         self.rate_left: float = 1.0  # share of the learning rates
-        self._interval = num_photos * math.ceil(STEPS / num_photos)
+        self._interval = num_photos * math.ceil(PLATEAU_STEPS / num_photos)
         self._steps = 0
         self._sums, self._counts = torch.zeros(2, num_photos, dtype=torch.float64)
         self._best = torch.full((num_photos,), torch.nan, dtype=torch.float64)
@@ -88,7 +87,7 @@ class Plateau:
         gains = self._best - now
         known = torch.isfinite(gains)
         if known.any() and gains[known].mean() <= 0:
-            self.rate_left = max(self.rate_left * FACTOR, LEAST)
+            self.rate_left = max(self.rate_left * PLATEAU_FACTOR, PLATEAU_LEAST)
         else:
             self._best = torch.where(torch.isfinite(now), now, self._best)
         self._sums.zero_()

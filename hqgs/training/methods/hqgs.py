@@ -19,6 +19,7 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
+from hqgs.training.constants import KNEE, SIZES_REFRESH, STEEPER
 from hqgs.training.methods.base import Method
 from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
@@ -26,10 +27,6 @@ from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
-
-KNEE = 2.0  # standard deviations of the noise up to which differences count by their square
-STEEPER = 2.0  # on average the square is half as steep there as L1, and growth goes by the gradient
-REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
 class HQGS(Method[FormedTarget]):
@@ -146,7 +143,7 @@ class HQGS(Method[FormedTarget]):
 
     def after_step(self, state: TrainState, view: View, seen: Tensor) -> None:
         """The smallest sizes and the cameras' depths age, and the held pixels decide on the rates."""
-        if self._smallest is not None and state.iteration - self._since >= REFRESH:
+        if self._smallest is not None and state.iteration - self._since >= SIZES_REFRESH:
             self._measure(state.gaussians, state.iteration)
         if self._plateau is not None and len(seen):
             self._plateau.see(self._numbers[view.name], seen[0])

@@ -12,11 +12,14 @@ import math
 import torch
 from torch import Tensor
 
-NEAREST, FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes go
-FIRST_RADIUS = 0.0015  # of the photo's width: from 0 a lens has no direction to grow in
-SMALLEST = 0.35  # px, radius: a photo whose discs are smaller everywhere is sharp
-FEWEST, MOST = 6, 24  # samples of a disc
-GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
+from hqgs.training.constants import (
+    FEWEST_SAMPLES,
+    FIRST_RADIUS,
+    GOLDEN,
+    LENS_FARTHEST,
+    LENS_NEAREST,
+    MOST_SAMPLES,
+)
 
 
 def first_lens(width: float) -> Tensor:
@@ -26,18 +29,18 @@ def first_lens(width: float) -> Tensor:
 
 def widest(slope: float, offset: float) -> float:
     """The largest radius, px."""
-    return max(abs(slope * n + offset) for n in (NEAREST, FARTHEST))
+    return max(abs(slope * n + offset) for n in (LENS_NEAREST, LENS_FARTHEST))
 
 
 def sharp_at(slope: float, offset: float) -> float | None:
     """The depth in focus, 1 at the photo's median; None: all that photos show is in focus, or nothing."""
     near = -offset / slope if slope else 0.0
-    return 1 / near if FARTHEST <= near <= NEAREST else None
+    return 1 / near if LENS_FARTHEST <= near <= LENS_NEAREST else None
 
 
 def samples(lens: Tensor) -> int:
     """How many points of the lens stand for all of it: one for 2.5 px of the largest disc."""
-    return min(max(FEWEST, math.ceil(math.pi * widest(*lens.tolist()) ** 2 / 2.5)), MOST)
+    return min(max(FEWEST_SAMPLES, math.ceil(math.pi * widest(*lens.tolist()) ** 2 / 2.5)), MOST_SAMPLES)
 
 
 def lens_warps(lens: Tensor, count: int) -> Tensor:

@@ -14,14 +14,13 @@ from hqgs.photos.edges import edge_magnitude
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import ESFGConfig, PaperConfig
+from hqgs.training.constants import SCS_CACHE_BYTES, SCS_WEIGHT
 from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.esfg import ESFG
 from hqgs.training.methods.photometric import LAMBDA_DSSIM, photometric_loss
 from hqgs.training.methods.scs import ScsWeights, weighted_scs_loss
 from hqgs.training.state import TrainState
 
-SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS
-CACHE_BYTES = 2**30  # of SCS weights (12 bytes a pixel); those of further views are computed at each step
 VARIANTS = {
     "V1": PaperConfig(None, "l1+dssim"),
     "V2": PaperConfig(ESFGConfig(eaf=False, concat=False, cross_attention=False), "l1+dssim"),
@@ -61,7 +60,7 @@ class PaperHQGS(Method[ScsTarget]):
         esfg = self.config.esfg
         self.esfg: ESFG | None = None if esfg is None else ESFG(scene.train, seed, esfg)
         self.rows: Tensor = torch.zeros(0, dtype=torch.int64)  # of F', the one that each Gaussian reads, [N]
-        self._room = CACHE_BYTES
+        self._room = SCS_CACHE_BYTES
 
     def prepare(self, view: View) -> ScsTarget:
         photo, mask = photo_tensors(view)

@@ -10,10 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs.base.threads import one_torch_thread
-
-# A render dimmer than this part of its target counts as this bright. The gradient of a cosine grows with
-# 1 / |render|: without a floor one faint Gaussian in a black render would get any gradient at all.
-DIMMEST = 0.01
+from hqgs.training.constants import DIMMEST
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,93 @@
+"""The numbers of training, each with its meaning, its unit and where it comes from.
+
+Where no source is named, the number was chosen on held-back training photos of fern, fox and horns at half
+size, never on test photos. Those of few photos are in plan_few_photos.py and few_photos.py, beside the
+measurements that chose them; those of densification, of 3DGS, are the defaults of `DensifyConfig`.
+"""
+
+import math
+
+# The plan: points to start from, budget, length.
+PIXELS = 100  # of the photos, for each point to start from where they are as photographed
+TIMES_OWN_POINTS = 1.5  # the scene's own points so many times at least
+NOISE_HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
+DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
+# So many iterations are enough where cameras are learned or photos are as photographed; of the latter also so
+# many for each photo. More learn what no other photo shows: fox at stored size loses 0.5 dB in 2,250 more.
+ENOUGH, FOR_EACH_PHOTO = 7_000, 150
+GROWS_FROM = 140  # the iteration before which a run from points all over the photos does not grow
+# A mean step of a run over one at its start, and with DENSE times the scene's own points and more: such a run
+# grows little, and its Gaussians hide more of each other as they become opaque. Measured on four captures.
+SLOWER, SLOWER_DENSE, DENSE = 2.0, 1.0, 2
+FEWEST_ITERATIONS, MOST_ITERATIONS = 50, 30_000  # of a run that has a number of seconds
+WARM, TIMED = 3, 7  # steps of each size before it: the first ones start threads and fill caches
+
+# The schedule.
+COARSE_PART, COARSE_MOST = 0.6, 1_500  # of the run, and iterations, at the smaller size, at most
+COARSE_FACTOR, SMALLEST_SIDE = 2, 32  # of the sides; px that are left
+HELD_SHARE, MOST_HELD, FEWEST_VIEWS = 1 / 20, 4, 10  # of the training views; with fewer none is held back
+FINEST = 1.7  # px of the photo that sees a Gaussian best: with a larger standard deviation it may still grow
+BAND_INTERVAL, SHORT = 1 / 20, 3_000  # of a run of more iterations, at most, until the next degree is trained
+EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on the way, at most
+EVALUATIONS_APART = 50  # iterations, unless asked for: each evaluation takes as long as some steps
+TAIL, TAIL_PART = 50, 1 / 3  # steps after the end of growth that tell what the rest costs; of that rest
+FASTER, LAST_OF_FIRST = 2.0, 1 / 3  # at most, of the rates of short runs
+REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
+# Iterations between looks at whether the run still improves; dB and iterations: when it has stopped.
+CHECKS, BETTER, PATIENCE = 500, 0.05, 2_000
+TOLERANCE, TRIED = (
+    0.02,
+    8,
+)  # dB that leaving Gaussians out may cost; training photos that it is tried on, at most
+WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
+
+# The guard. Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.
+GUARD_LIMIT = 1e18
+EVENTS_KEPT, GAUSSIANS_LISTED = 20, 10  # the first events, and the first Gaussians that an event names
+MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
+
+# Cleaning: 300 steps gain 1.0 dB on the room of 8 photos, 600 gain 1.2; half the decay takes twice the steps.
+CLEANING_STEPS, CLEANING_DECAY, CLEANING_DROPOUT = 600, 0.01, 0.2  # the last two: shares, as of few photos
+
+# The loss under noise. Up to KNEE standard deviations differences count by their square (Huber), half as steep
+# there as L1 on average, and growth goes by the gradient: hence STEEPER.
+KNEE, STEEPER = 2.0, 2.0
+HELD_PIXELS = 50  # one of so many is held back under noise
+PLATEAU_STEPS, PLATEAU_FACTOR = (
+    200,
+    0.5,
+)  # from one look at them to the next, at least; of the rates, without a gain
+PLATEAU_LEAST = PLATEAU_FACTOR**20  # share of the rates below which nothing moves any more
+SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
+
+# Cameras of each photo: shares of the run before which trajectories would hide what the scene does not show
+# yet, at which short ones are given up, and of the rates at the end.
+CAMERAS_BEGIN, GIVE_UP_AT, CAMERA_RATES_LEFT = 0.1, (0.5, 0.75), 0.1
+SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle: with less a photo stands still
+# Of the photo's width, standard deviation and radius: from 0 neither has a direction to grow in.
+FIRST_TRAJECTORY, FIRST_RADIUS = 1e-3, 0.0015
+TRAJECTORY_RATE, LENS_RATE, GAIN_RATE = 8e-4, 4e-4, 0.005  # of the photo's width, twice; of the log gains
+NARROW = 200  # px: narrower photos count as that wide
+TRAJECTORY_POINTS = 9  # that stand for a trajectory
+WARP_SPACING, MOST_WARPS = (
+    1.5,
+    17,
+)  # px of a trajectory from one sample of the exposure to the next; and samples
+MOST_MARGIN = 48  # px around a render
+DEPTHS_REFRESH, DEPTHS_COARSER = (
+    8,
+    4,
+)  # visits of a photo until its map of depths is made anew; its pixels' sides
+SATURATED = 254  # levels of 1/255
+LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
+SMALLEST_RADIUS = 0.35  # px: a photo whose circles of confusion are smaller everywhere is sharp
+FEWEST_SAMPLES, MOST_SAMPLES = 6, 24  # of the aperture
+GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
+
+# The paper's form.
+SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS
+SCS_CACHE_BYTES = 2**30  # of its weights (12 bytes a pixel); those of further views are computed at each step
+# A render dimmer than this part of its target counts as this bright. The gradient of a cosine grows with
+# 1 / |render|: without a floor one faint Gaussian in a black render would get any gradient at all.
+DIMMEST = 0.01
+ESFG_HIDDEN = 64  # units of the one hidden layer of an MLP; the paper names no size
