@@ -49,8 +49,8 @@ MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should n
 # Cleaning: 300 steps gain 1.0 dB on the room of 8 photos, 600 gain 1.2; half the decay takes twice the steps.
 CLEANING_STEPS, CLEANING_DECAY, CLEANING_DROPOUT = 600, 0.01, 0.2  # the last two: shares, as of few photos
 
-# The loss under noise. Up to KNEE standard deviations differences count by their square (Huber), half as steep
-# there as L1 on average, and growth goes by the gradient: hence STEEPER.
+# The loss under noise. Up to KNEE standard deviations differences count by their square (Huber), half as
+# steep there as L1 on average, and growth goes by the gradient: hence STEEPER.
 KNEE, STEEPER = 2.0, 2.0
 HELD_PIXELS = 50  # one of so many is held back under noise
 PLATEAU_STEPS, PLATEAU_FACTOR = (
