@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import struct
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +41,20 @@ def film(path: Path, frames: int) -> Path:
     return encoded(path, images, 10)
 
 
-def encoded(path: Path, images: list[NDArray[np.uint8]], crf: int) -> Path:
-    """Pictures [H, W, 3] of one size as a film."""
+def encoded(path: Path, images: list[NDArray[np.uint8]], crf: int, times: list[int] | None = None) -> Path:
+    """Pictures [H, W, 3] of one size as a film; `times`: when each is shown, ms, where the rate varies."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=RATE)
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt, stream.options = "yuv420p", {"crf": str(crf)}
-        for image in images:
-            for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")):
+        if times is not None:
+            stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+            stream.options |= {"bf": "0"}  # as phones do: frames lie in the file as they are shown
+        for k, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            if times is not None:
+                frame.pts, frame.time_base = times[k], Fraction(1, 1000)
+            for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
@@ -70,6 +78,32 @@ def test_the_sharpest_frame_of_each_interval_is_taken_once(tmp_path: Path) -> No
     few, _ = film_frames(source, tmp_path / "frames")
     assert few != folder
     assert len(list(few.glob("*.jpg"))) == 30  # of 2 s: the fewest that are taken
+
+
+def test_a_variable_rate_counts_by_time(tmp_path: Path) -> None:
+    """30 frames in the first second, 5 then: an interval is a length of time, not of frames."""
+    times = [*range(0, 1000, 34), *range(1000, 3000, 400)]
+    images = [clean_photo(0)[:96, :128]] * len(times)
+    folder, _ = film_frames(encoded(tmp_path / "phone.mp4", images, 20, times), tmp_path / "frames", 6)
+    chosen = [times[int(path.stem)] for path in sorted(folder.glob("*.jpg"))]
+    assert [int(6 * time / (times[-1] + 1000 / RATE)) for time in chosen] == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_film_held_upright_is_shown_upright(tmp_path: Path) -> None:
+    """Phones store the matrix of the picture's turn (ISO 14496-12, tkhd): (x, y) goes to (-y, x), y down."""
+    picture = np.zeros((96, 128, 3), np.uint8)
+    picture[:, 96:, 0] = 250  # red on the right as stored, below as shown
+    path = encoded(tmp_path / "portrait.mp4", [picture] * 4, 12)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"tkhd") + 44
+    assert struct.unpack_from(">9i", content, at) == (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    struct.pack_into(">9i", content, at, 0, 1 << 16, 0, -(1 << 16), 0, 0, 96 << 16, 0, 1 << 30)
+    path.write_bytes(content)
+    folder, _ = film_frames(path, tmp_path / "frames", 3)
+    for frame in folder.glob("*.jpg"):
+        shown = np.asarray(Image.open(frame)).astype(int)
+        assert shown.shape == (128, 96, 3)
+        assert shown[100:, :, 0].min() > 200 > 60 > shown[:90, :, 0].max()
 
 
 def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
