@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from hqgs.evaluation.verdict import judged_by, verdict
+from hqgs.evaluation.verdict import judged_by, overdone, verdict
 
 
 def report(gains: list[list[float]], aligned: float | None) -> dict[str, Any]:
@@ -29,3 +29,22 @@ def test_brightness_is_set_aside_where_photos_were_exposed_each_in_its_own_way()
 )
 def test_the_word_rises_with_the_psnr(psnr: float | None, word: str) -> None:
     assert verdict(psnr)[0] == word
+
+
+def moments(*values: tuple[float | None, float | None], views: int | None = None) -> list[Any]:
+    more = {} if views is None else {"views": views}
+    return [
+        {"iteration": 100 * k, "seconds": k, "psnr": psnr, "ssim": ssim, **more}
+        for k, (psnr, ssim) in enumerate(values, 1)
+    ]
+
+
+def test_a_run_that_ends_below_its_best_is_told() -> None:
+    fell = moments((20.0, 0.5), (22.5, 0.7), (22.0, 0.69))
+    told = overdone(fell)
+    assert told is not None
+    assert "after iteration 200, 0.5 dB above the end" in told
+    assert overdone(moments((20.0, 0.5), (22.05, 0.71), (22.0, 0.7))) is None  # two seeds differ by more
+    assert overdone(moments((22.5, 0.6), (22.0, 0.7))) is None  # darker, say, and yet more like the photos
+    assert overdone(moments((22.5, 0.7), (None, None))) is None
+    assert overdone([*moments((22.5, 0.7), views=2), *moments((20.0, 0.5))]) is None  # of other photos

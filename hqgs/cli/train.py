@@ -24,7 +24,7 @@ from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
 from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
-from hqgs.evaluation.verdict import judged_by, told, verdict
+from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
@@ -340,6 +340,8 @@ def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     psnr, name = judged_by(done.report)
     word, why = verdict(psnr)
     print(f"quality: {word} ({why})" + ("" if psnr in (None, last["psnr"]) else f"; {psnr:.2f} dB {name}"))
+    if fell := overdone(done.history):
+        print(fell)
     print(f"time: {times.told(colmap)}")
     print(f"to send: {out / PAGE}, which any browser opens; {VIEWERS} open {out / PLY}")
     if not options.view:

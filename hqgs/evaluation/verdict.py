@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hqgs.evaluation.intervals import with_half
+from hqgs.evaluation.records import HistoryEntry
+
+SCATTER = 0.1  # dB that a run may end below its best: no more than what two seeds differ by
 
 _LEVELS = (
     (
@@ -24,6 +27,31 @@ def verdict(psnr: float | None) -> tuple[str, str]:
     if psnr is None:
         return "not measured", "no photo was held out: look at the scene"
     return next(((word, why) for limit, word, why in _LEVELS if psnr < limit), _BEST)
+
+
+def overdone(history: Sequence[HistoryEntry]) -> str | None:
+    """What to say of a run that did not end at its best, by PSNR and SSIM of held-out views; None: nothing.
+
+    Moments at which fewer views were measured than at the end are no judges of it.
+    """
+    last = history[-1]
+    moments = [
+        (psnr, ssim, entry["iteration"])
+        for entry in history
+        if entry.get("views") == last.get("views")
+        and (psnr := entry["psnr"]) is not None
+        and (ssim := entry["ssim"]) is not None
+    ]
+    if not moments or moments[-1][2] != last["iteration"]:
+        return None
+    psnr, ssim, iteration = max(moments)
+    fall = psnr - moments[-1][0]
+    if fall <= SCATTER or ssim <= moments[-1][1]:
+        return None
+    return (
+        f"more iterations did not pay: the held-out photos were best after iteration {iteration:,}, "
+        f"{fall:.1f} dB above the end"
+    )
 
 
 def judged_by(report: Mapping[str, Any]) -> tuple[float | None, str]:

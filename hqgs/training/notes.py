@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hqgs.evaluation.records import LearnedRecord
+from hqgs.evaluation.verdict import overdone
 from hqgs.training.methods.cameras import LearnedCamera
 from hqgs.training.trainer import Trainer
 
@@ -19,6 +20,8 @@ def run_notes(trainer: Trainer) -> list[str]:
             f"while it trained, {max(some)} of {len(trainer.scene.test)} held-out views were measured, which "
             "are evenly spread, to save time; the last values are of all"
         )
+    if fell := overdone(trainer.history):
+        notes.append(fell)
     if (seconds := trainer.config.seconds) is not None:
         text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
         if trainer.config.turn is None and not trainer.plan.follows_clock:
