@@ -47,4 +47,5 @@ def test_a_run_that_ends_below_its_best_is_told() -> None:
     assert overdone(moments((20.0, 0.5), (22.05, 0.71), (22.0, 0.7))) is None  # two seeds differ by more
     assert overdone(moments((22.5, 0.6), (22.0, 0.7))) is None  # darker, say, and yet more like the photos
     assert overdone(moments((22.5, 0.7), (None, None))) is None
+    assert overdone([]) is None
     assert overdone([*moments((22.5, 0.7), views=2), *moments((20.0, 0.5))]) is None  # of other photos

@@ -34,15 +34,16 @@ def overdone(history: Sequence[HistoryEntry]) -> str | None:
 
     Moments at which fewer views were measured than at the end are no judges of it.
     """
-    last = history[-1]
+    last = history[-1] if history else None
     moments = [
         (psnr, ssim, entry["iteration"])
         for entry in history
-        if entry.get("views") == last.get("views")
+        if last is not None
+        and entry.get("views") == last.get("views")
         and (psnr := entry["psnr"]) is not None
         and (ssim := entry["ssim"]) is not None
     ]
-    if not moments or moments[-1][2] != last["iteration"]:
+    if last is None or not moments or moments[-1][2] != last["iteration"]:
         return None
     psnr, ssim, iteration = max(moments)
     fall = psnr - moments[-1][0]
