@@ -12,7 +12,6 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.base.files import is_room
 from hqgs.base.typed import build
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import embedded_scene, room
@@ -20,6 +19,7 @@ from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.formats.degradation_json import FILE
 from hqgs.scene.formats.llff import hold_marker
 from hqgs.scene.load import load_scene
+from hqgs.scene.names import is_room
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_leave_out
 from hqgs.training.frugality import RULES

@@ -26,9 +26,9 @@ import hqgs
 from benchmarks.measure import Run
 from benchmarks.protocol import Protocol, Row, degraded, load_scenes, narrowed
 from benchmarks.rows import KEYS, Table, facts
-from hqgs.base.files import KEPT
 from hqgs.cli.progress import duration
 from hqgs.photos.formula import NONE
+from hqgs.scene.names import KEPT
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.training.checkpoint import scene_fingerprint

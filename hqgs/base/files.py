@@ -8,7 +8,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +15,8 @@ from filelock import FileLock, Timeout
 
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
-EMBEDDED, SPARSE, BEYOND, PANORAMA = "embedded", "sparse", "beyond", "true-panorama"
-# In the place of a scene folder: what is built in. From the fourth on they may have a value, `true-shake:8`.
-ROOMS = (
-    EMBEDDED,
-    SPARSE,
-    PANORAMA,
-    BEYOND,
-    "true-shake",
-    "true-defocus",
-    "true-rolling",
-    "true-exposure",
-    "true-crowd",
-)
-FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
-ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
 PLAN = "plan.json"  # what a number of seconds came to
-KEPT = "sfm"  # in the folder of a run: what COLMAP found
-FRAMES = "frames.json"  # in a folder of photos: they are frames of a film, named in its order
 
 
 @contextmanager
@@ -58,34 +40,6 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         tmp.replace(path)
     finally:
         tmp.unlink(missing_ok=True)
-
-
-def existing_folder(path: str | Path) -> Path:
-    """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file, or where
-    nothing is in it."""
-    folder = Path(path).resolve()
-    if not folder.exists():
-        near = ""
-        if folder.parent.is_dir():
-            names = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()]
-            alike = get_close_matches(folder.name, names, n=1)
-            near = f"; did you mean {folder.parent / alike[0]}?" if alike else ""
-        if not near and (alike := get_close_matches(str(path), ROOMS, n=1)):
-            near = f"; did you mean the built-in {alike[0]}?"
-        raise FileNotFoundError(f"there is no scene folder {folder}{near}")
-    if folder.is_dir():
-        if all(entry.name.startswith(".") for entry in folder.iterdir()):
-            raise ValueError(f"{folder} is empty: give a folder with photos")
-        return folder
-    if folder.name.lower().endswith(ARCHIVE_SUFFIXES):
-        raise ValueError(f"{folder} is an archive: unpack it, and give the folder with the photos")
-    raise ValueError(f"{folder} is a file, a scene is a folder with photos, or a film")
-
-
-def is_film(path: str | Path) -> bool:
-    """Whether it is a film's file, by its suffix."""
-    path = Path(path)
-    return path.name.lower().endswith(FILM_SUFFIXES) and path.is_file()
 
 
 def check_new_folder(out: Path) -> None:
@@ -187,8 +141,3 @@ def remove_leftovers(path: str | Path) -> None:
     for pattern in (f".{path.stem}.*{path.suffix}", SAFETENSORS_TMP):
         for leftover in path.parent.glob(pattern):
             leftover.unlink()
-
-
-def is_room(name: str | Path) -> bool:
-    """Whether this names a built-in scene."""
-    return str(name).partition(":")[0] in ROOMS

@@ -10,11 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from hqgs.base.files import CONFIG, existing_folder
+from hqgs.base.files import CONFIG
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import READERS, has_format, scene_file
+from hqgs.scene.names import existing_folder
 
 
 @dataclass(frozen=True, kw_only=True)

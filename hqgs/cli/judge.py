@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs import __version__
-from hqgs.base.files import CONFIG, is_film, is_room, write_json
+from hqgs.base.files import CONFIG, write_json
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.model.formats.files import format_of, scene_file
+from hqgs.scene.names import is_film, is_room
 from hqgs.training.settings import longest_side
 
 if TYPE_CHECKING:

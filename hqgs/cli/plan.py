@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from hqgs.base.files import KEPT
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Number, Photos, ready
+from hqgs.scene.names import KEPT
 from hqgs.training.config import AUTO, FORMATION, METHODS, run_config
 from hqgs.training.settings import longest_side
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.files import existing_folder, is_film, is_room
 from hqgs.cli.errors import fail
+from hqgs.scene.names import existing_folder, is_film, is_room
 
 if TYPE_CHECKING:
     from hqgs.cli.progress import LoadingScreen

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 import hqgs
-from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, PAGE, PLY
+from hqgs.base.files import CHECKPOINT, CONFIG, PAGE, PLY
 from hqgs.base.left_out import format_left_out
 from hqgs.base.ranks import RankError, Ranks, joined
 from hqgs.cli.errors import BAD_INPUT, fail
@@ -26,6 +26,7 @@ from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, r
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
+from hqgs.scene.names import KEPT
 from hqgs.show.viewer.guard import PORT, check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
 from hqgs.training.settings import (

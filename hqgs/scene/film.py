@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import FRAMES, is_room, missing_folders, remove_empty, write_json
+from hqgs.base.files import missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 from hqgs.photos.video import pyav
+from hqgs.scene.names import FRAMES, is_room
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
 LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured

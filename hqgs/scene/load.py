@@ -10,7 +10,6 @@ import numpy as np
 import pycolmap
 
 from hqgs.base.evenly import evenly
-from hqgs.base.files import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
@@ -23,6 +22,7 @@ from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_fo
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.metres import Distance, named_photos
+from hqgs.scene.names import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
 from hqgs.scene.photo_files import is_run
 from hqgs.scene.place import BEHIND, cut_outs, located, masks_told, placed, without_missing, without_strays
 from hqgs.scene.random_points import random_points

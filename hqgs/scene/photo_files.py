@@ -14,9 +14,10 @@ from pathlib import Path
 from unicodedata import normalize
 from urllib.parse import unquote
 
-from hqgs.base.files import CHECKPOINT, CONFIG, KEPT, LOCK, PAGE, PLAN, PLY
+from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PAGE, PLAN, PLY
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.scene.names import KEPT
 
 MASKS = "masks"
 _FILES = (

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hqgs.base.files import CONFIG, KEPT, is_film, is_room
+from hqgs.base.files import CONFIG
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
@@ -20,6 +20,7 @@ from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.load import check_names, load_pictures, load_scene
 from hqgs.scene.metres import distance_of, in_metres
+from hqgs.scene.names import KEPT, is_film, is_room
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene

@@ -16,13 +16,14 @@ from PIL import Image
 from torch import Tensor
 
 from hqgs.base.evenly import evenly
-from hqgs.base.files import FILM_SUFFIXES, atomic_path
+from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.video import pyav
+from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
 
 SHOWN = ("color", "depth", "alpha")

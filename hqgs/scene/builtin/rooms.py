@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from hqgs.base.files import BEYOND, EMBEDDED, PANORAMA, SPARSE
 from hqgs.scene.builtin.panorama import WIDTH, panorama_room
 from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.builtin.sparse import PHOTOS, beyond_room, sparse_room
 from hqgs.scene.builtin.wild import parse_true_kind, wild_room
+from hqgs.scene.names import BEYOND, EMBEDDED, PANORAMA, SPARSE
 from hqgs.scene.scene import Scene
 
 SIZE = (504, 378)  # px, of the photos where nothing else is said

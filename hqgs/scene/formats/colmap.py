@@ -8,7 +8,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.base.files import KEPT
 from hqgs.base.text import some
 from hqgs.scene.capture import (
     Capture,
@@ -23,6 +22,7 @@ from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_mod
 from hqgs.scene.formats.colmap_photos import photos_of, whole_names
 from hqgs.scene.geometry import project
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
+from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
 from hqgs.scene.scene import Camera, TrackStatistics
 

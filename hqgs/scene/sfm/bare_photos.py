@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from hqgs.base.files import FRAMES
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
@@ -26,6 +25,7 @@ from hqgs.photos.files import (
 )
 from hqgs.scene.capture import photo_folder
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
+from hqgs.scene.names import FRAMES
 from hqgs.scene.photo_files import MASKS, is_run
 from hqgs.scene.sfm.front_door import copies, films_beside, photos_below, strays, understood
 from hqgs.scene.sfm.panoramas import all_around, write_faces

@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 import pycolmap
 from PIL import Image
 
-from hqgs.base.files import existing_folder, is_film
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import decode
 from hqgs.scene.film import check_film, film_frames, frame_details, write_details
+from hqgs.scene.names import existing_folder, is_film
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos, readable
 from hqgs.scene.sfm.photos_alone import find_cameras

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hqgs.base.files import FILM_SUFFIXES
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode
+from hqgs.scene.names import FILM_SUFFIXES
 
 _BURST = re.compile(r"(.*?)BURST(\d{8,})?", re.IGNORECASE)  # with the time of a burst, or its photos' numbers
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
