@@ -9,10 +9,10 @@ from typing import Annotated
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.judge import check_source, read_photos
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Number, ready, tell_read
-from hqgs.model.formats.files import ANTIALIASED, format_of, scene_file
-from hqgs.training.settings import longest_side
+from hqgs.cli.scenes import Factor, Number, tell_read
+from hqgs.model.formats.files import ANTIALIASED, format_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,26 +37,16 @@ OPTIONS = Clean
 def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
     try:
-        source = scene_file(options.source)
+        source = check_source(options.source, options.photos)
         format = format_of(options.out, written=True)
-        if options.photos is None and not options.source.is_dir():
-            raise ValueError(f"{options.source} is a file: --photos names the photos that it was made of")
         if options.out.exists() and options.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is removed would be lost")
-        if options.photos is not None:
-            ready(options.photos)
         from hqgs.model.gaussians import Gaussians  # here: they load torch
-        from hqgs.scene.source import load, load_again
         from hqgs.training.cleaning import clean
         from hqgs.training.constants import CLEANING_STEPS
 
         with LoadingScreen() as screen:
-            if options.photos is None:
-                scene = load_again(options.source, on_stage=screen.stage)
-            else:
-                factor = 1.0 if options.downscale is None else options.downscale
-                longest = longest_side("standard", options.downscale)
-                scene = load(options.photos, downscale=factor, longest=longest, on_stage=screen.stage)
+            scene = read_photos(options.source, options.photos, options.downscale, None, screen)
             gaussians = Gaussians.load(source)
             done = clean(
                 gaussians.in_world(scene.world), scene, options.steps or CLEANING_STEPS, on_stage=screen.stage

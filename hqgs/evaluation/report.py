@@ -38,7 +38,7 @@ from hqgs.evaluation.records import (
     alike,
 )
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.photos.pixels import upright
+from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.sheet import printable, sheet
 
 if TYPE_CHECKING:
@@ -162,10 +162,8 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
 
     Of the view as it is shown upright.
     """
-    photo = view.photo / 255.0 if view.photo.dtype == np.uint8 else view.photo.clip(0, 1)
-    render = np.clip(view.render.astype(np.float64), 0.0, 1.0)
-    difference = np.minimum(AMPLIFICATION * np.abs(render - photo), 1.0)
-    panels = [np.round(panel * 255).astype(np.uint8) for panel in (photo, render, difference)]
+    photo, render = as_floats(view.photo).clip(0, 1), view.render.clip(0, 1)
+    panels = [to_uint8(panel) for panel in (photo, render, AMPLIFICATION * np.abs(render - photo))]
     amplified = f"absolute difference x{AMPLIFICATION}"
     if view.mask is not None:
         panels[2][~view.mask] = MASKED

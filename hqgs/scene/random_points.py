@@ -1,4 +1,4 @@
-"""Points to start from where a scene brings none, and points from a PLY file."""
+"""Points to start from where a scene brings none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints: all that a run needs to go on, in one safetensors file; and the lock of its folder."""
+"""Checkpoints: all that a run needs to go on, in one safetensors file."""
 
 from __future__ import annotations
 

@@ -17,6 +17,7 @@ from PIL import Image
 
 from hqgs.base.evenly import evenly
 from hqgs.base.files import write_text
+from hqgs.base.left_out import CORRECTION, LeftOutRecord
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
@@ -120,8 +121,8 @@ def page_text(page: Page) -> str:
         else [_row(p.name, photo_words(photo_record(p))) for p in diagnosis.photos],
         learned=[_row(record["name"], learned_words(record)) for record in report["learned"]],
         learned_picture=None if page.learned is None else jpeg(page.learned, LEARNED_SIDE),
-        left_out=[_left_out(dict(item)) for item in report["left_out"]],
-        plan=[_plan_row(row) for row in report.get("plan", [])],
+        left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
+        plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
@@ -236,18 +237,14 @@ def _plan_row(row: PlanRowRecord) -> tuple[str, ...]:
     return row["what"], row["value"], when + row["why"], row.get("evidence", ""), row.get("rule", "")
 
 
-def _left_out(item: dict[str, Any]) -> dict[str, str]:
-    saved = []
-    if "seconds" in item:
-        saved.append(_time(item["seconds"]))
-    if "bytes" in item:
-        saved.append(f"{item['bytes'] / 1e6:.1f} MB")
-    return {
-        "what": item["what"],
-        "why": item["why"],
-        "evidence": item.get("evidence", ""),
-        "saved": ", ".join(saved),
-    }
+def _left_out(item: LeftOutRecord) -> tuple[str, ...]:
+    saved = f"{item['bytes'] / 1e6:.1f} MB" if "bytes" in item else ""
+    return item["what"], item["why"], item.get("evidence", ""), saved
+
+
+def _correction(item: Mapping[str, Any]) -> bool:
+    """Whether it is of a correction that was not needed: those are told once, with what the photos show."""
+    return item["what"].startswith(CORRECTION)
 
 
 def _environment(report: Report) -> list[tuple[str, str]]:
