@@ -29,7 +29,7 @@ def mapped(arrays: Arrays, linear: Array, shift: Array) -> Arrays:
     if np.ptp(stretch) < SAME * stretch[0] and np.linalg.det(rotation) > 0:
         quats, logs = _times(_quat(rotation[None]), quats), logs + np.log(stretch[0])
     else:
-        factor = linear @ _matrices(quats) * np.exp(logs)[:, None, :]
+        factor = linear @ matrices(quats) * np.exp(logs)[:, None, :]
         axes, lengths, _ = np.linalg.svd(factor)
         axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
         quats, logs = _quat(axes), np.log(np.maximum(lengths, LEAST))
@@ -84,7 +84,7 @@ def basis(d: Array) -> Array:
     )
 
 
-def _matrices(quats: Array) -> Array:
+def matrices(quats: Array) -> Array:
     """Rotations [N, 3, 3] of w x y z, of any norm; the unit for one of norm 0."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     w, x, y, z = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1, 0, 0, 0]).T

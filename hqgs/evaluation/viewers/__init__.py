@@ -1,0 +1,1 @@
+"""Whether a viewer shows a scene right, and what is wrong where it does not."""

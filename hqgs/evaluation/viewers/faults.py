@@ -1,0 +1,149 @@
+"""Which fault a viewer's pictures show: each is imitated, and the nearest imitation names it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.evaluation.viewers.plain import Floats, Ways, render
+from hqgs.model.formats.arrays import Arrays
+from hqgs.photos.pixels import to_uint8
+from hqgs.scene.scene import Camera
+
+RIGHT = "right"
+ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float32 a little more
+WHOLLY = 0.5  # of the difference to the right picture: an imitation that leaves more explains nothing
+APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not told apart
+FAR_STEPS = 12  # far planes that are tried, at quantiles of the depths
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What pictures show."""
+
+    fault: str | None  # RIGHT, a fault's name, or None: none of these
+    detail: str  # which form of it
+    off: float  # levels, root mean square: from the right pictures
+    left: float  # and from the nearest imitation
+    nearest: str  # the fault of that imitation
+    worst: tuple[int, int, int]  # picture, row and column that differ most from the right ones
+
+    def __str__(self) -> str:
+        if self.fault == RIGHT:
+            return f"right ({self.off:.2f} levels off)"
+        if self.fault is None:
+            nearest = "" if self.nearest == RIGHT else f" (nearest: {self.nearest}, {self.left:.2f} left)"
+            return f"{self.off:.2f} levels off, by none of the known faults{nearest}"
+        form = f" ({self.detail})" if self.detail else ""
+        return f"{self.fault}{form}: {self.off:.2f} levels off, {self.left:.2f} left where it is imitated"
+
+
+def imitations(scene: Arrays, cameras: Sequence[Camera]) -> list[tuple[str, str, Ways]]:
+    """Faults, their forms, and how they render."""
+    flag = bool(scene.get("antialiased", False))
+    order, degree = "wrong order", int(np.sqrt(scene["shN"].shape[1] + 1)) - 1
+    found = [
+        (RIGHT, "", Ways()),
+        ("missing low-pass", "", Ways(eps2d=0.0)),
+        (
+            "antialias flag ignored" if flag else "antialiased without the flag",
+            "",
+            Ways(antialiased=not flag),
+        ),
+        *(("harmonics cut", f"to degree {k}", Ways(sh_degree=k)) for k in range(degree)),
+        ("harmonics clamped", "to white", Ways(brightest=1.0)),
+        ("blended in linear light", "", Ways(linear=True)),
+        ("8-bit accumulation", "from the front", Ways(bits="front")),
+        ("8-bit accumulation", "from the back", Ways(bits="back")),
+        (order, "reversed", Ways(order="reversed")),
+        (order, "as in the file", Ways(order="file")),
+        (order, "by distance, not depth", Ways(order="distance")),
+    ]
+    for form, positions in _coarse(scene["means"].astype(np.float64)).items():
+        found.append(("quantised positions", form, Ways(positions=positions)))
+    for form, directions in {"x": (-1, 1, 1), "y": (1, -1, 1), "z": (1, 1, -1), "all": (-1, -1, -1)}.items():
+        found.append(("flipped axes", f"of the harmonics, {form}", Ways(directions=directions)))
+    for form, picture in {"left to right": (1, -1), "upside down": (-1, 1), "both": (-1, -1)}.items():
+        found.append(("flipped axes", f"picture {form}", Ways(picture=picture)))
+    depths = np.concatenate([scene["means"] @ c.viewmat[2, :3] + c.viewmat[2, 3] for c in cameras])
+    steps = np.quantile(depths[depths > 0], np.linspace(0.3, 1, FAR_STEPS, endpoint=False))
+    gaps = np.sort(depths[depths > 0])
+    widest = np.argsort(-np.diff(np.log(gaps)))[:3]
+    for far in sorted({*steps.tolist(), *(float(np.sqrt(gaps[k] * gaps[k + 1])) for k in widest)}):
+        found.append(("far clip", f"at {far:.3g}", Ways(far=far)))
+    return found
+
+
+def _coarse(means: Floats) -> dict[str, Callable[[Floats], Floats]]:
+    """Positions as files and shaders hold them."""
+    low = means.min(0)
+    span = np.maximum(means.max(0) - low, 1e-12)
+
+    def steps(bits: int) -> Callable[[Floats], Floats]:
+        return lambda x: low + np.rint((x - low) / span * (2**bits - 1)) / (2**bits - 1) * span
+
+    return {
+        "16-bit floats": lambda x: x.astype(np.float16).astype(np.float64),
+        **{f"{bits} bits over the scene": steps(bits) for bits in (10, 11, 12, 14, 16)},
+    }
+
+
+class Imitations:
+    """The pictures of a scene as each fault makes them, rendered when they are asked for and kept."""
+
+    def __init__(self, scene: Arrays, cameras: Sequence[Camera]) -> None:
+        self._scene, self._cameras = scene, cameras
+        self._ways = imitations(scene, cameras)
+        self._kept: dict[tuple[int, int], NDArray[np.uint8]] = {}
+
+    def verdict(self, pictures: Mapping[int, NDArray[np.uint8]]) -> Verdict:
+        """The fault that the pictures [H, W, 3], by the number of their camera, show together.
+
+        ValueError for one of another size than its camera's.
+        """
+        for number, picture in pictures.items():
+            camera = self._cameras[number]
+            if picture.shape != (camera.height, camera.width, 3):
+                size, wanted = f"{picture.shape[1]} x {picture.shape[0]}", f"{camera.width} x {camera.height}"
+                raise ValueError(
+                    f"picture {number} is {size} px, its camera wants {wanted}, at one px a pixel"
+                )
+        first = min(pictures)
+        forms: dict[str, tuple[float, int]] = {}  # the best form of each fault, in one picture
+        for k, (fault, _, _) in enumerate(self._ways):
+            left = _rms([self._apart(k, first, pictures[first])])
+            if fault not in forms or left < forms[fault][0]:
+                forms[fault] = left, k
+        lefts = {
+            fault: (_rms([self._apart(k, number, shot) for number, shot in pictures.items()]), k)
+            for fault, (_, k) in forms.items()
+        }
+        off = lefts[RIGHT][0]
+        nearest = min(lefts, key=lambda fault: lefts[fault][0])
+        left, k = lefts[nearest]
+        others = [one for fault, (one, _) in lefts.items() if fault not in (nearest, RIGHT)]
+        fault = nearest if nearest != RIGHT and left <= min(WHOLLY * off, APART * min(others)) else None
+        if off <= ROUNDED:
+            fault = RIGHT
+        return Verdict(fault, self._ways[k][1], off, left, nearest, self._worst(pictures))
+
+    def _apart(self, k: int, number: int, picture: NDArray[np.uint8]) -> Floats:
+        if (k, number) not in self._kept:
+            made = render(self._scene, self._cameras[number], self._ways[k][2])
+            self._kept[k, number] = to_uint8(made.astype(np.float32))
+        return picture.astype(np.float64) - self._kept[k, number]
+
+    def _worst(self, pictures: Mapping[int, NDArray[np.uint8]]) -> tuple[int, int, int]:
+        found = []
+        for number, picture in pictures.items():
+            apart = np.abs(self._apart(0, number, picture)).sum(-1)
+            row, column = np.unravel_index(int(apart.argmax()), apart.shape)
+            found.append((float(apart.max()), (number, int(row), int(column))))
+        return max(found)[1]
+
+
+def _rms(apart: Sequence[Floats]) -> float:
+    return float(np.sqrt(np.mean([np.square(one).mean() for one in apart])))
