@@ -14,6 +14,7 @@ from reference import project, sh_colors
 
 import hqgs
 from hqgs.cli.main import main
+from hqgs.evaluation.viewers import kit as viewers_kit
 from hqgs.evaluation.viewers.faults import RIGHT, Imitations
 from hqgs.evaluation.viewers.kit import kit_cameras, kit_scene
 from hqgs.evaluation.viewers.plain import Ways, render
@@ -187,10 +188,16 @@ def test_what_is_none_of_them_is_said(tmp_path: Path) -> None:
     assert "by none of the known faults" in str(found)
 
 
-def test_the_kit_and_its_judge(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_kit_and_its_judge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     kit, shots = tmp_path / "kit", tmp_path / "shots"
     assert main(["judge", "--kit", str(kit)]) == 0
     assert sum(path.stat().st_size for path in kit.iterdir()) < 2e6
+    for name, side in {"WIDTH": SMALL[0], "HEIGHT": SMALL[1], "FOCAL": 97.5}.items():
+        monkeypatch.setattr(viewers_kit, name, side)  # a smaller one takes seconds less to judge
+    kit = tmp_path / "small"
+    assert main(["judge", "--kit", str(kit)]) == 0
     shots.mkdir()
     right = Image.open(kit / "plain_1.png")
     right.convert("RGBA").save(shots / "plain_1.PNG")
