@@ -14,7 +14,7 @@ from hqgs.scene.scene import Camera, Scene
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
 SIZE = (504, 378)
 FOV = 60.0
-MOST_KEYS = 24  # cameras that a path goes through: more of them shake it
+MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
 TURN = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle
 _Array = NDArray[np.float64]
@@ -252,6 +252,7 @@ def _range(flat: _Array, up: _Array) -> float:
 
 def _keys(cameras: list[Camera]) -> list[Camera]:
     """The cameras in the order of a walk, every so manieth of many."""
+    cameras = [cameras[k] for k in evenly(len(cameras), MOST_WALKED)]
     centers = np.stack([camera.center for camera in cameras])
     tour, own = _short_walk(centers), [*range(len(cameras))]
     length, own_length = (
@@ -271,7 +272,7 @@ def _short_walk(centers: _Array) -> list[int]:
     while left:
         order.append(min(left, key=lambda k: float(apart[order[-1], k])))
         left.remove(order[-1])
-    for _ in range(4 if len(order) <= 400 else 0):
+    for _ in range(4):
         before = list(order)
         for i in range(len(order) - 2):
             a, b = order[i], order[i + 1]

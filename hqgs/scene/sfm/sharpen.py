@@ -32,6 +32,7 @@ REACH = 3.0  # px that an observation may move
 SURE = 0.6  # correlation with the other photos' mean, of an observation that stays
 UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it
 NEW = 0.7  # the same, of one that no feature told of
+CANDIDATES = 1 << 21  # of a point in a photo, looked at together: 100 MB
 PHOTOS = 12  # that a point is looked for in, beside those whose features show it
 ENOUGH = 150  # observations of a photo, of the points whose patches are laid
 CELL = 2.0  # px, where points are the same
@@ -266,28 +267,43 @@ def _aligned(
     return replace(tracks, xy=at), np.where(stay, ~new, sure), unlike
 
 
+def _candidates(
+    views: list[_View], tracks: Tracks, normals: Floats, sizes: Floats, first: int, end: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Photos [O] that should show points from row `first` to `end`, which points [O], and where [O, 2]."""
+    points, normals, sizes = tracks.points[first:end], normals[first:end], sizes[first:end]
+    may, places = np.zeros((len(views), len(points)), bool), []
+    for k, view in enumerate(views):
+        at, depths = view.project(points)
+        rays = points - view.center
+        far = np.linalg.norm(rays, axis=1)
+        frontal = np.abs((rays * normals).sum(1)) > FRONTAL * far
+        inside = ((at >= HALF / view.ratio) & (at <= view.size - HALF / view.ratio)).all(1)
+        may[k] = inside & (depths > 0) & frontal & (far / view.focal < COARSER * sizes)
+        places.append(at)
+    own = (tracks.point >= first) & (tracks.point < end)
+    may[tracks.view[own], tracks.point[own] - first] = False
+    # Of each point's candidates some that are spread over the photos.
+    rank, count = np.cumsum(may, axis=0) - 1, may.sum(axis=0)
+    share = np.minimum(1, PHOTOS / np.maximum(count, 1))
+    may &= np.floor((rank + 1) * share) > np.floor(rank * share)
+    view, point = np.nonzero(may)
+    return view, point + first, np.array(places)[view, point]
+
+
 def _widened(views: list[_View], tracks: Tracks) -> tuple[Tracks, NDArray[np.bool_]]:
     """Also the observations that photos should have of points, PHOTOS of each; and which are new [O]."""
     axes = _axes(views, tracks)
     normals = np.cross(axes[:, :, 0], axes[:, :, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sizes = np.linalg.norm(axes[:, :, 0], axis=1)
-    may, places = np.zeros((len(views), len(tracks.points)), bool), []
-    for k, view in enumerate(views):
-        at, depths = view.project(tracks.points)
-        rays = tracks.points - view.center
-        far = np.linalg.norm(rays, axis=1)
-        frontal = np.abs((rays * normals).sum(1)) > FRONTAL * far
-        inside = ((at >= HALF / view.ratio) & (at <= view.size - HALF / view.ratio)).all(1)
-        may[k] = inside & (depths > 0) & frontal & (far / view.focal < COARSER * sizes)
-        places.append(at)
-    may[tracks.view, tracks.point] = False
-    # Of each point's candidates some that are spread over the photos.
-    rank, count = np.cumsum(may, axis=0) - 1, may.sum(axis=0)
-    share = np.minimum(1, PHOTOS / np.maximum(count, 1))
-    may &= np.floor((rank + 1) * share) > np.floor(rank * share)
-    view, point = np.nonzero(may)
-    more = Tracks(tracks.points, tracks.colors, view, point, np.array(places)[view, point])
+    step = max(1, CANDIDATES // len(views))  # points at a time
+    firsts = range(0, max(1, len(tracks.points)), step)
+    found = [_candidates(views, tracks, normals, sizes, first, first + step) for first in firsts]
+    view, point, xy = (np.concatenate(values) for values in zip(*found, strict=True))
+    order = np.lexsort((point, view))
+    view, point, xy = view[order], point[order], xy[order]
+    more = Tracks(tracks.points, tracks.colors, view, point, xy)
     joined = Tracks(
         tracks.points,
         tracks.colors,
