@@ -19,6 +19,7 @@ from hqgs.model.formats.spz import encode_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene import source as scene_source
+from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Camera
 from hqgs.show.export import (
     along_a_curve,
@@ -27,6 +28,7 @@ from hqgs.show.export import (
     needed_degrees,
     reduce_gaussians,
 )
+from hqgs.show.export_change import measure
 from hqgs.show.export_options import ExportOptions
 
 CAMERA = Camera(48, 32, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), np.eye(4))
@@ -228,6 +230,27 @@ def test_the_command_on_a_run_folder(
     assert abs(after - before) < 0.1
     assert "left out: 1 Gaussians: no pixel can show them" in text
     assert "left out: harmonics of degrees 1 to 3: at most 1 in 1,000 Gaussians needs them (0 of 39" in text
+    assert "measured: renders of 4 cameras around the scene change by 0." in text
+
+
+def test_what_a_file_changes_is_measured_in_the_cameras_of_its_run(tmp_path: Path) -> None:
+    scene, g = tiny_scene(), some_gaussians(40, 0)
+    other = g.like(g.named() | {"sh0": g.sh0 + torch.tensor([0.3, 0.0, 0.0])})
+    save_cameras(tmp_path, scene)
+    change = measure(g, other, tmp_path)
+    pairs = [[255 * x.render(view.camera).clamp(0, 1).double() for x in (g, other)] for view in scene.test]
+    away = [(a - b).abs() for a, b in pairs]
+    flat = torch.cat([x.flatten() for x in away])
+    assert change.mean == pytest.approx(float(flat.mean()))
+    assert change.psnr == pytest.approx(10 * math.log10(255**2 / float(flat.square().mean())))
+    assert change.worst == float(flat.max()) > 5
+    name, row, column = change.where
+    names = [view.name for view in scene.test]
+    assert float(away[names.index(name)][row, column].max()) == change.worst
+    assert str(change).startswith(
+        f"renders of {len(names)} held-out views change by {change.mean:.2f} levels"
+    )
+    assert str(measure(g, g, None)) == "no pixel of renders of 4 cameras around the scene changes"
 
 
 def test_the_format_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,7 +262,14 @@ def test_the_format_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 @pytest.mark.parametrize(
     ("name", "told"),
-    [("a.glb", True), ("a.splat", True), ("a.compressed.ply", True), ("a.spz", False), ("a.full.ply", False)],
+    [
+        ("a.glb", True),
+        ("a.splat", True),
+        ("a.compressed.ply", True),
+        ("a.spz", False),
+        ("a.sog", False),
+        ("a.full.ply", False),
+    ],
 )
 def test_a_lost_antialias_flag_is_told(
     tmp_path: Path, name: str, told: bool, capsys: pytest.CaptureFixture[str]
@@ -274,7 +304,7 @@ def test_bad_input_is_one_line_and_writes_nothing(tmp_path: Path, capsys: pytest
     before = sorted(tmp_path.iterdir())
     for source, out, message, *more in (
         ("a.ply", "b.xyz", "the suffix says no format"),
-        ("a.ply", "b.sog", "the suffix says no format"),
+        ("a.ply", "b.ksplat", "the suffix says no format"),
         ("a.ply", "a.ply", "--out is the source"),
         ("none.ply", "b.ply", "there is no"),
         ("empty", "b.ply", "scene.ply"),

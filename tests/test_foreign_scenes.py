@@ -281,11 +281,8 @@ def test_sog(tmp_path: Path, packed: bool, bands: int) -> None:
         Gaussians.load(broken)
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_ksplat(tmp_path: Path, level: int, degree: int) -> None:
-    """One section: a full bucket of four, and one that holds two."""
-    g = random_gaussians(6, 3)
+def ksplat(g: Gaussians, level: int, degree: int) -> bytes:
+    """Six Gaussians in one section: a full bucket of four, and one that holds two."""
     block, scale = 8.0, 32767
     head, section = bytearray(4096), bytearray(1024)
     head[1] = 1
@@ -315,7 +312,16 @@ def test_ksplat(tmp_path: Path, level: int, degree: int) -> None:
             values = g.shN[k, band**2 - 1 : (band + 1) ** 2 - 1].T.numpy().astype(np.float64)
             stored = np.rint((values + 4) / 8 * 255) if level == 2 else values
             body += stored.astype(sizes[1]).tobytes()
-    (tmp_path / "a.ksplat").write_bytes(bytes(head + section + body))
+    return bytes(head + section + body)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_ksplat(tmp_path: Path, level: int, degree: int) -> None:
+    g = random_gaussians(6, 3)
+    quats = torch.nn.functional.normalize(g.quats, dim=1).numpy()
+    content = ksplat(g, level, degree)
+    (tmp_path / "a.ksplat").write_bytes(content)
     read = Gaussians.load(tmp_path / "a.ksplat")
     assert read.sh_degree == degree
     np.testing.assert_allclose(read.means, g.means, atol=2e-4 if level else 1e-6)
@@ -323,6 +329,6 @@ def test_ksplat(tmp_path: Path, level: int, degree: int) -> None:
     np.testing.assert_allclose(read.quats, quats, atol=2e-3)
     wanted = g.shN[:, : (degree + 1) ** 2 - 1]
     np.testing.assert_allclose(read.shN, wanted, atol=(1e-6, 4e-3, 0.02)[level])
-    (tmp_path / "a.ksplat").write_bytes(bytes(head + section + body[:-10]))
+    (tmp_path / "a.ksplat").write_bytes(content[:-10])
     with pytest.raises(ValueError, match="reaches beyond its end"):
         Gaussians.load(tmp_path / "a.ksplat")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -24,9 +25,12 @@ from forks import forks
 from fuzz import Target, judge, mutations, run_in_child
 from PIL import Image
 from safetensors.torch import save_file
+from test_foreign_scenes import ksplat
+from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.report import read_report
+from hqgs.model.formats.sog_writer import encode_sog
 from hqgs.model.formats.spz import write_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
@@ -138,6 +142,26 @@ def as_format(root: Path, name: str) -> None:
     some_gaussians().save(root / f"scene.{name}")
 
 
+def as_gltf(root: Path) -> None:
+    """The text form, with its numbers inside."""
+    some_gaussians().save(root / "a.glb")
+    data = (root / "a.glb").read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    content = json.loads(data[20 : 20 + length])
+    numbers = base64.b64encode(data[28 + length :]).decode()
+    content["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{numbers}"
+    (root / "scene.gltf").write_text(json.dumps(content))
+
+
+def as_unpacked_sog(root: Path) -> None:
+    for name, content in encode_sog(some_gaussians().arrays(), False).items():
+        (root / name).write_bytes(content)
+
+
+def as_ksplat(root: Path) -> None:
+    (root / "scene.ksplat").write_bytes(ksplat(random_gaussians(6, 3), 1, 2))
+
+
 def as_spz_4(root: Path) -> None:
     write_spz(root / "scene.spz", some_gaussians().arrays(), version=4)
 
@@ -167,7 +191,10 @@ TARGETS: dict[str, tuple[Callable[[Path], None], str, Callable[[Path], None], bo
        for s in SUFFIXES},
     **{name: (lambda root, name=name: as_format(root, name), f"scene.{name}",
               partial(load_gaussians, name=f"scene.{name}"), False)
-       for name in ("spz", "splat", "compressed.ply", "glb")},
+       for name in ("spz", "splat", "compressed.ply", "glb", "sog")},
+    "ksplat": (as_ksplat, "scene.ksplat", partial(load_gaussians, name="scene.ksplat"), False),
+    "gltf": (as_gltf, "scene.gltf", partial(load_gaussians, name="scene.gltf"), True),
+    "sog unpacked": (as_unpacked_sog, "meta.json", partial(load_gaussians, name="meta.json"), True),
     "spz 4": (as_spz_4, "scene.spz", partial(load_gaussians, name="scene.spz"), False),
     "ply": (as_ply, "scene.ply", load_gaussians, False),
     "ply text": (lambda root: as_ply(root, True), "scene.ply", load_gaussians, True),

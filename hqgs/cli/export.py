@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from hqgs.base.files import PLY
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
@@ -67,6 +68,7 @@ def run(args: ExportScene) -> int:
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
         from hqgs.model.gaussians import Gaussians
         from hqgs.show.export import export
+        from hqgs.show.export_change import measure
 
         gaussians = Gaussians.load(source)
         scene = None
@@ -76,16 +78,19 @@ def run(args: ExportScene) -> int:
                 scene = load(Photos(scene=args.scene, downscale=args.downscale), screen)
         before = None if scene is None else held_out_psnr(scene, held_out_renders(scene, gaussians))
         written = export(gaussians, args.out, options)
-        after = None
-        if scene is not None:
-            back = Gaussians.load(args.out, options.format)
-            after = held_out_psnr(scene, held_out_renders(scene, back))
+        back = Gaussians.load(args.out, options.format)
+        after = None if scene is None else held_out_psnr(scene, held_out_renders(scene, back))
+        try:
+            changed = f"measured: {measure(gaussians, back, source.parent if source.name == PLY else None)}"
+        except ValueError as error:
+            changed = f"not measured: {error}"
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
         return fail(1, f"{args.out}: {error}")
     print(_table(source, gaussians, before, written, after), end="\n\n")
     tell_read(gaussians)
+    print(changed)
     for entry in written.left_out:
         evidence = "" if entry.evidence is None else f" ({entry.evidence})"
         saved = "" if entry.bytes is None else f": {entry.bytes:,} bytes"

@@ -21,6 +21,7 @@ from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
 from hqgs.model.formats.files import ANTIALIASED
 from hqgs.model.formats.rows import curve_order
+from hqgs.model.formats.sog_writer import encode_sog
 from hqgs.model.formats.spz import encode_spz, write_spz
 from hqgs.model.formats.world_file import keep_world
 from hqgs.model.gaussians import Gaussians
@@ -44,7 +45,7 @@ class Export:
 def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Export:
     """Write what the options leave of the Gaussians, atomically.
 
-    The Gaussians of a PLY file keep their order, those of an SPZ file get one that packs well.
+    The Gaussians of a PLY file keep their order, those of an SPZ or SOG file get one that packs well.
 
     Raises ValueError where SPZ cannot hold the scene (see `hqgs.model.formats.spz.encode_spz`).
     """
@@ -115,7 +116,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
         )
         g = _cut(g, degree)
         steps.append(Reduction(g, f"harmonics of {bands}", why, evidence))
-    if options.format == "spz":  # zeros save nothing in a PLY file
+    if options.format in ("spz", "sog"):  # zeros save nothing in the others
         fewer = _without_bands(g, degrees)
         if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
             why = f"they change a colour by at most {options.band_tolerance:g}"
@@ -175,6 +176,8 @@ def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
         return 32 * n
     if options.format == "compressed.ply":
         return n * (16 + higher) + -(-n // 256) * 72
+    if options.format == "sog":
+        return sum(map(len, encode_sog(along_a_curve(gaussians).arrays(), gaussians.antialiased).values()))
     try:
         return len(encode_spz(along_a_curve(gaussians).arrays(), options.sh_bits, options.spz_version).data)
     except ValueError:

@@ -14,13 +14,14 @@ from hqgs.model.formats.ksplat import read_ksplat
 from hqgs.model.formats.nerfstudio import in_data_frame
 from hqgs.model.formats.ply import read_ply, write_ply
 from hqgs.model.formats.sog import read_sog
+from hqgs.model.formats.sog_writer import write_sog
 from hqgs.model.formats.splat import read_splat, write_splat
 from hqgs.model.formats.spz import read_spz, write_spz
 from hqgs.model.formats.world_file import keep_world, read_world
 from hqgs.scene.world import World
 
 OWN_PLACE = ("ply", "glb", "gltf")  # formats that hold the frame themselves
-ANTIALIASED = ("ply", "full.ply", "spz")  # formats that are written with that flag
+ANTIALIASED = ("ply", "full.ply", "spz", "sog")  # formats that are written with that flag
 
 
 def read_scene(path: Path, format: str) -> Arrays:
@@ -62,6 +63,7 @@ WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
     "compressed.ply": write_compressed_ply,
     "glb": write_gltf,
     "full.ply": partial(write_ply, full=True),
+    "sog": write_sog,
 }
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hqgs.model.constants import SH_C0
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import to_logits
+from hqgs.model.formats.rows import to_logits, whole_rows
 
 HEADER, SECTION = 4096, 1024
 SMALLEST = 1e-20  # a scale of 0 has no log
@@ -65,13 +65,17 @@ def _read(data: bytes) -> Arrays:
         found = np.frombuffer(data, kind, used, splats_at)
         means = found["means"].astype(np.float64)
         if level:
-            lengths = np.frombuffer(data, "<u4", partial, lengths_at).astype(np.int64)
-            counts = np.concatenate([np.full(full, size, np.int64), lengths])
-            if len(counts) != buckets or width != 12 or counts.sum() < used:
+            if full + partial != buckets or width != 12:
                 raise ValueError(f"section {k} has {buckets} buckets, and other numbers of them")
+            lengths = np.frombuffer(data, "<u4", partial, lengths_at).astype(np.int64)
+            ends = np.concatenate([np.full(full, size, np.int64), lengths]).cumsum()
+            if used > (ends[-1] if buckets else 0):
+                raise ValueError(f"section {k} has {used} splats, more than its buckets hold")
             middles = np.frombuffer(data, "<f4", 3 * buckets, middles_at).reshape(-1, 3)
             scale = scale_range or 32767
-            means = (means - scale) * (0.5 * block / scale) + np.repeat(middles, counts, axis=0)[:used]
+            means = (means - scale) * (0.5 * block / scale) + middles[
+                np.searchsorted(ends, np.arange(used), "right")
+            ]
         whole = np.empty(used, [("means", "f8", 3), *_SHARED])
         whole["means"] = means
         for name in ("scales", "quats", "colors"):
@@ -84,10 +88,9 @@ def _read(data: bytes) -> Arrays:
     g = np.concatenate(rows)
     higher = max(sh.shape[1] for sh in shs)
     padded = [np.pad(sh, ((0, 0), (0, higher - sh.shape[1]), (0, 0))) for sh in shs]
-    sound = np.isfinite(g["means"]).all() and np.isfinite(g["scales"]).all() and np.isfinite(g["quats"]).all()
-    if not sound or (g["scales"] < 0).any():
-        raise ValueError("positions, scales or rotations are no numbers of Gaussians")
-    return {
+    if (g["scales"] < 0).any():
+        raise ValueError("scales are below 0")
+    arrays: Arrays = {
         "means": g["means"].astype(np.float32),
         "scales": np.log(np.maximum(g["scales"], SMALLEST)).astype(np.float32),
         "quats": g["quats"].astype(np.float32),
@@ -95,6 +98,9 @@ def _read(data: bytes) -> Arrays:
         "sh0": ((g["colors"][:, None, :3] / 255 - 0.5) / SH_C0).astype(np.float32),
         "shN": np.concatenate(padded).astype(np.float32),
     }
+    if not whole_rows(arrays).all():
+        raise ValueError("positions, scales, rotations or harmonics are not finite")
+    return arrays
 
 
 _SHARED: list[Any] = [("scales", "f8", 3), ("quats", "f8", 4), ("colors", "u1", 4)]

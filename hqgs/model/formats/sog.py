@@ -1,7 +1,8 @@
 """SOG, the format of PlayCanvas: each value of the Gaussians a pixel of a lossless WebP picture.
 
 A zip file, or the folder that it unpacks to: meta.json says which pictures there are, and what their bytes
-stand for. Version 2 has codebooks, version 1, which names none, the ends of each range. Read alone.
+stand for. Version 2 has codebooks, version 1, which names none, the ends of each range. `sog_writer.py`
+writes version 2.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ MOST_BYTES = 1 << 30  # of a picture in its file
 MOST_GAUSSIANS = 50_000_000
 ACROSS = 64  # centroids of harmonics in a row of their picture
 _COEFFICIENTS = (0, 3, 8, 15)  # by bands
-_LARGEST = 252  # the alpha of a rotation whose w is its largest component, left out
+LARGEST = 252  # the alpha of a rotation whose w is its largest component, left out
 Bytes = NDArray[np.uint8]
 
 
@@ -55,7 +56,14 @@ def read_sog(path: str | Path) -> Arrays:
             return path.read_bytes() if name == META else (path.parent / name).read_bytes()
 
         return _read(beside)
-    except (*DECODE_ERRORS, zipfile.BadZipFile, KeyError, TypeError, IndexError, RecursionError) as error:
+    except (
+        *DECODE_ERRORS,
+        zipfile.BadZipFile,
+        LookupError,
+        TypeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         if isinstance(error, FileNotFoundError) and not path.exists():
             raise
         raise ValueError(f"{path}: not a readable SOG scene: {error!r:.200}") from error
@@ -116,7 +124,7 @@ def _coded(part: dict[str, Any], values: Bytes) -> NDArray[np.float64]:
 
 def _quats(packed: Bytes) -> NDArray[np.float64]:
     """w x y z of three components in 8 bits each, and the place of the fourth, the largest."""
-    place = packed[:, 3].astype(np.int64) - _LARGEST
+    place = packed[:, 3].astype(np.int64) - LARGEST
     if (place < 0).any():
         raise ValueError("a rotation does not say which component it leaves out")
     three = (packed[:, :3] / 255 - 0.5) * np.sqrt(2)

@@ -4,12 +4,13 @@ The arrays lie one after the other, little-endian, each component by itself, as 
 
 | values | stored as |
 |---|---|
-| means | 16 bits an axis, between the bounds of each block of 256 Gaussians along a curve through space |
+| means | sign(x) log(1 + abs(x)), 16 bits an axis between the bounds; all low bytes, then all high ones |
 | scales | logs, 8 bits between the smallest and largest |
 | quats | w x y z, unit, 127 levels to either side |
 | opacities | 8 bits |
 | sh0 | the colour that it gives, 8 bits from -0.25 to 1.25 |
-| shN | 127 levels to either side of 0, up to a largest value of each band |
+| shN | the number of one of a few sets, 16 bits |
+| the sets | 127 levels to either side of 0, up to a largest value of each band |
 
 `templates/splats.js` reads them.
 """
@@ -27,12 +28,12 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs.model.constants import SH_C0
+from hqgs.model.formats.codebooks import palette
 from hqgs.model.gaussians import Gaussians
 from hqgs.show.export import along_a_curve
 
-BLOCK = 256
 MOST = 400_000  # Gaussians in a page
-DEGREES = ((60_000, 3), (120_000, 2), (200_000, 1), (MOST, 0))  # up to so many, harmonics of this degree
+GAUSSIANS_A_SET, MOST_SETS = 8, 1 << 13  # of harmonics
 COLORS = (-0.25, 1.25)
 LEVELS = 127
 SHARE = 0.999  # of a band's coefficients that its largest value covers
@@ -57,8 +58,8 @@ class PackedScene:
 def pack_scene(gaussians: Gaussians, most: int = MOST) -> PackedScene:
     """Quantise the Gaussians, or of more than `most` those that show most; NaN, Inf and invisible ones go.
 
-    What shows most has the largest opacity times area. The harmonics' degree falls with the number, so that
-    the page stays small: 50,000 Gaussians of degree 3 take less than 5 MB.
+    What shows most has the largest opacity times area. Many Gaussians share a set of harmonics, so that the
+    page stays small: 50,000 Gaussians of degree 3 take less than 3 MB.
     """
     g = gaussians.detached()
     keep = g.finite() & (g.activated_opacities() > 1 / 255) & (g.quats.square().sum(1) > 1e-12)
@@ -69,49 +70,43 @@ def pack_scene(gaussians: Gaussians, most: int = MOST) -> PackedScene:
         keep[shown.topk(most).indices] = True
     g = along_a_curve(g.rows(keep))
     n = len(g)
-    degree = min(g.sh_degree, next((d for count, d in DEGREES if n <= count), 0))
-    means, low, size = _blocks(g.means.double().numpy())
+    degree = g.sh_degree
+    logs = np.sign(g.means.double().numpy()) * np.log1p(g.means.double().abs().numpy())
+    low, high = (logs.min(0), logs.max(0)) if n else (np.zeros(3), np.ones(3))
+    means = np.rint((logs - low) / np.maximum(high - low, 1e-12) * 65535).astype(np.int64)
     scales = g.scales.double().numpy()
     bounds = (float(scales.min()), float(scales.max())) if n else (0.0, 0.0)
     quats = g.quats.double().numpy()
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     colors = 0.5 + SH_C0 * g.sh0[:, 0].double().numpy()
-    rest = g.shN[:, : (degree + 1) ** 2 - 1].double().flatten(1).numpy()
+    opacities = g.activated_opacities().double().numpy()
+    rest, labels = np.zeros((0, 3 * g.shN.shape[1])), np.zeros(n, np.int64)
+    if n and degree:
+        rest, labels = palette(g.shN.flatten(1).numpy(), opacities, min(MOST_SETS, -(-n // GAUSSIANS_A_SET)))
     tops = [_top(rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]) for d in range(1, degree + 1)]
     units = np.repeat(tops, [3 * (2 * d + 1) for d in range(1, degree + 1)]) if degree else np.ones(0)
     parts = [
-        _planes(means.astype("<u2")),
+        _planes((means % 256).astype(np.uint8)),
+        _planes((means // 256).astype(np.uint8)),
         _planes(_byte(scales, *bounds)),
         _planes(np.rint(quats * LEVELS).astype(np.int8)),
-        _byte(g.activated_opacities().double().numpy(), 0, 1).tobytes(),
+        _byte(opacities, 0, 1).tobytes(),
         _planes(_byte(colors, *COLORS)),
+        labels.astype("<u2").tobytes(),
         _planes(np.rint(rest / units * LEVELS).clip(-LEVELS, LEVELS).astype(np.int8)),
     ]
     head: dict[str, Any] = {
         "count": n,
         "degree": degree,
-        "block": BLOCK,
-        "low": low.ravel().tolist(),
-        "size": size.ravel().tolist(),
+        "sets": len(rest),
+        "low": low.tolist(),
+        "high": high.tolist(),
         "scales": bounds,
         "colors": COLORS,
         "tops": tops,
     }
     data = base64.b64encode(gzip.compress(b"".join(parts), 9, mtime=0)).decode()
     return PackedScene(head, data, n, len(gaussians) - n, degree)
-
-
-def _blocks(
-    means: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-    """Levels 0..65535 [N, 3], and for each block the lower corner and the size of the box, [B, 3]."""
-    starts = np.arange(0, len(means), BLOCK)
-    if not len(starts):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    low = np.minimum.reduceat(means, starts).astype(np.float32)
-    size = np.maximum((np.maximum.reduceat(means, starts) - low).astype(np.float32), 1e-12)
-    block = np.arange(len(means)) // BLOCK
-    return np.rint(((means - low[block]) / size[block]).clip(0, 1) * 65535), low, size
 
 
 def _byte(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:

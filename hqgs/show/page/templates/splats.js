@@ -17,7 +17,7 @@ class SplatViewer {
   }
 
   decode(bytes) {
-    const { count: n, degree, block, low, size, scales, tops } = this.head;
+    const { count: n, degree, sets, low, high, scales, tops } = this.head;
     const rest = 3 * ((degree + 1) ** 2 - 1);
     let at = 0;
     const take = (Kind, many) => {
@@ -25,8 +25,9 @@ class SplatViewer {
       at += many * Kind.BYTES_PER_ELEMENT;
       return part;
     };
-    const xyz = take(Uint16Array, 3 * n), logs = take(Uint8Array, 3 * n), quats = take(Int8Array, 4 * n);
-    const alphas = take(Uint8Array, n), rgb = take(Uint8Array, 3 * n), sh = take(Int8Array, rest * n);
+    const fine = take(Uint8Array, 3 * n), coarse = take(Uint8Array, 3 * n), logs = take(Uint8Array, 3 * n), quats = take(Int8Array, 4 * n);
+    const alphas = take(Uint8Array, n), rgb = take(Uint8Array, 3 * n);
+    const labels = take(Uint16Array, n), sh = take(Int8Array, rest * sets);
     this.texels = 3 + Math.ceil(rest / 16);
     this.rows = Math.max(1, Math.ceil((n * this.texels) / SPLAT_WIDTH));
     const words = new Uint32Array(SPLAT_WIDTH * this.rows * 4), floats = new Float32Array(words.buffer);
@@ -34,9 +35,10 @@ class SplatViewer {
     this.means = new Float32Array(3 * n);
     const s = new Float64Array(3), range = (scales[1] - scales[0]) / 255;
     for (let i = 0; i < n; i++) {
-      const w = i * this.texels * 4, b = 3 * Math.floor(i / block);
+      const w = i * this.texels * 4;
       for (let k = 0; k < 3; k++) {
-        this.means[3 * i + k] = floats[w + k] = low[b + k] + (size[b + k] * xyz[k * n + i]) / 65535;
+        const log = low[k] + ((high[k] - low[k]) * (fine[k * n + i] + 256 * coarse[k * n + i])) / 65535;
+        this.means[3 * i + k] = floats[w + k] = Math.sign(log) * Math.expm1(Math.abs(log));
         s[k] = Math.exp(2 * (scales[0] + range * logs[k * n + i]));
       }
       words[w + 3] = (rgb[i] | (rgb[n + i] << 8) | (rgb[2 * n + i] << 16) | (alphas[i] << 24)) >>> 0;
@@ -52,7 +54,7 @@ class SplatViewer {
       for (let a = 0; a < 3; a++)
         for (let c = a; c < 3; c++)
           floats[place++] = M[3 * a] * M[3 * c] * s[0] + M[3 * a + 1] * M[3 * c + 1] * s[1] + M[3 * a + 2] * M[3 * c + 2] * s[2];
-      for (let k = 0; k < rest; k++) signed[4 * (w + 12) + k] = sh[k * n + i];
+      for (let k = 0; k < rest; k++) signed[4 * (w + 12) + k] = sh[k * sets + labels[i]];
     }
     this.words = words;
     this.tops = [...tops, 0, 0, 0].slice(0, 3);

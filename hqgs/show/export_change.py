@@ -1,0 +1,78 @@
+"""What a scene file changes: renders of what was written, read back, against those of its source."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.orbit import orbit
+from hqgs.scene.camera_files import CAMERAS, load_cameras
+from hqgs.scene.paths import resized
+from hqgs.scene.scene import Camera
+
+VIEWS, SIDE = 4, 800  # as many are rendered, of at most so many px
+
+
+@dataclass(frozen=True)
+class Change:
+    """Between two scenes in the same cameras; levels are those of pictures with 8 bits, from 0 to 255."""
+
+    cameras: str  # which those were
+    psnr: float  # dB, over all pixels of all of them; inf where none changes
+    mean: float  # levels, absolute
+    worst: float  # levels, of one channel of one pixel
+    where: tuple[str, int, int]  # the camera, row and column of that pixel
+
+    def __str__(self) -> str:
+        if not self.worst:
+            return f"no pixel of {self.cameras} changes"
+        camera, row, column = self.where
+        return (
+            f"{self.cameras} change by {self.mean:.2f} levels of 255 in the mean ({self.psnr:.1f} dB), by "
+            f"{self.worst:.0f} at the worst pixel (row {row}, column {column} of {camera})"
+        )
+
+
+def measure(before: Gaussians, after: Gaussians, run: Path | None) -> Change:
+    """Renders of both by a few cameras of the run in a folder, held-out ones where there are some.
+
+    Without a folder, or cameras in it, by some around the scene. ValueError for a scene of which nothing can
+    be seen, or cameras that are damaged.
+    """
+    said, cameras = _cameras(before, run)
+    after = after.in_world(before.world)
+    squares, total, count, worst = 0.0, 0.0, 0, (0.0, ("", 0, 0))
+    with torch.no_grad():
+        for name, camera in cameras:
+            pictures = [255 * g.render(camera).clamp(0, 1).double() for g in (before, after)]
+            away = (pictures[0] - pictures[1]).abs()
+            squares += float(away.square().sum())
+            total += float(away.sum())
+            count += away.numel()
+            at = int(away.amax(-1).argmax())
+            worst = max(worst, (float(away.max()), (name, at // camera.width, at % camera.width)))
+    psnr = 10 * math.log10(255**2 * count / squares) if squares else math.inf
+    return Change(said, psnr, total / count, *worst)
+
+
+def _cameras(gaussians: Gaussians, run: Path | None) -> tuple[str, list[tuple[str, Camera]]]:
+    if run is not None and (run / CAMERAS).is_file():
+        views = load_cameras(run).views
+        kind = "held-out views" if any(view.held_out for view in views) else "training views"
+        views = [view for view in views if view.held_out] or views
+        chosen = [
+            views[round(k * (len(views) - 1) / max(1, VIEWS - 1))] for k in range(min(VIEWS, len(views)))
+        ]
+        return f"renders of {len(chosen)} {kind}", [(view.name, _small(view.camera)) for view in chosen]
+    return f"renders of {VIEWS} cameras around the scene", [
+        (f"camera {k + 1}", camera) for k, camera in enumerate(orbit(gaussians, VIEWS))
+    ]
+
+
+def _small(camera: Camera) -> Camera:
+    share = min(1.0, SIDE / max(camera.width, camera.height))
+    return resized(camera, max(1, round(share * camera.width)), max(1, round(share * camera.height)))
