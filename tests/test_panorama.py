@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ from hqgs.base.stages import Stage
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene.builtin.panorama import panorama_room
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
+from hqgs.scene.geometry import project
 from hqgs.scene.load import load_scene
-from hqgs.scene.scene import Camera, View
+from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm.align import align, rotation_angles
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
+from hqgs.scene.sfm.folder import write_colmap_folder
 from hqgs.scene.sfm.likely import pairs_of_faces
 
 Floats = NDArray[np.float64]
@@ -278,23 +281,41 @@ def test_the_room_as_panoramas() -> None:
 @pytest.mark.slow
 def test_photos_alone_become_a_scene_of_faces(tmp_path: Path) -> None:
     """End to end: COLMAP finds the places of a rig to 0.1 degree, and each face is a view of the room."""
-    poses = write_walk(tmp_path / "walk", 8, 768)
-    told: list[Stage] = []
-    scene = load_scene(tmp_path / "walk", test_every=4, on_stage=told.append)
-    assert any("8 panoramas of 360 x 180 degrees" in stage.note for stage in told if stage.note)
+    poses = write_walk(tmp_path / "walk", 6, 640)
+    heard: list[Stage] = []
+    keep = tmp_path / "keep"
+    scene = load_scene(tmp_path / "walk", test_every=4, keep_sfm=keep, on_stage=heard.append)
+    assert any((stage.note or "").startswith("6 panoramas of 360 x 180 degrees") for stage in heard)
     assert {view.name for view in scene.test} == {face_name(f"{k:02d}.png", f) for k in (0, 4) for f in CUBE}
-    assert len(scene.train) == 6 * len(CUBE)
+    assert len(scene.train) == 4 * len(CUBE)
     assert scene.sfm is not None
-    assert (scene.sfm.photos, scene.sfm.not_registered) == (8, [])
+    assert (scene.sfm.photos, scene.sfm.not_registered) == (6, [])
+    assert set(scene.sfm.sure_px) == {f"{k:02d}.png" for k in range(6)}
+    assert scene.seen is not None
+    check_places(scene, poses)
+    for view in scene.train:
+        rows = scene.seen[view.name]
+        pixels, depths = project(view.camera, scene.points[rows].astype(np.float64))
+        assert len(rows) > 20
+        assert (depths > 0).all()
+        assert ((pixels >= 0) & (pixels <= view.camera.width)).all()
+    written = tmp_path / "written"
+    assert write_colmap_folder(tmp_path / "walk", written, keep).not_registered == []
+    check_places(load_scene(written, test_every=4), poses)
+
+
+def check_places(scene: Scene, poses: list[Floats]) -> None:
+    """All faces are turned as they were, up to one rotation of the world, and show the room."""
     views = [*scene.train, *scene.test]
+    assert len(views) == len(poses) * len(CUBE)
     found = np.stack([view.camera.viewmat for view in views])
-    true = np.stack(
-        [
-            np.vstack([CUBE[view.name.split(".")[1]] @ poses[int(view.name[:2])][:3], [0, 0, 0, 1]])
-            for view in views
-        ]
-    )
+    true = np.zeros_like(found)
+    true[:, 3, 3] = 1
+    for k, view in enumerate(views):
+        true[k, :3] = CUBE[view.name.split(".")[1]] @ poses[int(view.name[:2])][:3]
     similarity, _ = align(found, true)
     moved = similarity.viewmats(found)
     degrees = np.rad2deg(rotation_angles(np.einsum("nij,nkj->nik", moved[:, :3, :3], true[:, :3, :3])))
     assert degrees.max() < 0.1
+    for view, viewmat in zip(views, true, strict=True):
+        assert np.median(off(replace(view, camera=replace(view.camera, viewmat=viewmat)))) < 8
