@@ -98,7 +98,7 @@ impl fmt::Display for Error {
 impl std::error::Error for Error {}
 
 /// Check that `data` holds `expected` elements.
-pub(crate) fn check_len<T>(name: &str, data: &[T], expected: usize) -> Result<(), Error> {
+pub fn check_len<T>(name: &str, data: &[T], expected: usize) -> Result<(), Error> {
     if data.len() == expected {
         Ok(())
     } else {

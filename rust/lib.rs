@@ -2,9 +2,8 @@
 //!
 //! [`render::forward`] renders [`scene::Gaussians`] into a [`scene::Camera`], with colours from spherical harmonics
 //! or as any number of channels. [`render::backward`] gives the gradients of a loss with respect to each of the
-//! inputs, the camera's pose included. [`training`] has the usual loss on pictures and Adam. Arrays are row-major
-//! slices of f32 or f64; the bits of the results depend on no number of threads. The threads are those of rayon's
-//! current pool.
+//! inputs, the camera's pose included. Arrays are row-major slices of f32 or f64; the bits of the results depend on no
+//! number of threads. The threads are those of rayon's current pool.
 //!
 //! ```
 //! use hqgs::{render, scene};
@@ -39,7 +38,8 @@
 //! # }
 //! ```
 //!
-//! `rust/examples/fit_image.rs` fits Gaussians to a picture.
+//! The crate `hqgs-training` has the usual loss on pictures and Adam; its example `fit_image` fits Gaussians to a
+//! picture.
 //!
 //! # The pipeline
 //! The modules in its order, of which a caller needs the first and the last:
@@ -47,24 +47,19 @@
 //! 1. [`scene`]: Gaussians and cameras, what comes in;
 //! 2. `project`: Gaussians become splats, their harmonics colours;
 //! 3. `tiles`: splats are sorted into the tiles that they reach, front to back;
-//! 4. `composite`: the splats of each tile are blended into pixels;
-//! 5. [`training`]: the loss of the picture, and the step of the optimizer.
-//!
-//! Before the first step, `stereo` finds where photos agree on a surface, for points to start from.
+//! 4. `composite`: the splats of each tile are blended into pixels.
 //!
 //! [`render`] is the whole way of one image, there and back. Each stage has its forward function and its
 //! vector-Jacobian product side by side.
 //!
-//! The stages are for the Python binding and the benchmarks, which need them one by one: they are in `internals`,
+//! The stages are for the crate `hqgs-training`, the Python binding and the benchmarks, which need them one by one: they are in `internals`,
 //! which is not documented and may change in any version.
 
 mod composite;
 mod project;
 pub mod render;
 pub mod scene;
-mod stereo;
 mod tiles;
-pub mod training;
 
 mod accuracy_knobs;
 mod constants;
@@ -77,10 +72,10 @@ mod uninit;
 pub use error::Error;
 pub use simd::{Level, Real, levels};
 
-/// The stages, for the Python binding, the benchmarks and the tests of this repository alone.
+/// The stages, for the other crates, the benchmarks and the tests of this repository alone.
 #[doc(hidden)]
 pub mod internals {
-    pub use crate::Error;
+    pub use crate::{Error, error::check_len};
 
     macro_rules! expose {
         ($($module:ident),*) => { $(pub mod $module { pub use crate::$module::*; })* };
@@ -90,9 +85,9 @@ pub mod internals {
         composite,
         constants,
         counts,
+        memory,
         project,
         simd,
-        stereo,
         tiles
     );
 
@@ -100,22 +95,6 @@ pub mod internals {
         pub use crate::scene::*;
         pub mod synthetic {
             pub use crate::scene::synthetic::*;
-        }
-    }
-
-    pub mod training {
-        pub use crate::training::{adam, loss};
-        pub mod exposure {
-            pub use crate::training::exposure::*;
-        }
-        pub mod jpeg_cells {
-            pub use crate::training::jpeg_cells::*;
-        }
-        pub mod rows {
-            pub use crate::training::rows::*;
-        }
-        pub mod separable {
-            pub use crate::training::separable::*;
         }
     }
 }

@@ -4,14 +4,14 @@ use crate::error::Error;
 
 /// Room for `additional` more elements of what `name` says.
 #[inline(always)]
-pub(crate) fn reserve<T>(vector: &mut Vec<T>, additional: usize, name: &str) -> Result<(), Error> {
+pub fn reserve<T>(vector: &mut Vec<T>, additional: usize, name: &str) -> Result<(), Error> {
     vector
         .try_reserve(additional)
         .map_err(|_| no_memory::<T>(additional, name))
 }
 
 /// A vector with room for `len` elements of what `name` says.
-pub(crate) fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> {
+pub fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> {
     let mut vector = Vec::new();
     match vector.try_reserve_exact(len) {
         Ok(()) => Ok(vector),
@@ -21,7 +21,7 @@ pub(crate) fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> 
 
 /// Make a vector `len` long; elements that it did not have are `value`.
 #[inline(always)]
-pub(crate) fn resize<T: Clone>(
+pub fn resize<T: Clone>(
     vector: &mut Vec<T>,
     len: usize,
     value: T,
@@ -33,14 +33,14 @@ pub(crate) fn resize<T: Clone>(
 }
 
 /// A vector of `len` times the same value.
-pub(crate) fn filled<T: Clone>(value: T, len: usize, name: &str) -> Result<Vec<T>, Error> {
+pub fn filled<T: Clone>(value: T, len: usize, name: &str) -> Result<Vec<T>, Error> {
     let mut vector = with_capacity(len, name)?;
     vector.resize(len, value);
     Ok(vector)
 }
 
 /// A copy of a slice.
-pub(crate) fn copied<T: Copy>(from: &[T], name: &str) -> Result<Vec<T>, Error> {
+pub fn copied<T: Copy>(from: &[T], name: &str) -> Result<Vec<T>, Error> {
     let mut vector = with_capacity(from.len(), name)?;
     vector.extend_from_slice(from);
     Ok(vector)

@@ -1,5 +1,5 @@
 //! `cargo bench`: the stages of the rasterizer at three sizes, 504 x 378, degree 3, f32, all threads, for a
-//! cloud and for a room as a trained scene looks like; and Adam on as many Gaussians.
+//! cloud and for a room as a trained scene looks like.
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::internals::{
@@ -7,7 +7,6 @@ use hqgs::internals::{
     project::{self, ProjectCotangents, ProjectOptions, Projected},
     scene::{Colors, Harmonics, synthetic::Synthetic},
     tiles,
-    training::adam::{self, AdamArrays, AdamOptions, Selection},
 };
 use std::time::Duration;
 
@@ -125,54 +124,11 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
     group.finish();
 }
 
-/// One step on all parameters of N Gaussians, 59 numbers each, in one array; and with a mask in which two of
-/// three are visible, as they come in a scene that is sorted in no way.
-fn optimizer(c: &mut Criterion) {
-    const NUMBERS: usize = 59;
-    let options = AdamOptions {
-        lr: 1e-3,
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-15,
-    };
-    for n in SIZES {
-        let wave =
-            |step: f32| -> Vec<f32> { (0..n * NUMBERS).map(|i| (i as f32 * step).sin()).collect() };
-        let (mut param, grad) = (wave(0.37), wave(0.73));
-        let (mut exp_avg, mut exp_avg_sq) = (vec![0f32; n * NUMBERS], vec![0f32; n * NUMBERS]);
-        let hash = |i: usize| (i as u32).wrapping_mul(0x9e37_79b9) >> 16;
-        let visible: Vec<u8> = (0..n).map(|i| u8::from(hash(i) % 3 != 0)).collect();
-        let mut group = c.benchmark_group("adam");
-        group.sample_size(20);
-        for (name, visible) in [("all", None), ("visible", Some(&visible[..]))] {
-            let mut step = 0;
-            let selection = Selection {
-                visible,
-                width: NUMBERS,
-                used: NUMBERS,
-            };
-            group.bench_function(BenchmarkId::new(name, n), |b| {
-                b.iter(|| {
-                    step += 1;
-                    let arrays = AdamArrays {
-                        param: &mut param,
-                        grad: &grad,
-                        exp_avg: &mut exp_avg,
-                        exp_avg_sq: &mut exp_avg_sq,
-                    };
-                    adam::step(arrays, step, &options, &selection).expect("right lengths");
-                });
-            });
-        }
-        group.finish();
-    }
-}
-
 criterion_group! {
     name = benches;
     config = Criterion::default()
         .warm_up_time(Duration::from_secs(1))
         .measurement_time(Duration::from_secs(3));
-    targets = cloud, room, optimizer
+    targets = cloud, room
 }
 criterion_main!(benches);

@@ -15,7 +15,8 @@ pub const MAX_DEGREE: usize = 3;
 /// Coefficients of degree 3.
 pub const MAX_COUNT: usize = count(MAX_DEGREE);
 
-pub(crate) const C0: f64 = 0.282_094_791_773_878_14; // sqrt(1 / 4 pi)
+/// The function of degree 0.
+pub const C0: f64 = 0.282_094_791_773_878_14; // sqrt(1 / 4 pi)
 const C1: f64 = 0.488_602_511_902_919_9; // sqrt(3 / 4 pi)
 const C2A: f64 = 1.092_548_430_592_079_2; // sqrt(15 / 4 pi)
 const C2B: f64 = 0.315_391_565_252_520_05; // sqrt(5 / 16 pi)
@@ -28,7 +29,7 @@ const C3E: f64 = 1.445_305_721_320_277; // sqrt(105 / 16 pi)
 
 /// Basis functions at the unit vector `d`; those above `degree` are 0.
 #[inline(always)]
-pub(crate) fn basis<S: Simd, T: Real>(
+pub fn basis<S: Simd, T: Real>(
     simd: S,
     degree: usize,
     d: V3<Lanes<T, S>>,
@@ -64,7 +65,7 @@ pub(crate) fn basis<S: Simd, T: Real>(
 
 /// Gradient of `sum_k weights[k] basis[k]` with respect to `d`, as three free variables.
 #[inline(always)]
-pub(crate) fn basis_vjp<S: Simd, T: Real>(
+pub fn basis_vjp<S: Simd, T: Real>(
     simd: S,
     degree: usize,
     d: V3<Lanes<T, S>>,

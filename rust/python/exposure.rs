@@ -5,10 +5,8 @@ use crate::{
     arrays::{AnyType, Array, Scalar, by_dtype, filled, of_type, optional_of_shape},
     error::BindingResult,
 };
-use hqgs::internals::{
-    Error,
-    training::exposure::{Frame, Light, Photograph, Warp},
-};
+use hqgs::Error;
+use hqgs_training::exposure::{Frame, Light, Photograph, Warp};
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
 

@@ -3,13 +3,10 @@
 use crate::arrays::{Array, by_dtype, gradient};
 use crate::error::BindingResult;
 use crate::threads;
-use hqgs::internals::{
-    Error,
-    simd::Real,
-    training::{
-        jpeg_cells,
-        separable::{self, Dense},
-    },
+use hqgs::{Error, Real};
+use hqgs_training::{
+    jpeg_cells,
+    separable::{self, Dense},
 };
 use numpy::{Element, IntoPyArray};
 use pyo3::prelude::*;

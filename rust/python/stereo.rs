@@ -3,10 +3,8 @@
 use crate::arrays::{Array, filled};
 use crate::error::BindingResult;
 use crate::threads;
-use hqgs::internals::{
-    Error,
-    stereo::{Other, Picture, Sweep},
-};
+use hqgs::Error;
+use hqgs_training::stereo::{Other, Picture, Sweep};
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
 

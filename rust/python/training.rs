@@ -3,14 +3,11 @@
 use crate::arrays::{Array, ArrayMut, gradient, is_f32, optional_of_shape};
 use crate::error::BindingResult;
 use crate::threads;
-use hqgs::internals::{
-    Error,
-    simd::Real,
-    training::{
-        adam::{self, AdamArrays, AdamOptions, Selection},
-        loss::{self, LossScratch, Sample},
-        rows::{self, ViewColors, ViewRows},
-    },
+use hqgs::{Error, Real};
+use hqgs_training::{
+    adam::{self, AdamArrays, AdamOptions, Selection},
+    loss::{self, LossScratch, Sample},
+    rows::{self, ViewColors, ViewRows},
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn};
 use pyo3::prelude::*;

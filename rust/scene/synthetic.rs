@@ -190,19 +190,6 @@ impl<T: Real> Synthetic<T> {
     }
 }
 
-/// Numbers in [0, 1) for the tests of what works on plain arrays.
-#[cfg(test)]
-pub(crate) fn noise(seed: u64, n: usize) -> Vec<f64> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
-    let next = |_| {
-        state = state
-            .wrapping_mul(6_364_136_223_846_793_005)
-            .wrapping_add(1_442_695_040_888_963_407);
-        (state >> 40) as f64 / (1u64 << 24) as f64
-    };
-    (0..n).map(next).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -6,14 +6,15 @@ use super::{Lanes, Real, Wide, lanes, vec3::V3};
 use fearless_simd::{Simd, SimdBase};
 
 /// Gaussians in a group: one AVX-512 vector of f32. Any vector of f32 or f64 divides it.
-pub(crate) const GROUP: usize = 16;
+pub const GROUP: usize = 16;
 
 /// One number of each Gaussian of a group.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
-pub(crate) struct Column<T>(pub [T; GROUP]);
+pub struct Column<T>(pub [T; GROUP]);
 
 impl<T: Real> Column<T> {
+    /// All of them 0.
     pub const ZERO: Self = Self([T::ZERO; GROUP]);
 
     /// Gaussians `first..` of an array with one number each; 0 beyond its end.
@@ -63,7 +64,7 @@ impl<T: Real> Column<T> {
 
 /// Three columns as a vector in f64.
 #[inline(always)]
-pub(crate) fn wide3<S: Simd, T: Real>(simd: S, columns: &[Column<T>; 3], at: usize) -> V3<Wide<S>> {
+pub fn wide3<S: Simd, T: Real>(simd: S, columns: &[Column<T>; 3], at: usize) -> V3<Wide<S>> {
     V3::new(
         columns[0].wide(simd, at),
         columns[1].wide(simd, at),
@@ -73,11 +74,7 @@ pub(crate) fn wide3<S: Simd, T: Real>(simd: S, columns: &[Column<T>; 3], at: usi
 
 /// Three columns as a vector.
 #[inline(always)]
-pub(crate) fn get3<S: Simd, T: Real>(
-    simd: S,
-    columns: &[Column<T>; 3],
-    at: usize,
-) -> V3<Lanes<T, S>> {
+pub fn get3<S: Simd, T: Real>(simd: S, columns: &[Column<T>; 3], at: usize) -> V3<Lanes<T, S>> {
     V3::new(
         columns[0].get(simd, at),
         columns[1].get(simd, at),
@@ -97,11 +94,9 @@ macro_rules! sixteen {
         }),*]
     };
 }
-pub(crate) use sixteen;
-
 /// Transpose the first `LEN` rows of a matrix: each stage is a perfect shuffle of all its elements.
 #[inline(always)]
-pub(crate) fn transpose<S: Simd, V: SimdBase<S>>(mut m: [V; GROUP]) -> [V; GROUP] {
+fn transpose<S: Simd, V: SimdBase<S>>(mut m: [V; GROUP]) -> [V; GROUP] {
     let half = V::LEN / 2;
     let mut side = 1;
     while side < V::LEN {
@@ -117,6 +112,13 @@ pub(crate) fn transpose<S: Simd, V: SimdBase<S>>(mut m: [V; GROUP]) -> [V; GROUP
         side *= 2;
     }
     m
+}
+
+/// The transpose of `LEN` vectors that lie one after the other.
+#[inline(always)]
+pub fn turned<S: Simd, T: Real>(simd: S, data: &[T]) -> [Lanes<T, S>; GROUP] {
+    let n = Lanes::<T, S>::LEN;
+    transpose(sixteen!(i => Lanes::<T, S>::from_slice(simd, &data[i % n * n..][..n])))
 }
 
 /// Columns `begin..` of the rows `first..` of an array with `row` numbers per row: as many as the vector is
@@ -157,7 +159,7 @@ fn read_block<S: Simd, T: Real>(
 
 /// The columns of the rows `first..` of an array with C numbers per row; 0 beyond its end.
 #[inline(always)]
-pub(crate) fn read<S: Simd, T: Real, const C: usize>(
+pub fn read<S: Simd, T: Real, const C: usize>(
     simd: S,
     data: &[T],
     first: usize,
@@ -169,13 +171,14 @@ pub(crate) fn read<S: Simd, T: Real, const C: usize>(
 }
 
 /// Most columns that are read or written at once, rounded up so that each block of them is a whole vector.
-pub(crate) const MAX_COLUMNS: usize = 64;
+pub const MAX_COLUMNS: usize = 64;
 
 /// The rows of a group, on their way from an array to columns: memory is read in the order of its addresses,
 /// which the processor fetches ahead; blocks of columns would jump from row to row.
-pub(crate) struct Rows<T>([[T; MAX_COLUMNS]; GROUP]);
+pub struct Rows<T>([[T; MAX_COLUMNS]; GROUP]);
 
 impl<T: Real> Rows<T> {
+    /// All of them 0.
     pub const ZERO: Self = Self([[T::ZERO; MAX_COLUMNS]; GROUP]);
 
     /// Columns `..count` of the rows `first..` of an array with `row` numbers per row; rows beyond the end keep
@@ -215,12 +218,7 @@ impl<T: Real> Rows<T> {
 
 /// Write columns as the first numbers of the 16 rows of an array with `row` numbers per row, in cache.
 #[inline(always)]
-pub(crate) fn write_rows<S: Simd, T: Real>(
-    simd: S,
-    columns: &[Column<T>],
-    out: &mut [T],
-    row: usize,
-) {
+pub fn write_rows<S: Simd, T: Real>(simd: S, columns: &[Column<T>], out: &mut [T], row: usize) {
     let n = Lanes::<T, S>::LEN;
     let count = columns.len();
     if count < n {
@@ -246,7 +244,7 @@ pub(crate) fn write_rows<S: Simd, T: Real>(
 
 /// Write C columns as the first rows of an array with C numbers per row, as many as it has.
 #[inline(always)]
-pub(crate) fn write<T: Copy, const C: usize>(columns: [&[T; GROUP]; C], out: &mut [T]) {
+pub fn write<T: Copy, const C: usize>(columns: [&[T; GROUP]; C], out: &mut [T]) {
     let rows = out.as_chunks_mut::<C>().0;
     if let Some(rows) = rows.first_chunk_mut::<GROUP>() {
         for i in 0..GROUP {

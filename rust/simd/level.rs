@@ -35,6 +35,12 @@ impl Level {
         matches!(self.name(), "AVX-512" | "AVX2" | "NEON")
     }
 
+    /// For `dispatch!`.
+    #[doc(hidden)]
+    pub fn token(self) -> fearless_simd::Level {
+        self.token
+    }
+
     fn names(self) -> (&'static str, &'static str) {
         NAMES[match self.token {
             #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]

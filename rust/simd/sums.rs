@@ -9,17 +9,17 @@ use fearless_simd::{Simd, SimdBase};
 use std::ops::Add;
 
 /// Most vectors that a sum needs.
-pub(crate) const MAX_PARTS: usize = 4;
+pub const MAX_PARTS: usize = 4;
 
 /// Vectors of `T` that a sum needs.
 #[inline(always)]
-pub(crate) const fn parts<S: Simd, T: Real>() -> usize {
+pub const fn parts<S: Simd, T: Real>() -> usize {
     64 / (<Lanes<T, S> as SimdBase<S>>::LEN * size_of::<T>())
 }
 
 /// Add halves until one is left, as `reduce_sum` of one wide vector begins. The number of parts is a power of 2.
 #[inline(always)]
-pub(crate) fn fold<V: Copy + Add<Output = V>>(parts: &mut [V]) -> V {
+pub fn fold<V: Copy + Add<Output = V>>(parts: &mut [V]) -> V {
     let mut n = parts.len();
     while n > 1 {
         n /= 2;

@@ -6,31 +6,34 @@ use std::ops::{Add, Mul, Sub};
 
 /// Three numbers per lane.
 #[derive(Clone, Copy)]
-pub(crate) struct V3<V> {
+pub struct V3<V> {
+    /// Along x.
     pub x: V,
+    /// Along y.
     pub y: V,
+    /// Along z.
     pub z: V,
 }
 
 /// What lanes can do without knowing their instruction set.
-pub(crate) trait Number:
-    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self>
-{
-}
+pub trait Number: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> {}
 
 impl<V: Copy + Add<Output = V> + Sub<Output = V> + Mul<Output = V>> Number for V {}
 
 impl<V: Number> V3<V> {
+    /// From its parts.
     #[inline(always)]
     pub fn new(x: V, y: V, z: V) -> Self {
         Self { x, y, z }
     }
 
+    /// The scalar product.
     #[inline(always)]
     pub fn dot(self, o: Self) -> V {
         self.x * o.x + self.y * o.y + self.z * o.z
     }
 
+    /// The vector product.
     #[inline(always)]
     pub fn cross(self, o: Self) -> Self {
         Self::new(
@@ -84,7 +87,7 @@ impl<V: Number> Sub for V3<V> {
 
 /// A 3 x 3 matrix by rows.
 #[derive(Clone, Copy)]
-pub(crate) struct M3<V>(pub [V3<V>; 3]);
+pub struct M3<V>(pub [V3<V>; 3]);
 
 impl<V: Number> M3<V> {
     /// Matrix times column.
@@ -102,6 +105,6 @@ impl<V: Number> M3<V> {
 
 /// The same numbers in each lane.
 #[inline(always)]
-pub(crate) fn splat3<S: Simd>(simd: S, v: glam::DVec3) -> V3<Wide<S>> {
+pub fn splat3<S: Simd>(simd: S, v: glam::DVec3) -> V3<Wide<S>> {
     V3::new(splat(simd, v.x), splat(simd, v.y), splat(simd, v.z))
 }

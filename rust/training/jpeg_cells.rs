@@ -1,13 +1,13 @@
 //! The distance of numbers to cells around given centres: what a quantised file leaves open costs nothing.
 
-use crate::{
-    error::{Error, check_len},
+use fearless_simd::{Select, Simd, SimdBase, dispatch};
+use hqgs::internals::{
+    Error, check_len,
     simd::{
         self, Lanes, Level, Real,
         sums::{MAX_PARTS, parts},
     },
 };
-use fearless_simd::{Select, Simd, SimdBase, dispatch};
 use rayon::prelude::*;
 
 /// Numbers whose distances are summed together: the order of the sums depends on nothing else.
@@ -51,7 +51,7 @@ fn distance_at<T: Real>(
     // One piece of the gradient for each chunk, empty where it is not wanted.
     let mut grads: Vec<&mut [T]> = grad.chunks_mut(CHUNK).collect();
     grads.resize_with(sums.len(), Default::default);
-    let level = level.token;
+    let level = level.token();
     sums.par_iter_mut()
         .zip(grads)
         .zip(x.par_chunks(CHUNK))
@@ -115,7 +115,8 @@ fn load<S: Simd, T: Real>(simd: S, data: &[T], at: usize) -> Lanes<T, S> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::{at_each_level, levels};
+    use crate::at_each_level;
+    use hqgs::levels;
     use rayon::ThreadPoolBuilder;
 
     fn numbers<T: Real>(n: usize, k: f64) -> Vec<T> {

@@ -4,15 +4,15 @@
 //! direction of the Gaussian and of the colour's gradient, which that of degree 0 is but for a factor. No
 //! product is fused with a sum, so that the bits depend neither on the number of threads nor on the machine.
 
-use crate::{
-    error::{Error, check_len},
+use fearless_simd::{Simd, SimdBase, dispatch};
+use hqgs::internals::{
+    Error, check_len,
     project::sh,
     simd::{
         self, Lanes,
         groups::{Column, GROUP, get3},
     },
 };
-use fearless_simd::{Simd, SimdBase, dispatch};
 use rayon::prelude::*;
 
 /// Gaussians per task: their sums fit in the second-level cache.
@@ -96,7 +96,7 @@ pub fn add_harmonics(
             return Err(Error::new("degree", message));
         }
     }
-    let level = simd::level()?.token;
+    let level = simd::level()?.token();
     high.par_chunks_mut((CHUNK * width).max(1))
         .enumerate()
         .for_each(|(i, high)| {

@@ -3,11 +3,11 @@
 //! Each element depends on itself alone and no product is fused with a sum, so that the bits depend neither on
 //! the number of threads nor on the machine.
 
-use crate::{
-    error::{Error, check_len},
+use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
+use hqgs::internals::{
+    Error, check_len,
     simd::{self, Lanes, Level, Real},
 };
-use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use rayon::prelude::*;
 
 /// Elements per task: four arrays of this size fit in the second-level cache.
@@ -138,7 +138,7 @@ fn step_at<T: Real>(
         used,
     } = *selection;
     let chunk = (CHUNK / width).max(1) * width;
-    let level = level.token;
+    let level = level.token();
     param
         .par_chunks_mut(chunk)
         .zip(exp_avg.par_chunks_mut(chunk))

@@ -1,7 +1,7 @@
 //! The fused step against the formulas of torch, and what must hold exactly.
 
 use super::*;
-use crate::{scene::synthetic, simd::at_each_level};
+use crate::{at_each_level, noise};
 
 /// torch's formulas, one element at a time.
 macro_rules! reference {
@@ -28,14 +28,14 @@ const OPTIONS: AdamOptions = AdamOptions {
 };
 
 /// In [-1, 1).
-fn noise(seed: u64, n: usize) -> Vec<f64> {
-    let values = synthetic::noise(seed, n).into_iter();
+fn signed(seed: u64, n: usize) -> Vec<f64> {
+    let values = noise(seed, n).into_iter();
     values.map(|v| 2.0 * v - 1.0).collect()
 }
 
 /// param, exp_avg, exp_avg_sq after `steps` steps.
 fn run<T: Real>(level: Level, n: usize, steps: u64, selection: &Selection) -> [Vec<T>; 3] {
-    let param = noise(1, n).into_iter().map(T::from_f64).collect();
+    let param = signed(1, n).into_iter().map(T::from_f64).collect();
     let mut arrays = [param, vec![T::ZERO; n], vec![T::ZERO; n]];
     for at in 1..=steps {
         let [param, exp_avg, exp_avg_sq] = &mut arrays;
@@ -52,7 +52,7 @@ fn run<T: Real>(level: Level, n: usize, steps: u64, selection: &Selection) -> [V
 
 fn grad<T: Real>(at: u64, n: usize) -> Vec<T> {
     let scale = 10f64.powi(at as i32 % 5 - 3);
-    noise(at + 2, n)
+    signed(at + 2, n)
         .into_iter()
         .map(|v| T::from_f64(v * scale))
         .collect()
@@ -61,7 +61,7 @@ fn grad<T: Real>(at: u64, n: usize) -> Vec<T> {
 macro_rules! check {
     ($level:expr, $type:ty, $reference:ident, $n:expr) => {
         let got = run::<$type>($level, $n, 20, &Selection::ALL);
-        let mut state: Vec<_> = noise(1, $n)
+        let mut state: Vec<_> = signed(1, $n)
             .into_iter()
             .map(|p| [p as $type, 0.0, 0.0])
             .collect();
@@ -97,7 +97,7 @@ fn rows_that_are_not_visible_are_left_alone() {
 fn check_visible(level: Level) {
     for width in [1, 3, 45] {
         let rows = 1000;
-        let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
+        let visible: Vec<u8> = signed(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
         let [all, some, none] =
             [None, Some(&visible[..]), Some(&vec![0; rows][..])].map(|visible| {
                 let used = width;
@@ -114,7 +114,7 @@ fn check_visible(level: Level) {
                 assert_eq!(some[k][i], expected[k][i], "array {k}, element {i}");
             }
         }
-        let start: Vec<f32> = noise(1, rows * width)
+        let start: Vec<f32> = signed(1, rows * width)
             .into_iter()
             .map(|v| v as f32)
             .collect();
@@ -132,7 +132,7 @@ fn numbers_of_a_row_that_are_not_used_are_left_alone() {
 
 fn check_used(level: Level) {
     let (rows, width) = (1000, 45);
-    let visible: Vec<u8> = noise(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
+    let visible: Vec<u8> = signed(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
     let all = run::<f32>(level, rows * width, 3, &Selection::ALL);
     for used in [0, 9, 24, 45] {
         for visible in [None, Some(&visible[..])] {
@@ -142,7 +142,7 @@ fn check_used(level: Level) {
                 used,
             };
             let some = run::<f32>(level, rows * width, 3, &selection);
-            for (i, start) in noise(1, rows * width).into_iter().enumerate() {
+            for (i, start) in signed(1, rows * width).into_iter().enumerate() {
                 let updated = i % width < used && visible.is_none_or(|v| v[i / width] != 0);
                 let expected = if updated {
                     all.each_ref().map(|a| a[i])

@@ -2,7 +2,7 @@
 //!
 //! Above 1 the power goes on, below 0 the straight line.
 
-use crate::simd::Real;
+use hqgs::internals::simd::Real;
 use std::{
     ops::{Add, AddAssign, Div, Mul, MulAssign, Sub},
     sync::OnceLock,

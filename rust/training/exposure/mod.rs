@@ -8,13 +8,12 @@ mod curve;
 
 pub use curve::Light;
 
-use crate::{
-    error::{Error, check_len},
-    memory,
-    simd::{self, Level},
-};
 use curve::{Tables, tables};
 use fearless_simd::{Simd, dispatch};
+use hqgs::internals::{
+    Error, check_len, memory,
+    simd::{self, Level},
+};
 use rayon::prelude::*;
 
 /// Rows that are done together: the order of the sums depends on nothing else.
@@ -150,7 +149,7 @@ impl<T: Light> Photograph<T> {
         };
         let mut mean = memory::filled([T::ZERO; WIDE], frame.pixels(), "mean")?;
         let mut photo = std::mem::take(&mut taken.photo);
-        let (across, token) = (frame.size[1], level.token);
+        let (across, token) = (frame.size[1], level.token());
         mean.par_chunks_mut(across)
             .zip(photo.par_chunks_mut(across * 3))
             .enumerate()
@@ -177,7 +176,7 @@ impl<T: Light> Photograph<T> {
     fn backward_at(&self, level: Level, v_photo: &[T]) -> Result<PhotographGradients<T>, Error> {
         check_len("v_photo", v_photo, self.photo.len())?;
         let ([height, width], across) = (self.frame.render_size(), self.frame.size[1]);
-        let token = level.token;
+        let token = level.token();
         let mut image = memory::filled(T::ZERO, height * width * 3, "gradient")?;
         let mut warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
         let mut gains = [0.0; 3];

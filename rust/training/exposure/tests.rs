@@ -1,5 +1,6 @@
 use super::*;
-use crate::simd::{at_each_level, levels};
+use crate::at_each_level;
+use hqgs::levels;
 use rayon::ThreadPoolBuilder;
 
 const FRAME: Frame = Frame {

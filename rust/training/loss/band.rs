@@ -7,12 +7,11 @@
 //! No closure holds SIMD code here: one that the compiler does not inline loses the instruction set.
 
 use super::{Images, NAME, Plan, Sample, Sums};
-use crate::{
-    error::Error,
-    memory,
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+use hqgs::internals::{
+    Error, memory,
     simd::{Lanes, Real},
 };
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
 /// Half the window: 11 taps.
 const REACH: usize = 5;

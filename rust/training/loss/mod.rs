@@ -16,13 +16,12 @@
 
 mod band;
 
-use crate::{
-    error::{Error, check_len},
-    memory,
-    simd::{self, Level, Real},
-};
 use band::Band;
 use fearless_simd::dispatch;
+use hqgs::internals::{
+    Error, check_len, memory,
+    simd::{self, Level, Real},
+};
 use rayon::prelude::*;
 
 /// What an error calls the buffers of this folder.
@@ -44,12 +43,17 @@ impl<T: Real> Sample<T> for u8 {
     }
 }
 
-impl<T: Real> Sample<T> for T {
-    #[inline(always)]
-    fn value(self) -> T {
-        self
-    }
+macro_rules! sample {
+    ($($real:ty),*) => {
+        $(impl Sample<$real> for $real {
+            #[inline(always)]
+            fn value(self) -> $real {
+                self
+            }
+        })*
+    };
 }
+sample!(f32, f64);
 
 /// The loss and its two parts.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -305,7 +309,7 @@ fn run<T: Real, Y: Sample<T>>(
     jobs.into_par_iter()
         .try_for_each(|(first, sums, buffer, grad)| {
             let band = Band::new(images, plan, first, buffer)?;
-            dispatch!(level.token, simd => band.run(simd, grad, sums));
+            dispatch!(level.token(), simd => band.run(simd, grad, sums));
             Ok(())
         })?;
     Ok(scratch.sums.iter().fold(Sums::default(), |a, b| Sums {

@@ -4,10 +4,8 @@ use super::{
     band::{C1, C2, SIGMA},
     *,
 };
-use crate::{
-    scene::synthetic::noise,
-    simd::{at_each_level, levels},
-};
+use crate::{at_each_level, noise};
+use hqgs::levels;
 
 /// The textbook formula with direct 11 x 11 sums: (L1, SSIM).
 fn reference(x: &[f64], y: &[f64], mask: Option<&[u8]>, [h, w, c]: [usize; 3]) -> (f64, f64) {

@@ -1,12 +1,11 @@
 //! Linear operators on pictures [H, W, C]: a banded matrix for each axis, and one that mixes the channels.
 
-use crate::{
-    error::{Error, check_len},
-    memory,
-    simd::groups::{GROUP, sixteen, transpose},
+use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
+use hqgs::internals::{
+    Error, check_len, memory,
+    simd::groups::{GROUP, turned},
     simd::{self, Lanes, Level, Real},
 };
-use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use rayon::prelude::*;
 
 /// A matrix whose rows are kept from their first weight to their last: the zeros between them count, too.
@@ -191,7 +190,7 @@ impl<T: Real> Separable<T> {
             channels: shape[2],
         };
         let mut out = memory::filled(T::ZERO, h * w * d, "image")?;
-        let level = level.token;
+        let level = level.token();
         out.par_chunks_mut(GROUP * w * d).enumerate().try_for_each_init(
             Buffers::default,
             |buffers, (group, out)| {
@@ -267,7 +266,7 @@ impl<T: Real> Separable<T> {
                 let data = &image.data[top * image.pitch + at..];
                 sum(simd, weights, data, image.pitch).store_slice(&mut block[lane * n..][..n]);
             }
-            let m = transpose(sixteen!(i => load(simd, &block, i % n * n)));
+            let m = turned::<S, T>(simd, &block);
             for (m, tall) in m[..n].iter().zip(tall[at * n..].chunks_exact_mut(n)) {
                 m.store_slice(tall);
             }
@@ -315,7 +314,7 @@ fn turn_into_rows<S: Simd, T: Real>(simd: S, small: &[T], row: usize, out: &mut 
     let n = Lanes::<T, S>::LEN;
     for at in (0..row).step_by(n) {
         let at = at.min(row.saturating_sub(n));
-        let m = transpose(sixteen!(i => load(simd, small, (at + i % n) * n)));
+        let m = turned::<S, T>(simd, &small[at * n..]);
         for (m, out) in m[..n].iter().zip(out.chunks_exact_mut(row)) {
             if row >= n {
                 m.store_slice(&mut out[at..at + n]);

@@ -1,7 +1,8 @@
 //! The operator against dense matrices, and what must hold exactly.
 
 use super::*;
-use crate::simd::{at_each_level, levels};
+use crate::at_each_level;
+use hqgs::levels;
 use rayon::ThreadPoolBuilder;
 
 /// A number in [-1, 1] for each (a, b).

@@ -1,17 +1,17 @@
 //! Fits a few hundred Gaussians to a picture with gradients and Adam, and writes what came out as a PNG.
 //!
 //! ```sh
-//! cargo run --release --example fit_image -- --out fit.png
+//! cargo run --release -p hqgs-training --example fit_image -- --out fit.png
 //! ```
 
 use hqgs::{
     Error,
     render::{self, Cotangents, ProjectOptions, Wanted},
     scene::{Camera, Colors, Gaussians},
-    training::{
-        adam::{self, AdamArrays, AdamOptions, Selection},
-        loss::{self, LossScratch},
-    },
+};
+use hqgs_training::{
+    adam::{self, AdamArrays, AdamOptions, Selection},
+    loss::{self, LossScratch},
 };
 use std::{fs::File, io::BufWriter};
 

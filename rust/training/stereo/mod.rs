@@ -7,12 +7,11 @@
 #[cfg(test)]
 mod tests;
 
-use crate::{
-    error::{Error, check_len},
-    memory,
+use fearless_simd::{Simd, dispatch};
+use hqgs::internals::{
+    Error, check_len, memory,
     simd::{self, Level},
 };
-use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
 
 /// Samples to each side of a patch's middle.
@@ -135,7 +134,7 @@ impl Sweep {
             return Err(Error::new("pixels", format!("must be finite, got {bad:?}")));
         }
         let mut found = memory::filled((0.0, NOTHING), pixels.len(), "depths")?;
-        let token = level.token;
+        let token = level.token();
         found
             .par_chunks_mut(CHUNK)
             .zip(pixels.par_chunks(CHUNK).zip(ranges.par_chunks(CHUNK)))

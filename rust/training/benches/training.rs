@@ -1,16 +1,15 @@
 //! `cargo bench --bench training`: the parts of a step beside the rasterizer, 504 x 378, f32, all threads: the loss, an
-//! exposure, the operators, cells of JPEG, a sweep of depths and the sum of several views.
+//! exposure, the operators, cells of JPEG, a sweep of depths, the sum of several views and Adam.
 
-use criterion::{Criterion, criterion_group, criterion_main};
-use hqgs::internals::{
+use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use hqgs_training::{
+    adam::{self, AdamArrays, AdamOptions, Selection},
+    exposure::{Frame, Photograph, Warp},
+    jpeg_cells,
+    loss::{self, LossScratch},
+    rows::{self, ViewColors, ViewRows},
+    separable::{Dense, Separable},
     stereo::{Other, Picture, Sweep},
-    training::{
-        exposure::{Frame, Photograph, Warp},
-        jpeg_cells,
-        loss::{self, LossScratch},
-        rows::{self, ViewColors, ViewRows},
-        separable::{Dense, Separable},
-    },
 };
 use std::time::Duration;
 
@@ -196,12 +195,44 @@ fn views(c: &mut Criterion) {
     group.finish();
 }
 
+/// One step on all parameters of N Gaussians, 59 numbers each, in one array.
+fn optimizer(c: &mut Criterion) {
+    const NUMBERS: usize = 59;
+    let options = AdamOptions {
+        lr: 1e-3,
+        beta1: 0.9,
+        beta2: 0.999,
+        eps: 1e-15,
+    };
+    let mut group = c.benchmark_group("adam");
+    for n in [10_000, 100_000] {
+        let wave =
+            |step: f32| -> Vec<f32> { (0..n * NUMBERS).map(|i| (i as f32 * step).sin()).collect() };
+        let (mut param, grad) = (wave(0.37), wave(0.73));
+        let (mut exp_avg, mut exp_avg_sq) = (vec![0f32; n * NUMBERS], vec![0f32; n * NUMBERS]);
+        let mut step = 0;
+        group.bench_function(BenchmarkId::from_parameter(n), |b| {
+            b.iter(|| {
+                step += 1;
+                let arrays = AdamArrays {
+                    param: &mut param,
+                    grad: &grad,
+                    exp_avg: &mut exp_avg,
+                    exp_avg_sq: &mut exp_avg_sq,
+                };
+                adam::step(arrays, step, &options, &Selection::ALL).expect("right lengths");
+            });
+        });
+    }
+    group.finish();
+}
+
 criterion_group! {
     name = benches;
     config = Criterion::default()
         .sample_size(20)
         .warm_up_time(Duration::from_secs(1))
         .measurement_time(Duration::from_secs(3));
-    targets = losses, exposures, operators, depths, views
+    targets = losses, exposures, operators, depths, views, optimizer
 }
 criterion_main!(benches);
