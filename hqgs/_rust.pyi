@@ -100,7 +100,6 @@ def adam_step(
     exp_avg_sq: Array,
     step: int,
     options: tuple[float, float, float, float],
-    visible: Array | None,
     used: int | None,
 ) -> None: ...
 def add_rows(views: list[tuple[Array, Array]], sums: Array, scale: float) -> None: ...

@@ -61,6 +61,18 @@ impl Error {
         }
     }
 
+    /// The same of an argument that is called `other` where `name` stands.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn renamed(mut self, from: &str, to: &str) -> Self {
+        if let Self::InvalidArgument { name, .. } | Self::Shape { name, .. } = &mut self
+            && name == from
+        {
+            *name = to.into();
+        }
+        self
+    }
+
     /// The argument or the resource that the message begins with.
     pub fn name(&self) -> &str {
         match self {

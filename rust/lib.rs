@@ -9,9 +9,7 @@
 //! use hqgs::{render, scene};
 //!
 //! # fn main() -> Result<(), hqgs::Error> {
-//! // A camera at the origin that looks along z, 32 x 24 pixels.
-//! let viewmat = [1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.];
-//! let camera = scene::Camera::new(&viewmat, &[30., 0., 16., 0., 30., 12., 0., 0., 1.], 32, 24)?;
+//! let camera = scene::Camera::at_origin(30.0, 32, 24)?;
 //! // One red Gaussian in front of it, a little to the right.
 //! let gaussians = scene::Gaussians::<f32> {
 //!     means: &[0.1, 0.0, 4.0],
@@ -21,8 +19,7 @@
 //! };
 //! let red = scene::Colors::Channels(&[1.0, 0.0, 0.0], 3);
 //! let white = [1.0; 3];
-//! let options = render::ProjectOptions::default();
-//! let rendered = render::forward(gaussians, red, Some(&white), &camera, &options)?;
+//! let rendered = render::forward(gaussians, red, Some(&white), &camera, &Default::default())?;
 //! let pixel = 12 * 32 + 16;
 //! assert!(rendered.alphas[pixel] > 0.7);
 //! assert!(rendered.image[3 * pixel] > 0.99 && rendered.image[3 * pixel + 1] < 0.3);
@@ -70,7 +67,7 @@ mod simd;
 mod uninit;
 
 pub use error::Error;
-pub use simd::{Level, Real, levels};
+pub use simd::{Level, Real, level, levels};
 
 /// The stages, for the other crates, the benchmarks and the tests of this repository alone.
 #[doc(hidden)]
@@ -92,7 +89,7 @@ pub mod internals {
     );
 
     pub mod scene {
-        pub use crate::scene::*;
+        pub use crate::scene::{camera::CameraGrad, *};
         pub mod synthetic {
             pub use crate::scene::synthetic::*;
         }

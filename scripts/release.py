@@ -21,6 +21,7 @@ from pathlib import Path
 from wheel import ROOT, build
 
 OUT = ROOT / "dist" / "release"
+CRATES = ("-p", "hqgs", "-p", "hqgs-training")
 VERSIONS = {  # where each file says it
     "Cargo.toml": r'^\[workspace\.package\]\s+version = "([^"]+)"',
     "pyproject.toml": r'^name = "hqgs"\s+version = "([^"]+)"',
@@ -75,12 +76,12 @@ def main() -> int:
     files = sorted(str(path) for path in OUT.iterdir() if path.name.startswith("hqgs-"))
     dry = [] if upload else ["--dry-run"]
     dirty = ["--allow-dirty"] if wrong else []  # in a dry run alone
-    subprocess.run(["cargo", "publish", "--locked", *dry, *dirty], cwd=ROOT, check=True)
+    subprocess.run(["cargo", "publish", "--locked", *CRATES, *dry, *dirty], cwd=ROOT, check=True)
     # Without an index to ask, uv's dry run only looks at the files.
     subprocess.run(
         ["uv", "publish", *dry, *(["--token", "none"] if dry else []), *files], cwd=ROOT, check=True
     )
-    print("uploaded:" if upload else "would upload: the crate hqgs to crates.io, and to PyPI")
+    print("uploaded:" if upload else "would upload: the crates hqgs and hqgs-training to crates.io, and to PyPI")
     for file in files:
         print(f"  {Path(file).name}  {Path(file).stat().st_size / 1e6:.2f} MB")
     return 1 if wrong else 0

@@ -102,25 +102,22 @@ def test_the_constants_are_those_of_the_oracles() -> None:
 def test_adam_refuses_arrays_that_overlap() -> None:
     """Tensors over the same memory come as arrays that know nothing of each other."""
     memory = torch.ones(40)
-    flags = torch.ones(160, dtype=torch.uint8)
     apart = {"param": memory[:10], "grad": memory[10:20], "exp_avg": memory[20:30], "exp_avg_sq": memory[30:]}
 
-    def step(visible: torch.Tensor, **arrays: torch.Tensor) -> None:
+    def step(**arrays: torch.Tensor) -> None:
         param, grad, exp_avg, exp_avg_sq = (tensor.numpy() for tensor in arrays.values())
         options = (0.1, 0.9, 0.999, 1e-8)
-        _rust.adam_step(param, grad, exp_avg, exp_avg_sq, 1, options, visible.numpy(), None)
+        _rust.adam_step(param, grad, exp_avg, exp_avg_sq, 1, options, None)
 
-    step(flags[:10], **apart)
+    step(**apart)
     before = memory.clone()
     for name, other in (("exp_avg", "param"), ("exp_avg_sq", "param"), ("exp_avg_sq", "exp_avg")):
         begin = apart[other].storage_offset()
         for at in (begin, begin + 9, max(begin - 9, 0)):
             with pytest.raises(ValueError, match=f"^{name}: shares memory with {other}, which is written$"):
-                step(flags[:10], **{**apart, name: memory[at : at + 10]})
+                step(**{**apart, name: memory[at : at + 10]})
     with pytest.raises(ValueError, match=r"^grad: shares memory with param, which is written$"):
-        step(flags[:10], **{**apart, "grad": memory[9:19]})
-    with pytest.raises(ValueError, match=r"^visible: shares memory with exp_avg, which is written$"):
-        step(memory.view(torch.uint8)[80:90], **apart)
+        step(**{**apart, "grad": memory[9:19]})
     assert torch.equal(memory, before)
 
 
@@ -435,7 +432,7 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         ),
         "ssim": (_rust.ssim, {"a": pictures[0], "b": pictures[1], "mask": mask}),
         "cell_distance": (_rust.cell_distance, {**cells, "scale": 1.0, "want_grad": True}),
-        "adam_step": (_rust.adam_step, {**adam, **options, "visible": np.ones(12, np.uint8), "used": 2}),
+        "adam_step": (_rust.adam_step, {**adam, **options, "used": 2}),
         "Separable": (
             _rust.Separable, {"rows": np.eye(20), "columns": np.eye(30), "channels": np.eye(3)}
         ),

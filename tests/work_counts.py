@@ -60,7 +60,7 @@ def _of_backward(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
 
 
 def _of_adam(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
-    param, used = arguments[0], arguments[7]
+    param, used = arguments[0], arguments[6]
     return {"adam_numbers": param.size if used is None else param.size // param.shape[1] * used}
 
 

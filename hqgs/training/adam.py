@@ -113,7 +113,7 @@ class Adam(torch.optim.Optimizer):
         beta1, beta2 = group["betas"]
         options = (float(group["lr"]) * math.sqrt(views), beta1**views, beta2**views, group["eps"])
         used = group.get("used")
-        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, None, used)
+        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, used)
         for tensor in (param, *moments):
             increment_version(tensor)  # written behind torch's back
 

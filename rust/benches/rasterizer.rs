@@ -4,7 +4,7 @@
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use hqgs::internals::{
     composite::{self, CompositeCotangents, CompositeInput},
-    project::{self, ProjectCotangents, ProjectOptions, Projected},
+    project::{self, ProjectCotangents, Projected, RenderOptions},
     scene::{Colors, Harmonics, synthetic::Synthetic},
     tiles,
 };
@@ -37,11 +37,11 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
         stored: 16,
         degree: 3,
     };
-    let options = ProjectOptions::default();
+    let options = RenderOptions::default();
     let project = || {
         project::forward(
             &gaussians,
-            Colors::Harmonics(&harmonics),
+            Colors::Harmonics(harmonics),
             &s.camera,
             &options,
         )

@@ -73,9 +73,9 @@ pub fn backward<T: Real>(
     input.check()?;
     let (channels, tiles) = (input.channels(), input.tiles);
     check_len("composited", &composited.depths, tiles.lists.len())?;
-    check_len("v_render_colors", v.image, input.pixels() * channels)?;
+    check_len("v.image", v.image, input.pixels() * channels)?;
     if let Some(alphas) = v.alphas {
-        check_len("v_render_alphas", alphas, input.pixels())?;
+        check_len("v.alphas", alphas, input.pixels())?;
     }
     let background = if wanted.background {
         background_vjp(input, composited, v)?

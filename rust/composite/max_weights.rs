@@ -140,7 +140,7 @@ fn weigh<S: Simd, T: Real, const V: usize>(
 mod tests {
     use super::*;
     use crate::{
-        project::{self, ProjectOptions, Projection},
+        project::{self, Projection, RenderOptions},
         scene::{Colors, synthetic::Synthetic},
         simd::{Level, at_each_level},
         tiles::{self, Tiles},
@@ -149,9 +149,9 @@ mod tests {
 
     fn binned<T: Real>(level: Level, s: &Synthetic<T>) -> (Projection, Tiles<T>) {
         let none = Colors::Channels(&[], 0);
-        let options = ProjectOptions {
-            level,
-            ..ProjectOptions::default()
+        let options = RenderOptions {
+            level: Some(level),
+            ..RenderOptions::default()
         };
         let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
         let projection = projected.projection;

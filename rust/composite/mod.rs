@@ -37,7 +37,7 @@ impl<T: Real> CompositeInput<'_, T> {
     /// Check the lengths of the arrays, and that the tile lists are those of the projection and the camera.
     ///
     /// # Errors
-    /// Names `backgrounds`, or `tiles`.
+    /// Names `background`, or `tiles`.
     fn check(&self) -> Result<(), Error> {
         let sides = [self.camera.width, self.camera.height].map(|side| side.div_ceil(TILE));
         let (n, binned) = (self.projection.splats.len(), self.tiles.gaussians());
@@ -49,7 +49,7 @@ impl<T: Real> CompositeInput<'_, T> {
             return Err(Error::new("tiles", message));
         }
         self.background
-            .map_or(Ok(()), |b| check_len("backgrounds", b, self.channels()))
+            .map_or(Ok(()), |b| check_len("background", b, self.channels()))
     }
 
     fn channels(&self) -> usize {
@@ -153,7 +153,7 @@ use {for_channels, for_parts, for_vectors};
 mod tests {
     use super::*;
     use crate::{
-        project::{self, ProjectOptions},
+        project::{self, RenderOptions},
         scene::{Colors, synthetic::Synthetic},
         tiles,
     };
@@ -163,7 +163,7 @@ mod tests {
         let none = || Colors::<f32>::Channels(&[], 0);
         let binned = |n, width, height| {
             let s = Synthetic::<f32>::new(n, width, height, 1).unwrap();
-            let options = ProjectOptions::default();
+            let options = RenderOptions::default();
             let projected = project::forward(&s.gaussians(), none(), &s.camera, &options).unwrap();
             let tiles = tiles::bin::<f32>(&projected.projection, &[], 0, &s.camera).unwrap();
             (projected.projection, tiles, s.camera)

@@ -1,7 +1,7 @@
 //! Vector-Jacobian product of the projection.
 
 use super::{
-    Columns, Mask, ProjectOptions, Projection, Shading,
+    Columns, Mask, Projection, RenderOptions, Shading,
     camera_lanes::{CameraGradLanes, CameraLanes},
     chunks,
     colors::ColorGroup,
@@ -243,7 +243,7 @@ pub fn backward<T: Real>(
     gaussians: &Gaussians<T>,
     shading: Option<&Shading<T>>,
     camera: &Camera,
-    options: &ProjectOptions,
+    options: &RenderOptions,
     projection: &Projection,
     v: &ProjectCotangents<T>,
     wanted: Wanted,
@@ -322,7 +322,7 @@ fn backward_chunk<S: Simd, T: Real>(
     gaussians: &Gaussians<T>,
     shading: Option<&Shading<T>>,
     camera: &Camera,
-    options: &ProjectOptions,
+    options: &RenderOptions,
     projection: &Projection,
     v: &ProjectCotangents<T>,
     begin: usize,

@@ -1,7 +1,7 @@
 //! Projection, forward.
 
 use super::{
-    Columns, ProjectOptions, Projection, Shading, Splat,
+    Columns, Projection, RenderOptions, Shading, Splat,
     camera_lanes::CameraLanes,
     chunks,
     colors::{Coefficients, Slopes},
@@ -14,7 +14,7 @@ use crate::{
     error::Error,
     scene::{Camera, Colors, Gaussians},
     simd::{
-        Real,
+        self, Real,
         groups::{self, Column, GROUP},
     },
     uninit::{UninitPiece, UninitVec},
@@ -113,10 +113,11 @@ pub fn forward<T: Real>(
     gaussians: &Gaussians<T>,
     colors: Colors<T>,
     camera: &Camera,
-    options: &ProjectOptions,
+    options: &RenderOptions,
 ) -> Result<Projected<T>, Error> {
     let n = gaussians.len();
     options.check()?;
+    let level = options.level.map_or_else(simd::level, Ok)?;
     gaussians.check()?;
     colors.check(n)?;
     let harmonics = match colors {
@@ -147,7 +148,6 @@ pub fn forward<T: Real>(
         .zip(group_chunks(&mut slopes, n, sloped))
         .zip(group_chunks(&mut clamps, n, clamped))
         .collect();
-    let level = options.level.token;
     let counts = jobs
         .into_par_iter()
         .enumerate()
@@ -174,7 +174,7 @@ pub fn forward<T: Real>(
                     slopes: slopes.fill([Column::ZERO; 9]),
                     clamped: clamped.fill([0; 3]),
                 };
-                dispatch!(level, simd => forward_chunk(
+                dispatch!(level.token, simd => forward_chunk(
                     simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, out
                 ))
             },
@@ -185,7 +185,7 @@ pub fn forward<T: Real>(
             splats: splats.finish(),
             depths: keys.finish(),
             knobs: options.knobs,
-            level: options.level,
+            level,
         },
         means2d: means2d.finish(),
         depths: depths.finish(),
@@ -210,7 +210,7 @@ fn forward_chunk<S: Simd, T: Real>(
     gaussians: &Gaussians<T>,
     colors: Colors<T>,
     camera: &Camera,
-    options: &ProjectOptions,
+    options: &RenderOptions,
     begin: usize,
     mut out: ForwardChunk<T>,
 ) -> Counts {
@@ -239,7 +239,7 @@ fn forward_chunk<S: Simd, T: Real>(
             keep &= (1 << rows) - 1;
         }
         match colors {
-            Colors::Harmonics(h) if keep != 0 => {
+            Colors::Harmonics(ref h) if keep != 0 => {
                 counts.harmonics += (rows * sh::count(h.degree)) as u64;
                 let (slopes, clamped) = (
                     out.slopes.get_mut(start / GROUP),

@@ -29,8 +29,8 @@ use fearless_simd::{Simd, SimdBase};
 use geometry::Geometry;
 
 /// Options of the projection; the defaults are gsplat's.
-#[derive(Debug, Clone, Copy)]
-pub struct ProjectOptions {
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RenderOptions {
     /// Gaussians nearer than this are culled.
     pub near_plane: f64,
     /// Gaussians farther than this are culled.
@@ -41,15 +41,17 @@ pub struct ProjectOptions {
     pub eps2d: f64,
     /// Scale the opacity so that the low-pass does not brighten small Gaussians.
     pub antialiased: bool,
-    /// Keep what [`backward()`] needs of the harmonics.
+    /// Keep what the gradients need of the harmonics.
     pub differentiable: bool,
     /// What trades accuracy for time, in this and the later stages.
+    #[doc(hidden)]
     pub knobs: AccuracyKnobs,
-    /// Vector instructions of this and the later stages.
-    pub level: Level,
+    /// Vector instructions of this and the later stages; None: those of the process.
+    #[doc(hidden)]
+    pub level: Option<Level>,
 }
 
-impl Default for ProjectOptions {
+impl Default for RenderOptions {
     fn default() -> Self {
         Self {
             near_plane: NEAR_PLANE,
@@ -59,12 +61,12 @@ impl Default for ProjectOptions {
             antialiased: false,
             differentiable: true,
             knobs: AccuracyKnobs::default(),
-            level: Level::default(),
+            level: None,
         }
     }
 }
 
-impl ProjectOptions {
+impl RenderOptions {
     /// Check the ranges.
     ///
     /// # Errors
@@ -122,7 +124,7 @@ impl Splat {
 }
 
 /// What the later stages need of the projection of N Gaussians.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Projection {
     /// All N Gaussians, culled ones included.
     pub splats: Vec<Splat>,
@@ -130,7 +132,7 @@ pub struct Projection {
     pub depths: Vec<f64>,
     /// Those of the options.
     pub knobs: AccuracyKnobs,
-    /// That of the options.
+    /// Vector instructions.
     pub level: Level,
 }
 

@@ -1,8 +1,7 @@
 //! Splats of a group of Gaussians: culling, and what the compositor reads.
 
 use super::{
-    Columns, ProjectOptions, Splat, camera_lanes::CameraLanes, colors::direction,
-    geometry::Geometry,
+    Columns, RenderOptions, Splat, camera_lanes::CameraLanes, colors::direction, geometry::Geometry,
 };
 use crate::{
     constants::{FACTOR_MAX, SUPPORT_SLACK, TILE},
@@ -54,7 +53,7 @@ impl SplatGroup {
         inputs: &Columns<T>,
         camera: &Camera,
         camera_lanes: &CameraLanes<S>,
-        options: &ProjectOptions,
+        options: &RenderOptions,
         directed: bool,
     ) -> u16 {
         let center = splat3(simd, camera.center);
@@ -87,7 +86,7 @@ impl SplatGroup {
         opacity: Wide<S>,
         camera: &Camera,
         camera_lanes: &CameraLanes<S>,
-        o: &ProjectOptions,
+        o: &RenderOptions,
     ) -> u64 {
         let (zero, infinity) = (splat_lanes(simd, 0.0), splat_lanes(simd, f64::INFINITY));
         let mean = g.mean2d(camera_lanes);

@@ -66,7 +66,7 @@ def train(dtype: type) -> None:
     distance, slope = _rust.cell_distance(flat, flat[::-1].copy(), np.full_like(flat, 0.1), 1.0, True)
     look(np.array(distance), slope)
     param, first, second = picture[0].copy(), np.zeros((WIDTH, 3), dtype), np.zeros((WIDTH, 3), dtype)
-    _rust.adam_step(param, picture[1].copy(), first, second, 1, (0.01, 0.9, 0.999, 1e-15), mask[0].copy(), 2)
+    _rust.adam_step(param, picture[1].copy(), first, second, 1, (0.01, 0.9, 0.999, 1e-15), 2)
     look(param, first, second)
 
 

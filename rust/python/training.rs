@@ -6,7 +6,7 @@ use crate::threads;
 use hqgs::{Error, Real};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
-    loss::{self, LossScratch, Sample},
+    loss::{self, LossOptions, LossScratch, Sample},
     rows::{self, ViewColors, ViewRows},
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn};
@@ -76,8 +76,16 @@ impl<'py, T: Element, Y: Element> Images<'py, T, Y> {
         Ok(Self { x, y, mask })
     }
 
-    fn mask(&self) -> BindingResult<Option<&[u8]>> {
-        self.mask.as_ref().map(Array::slice).transpose()
+    fn borrow(&self) -> BindingResult<loss::Images<'_, T, Y>> {
+        let &[h, w, c] = self.x.shape() else {
+            unreachable!("checked above")
+        };
+        Ok(loss::Images {
+            render: self.x.slice()?,
+            target: self.y.slice()?,
+            mask: self.mask.as_ref().map(Array::slice).transpose()?,
+            size: [h, w, c],
+        })
     }
 }
 
@@ -111,17 +119,16 @@ fn photometric_as<'py, T: Buffered, Y: Sample<T> + Element>(
 ) -> BindingResult<Loss<'py>> {
     let py = render.py();
     let images = Images::<T, Y>::new(["render", "target"], render, target, mask)?;
-    let &[h, w, c] = images.x.shape() else {
-        unreachable!("checked above")
+    let images = images.borrow()?;
+    let options = LossOptions {
+        lambda: lambda_dssim,
+        knee,
     };
-    let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
-    let mut grad = gradient::<T>(x.len(), want_grad)?;
+    let mut grad = gradient::<T>(images.render.len(), want_grad)?;
     let out = want_grad.then_some(&mut grad[..]);
     let value = py.detach(|| {
         T::with_scratch(|scratch| {
-            threads::install(|| {
-                loss::photometric(x, y, mask, h, w, c, lambda_dssim, knee, out, scratch)
-            })
+            threads::install(|| loss::photometric(images, &options, out, scratch))
         })
     })??;
     let grad = want_grad.then(|| grad.into_pyarray(py).into_any());
@@ -145,14 +152,11 @@ fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
     mask: Option<&Bound<'py, PyAny>>,
 ) -> BindingResult<f64> {
     let images = Images::<T, Y>::new(["a", "b"], a, b, mask)?;
-    let &[h, w, c] = images.x.shape() else {
-        unreachable!("checked above")
-    };
-    let (x, y, mask) = (images.x.slice()?, images.y.slice()?, images.mask()?);
-    let value = a.py().detach(|| {
-        T::with_scratch(|scratch| threads::install(|| loss::ssim(x, y, mask, h, w, c, scratch)))
-    });
-    Ok(value??)
+    let images = images.borrow()?;
+    let value = a
+        .py()
+        .detach(|| T::with_scratch(|scratch| threads::install(|| loss::ssim(images, scratch))))?;
+    Ok(value.map_err(|e| e.renamed("render", "a").renamed("target", "b"))?)
 }
 
 /// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
@@ -165,7 +169,6 @@ fn adam_step(
     exp_avg_sq: &Bound<'_, PyAny>,
     step: u64,
     options: (f64, f64, f64, f64),
-    visible: Option<&Bound<'_, PyAny>>,
     used: Option<usize>,
 ) -> BindingResult<()> {
     let (lr, beta1, beta2, eps) = options;
@@ -181,7 +184,7 @@ fn adam_step(
         adam_step_as::<f64>
     };
     let in_place = [param, exp_avg, exp_avg_sq];
-    update(in_place, grad, step, &options, visible, used)
+    update(in_place, grad, step, &options, used)
 }
 
 fn adam_step_as<T: Real + Element>(
@@ -189,7 +192,6 @@ fn adam_step_as<T: Real + Element>(
     grad: &Bound<'_, PyAny>,
     step: u64,
     options: &AdamOptions,
-    visible: Option<&Bound<'_, PyAny>>,
     used: Option<usize>,
 ) -> BindingResult<()> {
     let py = grad.py();
@@ -198,15 +200,12 @@ fn adam_step_as<T: Real + Element>(
     let mut exp_avg = ArrayMut::<T>::new("exp_avg", in_place[1])?.of_shape(&shape)?;
     let mut exp_avg_sq = ArrayMut::<T>::new("exp_avg_sq", in_place[2])?.of_shape(&shape)?;
     let grad = Array::<T>::new("grad", grad)?.of_shape(&shape)?;
-    let rows = &shape[..shape.len().min(1)];
-    let visible = optional_of_shape::<u8>("visible", visible, rows)?;
     if let Some(used) = used.filter(|used| shape.len() < 2 || *used > shape[1]) {
         let message = format!("cannot update {used} columns of {shape:?}");
         return Err(Error::new("used", message).into());
     }
     let width: usize = shape.iter().skip(1).product();
     let selection = Selection {
-        visible: visible.as_ref().map(Array::slice).transpose()?,
         width,
         used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
     };

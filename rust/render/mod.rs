@@ -1,10 +1,6 @@
 //! The whole path for one camera, from Gaussians to pixels and back.
 
-pub use crate::{
-    accuracy_knobs::{AccuracyKnobs, Spans},
-    composite::CompositeCotangents as Cotangents,
-    project::ProjectOptions,
-};
+pub use crate::{composite::CompositeCotangents as Cotangents, project::RenderOptions};
 
 use crate::{
     Error,
@@ -28,7 +24,7 @@ pub struct Rendered<'a, T> {
     gaussians: Gaussians<'a, T>,
     background: Option<&'a [T]>,
     camera: Camera,
-    options: ProjectOptions,
+    options: RenderOptions,
     projection: Projection,
     /// Whether the colours are harmonics, and how they change.
     harmonics: bool,
@@ -112,7 +108,7 @@ pub fn forward<'a, T: Real>(
     colors: Colors<'_, T>,
     background: Option<&'a [T]>,
     camera: &Camera,
-    options: &ProjectOptions,
+    options: &RenderOptions,
 ) -> Result<Rendered<'a, T>, Error> {
     let channels = colors.channels();
     if let Some(background) = background {
@@ -168,8 +164,6 @@ pub fn backward<T: Real>(
     wanted: Wanted,
 ) -> Result<Gradients<T>, Error> {
     let Rendered {
-        image,
-        alphas,
         gaussians,
         background,
         camera,
@@ -181,8 +175,6 @@ pub fn backward<T: Real>(
         composited,
         ..
     } = rendered;
-    check_len("v.image", v.image, image.len())?;
-    check_len("v.alphas", v.alphas.unwrap_or(alphas), alphas.len())?;
     let input = CompositeInput {
         projection,
         tiles,

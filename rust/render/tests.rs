@@ -18,16 +18,15 @@ fn harmonics<T: Real>(s: &Synthetic<T>) -> Harmonics<'_, T> {
     }
 }
 
-fn options(level: Level) -> ProjectOptions {
-    ProjectOptions {
-        level,
-        ..ProjectOptions::default()
+fn options(level: Level) -> RenderOptions {
+    RenderOptions {
+        level: Some(level),
+        ..RenderOptions::default()
     }
 }
 
-fn render_with<'a, T: Real>(s: &'a Synthetic<T>, options: &ProjectOptions) -> Rendered<'a, T> {
-    let harmonics = harmonics(s);
-    let colors = Colors::Harmonics(&harmonics);
+fn render_with<'a, T: Real>(s: &'a Synthetic<T>, options: &RenderOptions) -> Rendered<'a, T> {
+    let colors = Colors::Harmonics(harmonics(s));
     forward(s.gaussians(), colors, None, &s.camera, options).unwrap()
 }
 
@@ -133,7 +132,7 @@ fn tuned(
     s: &Synthetic<f32>,
     knobs: AccuracyKnobs,
 ) -> (Rendered<'_, f32>, Gradients<f32>) {
-    let options = ProjectOptions {
+    let options = RenderOptions {
         knobs,
         ..options(level)
     };
@@ -310,8 +309,8 @@ fn the_wrong_length_is_named() {
         ..s.gaussians()
     };
     let given = harmonics(&s);
-    let colors = Colors::Harmonics(&given);
-    let options = ProjectOptions::default();
+    let colors = Colors::Harmonics(given);
+    let options = RenderOptions::default();
     let error = forward(g, colors, None, &s.camera, &options).unwrap_err();
     assert_eq!(error.name(), "scales");
     let error = forward(s.gaussians(), colors, Some(&[0.0]), &s.camera, &options).unwrap_err();
@@ -319,7 +318,7 @@ fn the_wrong_length_is_named() {
     let channels = Colors::Channels(&s.harmonics, 47);
     let error = forward(s.gaussians(), channels, None, &s.camera, &options).unwrap_err();
     assert_eq!(error.name(), "colors");
-    let narrow = ProjectOptions {
+    let narrow = RenderOptions {
         far_plane: options.near_plane,
         ..options
     };
@@ -375,18 +374,18 @@ impl Inputs {
             degree: 3,
         };
         let colors = if self.harmonics {
-            Colors::Harmonics(&harmonics)
+            Colors::Harmonics(harmonics)
         } else {
             Colors::Channels(&self.colors, 5)
         };
         // No jumps: nothing is left out.
-        let options = ProjectOptions {
+        let options = RenderOptions {
             knobs: AccuracyKnobs {
                 alpha_min: 1e-15,
                 transmittance_min: 0.0,
                 ..AccuracyKnobs::default()
             },
-            ..ProjectOptions::default()
+            ..RenderOptions::default()
         };
         let background = Some(&self.background[..]);
         let r = forward(s.gaussians(), colors, background, &camera, &options).unwrap();

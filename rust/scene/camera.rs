@@ -57,20 +57,20 @@ impl Camera {
             || last_row.into_iter().any(|(x, e)| (x - e).abs() > 1e-4)
         {
             return Err(Error::new(
-                "viewmats",
+                "viewmat",
                 format!("must be finite with last row (0, 0, 0, 1), got {viewmat:?}"),
             ));
         }
         let focal = DVec2::new(k[0], k[4]);
         if !k.iter().all(|x| x.is_finite()) || focal.min_element() <= 0.0 {
             return Err(Error::new(
-                "Ks",
+                "k",
                 format!("must be finite with positive focal lengths, got {k:?}"),
             ));
         }
         if k[1] != 0.0 || k[3] != 0.0 || k[6..] != [0.0, 0.0, 1.0] {
             return Err(Error::new(
-                "Ks",
+                "k",
                 format!("must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {k:?}"),
             ));
         }
@@ -81,7 +81,7 @@ impl Camera {
         let center = -(rotation.inverse() * translation);
         if !center.is_finite() {
             return Err(Error::new(
-                "viewmats",
+                "viewmat",
                 format!("the rotation must be invertible, got {viewmat:?}"),
             ));
         }
@@ -99,6 +99,19 @@ impl Camera {
             ratio_min: -(principal / focal + margin),
             ratio_max: (size - principal) / focal + margin,
         })
+    }
+
+    /// A camera at the origin that looks along z, `focal` pixels from the middle of its image.
+    ///
+    /// # Errors
+    /// As for [`Self::new`].
+    pub fn at_origin(focal: f64, width: usize, height: usize) -> Result<Self, Error> {
+        let viewmat = [
+            1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0,
+        ];
+        let [x, y] = [width, height].map(|side| 0.5 * side as f64);
+        let k = [focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0];
+        Self::new(&viewmat, &k, width, height)
     }
 
     /// Image width, pixels.

@@ -68,11 +68,11 @@ impl<T: Real> Harmonics<'_, T> {
     /// Check the number of coefficients and the degree.
     ///
     /// # Errors
-    /// Names `sh_degree` or `colors`.
+    /// Names `degree` or `colors`.
     pub fn check(&self, n: usize) -> Result<(), Error> {
         if self.degree > sh::MAX_DEGREE {
             return Err(Error::new(
-                "sh_degree",
+                "degree",
                 format!("must be 0..=3, got {}", self.degree),
             ));
         }
@@ -80,7 +80,7 @@ impl<T: Real> Harmonics<'_, T> {
             let needed = sh::count(self.degree);
             return Err(Error::shape(
                 "colors",
-                format!("[N, K >= {needed}, 3] for sh_degree {}", self.degree),
+                format!("[N, K >= {needed}, 3] for degree {}", self.degree),
                 format!("K = {}", self.stored),
             ));
         }
@@ -96,7 +96,7 @@ impl<T: Real> Harmonics<'_, T> {
 #[derive(Debug, Clone, Copy)]
 pub enum Colors<'a, T> {
     /// Spherical harmonics, evaluated by the projection.
-    Harmonics(&'a Harmonics<'a, T>),
+    Harmonics(Harmonics<'a, T>),
     /// [N, channels], given. The projection only culls what is not finite.
     Channels(&'a [T], usize),
 }
@@ -113,11 +113,13 @@ impl<T: Real> Colors<'_, T> {
     /// Check that they are those of `n` Gaussians.
     ///
     /// # Errors
-    /// Names `sh_degree` or `colors`.
+    /// Names `degree` or `colors`.
     pub fn check(&self, n: usize) -> Result<(), Error> {
-        match *self {
+        match self {
             Self::Harmonics(harmonics) => harmonics.check(n),
-            Self::Channels(data, channels) => check_len("colors", data, n.saturating_mul(channels)),
+            Self::Channels(data, channels) => {
+                check_len("colors", data, n.saturating_mul(*channels))
+            }
         }
     }
 }

@@ -252,8 +252,8 @@ mod tests {
             stored: 16,
             degree: 3,
         };
-        let options = crate::project::ProjectOptions::default();
-        let colors = crate::scene::Colors::Harmonics(&harmonics);
+        let options = crate::project::RenderOptions::default();
+        let colors = crate::scene::Colors::Harmonics(harmonics);
         let r = crate::render::forward(s.gaussians(), colors, None, &s.camera, &options).unwrap();
         let open = r.alphas.iter().filter(|a| **a < 0.9).count();
         assert!(

@@ -31,6 +31,7 @@ impl Level {
 
     /// Whether the product in a sum stays unrounded (a fused multiply-add). Levels that agree in this give the same
     /// bits.
+    #[doc(hidden)]
     pub fn is_fused(self) -> bool {
         matches!(self.name(), "AVX-512" | "AVX2" | "NEON")
     }
@@ -57,16 +58,6 @@ impl Level {
             fearless_simd::Level::WasmSimd128(_) => 5,
             _ => 6,
         }]
-    }
-}
-
-/// That of [`level`].
-///
-/// # Panics
-/// With the message of its error.
-impl Default for Level {
-    fn default() -> Self {
-        level().unwrap_or_else(|error| panic!("{error}"))
     }
 }
 

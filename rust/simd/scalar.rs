@@ -7,13 +7,14 @@ use fearless_simd::{Simd, SimdFloatElement};
 pub type Lanes<T, S> = <T as SimdFloatElement>::Native<S>;
 
 mod sealed {
-    pub trait Sealed {}
-    impl Sealed for f32 {}
-    impl Sealed for f64 {}
+    /// What no other type is, and what the kernels ask of it.
+    pub trait Scalar: fearless_simd::SimdFloatElement {}
+    impl Scalar for f32 {}
+    impl Scalar for f64 {}
 }
 
 /// f32 or f64, and no other type.
-pub trait Real: sealed::Sealed + SimdFloatElement + Send + Sync + 'static {
+pub trait Real: sealed::Scalar + Send + Sync + 'static {
     /// Zero.
     const ZERO: Self;
     /// One.

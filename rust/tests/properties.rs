@@ -5,7 +5,7 @@
 use hqgs::internals::{
     accuracy_knobs::{AccuracyKnobs, Spans},
     composite::{self, CompositeCotangents, CompositeInput},
-    project::{self, ProjectCotangents, ProjectOptions},
+    project::{self, ProjectCotangents, RenderOptions},
     scene::{Camera, Colors, Gaussians, Harmonics},
     simd::{Real, levels},
     tiles,
@@ -29,7 +29,7 @@ struct Scene {
     degree: Option<usize>,
     background: [f64; 3],
     viewmat: [f64; 16],
-    options: ProjectOptions,
+    options: RenderOptions,
 }
 
 /// Image and gradients, per Gaussian.
@@ -122,9 +122,7 @@ impl Scene {
             degree,
         });
         let background = flat::<T, _>(&[self.background]);
-        let given_colors = harmonics
-            .as_ref()
-            .map_or(Colors::Channels(&given, 3), Colors::Harmonics);
+        let given_colors = harmonics.map_or(Colors::Channels(&given, 3), Colors::Harmonics);
         let projected =
             project::forward(&gaussians, given_colors, &camera, &self.options).expect("lengths");
         let (projection, radii) = (projected.projection, projected.radii);
@@ -277,9 +275,9 @@ fn gaussians(viewmat: [f64; 16], most: usize) -> impl Strategy<Value = Scene> {
                 degree: None,
                 background: [background[0], background[1], background[2]],
                 viewmat,
-                options: ProjectOptions {
+                options: RenderOptions {
                     antialiased,
-                    ..ProjectOptions::default()
+                    ..RenderOptions::default()
                 },
             };
             for ((x, y, z), quat, scale, opacity, color) in all {
@@ -573,7 +571,7 @@ fn levels_agree<T: Real>(s: &Scene) -> Result<(), TestCaseError> {
     let mut s = s.clone();
     let mut first: [Option<Output<T>>; 2] = [None, None];
     for level in levels() {
-        s.options.level = level;
+        s.options.level = Some(level);
         let out = s.render::<T>();
         if let Some(first) = &first[usize::from(level.is_fused())] {
             prop_assert!(out == *first, "{level:?}");
@@ -631,7 +629,7 @@ fn at_each_level(
 ) -> Result<(), TestCaseError> {
     for level in levels() {
         let mut s = s.clone();
-        s.options.level = level;
+        s.options.level = Some(level);
         check(&s).map_err(|error| match error {
             TestCaseError::Fail(why) => TestCaseError::fail(format!("{level:?}: {why}")),
             reject => reject,
@@ -652,13 +650,13 @@ fn longest_needle() {
         degree: None,
         background: [0.0; 3],
         viewmat: STRAIGHT,
-        options: ProjectOptions {
+        options: RenderOptions {
             eps2d: 0.0,
-            ..ProjectOptions::default()
+            ..RenderOptions::default()
         },
     };
     for level in levels() {
-        s.options.level = level;
+        s.options.level = Some(level);
         let out = s.render::<f64>();
         assert!(out.gaussians[0].radii[0] > 0, "{level:?}");
         assert!(

@@ -149,7 +149,7 @@ fn bin_at_most<T: Real>(
 mod tests {
     use super::*;
     use crate::{
-        project::{self, ProjectOptions},
+        project::{self, RenderOptions},
         scene::{Colors, synthetic::Synthetic},
     };
     use rayon::ThreadPoolBuilder;
@@ -158,7 +158,7 @@ mod tests {
     fn more_pairs_than_allowed_are_an_error_for_any_number_of_threads() {
         let s = Synthetic::<f32>::new(9000, 300, 200, 1).unwrap();
         let none = Colors::<f32>::Channels(&[], 0);
-        let options = ProjectOptions::default();
+        let options = RenderOptions::default();
         let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
         let projection = projected.projection;
         let pairs = bin::<f32>(&projection, &[], 0, &s.camera).unwrap().pairs() as u64;
@@ -185,7 +185,7 @@ mod tests {
     fn the_counting_stops_at_the_limit() {
         let s = Synthetic::<f32>::new(1000, 3000, 2000, 1).unwrap();
         let none = Colors::<f32>::Channels(&[], 0);
-        let options = ProjectOptions::default();
+        let options = RenderOptions::default();
         let projected = project::forward(&s.gaussians(), none, &s.camera, &options).unwrap();
         let source = |limit| Source::<f32> {
             projection: &projected.projection,

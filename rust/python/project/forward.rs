@@ -10,9 +10,8 @@ use hqgs::internals::{
     Error,
     accuracy_knobs::{AccuracyKnobs, Spans},
     counts::Counts,
-    project::{self, ProjectOptions},
+    project::{self, RenderOptions},
     scene::{Camera, Colors, Harmonics},
-    simd,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
@@ -33,7 +32,10 @@ fn cameras(
     let ((views, _), (ks, _)) = (viewmats.slice()?.as_chunks(), ks.slice()?.as_chunks());
     let cameras = views.iter().zip(ks);
     Ok(cameras
-        .map(|(v, k)| Camera::new(v, k, width, height))
+        .map(|(v, k)| {
+            let camera = Camera::new(v, k, width, height);
+            camera.map_err(|e| e.renamed("viewmat", "viewmats").renamed("k", "Ks"))
+        })
         .collect::<Result<_, _>>()?)
 }
 
@@ -82,7 +84,7 @@ pub(super) fn project_forward<'py>(
     knobs: Option<Knobs>,
 ) -> BindingResult<Bound<'py, PyAny>> {
     let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
-    let options = ProjectOptions {
+    let options = RenderOptions {
         near_plane,
         far_plane,
         radius_clip,
@@ -90,7 +92,7 @@ pub(super) fn project_forward<'py>(
         antialiased,
         differentiable,
         knobs: accuracy_knobs(knobs)?,
-        level: simd::level()?,
+        level: None,
     };
     by_dtype!(
         "means",
@@ -113,7 +115,7 @@ fn project_as<'py, T: Scalar>(
     ks: &Bound<'py, PyAny>,
     width: usize,
     height: usize,
-    options: ProjectOptions,
+    options: RenderOptions,
     sh_degree: Option<usize>,
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = means.py();
@@ -138,7 +140,7 @@ fn project_as<'py, T: Scalar>(
     let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
             let project = |(i, camera)| {
-                let colors = harmonics.as_ref().map_or_else(
+                let colors = harmonics.map_or_else(
                     || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
                     Colors::Harmonics,
                 );
@@ -213,6 +215,8 @@ fn harmonics<'a, T: Scalar>(
         stored,
         degree,
     };
-    harmonics.check(n)?;
+    harmonics
+        .check(n)
+        .map_err(|e| e.renamed("degree", "sh_degree"))?;
     Ok(harmonics)
 }

@@ -10,7 +10,7 @@ use crate::{
 use hqgs::internals::{
     Error,
     counts::Counts,
-    project::{ProjectOptions, Projection},
+    project::{Projection, RenderOptions},
     scene::{Camera, Gaussians},
 };
 use numpy::Element;
@@ -32,7 +32,7 @@ pub(crate) struct Frame(pub(crate) Arc<Projections>);
 pub(crate) struct Projections {
     pub(crate) cameras: Vec<Camera>,
     pub(crate) projections: Vec<Projection>,
-    options: ProjectOptions,
+    options: RenderOptions,
     pub(crate) n: usize,
     /// Of each camera; a `Vec<Option<Shading<T>>>`.
     shadings: AnyType,

@@ -28,6 +28,18 @@ pub struct AdamOptions {
     pub eps: f64,
 }
 
+impl AdamOptions {
+    /// With the decays of the field, 0.9 and 0.999, and the 1e-15 that 3DGS adds.
+    pub const fn new(lr: f64) -> Self {
+        Self {
+            lr,
+            beta1: 0.9,
+            beta2: 0.999,
+            eps: 1e-15,
+        }
+    }
+}
+
 /// One array of parameters with its gradient and its moments, all of the same length.
 #[derive(Debug)]
 pub struct AdamArrays<'a, T> {
@@ -43,42 +55,24 @@ pub struct AdamArrays<'a, T> {
 
 /// What a step updates; everything else is left as it is, moments included.
 #[derive(Debug, Clone, Copy)]
-pub struct Selection<'a> {
-    /// Rows whose number here is 0 are left out, `[N]` for arrays of N rows (the selective Adam of Taming 3DGS,
-    /// Mallick et al. 2024). None: none.
-    pub visible: Option<&'a [u8]>,
+pub struct Selection {
     /// Numbers of a row.
     pub width: usize,
     /// How many of them are updated, the first ones.
     pub used: usize,
 }
 
-impl Selection<'_> {
+impl Selection {
     /// Everything.
-    pub const ALL: Self = Self {
-        visible: None,
-        width: 1,
-        used: 1,
-    };
+    pub const ALL: Self = Self { width: 1, used: 1 };
 
     /// Check it against arrays of `n` numbers.
     fn check(&self, n: usize) -> Result<(), Error> {
-        let Self {
-            visible,
-            width,
-            used,
-        } = *self;
+        let Self { width, used } = *self;
         if width == 0 || used > width || !n.is_multiple_of(width) {
             return Err(Error::new(
                 "used",
                 format!("cannot update {used} of {width} numbers a row of {n} elements"),
-            ));
-        }
-        if let Some(got) = visible.map(<[u8]>::len).filter(|got| got * width != n) {
-            return Err(Error::shape(
-                "visible",
-                "[N] for arrays of N rows",
-                format!("{got} for {n} elements in rows of {width}"),
             ));
         }
         Ok(())
@@ -132,11 +126,7 @@ fn step_at<T: Real>(
         return Ok(());
     }
     selection.check(n)?;
-    let Selection {
-        visible,
-        width,
-        used,
-    } = *selection;
+    let Selection { width, used } = *selection;
     let chunk = (CHUNK / width).max(1) * width;
     let level = level.token();
     param
@@ -144,28 +134,8 @@ fn step_at<T: Real>(
         .zip(exp_avg.par_chunks_mut(chunk))
         .zip(exp_avg_sq.par_chunks_mut(chunk))
         .zip(grad.par_chunks(chunk))
-        .enumerate()
-        .for_each(|(i, (((param, m), v), grad))| {
-            let Some(visible) = visible else {
-                return dispatch!(level, simd => update_rows(simd, &factors, param, m, v, grad, width, used));
-            };
-            let first = i * chunk / width;
-            let mut at = 0;
-            for run in
-                visible[first..first + param.len() / width].chunk_by(|a, b| (*a != 0) == (*b != 0))
-            {
-                let part = at..at + run.len() * width;
-                at = part.end;
-                if run[0] != 0 {
-                    let (param, m, v) = (
-                        &mut param[part.clone()],
-                        &mut m[part.clone()],
-                        &mut v[part.clone()],
-                    );
-                    let grad = &grad[part];
-                    dispatch!(level, simd => update_rows(simd, &factors, param, m, v, grad, width, used));
-                }
-            }
+        .for_each(|(((param, m), v), grad)| {
+            dispatch!(level, simd => update_rows(simd, &factors, param, m, v, grad, width, used));
         });
     Ok(())
 }

@@ -90,71 +90,23 @@ fn agrees_with_the_formulas_of_torch() {
 }
 
 #[test]
-fn rows_that_are_not_visible_are_left_alone() {
-    at_each_level(check_visible);
-}
-
-fn check_visible(level: Level) {
-    for width in [1, 3, 45] {
-        let rows = 1000;
-        let visible: Vec<u8> = signed(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
-        let [all, some, none] =
-            [None, Some(&visible[..]), Some(&vec![0; rows][..])].map(|visible| {
-                let used = width;
-                let selection = Selection {
-                    visible,
-                    width,
-                    used,
-                };
-                run::<f32>(level, rows * width, 3, &selection)
-            });
-        for k in 0..3 {
-            for i in 0..rows * width {
-                let expected = if visible[i / width] != 0 { &all } else { &none };
-                assert_eq!(some[k][i], expected[k][i], "array {k}, element {i}");
-            }
-        }
-        let start: Vec<f32> = signed(1, rows * width)
-            .into_iter()
-            .map(|v| v as f32)
-            .collect();
-        assert_eq!(
-            none,
-            [start, vec![0.0; rows * width], vec![0.0; rows * width]]
-        );
-    }
-}
-
-#[test]
 fn numbers_of_a_row_that_are_not_used_are_left_alone() {
     at_each_level(check_used);
 }
 
 fn check_used(level: Level) {
     let (rows, width) = (1000, 45);
-    let visible: Vec<u8> = signed(5, rows).iter().map(|&v| u8::from(v > 0.2)).collect();
     let all = run::<f32>(level, rows * width, 3, &Selection::ALL);
     for used in [0, 9, 24, 45] {
-        for visible in [None, Some(&visible[..])] {
-            let selection = Selection {
-                visible,
-                width,
-                used,
+        let some = run::<f32>(level, rows * width, 3, &Selection { width, used });
+        for (i, start) in signed(1, rows * width).into_iter().enumerate() {
+            let expected = if i % width < used {
+                all.each_ref().map(|a| a[i])
+            } else {
+                [start as f32, 0.0, 0.0]
             };
-            let some = run::<f32>(level, rows * width, 3, &selection);
-            for (i, start) in signed(1, rows * width).into_iter().enumerate() {
-                let updated = i % width < used && visible.is_none_or(|v| v[i / width] != 0);
-                let expected = if updated {
-                    all.each_ref().map(|a| a[i])
-                } else {
-                    [start as f32, 0.0, 0.0]
-                };
-                assert_eq!(
-                    some.each_ref().map(|a| a[i]),
-                    expected,
-                    "{used}, element {i}"
-                );
-            }
+            let got = some.each_ref().map(|a| a[i]);
+            assert_eq!(got, expected, "{used}, element {i}");
         }
     }
 }
@@ -177,7 +129,7 @@ fn same_bits_for_any_number_of_threads() {
 
 #[test]
 fn wrong_input_is_named() {
-    let call = |lengths: [usize; 4], at, options: AdamOptions, visible: Option<&[u8]>| {
+    let call = |lengths: [usize; 4], at, options: AdamOptions| {
         let [mut param, grad, mut exp_avg, mut exp_avg_sq] = lengths.map(|n| vec![1.0f32; n]);
         let arrays = AdamArrays {
             param: &mut param,
@@ -185,21 +137,14 @@ fn wrong_input_is_named() {
             exp_avg: &mut exp_avg,
             exp_avg_sq: &mut exp_avg_sq,
         };
-        let selection = Selection {
-            visible,
-            ..Selection::ALL
-        };
-        step(arrays, at, &options, &selection).map_err(|e| e.name().to_owned())
+        step(arrays, at, &options, &Selection::ALL).map_err(|e| e.name().to_owned())
     };
     let named = |name: &str| Err(name.to_owned());
-    assert_eq!(call([6, 5, 6, 6], 1, OPTIONS, None), named("grad"));
-    assert_eq!(call([6, 6, 5, 6], 1, OPTIONS, None), named("exp_avg"));
-    assert_eq!(call([6, 6, 6, 5], 1, OPTIONS, None), named("exp_avg_sq"));
-    assert_eq!(call([6; 4], 1, OPTIONS, Some(&[1; 4])), named("visible"));
-    assert_eq!(call([6; 4], 1, OPTIONS, Some(&[])), named("visible"));
-    assert_eq!(call([0; 4], 1, OPTIONS, Some(&[1; 4])), Ok(()));
-    assert_eq!(call([0; 4], 1, OPTIONS, None), Ok(()));
-    assert_eq!(call([6; 4], 0, OPTIONS, None), named("step"));
+    assert_eq!(call([6, 5, 6, 6], 1, OPTIONS), named("grad"));
+    assert_eq!(call([6, 6, 5, 6], 1, OPTIONS), named("exp_avg"));
+    assert_eq!(call([6, 6, 6, 5], 1, OPTIONS), named("exp_avg_sq"));
+    assert_eq!(call([0; 4], 1, OPTIONS), Ok(()));
+    assert_eq!(call([6; 4], 0, OPTIONS), named("step"));
     assert_eq!(
         call(
             [6; 4],
@@ -207,8 +152,7 @@ fn wrong_input_is_named() {
             AdamOptions {
                 lr: f64::NAN,
                 ..OPTIONS
-            },
-            None
+            }
         ),
         named("lr")
     );
@@ -219,8 +163,7 @@ fn wrong_input_is_named() {
             AdamOptions {
                 beta1: 1.0,
                 ..OPTIONS
-            },
-            None
+            }
         ),
         named("beta1")
     );
@@ -231,8 +174,7 @@ fn wrong_input_is_named() {
             AdamOptions {
                 beta2: -0.1,
                 ..OPTIONS
-            },
-            None
+            }
         ),
         named("beta2")
     );
@@ -243,8 +185,7 @@ fn wrong_input_is_named() {
             AdamOptions {
                 eps: -1.0,
                 ..OPTIONS
-            },
-            None
+            }
         ),
         named("eps")
     );

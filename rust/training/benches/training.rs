@@ -6,7 +6,7 @@ use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
     exposure::{Frame, Photograph, Warp},
     jpeg_cells,
-    loss::{self, LossScratch},
+    loss::{self, Images, LossOptions, LossScratch},
     rows::{self, ViewColors, ViewRows},
     separable::{Dense, Separable},
     stereo::{Other, Picture, Sweep},
@@ -29,24 +29,19 @@ fn losses(c: &mut Criterion) {
     let (render, floats) = (wave(3 * PIXELS, 0.37), wave(3 * PIXELS, 0.11));
     let bytes: Vec<u8> = floats.iter().map(|x| (255.0 * x) as u8).collect();
     let (mut grad, mut scratch) = (vec![0.0; 3 * PIXELS], LossScratch::default());
+    let images = Images {
+        render: &render[..],
+        target: &bytes[..],
+        mask: None,
+        size: [HEIGHT, WIDTH, 3],
+    };
     let mut group = c.benchmark_group("loss");
     for (name, lambda) in [("L1", 0.0), ("L1 and D-SSIM", 0.2)] {
+        let options = LossOptions { lambda, knee: 0.0 };
         group.bench_function(name, |b| {
             b.iter(|| {
                 let out = Some(&mut grad[..]);
-                loss::photometric(
-                    &render,
-                    &bytes,
-                    None,
-                    HEIGHT,
-                    WIDTH,
-                    3,
-                    lambda,
-                    0.0,
-                    out,
-                    &mut scratch,
-                )
-                .expect("right lengths")
+                loss::photometric(images, &options, out, &mut scratch).expect("right lengths")
             });
         });
     }
@@ -198,12 +193,7 @@ fn views(c: &mut Criterion) {
 /// One step on all parameters of N Gaussians, 59 numbers each, in one array.
 fn optimizer(c: &mut Criterion) {
     const NUMBERS: usize = 59;
-    let options = AdamOptions {
-        lr: 1e-3,
-        beta1: 0.9,
-        beta2: 0.999,
-        eps: 1e-15,
-    };
+    let options = AdamOptions::new(1e-3);
     let mut group = c.benchmark_group("adam");
     for n in [10_000, 100_000] {
         let wave =

@@ -6,12 +6,12 @@
 
 use hqgs::{
     Error,
-    render::{self, Cotangents, ProjectOptions, Wanted},
+    render::{self, Cotangents, RenderOptions, Wanted},
     scene::{Camera, Colors, Gaussians},
 };
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
-    loss::{self, LossScratch},
+    loss::{self, Images, LossOptions, LossScratch},
 };
 use std::{fs::File, io::BufWriter};
 
@@ -66,19 +66,13 @@ impl Parameters {
     }
 
     fn step(&mut self, grad: &[f32], step: u64) -> Result<(), Error> {
-        let options = AdamOptions {
-            lr: self.lr,
-            beta1: 0.9,
-            beta2: 0.999,
-            eps: 1e-15,
-        };
         let arrays = AdamArrays {
             param: &mut self.values,
             grad,
             exp_avg: &mut self.exp_avg,
             exp_avg_sq: &mut self.exp_avg_sq,
         };
-        adam::step(arrays, step, &options, &Selection::ALL)
+        adam::step(arrays, step, &AdamOptions::new(self.lr), &Selection::ALL)
     }
 }
 
@@ -89,12 +83,7 @@ fn sigmoid(x: f32) -> f32 {
 /// Fit the Gaussians to `target`. Returns the last picture, and the loss of each iteration.
 fn fit(target: &[f32], iterations: u64) -> Result<(Vec<f32>, Vec<f64>), Error> {
     // A camera one focal length away from the plane z = 1, on which a pixel is 1 / HEIGHT wide.
-    let (w, h) = (WIDTH as f64, HEIGHT as f64);
-    let viewmat = [
-        1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0,
-    ];
-    let k = [h, 0.0, w / 2.0, 0.0, h, h / 2.0, 0.0, 0.0, 1.0];
-    let camera = Camera::new(&viewmat, &k, WIDTH, HEIGHT)?;
+    let camera = Camera::at_origin(HEIGHT as f64, WIDTH, HEIGHT)?;
 
     // Round, grey and half clear, on a grid; scales as logarithms and opacities as logits, which have no bounds.
     let [across, down] = GRID;
@@ -113,7 +102,7 @@ fn fit(target: &[f32], iterations: u64) -> Result<(Vec<f32>, Vec<f64>), Error> {
     let mut logits = Parameters::new(vec![0.0; n], 5e-2);
     let mut colors = Parameters::new(vec![0.5; 3 * n], 2e-2);
 
-    let options = ProjectOptions::default();
+    let options = RenderOptions::default();
     let wanted = Wanted {
         means: true,
         quats: true,
@@ -136,15 +125,15 @@ fn fit(target: &[f32], iterations: u64) -> Result<(Vec<f32>, Vec<f64>), Error> {
         };
         let channels = Colors::Channels(&colors.values, 3);
         let rendered = render::forward(gaussians, channels, Some(&BACKGROUND), &camera, &options)?;
-        let value = loss::photometric(
-            &rendered.image,
+        let images = Images {
+            render: &rendered.image[..],
             target,
-            None,
-            HEIGHT,
-            WIDTH,
-            3,
-            0.2,
-            0.0,
+            mask: None,
+            size: [HEIGHT, WIDTH, 3],
+        };
+        let value = loss::photometric(
+            images,
+            &LossOptions::default(),
             Some(&mut v_image),
             &mut scratch,
         )?;

@@ -109,7 +109,8 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
         first: usize,
         memory: &'a mut Vec<T>,
     ) -> Result<Self, Error> {
-        let (n, pad) = (images.width * images.channels, REACH * images.channels);
+        let [_, width, channels] = images.size;
+        let (n, pad) = (width * channels, REACH * channels);
         let row = n.next_multiple_of(LINE) + (2 * pad).next_multiple_of(LINE);
         let size = BUFFER_ROWS * row;
         if memory.len() < size + LINE {
@@ -188,31 +189,30 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
     fn inside(&self, row: isize) -> Option<usize> {
         usize::try_from(row)
             .ok()
-            .filter(|&row| row < self.images.height)
+            .filter(|&row| row < self.images.size[0])
     }
 
     /// Read a row as `p = x + y - 1` and `q = x - y`. Where the mask is 0, x is taken to be y.
     #[inline(always)]
     fn load(&mut self, row: usize) {
         let Images {
-            x,
-            y,
+            render,
+            target,
             mask,
-            channels,
-            ..
+            size: [.., channels],
         } = self.images.row(row);
         let (p, q) = (
             &mut self.buffers.p[self.pad..],
             &mut self.buffers.q[self.pad..],
         );
-        for (((p, q), &x), &y) in p.iter_mut().zip(q.iter_mut()).zip(x).zip(y) {
+        for (((p, q), &x), &y) in p.iter_mut().zip(q.iter_mut()).zip(render).zip(target) {
             let y = y.value();
             *p = x + y - T::ONE;
             *q = x - y;
         }
         for pixel in ignored(mask) {
             for c in pixel * channels..(pixel + 1) * channels {
-                let y = y[c].value();
+                let y = target[c].value();
                 p[c] = y + y - T::ONE;
                 q[c] = T::ZERO;
             }
@@ -238,7 +238,7 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
             sqq.fill(T::ZERO);
             return;
         }
-        let (n, pad, step) = (self.n, self.pad, self.images.channels);
+        let (n, pad, step) = (self.n, self.pad, self.images.size[2]);
         for (values, sums, squares) in [(&*self.buffers.p, sp, spp), (&*self.buffers.q, sq, sqq)] {
             for j in (0..n).step_by(Lanes::<T, S>::LEN) {
                 let v = read(simd, values, j + pad);
@@ -306,7 +306,7 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
     /// Filter the maps of the rows `row` and `row + 1` horizontally into the rings.
     #[inline(always)]
     fn filter_maps<S: Simd>(&mut self, simd: S, kernel: &Kernel<T, S>, row: isize) {
-        let (n, pad, step) = (self.n, self.pad, self.images.channels);
+        let (n, pad, step) = (self.n, self.pad, self.images.size[2]);
         for i in 0..PAIR {
             let row = row + i as isize;
             let inside = self.inside(row).is_some();
@@ -350,7 +350,11 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
     #[inline(always)]
     fn finish(&mut self, row: usize, grad: Option<&mut [T]>, i: Option<usize>) -> f64 {
         self.load(row);
-        let Images { mask, channels, .. } = self.images.row(row);
+        let Images {
+            mask,
+            size: [.., channels],
+            ..
+        } = self.images.row(row);
         let knee = self.plan.knee;
         let part = self.pad..self.pad + self.n;
         let (p, q) = (&self.buffers.p[part.clone()], &self.buffers.q[part.clone()]);

@@ -81,15 +81,35 @@ struct Sums {
     dissimilarity: f64,
 }
 
-/// The pair of images, [H, W, C] each, and the mask, [H, W], 0 where the target does not count.
-#[derive(Clone, Copy)]
-struct Images<'a, T, Y> {
-    x: &'a [T],
-    y: &'a [Y],
-    mask: Option<&'a [u8]>,
-    height: usize,
-    width: usize,
-    channels: usize,
+/// The pair of images, and what of them counts.
+#[derive(Debug, Clone, Copy)]
+pub struct Images<'a, T, Y> {
+    /// What is judged, [H, W, C].
+    pub render: &'a [T],
+    /// What it is compared with, [H, W, C]; u8 is divided by 255.
+    pub target: &'a [Y],
+    /// [H, W], 0 where a pixel does not count. None: all of them do.
+    pub mask: Option<&'a [u8]>,
+    /// Height, width and channels.
+    pub size: [usize; 3],
+}
+
+/// How they are compared; the default is that of 3DGS.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossOptions {
+    /// The part of `1 - SSIM` in the loss, in [0, 1]; with 0 no SSIM is computed.
+    pub lambda: f64,
+    /// k > 0 puts Huber's function in the place of |x|: x^2 / (2 k) up to k, |x| - k / 2 beyond.
+    pub knee: f64,
+}
+
+impl Default for LossOptions {
+    fn default() -> Self {
+        Self {
+            lambda: 0.2,
+            knee: 0.0,
+        }
+    }
 }
 
 /// What to compute, and the factors of the gradient.
@@ -101,60 +121,33 @@ struct Plan {
     ssim_scale: f64,
 }
 
-/// The loss of `render` against `target`, both [height, width, channels], and its gradient with respect to
-/// the render (overwritten).
+/// The loss of a render, and its gradient with respect to the render (`grad` is overwritten).
 ///
-/// A `target` of u8 is divided by 255. Where `mask` [height, width] is 0 a pixel contributes nothing: L1 is
-/// the mean over the other pixels, and for SSIM the render is replaced by the target there; the gradient is
-/// 0. SSIM is still averaged over all pixels. The gradient of |x| at 0 is 0. With `lambda` 0 no SSIM is
-/// computed. NaN in the render gives a NaN loss. The same bits for any number of threads.
-///
-/// With a `knee` k > 0, Huber's function stands for |x|: x^2 / (2 k) up to k, |x| - k / 2 beyond.
+/// Where the mask is 0 a pixel contributes nothing: L1 is the mean over the other pixels, and for SSIM the render is
+/// replaced by the target there; the gradient is 0. SSIM is still averaged over all pixels. The gradient of |x| at 0
+/// is 0. NaN in the render gives a NaN loss. The same bits for any number of threads.
 ///
 /// # Errors
 /// Names the array whose length does not match, `lambda` outside [0, 1], or a `knee` that is negative or not
 /// finite.
 pub fn photometric<T: Real, Y: Sample<T>>(
-    render: &[T],
-    target: &[Y],
-    mask: Option<&[u8]>,
-    height: usize,
-    width: usize,
-    channels: usize,
-    lambda: f64,
-    knee: f64,
+    images: Images<'_, T, Y>,
+    options: &LossOptions,
     grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Photometric, Error> {
-    photometric_at(
-        simd::level()?,
-        render,
-        target,
-        mask,
-        height,
-        width,
-        channels,
-        lambda,
-        knee,
-        grad,
-        scratch,
-    )
+    photometric_at(simd::level()?, images, options, grad, scratch)
 }
 
 /// [`photometric`] with the vector instructions of `level`.
 fn photometric_at<T: Real, Y: Sample<T>>(
     level: Level,
-    render: &[T],
-    target: &[Y],
-    mask: Option<&[u8]>,
-    height: usize,
-    width: usize,
-    channels: usize,
-    lambda: f64,
-    knee: f64,
+    images: Images<'_, T, Y>,
+    options: &LossOptions,
     grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Photometric, Error> {
+    let LossOptions { lambda, knee } = *options;
     if !(0.0..=1.0).contains(&lambda) {
         return Err(Error::new(
             "lambda",
@@ -167,15 +160,13 @@ fn photometric_at<T: Real, Y: Sample<T>>(
             format!("must be finite and at least 0, got {knee}"),
         ));
     }
-    let images = Images {
-        x: render,
-        y: target,
+    images.check()?;
+    let Images {
+        render,
         mask,
-        height,
-        width,
-        channels,
-    };
-    images.check("render", "target")?;
+        size: [height, width, channels],
+        ..
+    } = images;
     if let Some(grad) = &grad {
         check_len("grad", grad, render.len())?;
     }
@@ -203,42 +194,24 @@ fn photometric_at<T: Real, Y: Sample<T>>(
     })
 }
 
-/// Mean SSIM of two images [height, width, channels], in [0, 1] or `b` in u8; for `mask` see [`photometric`].
+/// Mean SSIM of a render; for the mask see [`photometric`].
 ///
 /// # Errors
 /// Names the array whose length does not match.
 pub fn ssim<T: Real, Y: Sample<T>>(
-    a: &[T],
-    b: &[Y],
-    mask: Option<&[u8]>,
-    height: usize,
-    width: usize,
-    channels: usize,
+    images: Images<'_, T, Y>,
     scratch: &mut LossScratch<T>,
 ) -> Result<f64, Error> {
-    ssim_at(simd::level()?, a, b, mask, height, width, channels, scratch)
+    ssim_at(simd::level()?, images, scratch)
 }
 
 /// [`ssim`] with the vector instructions of `level`.
 fn ssim_at<T: Real, Y: Sample<T>>(
     level: Level,
-    a: &[T],
-    b: &[Y],
-    mask: Option<&[u8]>,
-    height: usize,
-    width: usize,
-    channels: usize,
+    images: Images<'_, T, Y>,
     scratch: &mut LossScratch<T>,
 ) -> Result<f64, Error> {
-    let images = Images {
-        x: a,
-        y: b,
-        mask,
-        height,
-        width,
-        channels,
-    };
-    images.check("a", "b")?;
+    images.check()?;
     let plan = Plan {
         ssim: true,
         knee: 0.0,
@@ -246,34 +219,36 @@ fn ssim_at<T: Real, Y: Sample<T>>(
         ssim_scale: 0.0,
     };
     let sums = run(level, images, plan, None, scratch)?;
-    Ok(1.0 - sums.dissimilarity / a.len() as f64)
+    Ok(1.0 - sums.dissimilarity / images.render.len() as f64)
 }
 
 impl<T, Y> Images<'_, T, Y> {
-    fn check(&self, x: &str, y: &str) -> Result<(), Error> {
-        let sides = [self.height, self.width, self.channels];
+    fn check(&self) -> Result<(), Error> {
+        let [height, width, _] = self.size;
         // No slice has so many elements; a product that wrapped around could fit one.
-        let n = sides.into_iter().fold(1, usize::saturating_mul);
+        let n = self.size.into_iter().fold(1, usize::saturating_mul);
         if n == 0 {
-            let got = format!("[{}, {}, {}]", self.height, self.width, self.channels);
-            return Err(Error::shape(x, "[H, W, C] with at least one pixel", got));
+            let got = format!("{:?}", self.size);
+            return Err(Error::shape(
+                "render",
+                "[H, W, C] with at least one pixel",
+                got,
+            ));
         }
-        check_len(x, self.x, n)?;
-        check_len(y, self.y, n)?;
+        check_len("render", self.render, n)?;
+        check_len("target", self.target, n)?;
         self.mask
-            .map_or(Ok(()), |m| check_len("mask", m, self.height * self.width))
+            .map_or(Ok(()), |m| check_len("mask", m, height * width))
     }
 
     fn row(&self, row: usize) -> Images<'_, T, Y> {
-        let n = self.width * self.channels;
+        let [_, width, channels] = self.size;
+        let n = width * channels;
         Images {
-            x: &self.x[row * n..(row + 1) * n],
-            y: &self.y[row * n..(row + 1) * n],
-            mask: self
-                .mask
-                .map(|m| &m[row * self.width..(row + 1) * self.width]),
-            height: 1,
-            ..*self
+            render: &self.render[row * n..(row + 1) * n],
+            target: &self.target[row * n..(row + 1) * n],
+            mask: self.mask.map(|m| &m[row * width..(row + 1) * width]),
+            size: [1, width, channels],
         }
     }
 }
@@ -289,7 +264,8 @@ fn run<T: Real, Y: Sample<T>>(
     mut grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Sums, Error> {
-    let (height, n) = (images.height, images.width * images.channels);
+    let [height, width, channels] = images.size;
+    let n = width * channels;
     let threads = rayon::current_num_threads();
     let wanted = if threads == 1 { 1 } else { 2 * threads }; // two each, so that a late thread can be helped
     let rows = height.div_ceil(wanted).max(MIN_BAND);

@@ -53,19 +53,34 @@ fn unit(y: &[u8]) -> Vec<f64> {
     y.iter().map(|&v| f64::from(v) / 255.0).collect()
 }
 
+fn images<'a, T, Y>(
+    render: &'a [T],
+    target: &'a [Y],
+    mask: Option<&'a [u8]>,
+    size: [usize; 3],
+) -> Images<'a, T, Y> {
+    Images {
+        render,
+        target,
+        mask,
+        size,
+    }
+}
+
 fn loss<T: Real>(
     level: Level,
     x: &[T],
     y: &[u8],
     mask: Option<&[u8]>,
-    [h, w, c]: [usize; 3],
+    size: [usize; 3],
     lambda: f64,
 ) -> (Photometric, Vec<T>) {
     let mut grad = vec![T::from_f64(7.0); x.len()];
     let mut scratch = LossScratch::default();
     let (out, s) = (Some(&mut grad[..]), &mut scratch);
-    let value = photometric_at(level, x, y, mask, h, w, c, lambda, 0.0, out, s).unwrap();
-    let alone = photometric_at(level, x, y, mask, h, w, c, lambda, 0.0, None, s).unwrap();
+    let (images, options) = (images(x, y, mask, size), LossOptions { lambda, knee: 0.0 });
+    let value = photometric_at(level, images, &options, out, s).unwrap();
+    let alone = photometric_at(level, images, &options, None, s).unwrap();
     assert!(
         value == alone || value.loss.is_nan(),
         "{value:?} with the gradient, {alone:?} without"
@@ -344,14 +359,7 @@ fn each_level_agrees_with_the_best() {
     let [height, width, channels] = [33, 17, 3];
     let n = height * width * channels;
     let (x, y) = (noise(1, n), photo(2, n));
-    let images = Images {
-        x: &x[..],
-        y: &y[..],
-        mask: None,
-        height,
-        width,
-        channels,
-    };
+    let images = images(&x, &y, None, [height, width, channels]);
     let plan = Plan {
         ssim: true,
         knee: 0.0,
@@ -394,7 +402,12 @@ fn ssim_of_two_float_images() {
 fn check_ssim(level: Level) {
     let size @ [h, w, c] = [21, 14, 3];
     let (a, b) = (noise(1, h * w * c), noise(2, h * w * c));
-    let got = ssim_at(level, &a, &b, None, h, w, c, &mut LossScratch::default()).unwrap();
+    let got = ssim_at(
+        level,
+        images(&a, &b, None, size),
+        &mut LossScratch::default(),
+    )
+    .unwrap();
     assert!((got - reference(&a, &b, None, size).1).abs() < 1e-13);
 }
 
@@ -407,8 +420,14 @@ fn check_scratch(level: Level) {
     let mut scratch = LossScratch::default();
     for size @ [h, w, c] in SIZES.into_iter().rev() {
         let (x, y) = (noise(1, h * w * c), photo(2, h * w * c));
-        let got =
-            photometric_at(level, &x, &y, None, h, w, c, 0.2, 0.0, None, &mut scratch).unwrap();
+        let got = photometric_at(
+            level,
+            images(&x, &y, None, size),
+            &LossOptions::default(),
+            None,
+            &mut scratch,
+        )
+        .unwrap();
         assert_eq!(got, loss(level, &x, &y, None, size, 0.2).0);
     }
 }
@@ -437,20 +456,9 @@ fn check_knee(level: Level) {
     let mut scratch = LossScratch::default();
     let mut grad = vec![0.0; x.len()];
     let (y, m) = (&y[..], Some(&mask[..]));
-    let got = photometric_at(
-        level,
-        &x,
-        y,
-        m,
-        h,
-        w,
-        c,
-        0.0,
-        knee,
-        Some(&mut grad),
-        &mut scratch,
-    )
-    .unwrap();
+    let images = images(&x, y, m, size);
+    let options = LossOptions { lambda: 0.0, knee };
+    let got = photometric_at(level, images, &options, Some(&mut grad), &mut scratch).unwrap();
     assert!((got.loss - huber.sum::<f64>()).abs() < 1e-14);
     for (i, (&g, &d)) in grad.iter().zip(&difference).enumerate() {
         assert!(
@@ -459,7 +467,8 @@ fn check_knee(level: Level) {
         );
     }
     assert!(difference.iter().any(|d| d.abs() < knee) && difference.iter().any(|d| d.abs() > knee));
-    let both = photometric_at(level, &x, y, m, h, w, c, 0.4, knee, None, &mut scratch).unwrap();
+    let options = LossOptions { lambda: 0.4, knee };
+    let both = photometric_at(level, images, &options, None, &mut scratch).unwrap();
     let plain = loss(level, &x, y, m, size, 0.4).0;
     assert_eq!(both.ssim, plain.ssim);
     assert!((both.loss - plain.loss - 0.6 * (got.loss - plain.l1)).abs() < 1e-14);
@@ -470,21 +479,11 @@ fn wrong_input_is_named() {
     let mut scratch = LossScratch::default();
     let x = [0.0f32; 12];
     let mut call = |y: &[u8], mask: Option<&[u8]>, lambda, knee, shape: [usize; 3]| {
-        photometric(
-            &x,
-            y,
-            mask,
-            shape[0],
-            shape[1],
-            shape[2],
-            lambda,
-            knee,
-            None,
-            &mut scratch,
-        )
-        .unwrap_err()
-        .name()
-        .to_owned()
+        let options = LossOptions { lambda, knee };
+        photometric(images(&x, y, mask, shape), &options, None, &mut scratch)
+            .unwrap_err()
+            .name()
+            .to_owned()
     };
     assert_eq!(call(&[0; 12], None, 0.2, 0.0, [2, 2, 4]), "render");
     assert_eq!(call(&[0; 12], None, 0.2, 0.0, [0, 2, 3]), "render");
@@ -502,7 +501,10 @@ fn sides_whose_product_wraps_around_are_refused() {
     let pixels = [0.5f32; 12];
     let (height, width) = (1 << 63, 2); // 0 pixels, or 4 with one row more
     for height in [height, height + 2] {
-        let found = ssim(&pixels, &pixels, None, height, width, 3, &mut scratch);
-        assert_eq!(found.unwrap_err().name(), "a");
+        let found = ssim(
+            images(&pixels, &pixels, None, [height, width, 3]),
+            &mut scratch,
+        );
+        assert_eq!(found.unwrap_err().name(), "render");
     }
 }
