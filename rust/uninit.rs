@@ -1,9 +1,13 @@
 //! New vectors whose chunks are set by the jobs that fill them, while they are in the cache of one core. To set
 //! a large vector to zero before that would be one more pass through memory, which costs more than the
-//! arithmetic on it. What does not stay in cache anyway goes around it where the processor can do that: a cached
-//! store first reads what it overwrites.
+//! arithmetic on it. What does not stay in cache anyway goes around it where the processor can do that: a cached store first reads what it overwrites.
 
-use crate::{error::Error, memory, simd::Real};
+use crate::{
+    error::Error,
+    memory,
+    project::Splat,
+    simd::{Real, groups::Column},
+};
 use std::{
     marker::PhantomData,
     mem::MaybeUninit,
@@ -13,11 +17,42 @@ use std::{
 
 /// Vectors of at least so many bytes go around the cache. The last caches of today's processors hold tens of
 /// megabytes, and the gradients have company there.
-const STREAMED: usize = 8 << 20;
+const STREAMED: usize = if cfg!(miri) { 1 << 12 } else { 8 << 20 };
+
+/// Types that are copied as bytes.
+///
+/// # Safety
+/// Every byte of a value has been set: there is no padding.
+#[allow(unsafe_code)]
+pub unsafe trait Plain: Copy {}
+
+macro_rules! plain {
+    ($($type:ty),*) => {
+        $(
+            // SAFETY: a number has no padding.
+            #[allow(unsafe_code)]
+            unsafe impl Plain for $type {}
+        )*
+    };
+}
+plain!(f32, f64, i32, u16);
+
+const _: () = assert!(size_of::<Splat>() == 6 * 8 + 4 + 4 * 2 + 4);
+// SAFETY: its fields, which have no padding, fill it.
+#[allow(unsafe_code)]
+unsafe impl Plain for Splat {}
+
+// SAFETY: an array has no padding between its elements.
+#[allow(unsafe_code)]
+unsafe impl<T: Plain, const N: usize> Plain for [T; N] {}
+
+// SAFETY: 16 numbers of at least 4 bytes fill whole multiples of the 64 bytes to which it is aligned.
+#[allow(unsafe_code)]
+unsafe impl<T: Real> Plain for Column<T> {}
 
 /// A vector in the making.
 #[derive(Debug)]
-pub(crate) struct UninitVec<T> {
+pub struct UninitVec<T> {
     memory: Vec<T>,
     len: usize,
     /// Elements that were set since the last cut.
@@ -26,7 +61,7 @@ pub(crate) struct UninitVec<T> {
 
 /// A piece of a vector in the making, none of which is set yet.
 #[derive(Debug)]
-pub(crate) struct UninitPiece<'a, T> {
+pub struct UninitPiece<'a, T> {
     memory: &'a mut [MaybeUninit<T>],
     set: &'a AtomicUsize,
     /// Whether what is put goes around the cache.
@@ -38,7 +73,7 @@ pub(crate) struct UninitPiece<'a, T> {
 /// What goes around the cache is ordered before what follows only on the thread that wrote it, so that this type
 /// cannot be sent to another one: the thread that drops it is the one that put.
 #[derive(Debug)]
-pub(crate) struct PieceWriter<'a, T> {
+pub struct PieceWriter<'a, T> {
     memory: &'a mut [MaybeUninit<T>],
     /// Elements that were set.
     done: usize,
@@ -127,7 +162,7 @@ impl<'a, T: Copy> UninitPiece<'a, T> {
     }
 }
 
-impl<T: Real> PieceWriter<'_, T> {
+impl<T: Plain> PieceWriter<'_, T> {
     /// Set the next elements to those of a slice.
     #[inline(always)]
     pub fn put(&mut self, from: &[T]) {
@@ -143,11 +178,11 @@ impl<T: Real> PieceWriter<'_, T> {
 }
 
 /// Copy around the cache, in pieces of 16 bytes; returns whether that was possible. What was written may not be
-/// read by another thread before `fence` on this one.
-#[cfg(target_arch = "x86_64")]
+/// read by another thread before `fence` on this one. Miri has no such stores.
+#[cfg(all(target_arch = "x86_64", not(miri)))]
 #[inline(always)]
 #[allow(unsafe_code)]
-fn stream<T: Real>(to: &mut [MaybeUninit<T>], from: &[T]) -> bool {
+fn stream<T: Plain>(to: &mut [MaybeUninit<T>], from: &[T]) -> bool {
     use std::arch::x86_64::{__m128i, _mm_loadu_si128, _mm_stream_si128};
     let (pieces, rest) = (size_of_val(from) / 16, size_of_val(from) % 16);
     let (to, source) = (
@@ -159,26 +194,26 @@ fn stream<T: Real>(to: &mut [MaybeUninit<T>], from: &[T]) -> bool {
     }
     for k in 0..pieces {
         // SAFETY: `to` has as many elements as `from`, which are `16 * pieces` bytes; `to` is aligned and borrowed
-        // mutably, and any x86_64 has SSE2. Every bit pattern of `from` is a float.
+        // mutably, and any x86_64 has SSE2. Every byte of `from` has been set.
         unsafe { _mm_stream_si128(to.add(k), _mm_loadu_si128(source.add(k))) };
     }
     true
 }
 
 /// Order what `stream` wrote before everything that follows.
-#[cfg(target_arch = "x86_64")]
+#[cfg(all(target_arch = "x86_64", not(miri)))]
 #[allow(unsafe_code)]
 fn fence() {
     // SAFETY: any x86_64 has it.
     unsafe { std::arch::x86_64::_mm_sfence() };
 }
 
-#[cfg(not(target_arch = "x86_64"))]
-fn stream<T: Real>(_: &mut [MaybeUninit<T>], _: &[T]) -> bool {
+#[cfg(any(not(target_arch = "x86_64"), miri))]
+fn stream<T: Plain>(_: &mut [MaybeUninit<T>], _: &[T]) -> bool {
     false
 }
 
-#[cfg(not(target_arch = "x86_64"))]
+#[cfg(any(not(target_arch = "x86_64"), miri))]
 fn fence() {}
 
 impl<T> Drop for PieceWriter<'_, T> {
@@ -187,6 +222,28 @@ impl<T> Drop for PieceWriter<'_, T> {
             fence(); // before another thread learns that this job is done
         }
         self.set.fetch_add(self.done, Ordering::Relaxed);
+    }
+}
+
+/// Ask for the cache line of a value that is needed soon. Where the processor is not asked, it reads it and waits.
+#[inline(always)]
+#[allow(unsafe_code)]
+pub(crate) fn prefetch<T: Copy>(value: &T) {
+    #[cfg(all(target_arch = "x86_64", not(miri)))]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: any x86_64 has it, and caches are all that it changes.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(ptr::from_ref(value).cast()) };
+    }
+    #[cfg(any(not(target_arch = "x86_64"), miri))]
+    std::hint::black_box(*value);
+}
+
+/// The same for all cache lines of a slice.
+#[inline(always)]
+pub(crate) fn prefetch_all<T: Copy>(data: &[T]) {
+    for element in data.iter().step_by((64 / size_of::<T>()).max(1)) {
+        prefetch(element);
     }
 }
 

@@ -17,10 +17,11 @@ use crate::{
         self, Real,
         groups::{self, Column, GROUP},
     },
-    uninit::{UninitPiece, UninitVec},
+    uninit::{PieceWriter, UninitPiece, UninitVec},
 };
 use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
+use std::slice;
 
 /// What the projection gives; zeros where a Gaussian is culled.
 #[derive(Debug)]
@@ -45,48 +46,95 @@ pub struct Projected<T> {
     pub counts: Counts,
 }
 
-/// What one job fills of it; zeros before.
+/// What one job fills of it, group by group.
 struct ForwardChunk<'a, T> {
-    splats: &'a mut [Splat],
+    splats: PieceWriter<'a, Splat>,
     /// The depths of `Projection`.
-    keys: &'a mut [f64],
-    means2d: &'a mut [T],
-    depths: &'a mut [T],
-    conics: &'a mut [T],
-    radii: &'a mut [i32],
-    opacities: &'a mut [T],
-    colors: &'a mut [T],
-    /// Empty where not asked for.
-    slopes: &'a mut [Slopes<T>],
-    clamped: &'a mut [[u16; 3]],
+    keys: PieceWriter<'a, f64>,
+    means2d: PieceWriter<'a, T>,
+    depths: PieceWriter<'a, T>,
+    conics: PieceWriter<'a, T>,
+    radii: PieceWriter<'a, i32>,
+    opacities: PieceWriter<'a, T>,
+    colors: PieceWriter<'a, T>,
+    slopes: PieceWriter<'a, Slopes<T>>,
+    clamped: PieceWriter<'a, [u16; 3]>,
+    /// Whether colours, and how they change, are asked for.
+    asked: [bool; 3],
+}
+
+/// The colours of a group and how they change.
+struct Shaded<T> {
+    colors: [T; 3 * GROUP],
+    slopes: Slopes<T>,
+    clamped: [u16; 3],
+}
+
+impl<T: Real> Shaded<T> {
+    const ZERO: Self = Self {
+        colors: [T::ZERO; 3 * GROUP],
+        slopes: [Column::ZERO; 9],
+        clamped: [0; 3],
+    };
 }
 
 impl<T: Real> ForwardChunk<'_, T> {
-    /// Write the Gaussians in `keep` of a group of `rows`, the first of which is the chunk's `start`.
+    /// Give out the next `rows` Gaussians, of which those in `keep` are kept.
     #[inline(always)]
-    fn write(&mut self, group: &SplatGroup, keep: u16, start: usize, rows: usize) {
-        let splats = &mut self.splats[start..start + rows];
-        for (lane, splat) in splats.iter_mut().enumerate() {
-            if keep >> lane & 1 == 1 {
-                *splat = group.splat(lane);
-            }
+    fn put(&mut self, group: &SplatGroup, keep: u16, rows: usize) {
+        for lane in 0..rows {
+            let splat = if keep >> lane & 1 == 1 {
+                group.splat(lane)
+            } else {
+                Splat::default()
+            };
+            self.splats.put(slice::from_ref(&splat));
         }
-        let depth = kept::<f64>(&group.depth, keep);
-        self.keys[start..start + rows].copy_from_slice(&depth[..rows]);
-        let depth = kept(&group.depth, keep);
-        groups::write([&depth], rows_of(self.depths, 1, start, rows));
-        let opacity = kept(&group.opacity, keep);
-        groups::write([&opacity], rows_of(self.opacities, 1, start, rows));
+        self.keys.put(&kept::<f64>(&group.depth, keep)[..rows]);
+        self.depths.put(&kept::<T>(&group.depth, keep)[..rows]);
+        self.opacities.put(&kept::<T>(&group.opacity, keep)[..rows]);
+        let mut pairs = [T::ZERO; 2 * GROUP];
         let (x, y) = (kept(&group.mean[0], keep), kept(&group.mean[1], keep));
-        groups::write([&x, &y], rows_of(self.means2d, 2, start, rows));
+        groups::write([&x, &y], &mut pairs);
+        self.means2d.put(&pairs[..2 * rows]);
+        let mut radii = [0; 2 * GROUP];
         let (x, y) = (kept(&group.radii[0], keep), kept(&group.radii[1], keep));
-        groups::write(
-            [&integers(&x), &integers(&y)],
-            rows_of(self.radii, 2, start, rows),
-        );
+        groups::write([&integers(&x), &integers(&y)], &mut radii);
+        self.radii.put(&radii[..2 * rows]);
+        let mut conics = [T::ZERO; 3 * GROUP];
         let [a, b, c] = &group.conic;
-        let conic = [&kept(a, keep), &kept(b, keep), &kept(c, keep)];
-        groups::write(conic, rows_of(self.conics, 3, start, rows));
+        groups::write(
+            [&kept(a, keep), &kept(b, keep), &kept(c, keep)],
+            &mut conics,
+        );
+        self.conics.put(&conics[..3 * rows]);
+    }
+
+    /// The same where none is kept.
+    #[inline(always)]
+    fn put_none(&mut self, rows: usize) {
+        self.splats.put(&[Splat::default(); GROUP][..rows]);
+        self.keys.put(&[0.0; GROUP][..rows]);
+        self.depths.put(&[T::ZERO; GROUP][..rows]);
+        self.opacities.put(&[T::ZERO; GROUP][..rows]);
+        self.means2d.put(&[T::ZERO; 2 * GROUP][..2 * rows]);
+        self.radii.put(&[0; 2 * GROUP][..2 * rows]);
+        self.conics.put(&[T::ZERO; 3 * GROUP][..3 * rows]);
+    }
+
+    /// Give out the colours of the next `rows` Gaussians, where they are asked for.
+    #[inline(always)]
+    fn put_colors(&mut self, shaded: &Shaded<T>, rows: usize) {
+        let [colors, clamped, slopes] = self.asked;
+        if colors {
+            self.colors.put(&shaded.colors[..3 * rows]);
+        }
+        if clamped {
+            self.clamped.put(slice::from_ref(&shaded.clamped));
+        }
+        if slopes {
+            self.slopes.put(slice::from_ref(&shaded.slopes));
+        }
     }
 }
 
@@ -126,7 +174,7 @@ pub fn forward<T: Real>(
     };
     let channels = if harmonics.is_some() { 3 } else { 0 };
     let shaded = harmonics.filter(|_| options.differentiable);
-    let clamped = usize::from(shaded.is_some());
+    let clamped_rows = usize::from(shaded.is_some());
     let sloped = usize::from(shaded.is_some_and(|h| h.degree > 0));
     let groups = n.div_ceil(GROUP);
     let name = "splats";
@@ -135,7 +183,7 @@ pub fn forward<T: Real>(
         UninitVec::several([2 * n, n, 3 * n, n, channels * n], name)?;
     let mut radii = UninitVec::new(2 * n, name)?;
     let mut slopes = UninitVec::new(sloped * groups, name)?;
-    let mut clamps = UninitVec::new(clamped * groups, name)?;
+    let mut clamps = UninitVec::new(clamped_rows * groups, name)?;
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))
@@ -146,7 +194,7 @@ pub fn forward<T: Real>(
         .zip(chunks(&mut opacities, n, 1))
         .zip(chunks(&mut rgb, n, channels))
         .zip(group_chunks(&mut slopes, n, sloped))
-        .zip(group_chunks(&mut clamps, n, clamped))
+        .zip(group_chunks(&mut clamps, n, clamped_rows))
         .collect();
     let counts = jobs
         .into_par_iter()
@@ -163,19 +211,20 @@ pub fn forward<T: Real>(
                 ),
             )| {
                 let out = ForwardChunk {
-                    splats: splats.fill(Splat::default()),
-                    keys: keys.fill(0.0),
-                    means2d: means2d.fill(T::ZERO),
-                    depths: depths.fill(T::ZERO),
-                    conics: conics.fill(T::ZERO),
-                    radii: radii.fill(0),
-                    opacities: opacities.fill(T::ZERO),
-                    colors: rgb.fill(T::ZERO),
-                    slopes: slopes.fill([Column::ZERO; 9]),
-                    clamped: clamped.fill([0; 3]),
+                    splats: splats.writer(),
+                    keys: keys.writer(),
+                    means2d: means2d.writer(),
+                    depths: depths.writer(),
+                    conics: conics.writer(),
+                    radii: radii.writer(),
+                    opacities: opacities.writer(),
+                    colors: rgb.writer(),
+                    slopes: slopes.writer(),
+                    clamped: clamped.writer(),
+                    asked: [channels, clamped_rows, sloped].map(|row| row > 0),
                 };
                 dispatch!(level.token, simd => forward_chunk(
-                    simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, out
+                    simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, n, out
                 ))
             },
         )
@@ -203,7 +252,7 @@ pub fn forward<T: Real>(
     })
 }
 
-/// Project the Gaussians from `begin` on, as many as `out` has.
+/// Project the Gaussians from `begin` on, a chunk of the `n` that there are.
 #[inline(always)]
 fn forward_chunk<S: Simd, T: Real>(
     simd: S,
@@ -212,9 +261,10 @@ fn forward_chunk<S: Simd, T: Real>(
     camera: &Camera,
     options: &RenderOptions,
     begin: usize,
+    n: usize,
     mut out: ForwardChunk<T>,
 ) -> Counts {
-    let count = out.splats.len();
+    let count = PROJECT_CHUNK.min(n - begin);
     let mut counts = Counts {
         gaussians: count as u64,
         ..Counts::default()
@@ -229,6 +279,7 @@ fn forward_chunk<S: Simd, T: Real>(
     let mut inputs = Columns::ZERO;
     let mut group = SplatGroup::ZERO;
     let mut harmonics = Coefficients::ZERO;
+    let (mut shaded, none) = (Shaded::ZERO, Shaded::ZERO);
     let directed = matches!(colors, Colors::Harmonics(_));
     for start in (0..count).step_by(GROUP) {
         let rows = GROUP.min(count - start);
@@ -238,19 +289,20 @@ fn forward_chunk<S: Simd, T: Real>(
         if rows < GROUP {
             keep &= (1 << rows) - 1;
         }
+        // Those that harmonics made not finite have colours, too.
+        let shown = keep != 0;
+        shaded.clamped = [0; 3];
         match colors {
             Colors::Harmonics(ref h) if keep != 0 => {
                 counts.harmonics += (rows * sh::count(h.degree)) as u64;
-                let (slopes, clamped) = (
-                    out.slopes.get_mut(start / GROUP),
-                    out.clamped.get_mut(start / GROUP),
-                );
-                counts.slopes += if slopes.is_some() { rows as u64 } else { 0 };
+                let [_, clamped, sloped] = out.asked;
+                counts.slopes += if sloped { rows as u64 } else { 0 };
+                let slopes = sloped.then_some(&mut shaded.slopes);
+                let clamped = clamped.then_some(&mut shaded.clamped);
                 let direction = &group.direction;
                 let [r, g, b] =
                     harmonics.shade(simd, h, first, direction, &mut keep, slopes, clamped);
-                let colors = rows_of(out.colors, 3, start, rows);
-                groups::write([&r.0, &g.0, &b.0], colors);
+                groups::write([&r.0, &g.0, &b.0], &mut shaded.colors);
             }
             Colors::Harmonics(_) => {}
             Colors::Channels(data, channels) => {
@@ -264,8 +316,11 @@ fn forward_chunk<S: Simd, T: Real>(
         }
         counts.projected += u64::from(keep.count_ones());
         if keep != 0 {
-            out.write(&group, keep, start, rows);
+            out.put(&group, keep, rows);
+        } else {
+            out.put_none(rows);
         }
+        out.put_colors(if shown { &shaded } else { &none }, rows);
     }
     counts
 }
@@ -291,12 +346,6 @@ fn integers(values: &[f64; GROUP]) -> [i32; GROUP] {
         *o = *x as i32; // saturates
     }
     out
-}
-
-/// Rows `start..start + rows` of an array.
-#[inline(always)]
-fn rows_of<T>(data: &mut [T], row: usize, start: usize, rows: usize) -> &mut [T] {
-    &mut data[start * row..(start + rows) * row]
 }
 
 fn finite<T: Real>(values: &[T]) -> bool {

@@ -105,6 +105,8 @@ pub struct Splat {
     pub reach: f32,
     /// Tiles that its bounding box touches: x begin, x end, y begin, y end.
     pub tiles: [u16; 4],
+    /// Fills the cache line, so that no byte of it is without a value.
+    pub(crate) rest: u32,
 }
 
 impl Splat {

@@ -152,6 +152,7 @@ impl SplatGroup {
                 self.tiles[2].0[i] as u16,
                 self.tiles[3].0[i] as u16,
             ],
+            rest: 0,
         }
     }
 }
