@@ -40,20 +40,32 @@ pub(crate) struct Record<T> {
 pub(crate) const UNIT: f64 = 0.849_321_800_288_019_1;
 
 impl<T: Real> Record<T> {
+    /// All of it that is the same in each tile.
     #[inline(always)]
-    pub fn new(splat: &Splat, gaussian: u32, center: [f64; 2]) -> Self {
+    fn new(splat: &Splat, gaussian: u32) -> Self {
         let [s, m, t] = splat.factors;
-        let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
         let (s, t) = (UNIT * s, UNIT * t);
         Self {
-            u0: T::from_f64(s * (m * y - x)),
-            v0: T::from_f64(-t * y),
+            u0: T::ZERO,
+            v0: T::ZERO,
             s: T::from_f64(s),
             n: T::from_f64(-s * m),
             t: T::from_f64(t),
             opacity: T::from_f64(splat.opacity),
             reach: T::from_f64(UNIT * f64::from(splat.reach)),
             gaussian,
+        }
+    }
+
+    /// The same in the tile around `center`.
+    #[inline(always)]
+    fn at(self, splat: &Splat, center: [f64; 2]) -> Self {
+        let [s, m, t] = splat.factors;
+        let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
+        Self {
+            u0: T::from_f64(UNIT * s * (m * y - x)),
+            v0: T::from_f64(-(UNIT * t) * y),
+            ..self
         }
     }
 }
@@ -84,7 +96,10 @@ pub(super) struct Pairs<T> {
 
 impl<T> Pairs<T> {
     pub fn tile(&self, tile: usize) -> Range<usize> {
-        self.begins[tile] as usize..self.begins[tile + 1] as usize
+        match self.begins.get(tile..tile + 2) {
+            Some(&[begin, end]) => begin as usize..end as usize,
+            _ => 0..0,
+        }
     }
 }
 
@@ -179,23 +194,27 @@ impl<T: Real> Source<'_, T> {
         }
         let mut next = memory::with_capacity(begins.len(), NAME)?;
         next.extend_from_slice(&begins);
+        // Zeros first: they bring the lines into cache one after the other, which is faster than to wait for each one.
         let mut depths = memory::filled(0, sum, NAME)?;
         let mut records = memory::filled(Record::default(), sum, NAME)?;
         let mut colors = memory::filled(T::ZERO, sum * d, NAME)?;
         let middle = |k: usize| (k * TILE + TILE / 2) as f64;
-        for span in spans {
-            let i = span.gaussian as usize;
+        for of_one in spans.chunk_by(|a, b| a.gaussian == b.gaussian) {
+            let i = of_one[0].gaussian as usize;
             let splat = &self.projection.splats[i];
             let depth = (self.projection.depths[i] as f32).to_bits();
             let color = &self.colors[i * d..(i + 1) * d];
-            for x in span.begin..span.end {
-                let slot = &mut next[usize::from(span.row) * self.tiles_x + usize::from(x)];
-                let at = *slot as usize;
-                *slot += 1;
-                let center = [middle(usize::from(x)), middle(usize::from(span.row))];
-                depths[at] = depth;
-                records[at] = Record::new(splat, span.gaussian, center);
-                copy_color(&mut colors[at * d..(at + 1) * d], color);
+            let record = Record::new(splat, i as u32);
+            for span in of_one {
+                let row = usize::from(span.row);
+                for x in span.begin..span.end {
+                    let slot = &mut next[row * self.tiles_x + usize::from(x)];
+                    let at = *slot as usize;
+                    *slot += 1;
+                    depths[at] = depth;
+                    records[at] = record.at(splat, [middle(usize::from(x)), middle(row)]);
+                    copy_color(&mut colors[at * d..(at + 1) * d], color);
+                }
             }
         }
         Ok(Pairs {
