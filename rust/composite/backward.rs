@@ -158,7 +158,9 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
         return Ok((Vec::new(), counts));
     }
     counts.backward_tiles = 1;
-    list.fetch();
+    if let Some(next) = input.tiles.lists.get(tile + 1) {
+        next.prefetch();
+    }
     let begins = replay_blocks::<S, T>(simd, input, grid, tile, &depths, adjoint, layers)?;
     let out = for_parts!(S, T, P => unblend::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
     Ok((out, counts))

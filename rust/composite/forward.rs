@@ -122,7 +122,9 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     colors: &mut [Pixels<T>],
 ) -> Counts {
     let list = &input.tiles.lists[tile];
-    list.fetch();
+    if let Some(next) = input.tiles.lists.get(tile + 1) {
+        next.prefetch();
+    }
     let mut counts = Counts {
         tiles: u64::from(!list.records.is_empty()),
         pairs: list.records.len() as u64,

@@ -9,12 +9,11 @@ use crate::{
     memory,
     project::Splat,
     simd::Real,
-    tiles::{Chunk, UNIT},
-    uninit::UninitVec,
+    tiles::{Chunk, Span, UNIT},
+    uninit::{UninitVec, prefetch},
 };
 use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
-use std::hint::black_box;
 
 /// What an error calls the buffers of this file.
 const NAME: &str = "gradients";
@@ -113,17 +112,23 @@ impl<T: Real> Gather<'_, T> {
         let i = i - self.chunk.begin;
         write(self.colors, i, colors);
         let [s, m, t] = splat.factors;
-        // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that.
-        let (wu, wv) = (moments[1] / UNIT, moments[2] / UNIT);
+        // sigma = (u^2 + v^2) / 2 in standard deviations; the kernel's u and v are UNIT times that. It enters as
+        // opacity exp(-sigma). All in one vector: divisions are what takes time here.
+        let mut quotients = [moments[1], moments[2], -moments[0], 0.0];
+        for (x, by) in quotients.iter_mut().zip([UNIT, UNIT, splat.opacity, 1.0]) {
+            *x /= by;
+        }
+        let [wu, wv, opacity, _] = quotients;
         write(self.means2d, i, &[-s * wu, s * m * wu - t * wv]);
         // d sigma = -1/2 (y^T d cov y) with y = L (u, v)
         let k = -0.5 / (UNIT * UNIT);
         let whitened = [k * moments[3], k * moments[4], k * moments[5]];
         write(self.whitened, i, &whitened);
-        // sigma enters as opacity exp(-sigma)
-        write(self.opacities, i, &[-moments[0] / splat.opacity]);
-        let absolute = [s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)];
-        write(self.absolute, i, &absolute);
+        write(self.opacities, i, &[opacity]);
+        if !self.absolute.is_empty() {
+            let absolute = [s * absolute[0] / UNIT, absolute[1] / (UNIT * UNIT)];
+            write(self.absolute, i, &absolute);
+        }
     }
 }
 
@@ -151,28 +156,37 @@ fn gather_chunk<S: Simd, T: Real, const D: usize>(
 ) -> Result<(), Error> {
     let channels = if D > 0 { D } else { layout.channels };
     let row = PairLayout { channels, ..layout }.row();
+    let tiles_x = input.tiles.tiles_x;
     let mut next = memory::copied(&out.chunk.starts, NAME)?;
     let zeros = memory::filled(T::ZERO, row, NAME)?;
     let mut moments = [0.0; MOMENTS];
     let mut absolute = [0.0; ABSOLUTE];
     let mut colors = memory::filled(0.0, channels, NAME)?;
     let mut current = None;
-    let mut rows: Vec<&[T]> = Vec::new();
-    for spans in out.chunk.spans.chunks(FETCH) {
-        // A short loop that only looks the rows up: its many misses overlap.
+    // While the rows of some spans are added, those of the next are on their way.
+    let (mut rows, mut coming) = (Vec::new(), Vec::new());
+    let mut blocks = out.chunk.spans.chunks(FETCH);
+    let mut look_up = |spans: Option<&[Span]>, rows: &mut Vec<_>| {
         rows.clear();
-        for span in spans {
-            for tile in span.tiles(input.tiles.tiles_x) {
+        for span in spans.unwrap_or(&[]) {
+            for tile in span.tiles(tiles_x) {
                 let place = next[tile] as usize;
                 next[tile] += 1;
                 let grads = pair_grads[tile]
                     .get(place * row..(place + 1) * row)
                     .unwrap_or(&zeros);
-                black_box(grads[0]);
-                black_box(grads[row - 1]);
+                prefetch(&grads[0]);
+                prefetch(&grads[row - 1]);
                 rows.push(grads);
             }
         }
+    };
+    let mut ahead = blocks.next();
+    look_up(ahead, &mut coming);
+    while let Some(spans) = ahead {
+        ahead = blocks.next();
+        std::mem::swap(&mut rows, &mut coming);
+        look_up(ahead, &mut coming);
         let mut rows = rows.iter();
         for span in spans {
             let i = span.gaussian as usize;
@@ -184,7 +198,7 @@ fn gather_chunk<S: Simd, T: Real, const D: usize>(
                 absolute.fill(0.0);
             }
             current = Some(i);
-            for grads in rows.by_ref().take(span.tiles(input.tiles.tiles_x).len()) {
+            for grads in rows.by_ref().take(span.tiles(tiles_x).len()) {
                 add(&mut moments, grads);
                 add(&mut colors[..channels], &grads[MOMENTS..]);
                 if layout.absolute {

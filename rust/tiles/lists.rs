@@ -3,11 +3,13 @@
 use super::{
     NAME,
     block_masks::{Shapes, all_blocks, make_room, reached_blocks},
-    pairs::{Pairs, Record, copy_color},
+    pairs::{Pairs, Record},
 };
-use crate::{constants::TILE_BLOCKS, error::Error, memory, project::Projection, simd::Real};
+use crate::{
+    constants::TILE_BLOCKS, error::Error, memory, project::Projection, simd::Real,
+    uninit::prefetch_all,
+};
 use fearless_simd::Simd;
-use std::hint::black_box;
 
 /// The Gaussians whose support reaches a pixel centre of one tile.
 #[derive(Debug, Default)]
@@ -27,19 +29,11 @@ pub(crate) struct List<T> {
 }
 
 impl<T: Copy> List<T> {
-    /// Bring the records and colours into cache, before the blocks ask for them one by one.
+    /// Send for the records and colours, for which the blocks will ask one by one.
     #[inline(always)]
-    pub fn fetch(&self) {
-        fetch(&self.records);
-        fetch(&self.colors);
-    }
-}
-
-/// Read one element of each cache line: in so short a loop many misses overlap.
-#[inline(always)]
-fn fetch<T: Copy>(data: &[T]) {
-    for element in data.iter().step_by((64 / size_of::<T>()).max(1)) {
-        black_box(*element);
+    pub fn prefetch(&self) {
+        prefetch_all(&self.records);
+        prefetch_all(&self.colors);
     }
 }
 
@@ -94,12 +88,12 @@ pub(super) fn list<S: Simd, T: Real>(
     memory::reserve(keys, n, NAME)?;
     memory::reserve(records, n, NAME)?;
     memory::reserve(colors, n * channels, NAME)?;
-    // The pieces are short, and the first line of each is a miss.
+    // The pieces are short, and the first line of each is a miss: those of the next tile are sent for now.
     for pairs in chunks {
-        let range = pairs.tile(tile);
-        fetch(&pairs.depths[range.clone()]);
-        fetch(&pairs.records[range.clone()]);
-        fetch(&pairs.colors[range.start * channels..range.end * channels]);
+        let range = pairs.tile(tile + 1);
+        prefetch_all(&pairs.depths[range.clone()]);
+        prefetch_all(&pairs.records[range.clone()]);
+        prefetch_all(&pairs.colors[range.start * channels..range.end * channels]);
     }
     for pairs in chunks {
         let range = pairs.tile(tile);
@@ -111,7 +105,7 @@ pub(super) fn list<S: Simd, T: Real>(
     }
     let mut list = List {
         records: memory::with_capacity(n, NAME)?,
-        colors: memory::filled(T::ZERO, n * channels, NAME)?,
+        colors: memory::with_capacity(n * channels, NAME)?,
         places: memory::with_capacity(n, NAME)?,
         ..List::default()
     };
@@ -126,10 +120,10 @@ pub(super) fn list<S: Simd, T: Real>(
     shapes.resize(n)?;
     for (k, place) in list.places.iter().enumerate() {
         let place = *place as usize;
-        copy_color(
-            &mut list.colors[k * channels..(k + 1) * channels],
-            &colors[place * channels..(place + 1) * channels],
-        );
+        match &colors[place * channels..(place + 1) * channels] {
+            &[r, g, b] => list.colors.extend_from_slice(&[r, g, b]), // as in `copy_color`
+            color => list.colors.extend_from_slice(color),
+        }
         shapes.set(k, &records[place]);
         list.records.push(records[place]);
     }

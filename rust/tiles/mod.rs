@@ -11,6 +11,7 @@ mod pairs;
 mod spans;
 
 pub(crate) use pairs::{Chunk, Record, UNIT};
+pub(crate) use spans::Span;
 
 use crate::{
     constants::{MAX_PAIR_BYTES, MAX_PAIRS, TILE},
