@@ -98,7 +98,7 @@ impl<S: Simd, T: Real> RecordLanes<S, T> {
     pub fn alpha(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
         let (u, v) = self.position(x, y);
         let power = u.mul_add(u, v * v);
-        let alpha = self.opacity * T::exp2(simd, Lanes::<T, S>::splat(simd, T::ZERO) - power);
+        let alpha = self.opacity * T::exp2(simd, -power);
         alpha.min(Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX)))
     }
 }
@@ -177,14 +177,15 @@ impl<S: Simd, T: Real> Decision<S, T> {
     /// they cannot disagree.
     #[inline(always)]
     pub fn meet(&self, alpha: Lanes<T, S>, open: Lanes<T, S>) -> Met<S, T> {
+        // From layer to layer a product, a comparison and a choice depend on each other, and no more: what `open` holds
+        // is 0 or larger than `least`, so that a layer which is too clear leaves it.
         let opaque = alpha.simd_ge(self.floor);
-        let behind = open * (self.one - alpha);
-        let blended = opaque & behind.simd_gt(self.least);
+        let behind = open * opaque.select(self.one - alpha, self.one);
+        let left = behind.simd_gt(self.least);
         Met {
-            blended,
+            blended: opaque & left,
             behind,
-            // An opaque lane that does not blend is finished.
-            open: opaque.select(blended.select(behind, self.zero), open),
+            open: left.select(behind, self.zero),
         }
     }
 

@@ -218,15 +218,15 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
             vectors = vectors.div_ceil(2);
             lanes /= 2;
         }
-        for k in 0..count {
-            let sum = sums[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
-            // Without compiled channels the colours lie between the moments and the absolute gradients.
-            let place = if D == 0 && k >= MOMENTS {
-                out.len() - count + k
-            } else {
-                k
-            };
-            out[place] = sum;
+        let sum = |k: usize| sums[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
+        let first = if D > 0 { count } else { MOMENTS };
+        for (k, out) in out[..first].iter_mut().enumerate() {
+            *out = sum(k);
+        }
+        // Without compiled channels the colours lie between the moments and the absolute gradients.
+        let at = out.len() + first - count;
+        for (k, out) in out[at..].iter_mut().enumerate() {
+            *out = sum(first + k);
         }
     }
 }
