@@ -85,7 +85,8 @@ pub mod internals {
         memory,
         project,
         simd,
-        tiles
+        tiles,
+        uninit
     );
 
     pub mod scene {

@@ -13,6 +13,7 @@ use fearless_simd::{Simd, dispatch};
 use hqgs::internals::{
     Error, check_len, memory,
     simd::{self, Level},
+    uninit::{UninitPiece, UninitVec},
 };
 use rayon::prelude::*;
 
@@ -86,6 +87,22 @@ pub struct PhotographGradients<T> {
     pub gains: [f64; 3],
 }
 
+/// Cut a vector of `len` elements into pieces of `size`, of which the last one may be shorter.
+fn pieces<T: Copy>(vector: &mut UninitVec<T>, len: usize, size: usize) -> Vec<UninitPiece<'_, T>> {
+    vector.cut((0..len).step_by(size).map(|at| size.min(len - at)))
+}
+
+/// A copy, made by all threads.
+fn copied<T: Light>(from: &[T], name: &str) -> Result<Vec<T>, Error> {
+    const PIECE: usize = 1 << 14;
+    let mut copy = UninitVec::new(from.len(), name)?;
+    pieces(&mut copy, from.len(), PIECE)
+        .into_par_iter()
+        .zip(from.par_chunks(PIECE))
+        .for_each(|(to, from)| to.writer().put(from));
+    Ok(copy.finish())
+}
+
 impl<T: Light> Photograph<T> {
     /// The photo [H, W, 3] of a render [H + 2 margin, W + 2 margin, 3], values of sRGB: the mean of the `warps` of
     /// its light, times `gains`. Without warps the render as it stands. `nearness` [H, W] is the inverse depth of
@@ -126,11 +143,12 @@ impl<T: Light> Photograph<T> {
             }
         }
         let tables = tables();
-        let mut light = memory::filled([T::ZERO; WIDE], height * width, "light")?;
-        light
-            .par_chunks_mut(BAND * width)
+        let mut light = UninitVec::new(height * width, "light")?;
+        pieces(&mut light, height * width, BAND * width)
+            .into_par_iter()
             .zip(image.par_chunks(BAND * width * 3))
             .for_each(|(light, image)| {
+                let light = light.fill([T::ZERO; WIDE]);
                 for (light, pixel) in light.iter_mut().zip(image.chunks_exact(3)) {
                     for c in 0..3 {
                         light[c] = pixel[c].to_light(tables);
@@ -139,24 +157,26 @@ impl<T: Light> Photograph<T> {
             });
         let mut taken = Self {
             frame,
-            photo: memory::filled(T::ZERO, frame.pixels() * 3, "photo")?,
-            image: memory::copied(image, "image")?,
-            light,
+            photo: Vec::new(),
+            image: copied(image, "image")?,
+            light: light.finish(),
             mean: Vec::new(),
-            nearness: memory::copied(nearness, "nearness")?,
+            nearness: copied(nearness, "nearness")?,
             warps: memory::copied(warps, "warps")?,
             gains,
         };
-        let mut mean = memory::filled([T::ZERO; WIDE], frame.pixels(), "mean")?;
-        let mut photo = std::mem::take(&mut taken.photo);
+        let mut mean = UninitVec::new(frame.pixels(), "mean")?;
+        let mut photo = UninitVec::new(frame.pixels() * 3, "photo")?;
         let (across, token) = (frame.size[1], level.token());
-        mean.par_chunks_mut(across)
-            .zip(photo.par_chunks_mut(across * 3))
+        pieces(&mut mean, frame.pixels(), across)
+            .into_par_iter()
+            .zip(pieces(&mut photo, frame.pixels() * 3, across * 3))
             .enumerate()
             .try_for_each_init(Places::default, |places, (row, (mean, photo))| {
+                let (mean, photo) = (mean.fill([T::ZERO; WIDE]), photo.fill(T::ZERO));
                 dispatch!(token, simd => taken.take_row(simd, row, places, tables, mean, photo))
             })?;
-        (taken.mean, taken.photo) = (mean, photo);
+        (taken.mean, taken.photo) = (mean.finish(), photo.finish());
         Ok(taken)
     }
 
