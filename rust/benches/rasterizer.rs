@@ -1,7 +1,9 @@
 //! `cargo bench`: the stages of the rasterizer at three sizes, 504 x 378, degree 3, f32, all threads, for a
 //! cloud and for a room as a trained scene looks like.
 
-use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+mod table;
+
+use criterion::{BenchmarkId, Criterion};
 use hqgs::internals::{
     composite::{self, CompositeCotangents, CompositeInput},
     project::{self, ProjectCotangents, Projected, RenderOptions},
@@ -124,11 +126,9 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
     group.finish();
 }
 
-criterion_group! {
-    name = benches;
-    config = Criterion::default()
+fn main() {
+    let settings = Criterion::default()
         .warm_up_time(Duration::from_secs(1))
         .measurement_time(Duration::from_secs(3));
-    targets = cloud, room
+    table::run(settings, &[cloud, room]);
 }
-criterion_main!(benches);

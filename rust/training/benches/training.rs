@@ -1,7 +1,9 @@
 //! `cargo bench --bench training`: the parts of a step beside the rasterizer, 504 x 378, f32, all threads: the loss, an
 //! exposure, the operators, cells of JPEG, a sweep of depths, the sum of several views and Adam.
 
-use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+mod table;
+
+use criterion::{BenchmarkId, Criterion};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
     exposure::{Frame, Photograph, Warp},
@@ -217,12 +219,11 @@ fn optimizer(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group! {
-    name = benches;
-    config = Criterion::default()
+fn main() {
+    let settings = Criterion::default()
         .sample_size(20)
         .warm_up_time(Duration::from_secs(1))
         .measurement_time(Duration::from_secs(3));
-    targets = losses, exposures, operators, depths, views, optimizer
+    let benches = [losses, exposures, operators, depths, views, optimizer];
+    table::run(settings, &benches);
 }
-criterion_main!(benches);
