@@ -81,7 +81,9 @@ def main() -> int:
     subprocess.run(
         ["uv", "publish", *dry, *(["--token", "none"] if dry else []), *files], cwd=ROOT, check=True
     )
-    print("uploaded:" if upload else "would upload: the crates hqgs and hqgs-training to crates.io, and to PyPI")
+    print(
+        "uploaded:" if upload else "would upload: the crates hqgs and hqgs-training to crates.io, and to PyPI"
+    )
     for file in files:
         print(f"  {Path(file).name}  {Path(file).stat().st_size / 1e6:.2f} MB")
     return 1 if wrong else 0
