@@ -7,7 +7,6 @@ import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -329,19 +328,21 @@ def test_scenes_that_cannot_be_trained_are_refused() -> None:
         Trainer(Scene(s.name, [view], [], s.points, s.point_colors, s.source), tiny_config())
 
 
-def test_rates_are_those_that_the_method_leaves() -> None:
-    config = tiny_config(10)
-    trainer = Trainer(tiny_scene(), config)
-    for k in range(1, 11):
-        left = 1.0 if k < 6 else 0.25
-        trainer.method = SimpleNamespace(rate_left=left, rates=lambda part: {})  # type: ignore[assignment]
-        trainer._set_rates(trainer.schedule.plan(k, trainer.state.decisions))
-        rates = {group["name"]: group["lr"] for group in trainer.state.optimizer.param_groups}
-        means = config.lr_means * (config.lr_means_final / config.lr_means) ** (k / 10)
-        assert rates.pop("means") == pytest.approx(left * trainer.scene.extent * means)
-        assert set(rates) == {"quats", "scales", "opacities", "sh0", "shN"}
-        for name, rate in rates.items():
-            assert rate == pytest.approx(left * getattr(config, f"lr_{name}")), name
+def test_a_method_may_still_the_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With none of the rates left nothing moves; with a quarter the first step is a quarter as long."""
+
+    def moved(left: float) -> dict[str, Tensor]:
+        monkeypatch.setattr(ThreeDGS, "rate_left", left)
+        trainer = Trainer(tiny_scene(), tiny_config(10, method="3dgs"))
+        before = {name: tensor.detach().clone() for name, tensor in trainer.gaussians.named().items()}
+        trainer.step()
+        return {name: tensor.detach() - before[name] for name, tensor in trainer.gaussians.named().items()}
+
+    whole, quarter = moved(1.0), moved(0.25)
+    assert not any(step.any() for step in moved(0.0).values())
+    for name in ("means", "scales", "quats", "opacities", "sh0"):
+        assert whole[name].any()
+        torch.testing.assert_close(quarter[name], whole[name] / 4, rtol=0.01, atol=1e-6)
 
 
 @pytest.mark.parametrize(
