@@ -36,7 +36,7 @@ def test_cameras_and_random_points(tmp_path: Path) -> None:
         np.testing.assert_allclose(view.camera.K, CENTRED)
         np.testing.assert_array_equal(view.image, truth.photos[i])
     assert "there is no COLMAP model" in scene.notes[0]
-    assert "20000 random points (seed 0) within the given depth bounds" in scene.notes[1]
+    assert "20000 random points within the given depth bounds" in scene.notes[1]
 
     # 7 training views share the points in order; each share lies within its view's bounds and frame, and
     # has the colour of the pixel that it projects to.

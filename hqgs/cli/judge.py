@@ -17,6 +17,7 @@ from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.model.formats.files import format_of, scene_file
+from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import is_film, is_room
 from hqgs.training.settings import longest_side
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 NUMBERS, PAGE = "judge.json", "judge.html"
 META = "meta.json"  # of a SOG scene that was unpacked
-TEST_EVERY = 8  # as everywhere
 
 
 @dataclass(frozen=True, kw_only=True)

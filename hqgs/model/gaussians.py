@@ -22,9 +22,10 @@ from hqgs.model.formats.files import format_of, read_scene, scene_file, write_sc
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import first_camera
+from hqgs.scene.constants import SMALLEST, USUAL
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
-from hqgs.scene.world import SMALLEST, USUAL, World
+from hqgs.scene.world import World
 
 MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
 INITIAL_OPACITY = 0.1

@@ -11,15 +11,11 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_LONGEST, AXES_NEAR, AXES_PAIRS, AXES_RATIO
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import View
 
 Floats = NDArray[np.float64]
-PAIRS = 6  # of neighbours, spread over the photos
-LONGEST = 640  # px of the copies that are matched
-RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004)
-NEAR = 3.0  # px from the epipolar line: a match fits
-FEWEST, CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])  # y down and z forward for y up and z back, and the other way round
 
 
@@ -32,12 +28,12 @@ def with_true_axes(views: Sequence[View]) -> tuple[list[View], str | None]:
     counts, told = np.zeros(3, int), pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.WARNING.value)
     try:
-        for k in evenly(max(len(views) - 1, 0), PAIRS):
+        for k in evenly(max(len(views) - 1, 0), AXES_PAIRS):
             counts += _fitting(views[k], views[k + 1])
     finally:
         pycolmap.logging.minloglevel = told
     stated, turned, matches = counts.tolist()
-    if turned < FEWEST or turned < CLEAR * stated:
+    if turned < AXES_FEWEST or turned < AXES_CLEAR * stated:
         return list(views), None
     note = (
         f"the cameras' y and z are turned: {turned} of {matches} matches between photos fit then, {stated} "
@@ -55,13 +51,13 @@ def _fitting(first: View, second: View) -> NDArray[np.int_]:
     found = []
     for turn in (np.eye(4), TURNED):
         relative = turn @ two.camera.viewmat @ np.linalg.inv(one.camera.viewmat) @ turn
-        found.append(int((_distances(one, two, relative, points, others) < NEAR).sum()))
+        found.append(int((_distances(one, two, relative, points, others) < AXES_NEAR).sum()))
     return np.array([*found, len(points)])
 
 
 def _small(view: View) -> View:
     width, height = view.camera.width, view.camera.height
-    factor = max(width, height) / LONGEST
+    factor = max(width, height) / AXES_LONGEST
     return view if factor <= 1 else resized(view, round(width / factor), round(height / factor))
 
 
@@ -75,7 +71,7 @@ def _matches(first: View, second: View) -> tuple[Floats, Floats]:
     far = np.sqrt(np.maximum(2 - 2 * alike, 0))
     nearest = far.argmin(1)
     best, second_best = np.partition(far, 1, axis=1)[:, :2].T
-    kept = (best < RATIO * second_best) & (far.argmin(0)[nearest] == np.arange(len(a)))
+    kept = (best < AXES_RATIO * second_best) & (far.argmin(0)[nearest] == np.arange(len(a)))
     return points[kept], others[nearest[kept]]
 
 

@@ -15,14 +15,12 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, write_json
 from hqgs.photos.pixels import to_uint8
+from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES, MOST_PIXELS
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.world import World
 
 CAMERAS, PHOTOS = "cameras.json", "photos"
-MAX_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to train
-MAX_PIXELS = 1 << 28  # of a camera in a file
-MAX_FRAMES = 100_000
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to OpenCV's
 
 
@@ -81,7 +79,7 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
     write_json(folder / CAMERAS, content | ({} if scene.world == World() else {"world": scene.world.json()}))
 
 
-def small_photo(view: View, most: int = MAX_SIDE) -> Image.Image:
+def small_photo(view: View, most: int = KEPT_SIDE) -> Image.Image:
     """The photo of a view with 8 bits, at most `most` px wide and high."""
     pixels = view.image if view.image.dtype == np.uint8 else to_uint8(cast(NDArray[np.float32], view.image))
     picture = Image.fromarray(pixels)
@@ -182,7 +180,7 @@ def load_path(path: str | Path) -> tuple[list[Camera], float]:
     try:
         width, height, fps = value["render_width"], value["render_height"], float(value.get("fps", 30))
         frames = value["camera_path"]
-        if not 0 < len(frames) <= MAX_FRAMES:
+        if not 0 < len(frames) <= MOST_FRAMES:
             raise ValueError(f"{len(frames)} frames")
         if not 0 < fps <= 1000:
             raise ValueError(f"fps is {fps}")
@@ -206,7 +204,7 @@ def _frame(frame: Any, width: int, height: int) -> Camera:
 
 def checked_camera(width: Any, height: Any, K: Any, viewmat: Any) -> Camera:
     """A pinhole camera of values from a file. ValueError for those that no camera has."""
-    if not all(type(side) is int and side > 0 for side in (width, height)) or width * height > MAX_PIXELS:
+    if not all(type(side) is int and side > 0 for side in (width, height)) or width * height > MOST_PIXELS:
         raise ValueError(f"a picture of {width!r:.20} x {height!r:.20} px")
     K, viewmat = np.array(K, np.float64), np.array(viewmat, np.float64)
     if K.shape != (3, 3) or viewmat.shape != (4, 4) or not (np.isfinite(K).all() and K[0, 0] * K[1, 1] > 0):

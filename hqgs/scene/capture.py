@@ -11,13 +11,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.scene.constants import LARGEST
 from hqgs.scene.faces import Face
 from hqgs.scene.photo_files import MASKS, Named, below
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.world import World
-
-MAX_SIDE = 65_535  # the largest side a JPEG can have; larger ones come from damaged files
-LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
 
 
 @dataclass(frozen=True)

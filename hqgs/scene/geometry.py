@@ -11,9 +11,8 @@ from torch import Tensor
 
 from hqgs._rust import NEAR_PLANE
 from hqgs.photos.resize import area_downscale
+from hqgs.scene.constants import PICTURE_MARGIN
 from hqgs.scene.scene import Camera, Scene, View
-
-MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
 
 
 def unproject(
@@ -87,8 +86,8 @@ def in_picture(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(1)
     seen = (
         (z > NEAR_PLANE)
-        & (x.abs() * K[0, 0] < MARGIN * camera.width / 2 * z)
-        & (y.abs() * K[1, 1] < MARGIN * camera.height / 2 * z)
+        & (x.abs() * K[0, 0] < PICTURE_MARGIN * camera.width / 2 * z)
+        & (y.abs() * K[1, 1] < PICTURE_MARGIN * camera.height / 2 * z)
     )
     return z, seen
 

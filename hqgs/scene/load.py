@@ -15,6 +15,7 @@ from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
+from hqgs.scene.constants import COARSE, MOST_BYTES
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
@@ -33,10 +34,6 @@ from hqgs.scene.views import load_views
 from hqgs.scene.wide import with_faces
 
 COLMAP = "colmap"
-MOST_BYTES = (
-    4e9  # of all photos in memory, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
-)
-COARSE = 640  # px: cameras for photos whose longer side is scaled down to no more need not be finer than that
 
 
 def load_scene(

@@ -9,13 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hqgs.base.evenly import evenly
+from hqgs.scene.constants import MOST_KEYS, MOST_WALKED, PATH_FOV, PATH_SIZE, TURN_EXTENT
 from hqgs.scene.scene import Camera, Scene
 
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
-SIZE = (504, 378)
-FOV = 60.0
-MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
-TURN = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle
 _Array = NDArray[np.float64]
 # What is right in a picture that is shown upright, by quarter turns clockwise, in the frame of its camera; up
@@ -28,9 +25,9 @@ def look_at(
     target: ArrayLike,
     *,
     up: ArrayLike = UP,
-    width: int = SIZE[0],
-    height: int = SIZE[1],
-    fov: float = FOV,
+    width: int = PATH_SIZE[0],
+    height: int = PATH_SIZE[1],
+    fov: float = PATH_FOV,
 ) -> Camera:
     """A camera at `eye` that looks at `target`, the principal point in the middle.
 
@@ -104,17 +101,23 @@ def scene_up(scene: Scene) -> _Array:
     return world_up([view.camera for view in scene.train], [view.quarter_turns for view in scene.train])
 
 
-def focus(cameras: Sequence[Camera]) -> _Array:
-    """The point that the cameras look at: nearest to all lines of sight, [3]; ahead of them if none is."""
+def sight_lines(cameras: Sequence[Camera]) -> tuple[_Array, _Array, _Array, _Array]:
+    """Centres [n, 3], directions [n, 3], and the normal equations A [3, 3], b [3] of the point nearest to all
+    lines of sight: there the mean of (I - d d^T) (x - c) is 0.
+    """
     centers = np.stack([camera.center for camera in cameras])
     forward = np.stack([camera.viewmat[2, :3] for camera in cameras])
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    return centers, forward, across.mean(0), (across @ centers[:, :, None])[..., 0].mean(0)
+
+
+def focus(cameras: Sequence[Camera]) -> _Array:
+    """The point that the cameras look at: nearest to all lines of sight, [3]; ahead of them if none is."""
+    centers, forward, normal, moment = sight_lines(cameras)
     reach = max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-6)
     # A pull towards what lies ahead by the cameras' own extent decides where the lines are parallel.
     ahead, pull = centers.mean(0) + 2 * reach * forward.mean(0), 0.02
-    point = np.linalg.solve(
-        across.mean(0) + pull * np.eye(3), (across @ centers[:, :, None])[..., 0].mean(0) + pull * ahead
-    )
+    point = np.linalg.solve(normal + pull * np.eye(3), moment + pull * ahead)
     return point if ((point - centers) * forward).sum(axis=1).mean() > 0 else ahead
 
 
@@ -293,7 +296,7 @@ def _steps(centers: _Array, R: _Array) -> _Array:
     extent = float(np.linalg.norm(centers - centers.mean(0), axis=1).max()) or 1.0
     cosines = (np.einsum("nij,nij->n", R[1:], R[:-1]) - 1) / 2
     turns = np.arccos(cosines.clip(-1, 1))
-    return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1), TURN * extent * turns)
+    return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1), TURN_EXTENT * extent * turns)
 
 
 def _check(cameras: Sequence[Camera], frames: int) -> None:

@@ -13,14 +13,12 @@ from hqgs.base.text import some
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
+from hqgs.scene.constants import FAR_OFF, LOOKED_AT, SHOWN
 from hqgs.scene.georeference import LEAST, Georeference, georeference
 from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
 
-FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
-SHOWN = 0.02  # of a photo's sides, which the points must span at least
-LOOKED_AT = 1000  # points
 BEHIND = (0.0, 0.0, 0.0)  # cut-out photos: what renders have behind everything, unless they are told
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.constants import RANDOM_POINTS
 from hqgs.scene.geometry import unproject
+from hqgs.scene.paths import sight_lines
 from hqgs.scene.scene import View
-
-COUNT = 20_000
-SEED = 0
 
 
 def random_points(
@@ -22,11 +21,11 @@ def random_points(
     that look in nearly one direction, 0.5 to 50 times the radius of their positions. Returns points [P, 3]
     in world units, colours [P, 3], and a note that says what was done.
     """
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(0)
     guessed = {} if all(v.name in near_far for v in views) else _guess_near_far(views)
     points, colors = [], []
     for i, view in enumerate(views):
-        count = COUNT * (i + 1) // len(views) - COUNT * i // len(views)
+        count = RANDOM_POINTS * (i + 1) // len(views) - RANDOM_POINTS * i // len(views)
         cells = np.arange(view.image.shape[0] * view.image.shape[1])
         if view.mask is not None:
             cells = cells[view.mask.ravel()]
@@ -41,20 +40,16 @@ def random_points(
         raise ValueError("the masks hide every pixel of every training view")
     depths = "a guessed depth range" if guessed else "the given depth bounds"
     note = (
-        f"no points in the scene: {COUNT} random points (seed {SEED}) within {depths} of the training views; "
+        f"no points in the scene: {RANDOM_POINTS} random points within {depths} of the training views; "
         "`--sfm` finds cameras and points from the photos"
     )
     return np.concatenate(points).astype(np.float32), np.concatenate(colors), note
 
 
 def _guess_near_far(views: list[View]) -> dict[str, tuple[float, float]]:
-    centers = np.stack([v.camera.center for v in views])
-    axes = np.stack([v.camera.viewmat[2, :3] for v in views])
-    # The point nearest to all optical axes, by least squares: sum (I - d d^T) (x - c) = 0.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.mean(0)
+    centers, axes, normal, moment = sight_lines([view.camera for view in views])
     if np.linalg.eigvalsh(normal)[0] > 0.05:  # the axes spread by about 13 degrees or more
-        focus = np.linalg.solve(normal, (across @ centers[:, :, None]).mean(0)[:, 0])
+        focus = np.linalg.solve(normal, moment)
         depths = ((focus - centers) * axes).sum(1)
         if (depths > 0).all():
             return {v.name: (0.3 * d, 3 * d) for v, d in zip(views, depths.tolist(), strict=True)}

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.constants import MOST_DEPTHS, STRAY
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.world import World
-
-MOST_DEPTHS = 1 << 22  # that `Scene.reach` looks at: they and their median take some 120 MB
-STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from hqgs.base.files import CONFIG
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
+from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.load import check_names, load_pictures, load_scene
@@ -25,8 +26,6 @@ from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.scene.tags import by_tags, check_tag_size
-
-ROOM_TEST_EVERY = 8
 
 
 def load(
@@ -107,10 +106,8 @@ def load(
     if is_room(path):
         if not downscale >= 1:
             raise ValueError(f"downscale must be at least 1, got {downscale}")
-        if test_every != ROOM_TEST_EVERY:
-            raise ValueError(
-                f"test_every is {test_every}, but built-in scenes hold out every {ROOM_TEST_EVERY}th"
-            )
+        if test_every != TEST_EVERY:
+            raise ValueError(f"test_every is {test_every}, but built-in scenes hold out every {TEST_EVERY}th")
         scene = room(path, None if kept is None else kept / "scene", downscale, seed)
     else:
         with ExitStack() as stack:

@@ -25,21 +25,25 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.resize import Pixels, area_downscale
-from hqgs.scene.capture import MAX_SIDE, Photo
+from hqgs.scene.capture import Photo
+from hqgs.scene.constants import (
+    BAND,
+    DENSE_SAMPLES,
+    DENSER,
+    EXACT,
+    FAR_SAMPLES,
+    FILM_SHRUNK,
+    GIVEN_BACK,
+    LATTICE,
+    LENS_SHARES,
+    MAX_WORKERS,
+    MOST_SIDE,
+    SMALLEST_SIDE,
+    STRAIGHT,
+)
 from hqgs.scene.faces import AROUND, Face, faces_of, lit, projected
 from hqgs.scene.scene import Camera, View
 
-STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is not resampled
-MAX_SHARE = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
-BAND = 1 << 20  # pixels mapped at a time, to bound memory
-SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
-GIVEN_BACK = 10  # photos after which freed memory goes back to the system
-MAX_WORKERS = 4  # each holds a few photos at their stored size
-DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
-LATTICE, EXACT = 8, 0.02  # px of such a grid: positions are computed so far apart, if that is exact enough
-FAR = 1.25  # pixels of the photo between samples; where they are farther apart, means come first
-DENSE = 1.75  # the same, at which it may be decoded: 6000 px go to 1600 by way of 3000
-FILM = 1.5  # until a frame is so much smaller it shows as much of the film's codec as at its own size
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
 SEAM = 2  # columns repeated beyond both ends of a photo of all around, as bicubic interpolation reads them
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int, str]
@@ -119,7 +123,10 @@ def _load_view(
     check_size(camera, *stored, photo.name)
     # A mask hides colours that must not be mixed into what it shows: such photos are decoded whole.
     enough = downscale > 1 and photo.mask_path is None
-    least = (math.ceil(DENSE * stored[0] / downscale), math.ceil(DENSE * stored[1] / downscale))
+    least = (
+        math.ceil(DENSE_SAMPLES * stored[0] / downscale),
+        math.ceil(DENSE_SAMPLES * stored[1] / downscale),
+    )
     image, mask = decode(photo.path, least if enough else None, over)
     height, width = image.shape[:2]
     if photo.mask_path is not None:
@@ -144,7 +151,7 @@ def _load_view(
     if flat.grid is not None:
         columns = flat.grid.shape[2]
         apart = flat.width / columns * size[0] / stored[0]  # pixels of the photo from one sample to the next
-        if apart > FAR:
+        if apart > FAR_SAMPLES:
             w, h = (max(1, round(side / apart)) for side in size)
             (image, mask), size = area_downscale(image, mask, w, h, size), (w, h)
         image, mask = flat.picture(image, size), flat.mask(mask)
@@ -154,7 +161,7 @@ def _load_view(
     if mask is not None and mask.all():
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
-    film = photo.film if downscale <= FILM else None
+    film = photo.film if downscale <= FILM_SHRUNK else None
     return View(
         photo.name, camera_now, image, mask, quarter_turns=read_exif(photo.path).quarter_turns, film=film
     )
@@ -208,7 +215,7 @@ class Pinhole:
 
 def check_camera(camera: pycolmap.Camera, name: str) -> None:
     """Raise ValueError, naming the photo, when the camera's size or parameters cannot be a camera's."""
-    if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
+    if not (1 <= camera.width <= MOST_SIDE and 1 <= camera.height <= MOST_SIDE):
         raise ValueError(f"the camera of photo {name!r} has the size {camera.width} x {camera.height}")
     if camera.model.name == AROUND:
         return
@@ -217,8 +224,8 @@ def check_camera(camera: pycolmap.Camera, name: str) -> None:
         raise ValueError(f"photo {name!r}: a {camera.model.name} camera has no pinhole view")
     shares = np.array([*focals, camera.principal_point_x, camera.principal_point_y])
     shares = shares / max(camera.width, camera.height)
-    sound = np.isfinite(camera.params).all() and (np.abs(shares) < MAX_SHARE).all()
-    if not (sound and (shares[: len(focals)] > 1 / MAX_SHARE).all()):
+    sound = np.isfinite(camera.params).all() and (np.abs(shares) < LENS_SHARES).all()
+    if not (sound and (shares[: len(focals)] > 1 / LENS_SHARES).all()):
         raise ValueError(
             f"the camera of photo {name!r} ({camera.model.name}) has the parameters {camera.params.tolist()}"
         )

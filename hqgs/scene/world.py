@@ -15,11 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.constants import FAR_ORIGIN, GREATEST, SMALLEST, USUAL
 from hqgs.scene.georeference import Georeference
-
-SMALLEST, LARGEST = 0.25, 256.0  # sizes that are ordinary, world units
-USUAL = 4.0  # the size that others are brought next to
-FAR = 100.0  # sizes from the origin: from here on the origin is moved
 
 Array = NDArray[np.floating[Any]]
 
@@ -124,9 +121,9 @@ def world_for(centers: Array, points: Array) -> World:
     if not 0 < size < math.inf:
         return World()
     shift = (0.0, 0.0, 0.0)
-    if np.abs(middle).max() > FAR * size:
+    if np.abs(middle).max() > FAR_ORIGIN * size:
         step = 10.0 ** math.ceil(math.log10(size))
         x, y, z = (round(float(value) / step) * step for value in middle)
         shift = (x, y, z)
-    unit = 1.0 if SMALLEST <= size < LARGEST else 2.0 ** round(math.log2(size / USUAL))
+    unit = 1.0 if SMALLEST <= size < GREATEST else 2.0 ** round(math.log2(size / USUAL))
     return World(unit, shift)

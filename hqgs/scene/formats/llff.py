@@ -11,8 +11,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.scene.capture import (
-    LARGEST,
-    MAX_SIDE,
     Capture,
     Photo,
     find_mask,
@@ -21,6 +19,7 @@ from hqgs.scene.capture import (
     photo_folder,
     viewmat_from_pose,
 )
+from hqgs.scene.constants import LARGEST, MOST_SIDE
 
 POSES = "poses_bounds.npy"
 
@@ -46,7 +45,7 @@ def read_llff(root: Path, downscale: float) -> Capture:
         near, far = (float(b) for b in row[15:])
         down, right, back, center = pose.T
         opencv = np.stack([right, down, -back, center], -1)
-        if not (1 <= height <= MAX_SIDE and 1 <= width <= MAX_SIDE and 0 < focal < np.inf):
+        if not (1 <= height <= MOST_SIDE and 1 <= width <= MOST_SIDE and 0 < focal < np.inf):
             raise ValueError(f"{root / POSES}: photo {name!r} has h, w, f = {height}, {width}, {focal}")
         if not (0 < near < far < LARGEST):
             raise ValueError(f"{root / POSES}: photo {name!r} has the depth bounds {near}, {far}")

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import (
-    MAX_SIDE,
     Capture,
     Photo,
     find_mask,
@@ -24,6 +23,7 @@ from hqgs.scene.capture import (
     no_points,
     viewmat_from_pose,
 )
+from hqgs.scene.constants import MOST_SIDE
 from hqgs.scene.formats.ply_points import read_ply_points
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named, below
@@ -183,7 +183,7 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
     width, height = number("w"), number("h")
     if width is None or height is None:
         width, height = stored_size(path)
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+    if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"{where}: w, h = {width}, {height} is no photo size")
     fx = _focal(number("fl_x"), number("camera_angle_x"), width, where)
     fy = _focal(number("fl_y"), number("camera_angle_y"), height, where)
