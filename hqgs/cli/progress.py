@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -165,3 +166,24 @@ def _evaluated(now: Progress) -> str:
     where = f"iteration {now.iteration}: {now.gaussians} Gaussians, {now.seconds:.0f} s"
     which = f"{means['views']} of the held-out views" if "views" in means else "held-out views"
     return f"{where}, {which} {', '.join(values)}"
+
+
+@dataclass(frozen=True)
+class Times:
+    """When the parts of a command began, s."""
+
+    start: float
+    loaded: float
+    trained_from: float
+    trained_to: float
+    end: float
+
+    def told(self, colmap: float) -> str:
+        """How long each part took; `colmap`: s, of the loading."""
+        of_it = f" (COLMAP {duration(colmap)})" if colmap >= 1 else ""
+        return (
+            f"{duration(self.end - self.start)}: loading {duration(self.loaded - self.start)}{of_it}, "
+            f"preparing {duration(self.trained_from - self.loaded)}, "
+            f"training {duration(self.trained_to - self.trained_from)}, "
+            f"report {duration(self.end - self.trained_to)}"
+        )

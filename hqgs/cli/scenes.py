@@ -10,7 +10,7 @@ import warnings
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -27,6 +27,12 @@ Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 Factor = Annotated["float | None", tyro.conf.arg(metavar="F", help_behavior_hint="")]
 Number = Annotated["int | None", tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Apart = Annotated["tuple[str, str, float] | None", tyro.conf.arg(metavar="A B METRES", help_behavior_hint="")]
+Features = Annotated[
+    Literal["auto", "sift", "learned"],
+    tyro.conf.arg(
+        help="Of photos, to find cameras; learned: by networks, hqgs[learned]; auto: where SIFT fails."
+    ),
+]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 KINDS = (
     "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "

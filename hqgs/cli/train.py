@@ -20,9 +20,9 @@ from hqgs.base.ranks import RankError, Ranks, joined
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_out
 from hqgs.cli.parse import parse
-from hqgs.cli.progress import LoadingScreen, TrainingScreen, duration
+from hqgs.cli.progress import LoadingScreen, Times, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
-from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.cli.scenes import Apart, Factor, Features, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
@@ -45,7 +45,17 @@ if TYPE_CHECKING:
 
 EXPERT = "--config."
 # Options that shape the scene.
-LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "distance", "tag_size")
+LOADING = (
+    "downscale",
+    "test_every",
+    "sfm",
+    "degrade",
+    "restore",
+    "features",
+    "frames",
+    "distance",
+    "tag_size",
+)
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
@@ -81,6 +91,7 @@ class Train(Photos):
     """Begin anew in a folder that holds a run."""
     sfm: Flag = False
     """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
+    features: Features = "auto"
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
     distance: Apart = None
@@ -131,27 +142,6 @@ class Whole(Train):
 
 
 OPTIONS = Train
-
-
-@dataclass(frozen=True)
-class Times:
-    """When the parts of a command began, s."""
-
-    start: float
-    loaded: float
-    trained_from: float
-    trained_to: float
-    end: float
-
-    def told(self, colmap: float) -> str:
-        """How long each part took; `colmap`: s, of the loading."""
-        of_it = f" (COLMAP {duration(colmap)})" if colmap >= 1 else ""
-        return (
-            f"{duration(self.end - self.start)}: loading {duration(self.loaded - self.start)}{of_it}, "
-            f"preparing {duration(self.trained_from - self.loaded)}, "
-            f"training {duration(self.trained_to - self.trained_from)}, "
-            f"report {duration(self.end - self.trained_to)}"
-        )
 
 
 def read(options: type[Train], command: str, about: str, arguments: Sequence[str]) -> Train:

@@ -103,6 +103,7 @@ class SfmRecord(TypedDict):
     first_pass: int | None
     advice: str | None
     lost: dict[str, str]
+    learned: bool
     sure_px: dict[str, float]
     auc: dict[str, float] | None
 

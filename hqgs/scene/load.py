@@ -30,6 +30,7 @@ from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
+from hqgs.scene.sfm.run import AUTO
 from hqgs.scene.views import load_views
 from hqgs.scene.wide import with_faces
 
@@ -45,6 +46,7 @@ def load_scene(
     longest: int | None = None,
     on_stage: OnStage = silent,
     sfm: bool = False,
+    features: str = AUTO,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
@@ -60,9 +62,10 @@ def load_scene(
     A folder that `hqgs degrade` wrote names its held-out photos itself. Its small photos go into `View.low`
     at downscale 1, the only one at which they stand for `View.image`.
 
-    A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is a
-    folder for that reconstruction, which the next call takes from there. `on_stage` hears what takes long.
-    Half a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
+    A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is
+    a folder for that reconstruction, which the next call takes from there. `on_stage` hears what takes
+    long. `features`: of which kind those are that COLMAP goes by (`run_colmap`). Half a COLMAP model
+    beside the photos is an error, unless `sfm` says that they are to be used alone.
 
     `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
     where all of them would take more than MOST_BYTES of memory. Cameras for small photos are found coarsely.
@@ -80,7 +83,7 @@ def load_scene(
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
     coarse = longest is not None and longest <= COARSE
-    capture = with_faces(_read(root, downscale, keep_sfm, on_stage, sfm, coarse))
+    capture = with_faces(_read(root, downscale, keep_sfm, on_stage, sfm, coarse, features))
     if longest is not None:
         capture = bounded(capture, longest)
     degraded = read_degraded_folder(root)
@@ -181,7 +184,13 @@ def formats_of(root: Path, downscale: float) -> list[str]:
 
 
 def _read(
-    root: Path, downscale: float, keep_sfm: Path | None, on_stage: OnStage, sfm: bool, coarse: bool
+    root: Path,
+    downscale: float,
+    keep_sfm: Path | None,
+    on_stage: OnStage,
+    sfm: bool,
+    coarse: bool,
+    features: str,
 ) -> Capture:
     formats = formats_of(root, downscale)
     others = [name for name in formats if name != COLMAP]
@@ -203,7 +212,7 @@ def _read(
         above = [] if sfm else _above(root)
         if above:
             on_stage(Stage("COLMAP", 0, len(photos.names), above[0]))
-        capture = read_photos(root, photos, keep_sfm, on_stage, coarse)
+        capture = read_photos(root, photos, keep_sfm, on_stage, coarse, features)
         return replace(capture, notes=[*capture.notes, *above])
     raise ValueError(_nothing(root))
 

@@ -162,6 +162,7 @@ class SfmReport:
     first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do
     lost: dict[str, str] = field(default_factory=dict)  # photos without a place, and why
+    learned: bool = False  # by features of networks, not SIFT
     sure_px: dict[str, float] = field(default_factory=dict)  # of each photo with a place; see `sureness`
     auc: dict[str, float] | None = None  # of pairs' pose errors up to "1", "3", "5" degrees; see `pose_auc`
 
@@ -171,6 +172,8 @@ class SfmReport:
             text += (
                 f"; a first pass had registered {self.first_pass}, a second and more tolerant one the rest"
             )
+        if self.learned:
+            text += "; by features of networks (ALIKED, LightGlue) in place of SIFT"
         if self.not_registered:
             text += f"; {len(self.not_registered)} left out, as COLMAP found no place for them: " + ", ".join(
                 name + (f" ({self.lost[name]})" * (name in self.lost)) for name in self.not_registered

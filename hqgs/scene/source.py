@@ -25,6 +25,7 @@ from hqgs.scene.names import KEPT, is_film, is_room
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
+from hqgs.scene.sfm.run import AUTO, check_features
 from hqgs.scene.tags import by_tags, check_tag_size
 
 
@@ -34,6 +35,7 @@ def load(
     downscale: float = 1.0,
     test_every: int = 8,
     sfm: bool = False,
+    features: str = AUTO,
     degrade: str = "none",
     seed: int = 0,
     restore: str | Path | None = None,
@@ -56,6 +58,8 @@ def load(
         test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
         sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
+        features: of photos, to find cameras: "sift"; "learned", which networks recognise under noise and
+            codecs (the extra `learned`); "auto": those where SIFT places too few photos, if it is there.
         degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
         seed: of the degradation, and of what a built-in camera does.
         restore: weights of an image network that the training photos go through at last.
@@ -84,6 +88,7 @@ def load(
         "downscale": downscale,
         "test_every": test_every,
         "sfm": sfm,
+        "features": features,
         "degrade": degrade,
         "seed": seed,
         "restore": None if restore is None else str(Path(restore).resolve()),
@@ -96,6 +101,7 @@ def load(
     apart = None if distance is None else distance_of(distance)
     if tag_size is not None:
         check_tag_size(tag_size, distance)
+    check_features(features)
     degradation = parse_degradation(degrade)
     if restore is not None:
         check_weights(restore)
@@ -128,12 +134,13 @@ def load(
                 longest=longest,
                 on_stage=on_stage,
                 sfm=sfm,
+                features=features,
             )
             scene = replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
     if degradation.steps:
         scene = degrade_scene(scene, degradation, seed)
     if sfm and (scene.source != "photos" or degradation.steps):
-        scene = sfm_scene(scene, models, on_stage)
+        scene = sfm_scene(scene, models, on_stage, features)
     scene = scene if restore is None else restore_scene(scene, restore)
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if tag_size is None else by_tags(scene, tag_size)

@@ -18,6 +18,8 @@ import numpy as np
 import pycolmap
 
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
+from hqgs.scene.sfm.facts import apart, counts, placed_names
+from hqgs.scene.sfm.learned import look_learned
 from hqgs.scene.sfm.likely import MANY, likely_pairs, pairs_of_faces
 from hqgs.scene.sfm.matching import extract, match, pipeline_options
 from hqgs.scene.sfm.sharpen import sharpened
@@ -41,7 +43,8 @@ class Attempt:
     """A pass from photos to a model.
 
     The tolerant one takes weaker features, and fewer matches as enough. `smoothed` 1 looks at smoothed
-    photos, 2 at all versions together, after 1 and the pass without, whose database is `plain`.
+    photos, 2 at all versions together, after 1 and the pass without, whose database is `plain`. The
+    `learned` one has its features and matches from networks.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class Attempt:
         coarse: bool = False,
         smoothed: int = 0,
         plain: Path | None = None,
+        learned: bool = False,
     ) -> None:
         self.directory: Path = directory
         self.given: dict[str, Any] = given
@@ -60,9 +64,11 @@ class Attempt:
         self.tolerant: bool = tolerant
         self.coarse: bool = coarse
         self.smoothed: int = smoothed
+        self.learned: bool = learned
         self.plain: Path = plain or directory / "colmap.db"
         self.versions: list[Path] = [directory / f"smoothed_{sigma}.db" for sigma in SIGMAS]
         names = {"tolerant.db": tolerant, "coarse.db": coarse, "joined.db": smoothed == len(SIGMAS)}
+        names["learned.db"] = learned
         named = [directory / name for name, on in names.items() if on]
         self.database: Path = [*named, self.versions[0] if smoothed else self.plain][0]
         self.names: list[str] = given["names"].tolist()
@@ -92,7 +98,7 @@ class Attempt:
             new.rename(database)
 
     def run(self) -> None:
-        if not self.smoothed:
+        if not (self.smoothed or self.learned):
             self._begin(self.database)
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
@@ -101,7 +107,9 @@ class Attempt:
         photos = Path(str(self.given["photos"]))
         if self.coarse:
             self.coarse = self._probe(photos, extraction)
-        if self.smoothed:
+        if self.learned:
+            self._look_learned(photos)
+        elif self.smoothed:
             self._look_smoothed(photos, extraction)
         else:
             todo = self.directory, photos, self.names, extraction, self.threads, self.database
@@ -121,7 +129,7 @@ class Attempt:
         if models:
             order = sorted(models, key=lambda k: (-models[k].num_reg_images(), -models[k].num_points3D(), k))
             self.model = models[order[0]]
-            self.apart = apart([placed_names(models[k]) for k in order])
+            self.apart = apart([placed_names(models[k]) for k in order], SMALLEST)
             self._settle(self.model)
 
     def sharpen(self) -> None:
@@ -141,6 +149,17 @@ class Attempt:
             pycolmap.bundle_adjustment(model, options)
 
         self.model = sharpened(self.model, Path(str(self.given["photos"])), adjust)
+
+    def _look_learned(self, photos: Path) -> None:
+        """Features and matches of networks."""
+        if self.database.exists():
+            return
+        new = self.directory / "learning.db"
+        new.unlink(missing_ok=True)
+        self._begin(new)
+        masks, pairs = self.directory / "masks", self.given.get("pairs")
+        look_learned(photos, self.names, masks, pairs, self.threads, new, self._tell)
+        new.rename(self.database)
 
     def _look_smoothed(self, photos: Path, extraction: pycolmap.FeatureExtractionOptions) -> None:
         """Features and matches of the smoothed photos; of all versions, they are joined."""
@@ -200,35 +219,10 @@ class Attempt:
         return pairs if self.faces == 1 else pairs_of_faces(len(self.names), self.faces, pairs)
 
     def facts(self) -> dict[str, Any]:
-        """Features of each photo, matches and those that a geometry bears out of each pair, both sorted.
-
-        Of each photo also its best pair's, and how many one with a photo that has a place bears out; and the
-        photos that fit each other alone.
-        """
+        """What `Pass` holds of it."""
         placed = set() if self.model is None else placed_names(self.model)
-        with pycolmap.Database.open(self.database) as db:
-            images = {image.image_id: image.name for image in db.read_all_images()}
-            features = {name: int(db.num_keypoints_for_image(k)) for k, name in images.items()}
-            matches = _by_pair(images, *db.read_num_matches())
-            inliers = _by_pair(images, *db.read_two_view_geometry_num_inliers())
-        best = {name: [0, 0, 0] for name in features}
-        for column, counts in enumerate((matches, inliers)):
-            for pair, count in counts.items():
-                for name in pair:
-                    best[name][column] = max(best[name][column], count)
-        for (a, b), count in inliers.items():
-            for one, other in ((a, b), (b, a)):
-                if other in placed:
-                    best[one][2] = max(best[one][2], count)
-        return {
-            "tolerant": self.tolerant,
-            "registered": self.registered,
-            "features": features,
-            "matches": sorted(matches.values(), reverse=True),
-            "inliers": sorted(inliers.values(), reverse=True),
-            "best": best,
-            "apart": self.apart,
-        }
+        own = {"tolerant": self.tolerant, "registered": self.registered, "learned": self.learned}
+        return {**own, "apart": self.apart, **counts(self.database, placed)}
 
     def _geometry(self) -> pycolmap.TwoViewGeometryOptions:
         geometry = pycolmap.TwoViewGeometryOptions()
@@ -306,6 +300,7 @@ class Attempt:
         now = {
             "tolerant": self.tolerant,
             "smoothed": self.smoothed,
+            "learned": self.learned,
             "stage": stage,
             "done": done,
             "total": total,
@@ -313,24 +308,3 @@ class Attempt:
         new = self.directory / "stage.new"
         new.write_text(json.dumps(now), encoding="utf-8")
         new.replace(self.directory / "stage.json")
-
-
-def placed_names(model: pycolmap.Reconstruction) -> set[str]:
-    """The photos that have a place in a model."""
-    return {model.images[k].name for k in model.reg_image_ids()}
-
-
-def apart(models: list[set[str]]) -> list[list[str]]:
-    """Photos of each model but the first that no model before it has, sorted; of three and more."""
-    found, known = list[list[str]](), set[str]()
-    for names in models:
-        if known and len(names - known) >= SMALLEST:
-            found.append(sorted(names - known))
-        known |= names
-    return found
-
-
-def _by_pair(images: dict[int, str], pairs: Any, counts: Any) -> dict[tuple[str, str], int]:
-    """Counts by the names of two photos."""
-    ids = (pycolmap.pair_id_to_image_pair(pair) for pair in pairs)
-    return {(images[a], images[b]): int(count) for (a, b), count in zip(ids, counts, strict=True)}

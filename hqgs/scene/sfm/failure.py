@@ -27,6 +27,7 @@ class Pass:
     best: dict[str, list[int]] = field(default_factory=dict)  # of each photo's best pairs: matches, of them
     # those that a geometry bears out, and the same with a photo that has a place
     apart: list[list[str]] = field(default_factory=list)  # photos that fit each other, and no others
+    learned: bool = False  # by features of networks
 
 
 def why_no_model(photos: int, passes: Sequence[Pass]) -> str:

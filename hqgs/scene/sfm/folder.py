@@ -17,10 +17,16 @@ from hqgs.scene.names import existing_folder, is_film
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos, readable
 from hqgs.scene.sfm.photos_alone import find_cameras
+from hqgs.scene.sfm.run import AUTO, check_features
 
 
 def write_colmap_folder(
-    source: str | Path, out: Path, work: Path, frames: int | None = None, on_stage: OnStage = silent
+    source: str | Path,
+    out: Path,
+    work: Path,
+    frames: int | None = None,
+    on_stage: OnStage = silent,
+    features: str = AUTO,
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 
@@ -29,6 +35,7 @@ def write_colmap_folder(
     goes on with if this one is stopped; it is removed at the end. ValueError where there are no photos, or
     COLMAP finds no scene in them.
     """
+    check_features(features)
     if frames is not None:
         check_film(source)
     with TemporaryDirectory(prefix="hqgs-film-") as name:
@@ -38,7 +45,7 @@ def write_colmap_folder(
         photos = bare_photos(root, 1.0)
         if photos is None:
             raise ValueError(f"{root} holds no photos")
-        found = find_cameras(root, readable(photos, on_stage), work, on_stage)
+        found = find_cameras(root, readable(photos, on_stage), work, on_stage, features=features)
         images = out / "images"
         details = frame_details(found.photos.folder)
         kept: dict[str, float] = {}

@@ -34,10 +34,15 @@ def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
         ends = np.cumsum([len(one) for one in block])
         for k, one in enumerate(descriptors):
             for other, alike in enumerate(np.split(one @ together, ends[:-1], axis=1), start):
-                scores[k, other] = 0 if k == other else _fitting(alike)
-    scores += scores.T
+                scores[k, other] = 0 if k == other else fitting(alike, LENGTH)
+    return partners(scores + scores.T, BEST)
+
+
+def partners(scores: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Pairs [P, 2] of photos, sorted: the `most` that score best with each [V, V], and those that follow."""
+    count = len(scores)
     chosen = np.zeros((count, count), bool)
-    best = np.argsort(-scores, axis=1, kind="stable")[:, :BEST]
+    best = np.argsort(-scores, axis=1, kind="stable")[:, :most]
     np.put_along_axis(chosen, best, np.take_along_axis(scores, best, axis=1) > 0, axis=1)
     chosen |= chosen.T
     first, second = np.triu_indices(count, 1)
@@ -67,12 +72,12 @@ def _largest(db: pycolmap.Database, number: int) -> NDArray[np.float32]:
     return np.asarray(db.read_descriptors(number).data)[rows].astype(np.float32)
 
 
-def _fitting(alike: NDArray[np.float32]) -> int:
+def fitting(alike: NDArray[np.float32], length: int) -> int:
     """How many of the features [N] have one of another photo's [M] that fits clearly better than the rest.
 
-    `alike` [N, M] holds products of descriptors: the squared distance is 2 (LENGTH^2 - product).
+    `alike` [N, M] holds products of descriptors: the squared distance is 2 (length^2 - product).
     """
     if alike.shape[0] == 0 or alike.shape[1] < 2:
         return 0
     second, first = np.partition(alike, -2, axis=1)[:, -2:].T
-    return int((LENGTH**2 - first < RATIO**2 * (LENGTH**2 - second)).sum())
+    return int((length**2 - first < RATIO**2 * (length**2 - second)).sum())

@@ -19,7 +19,7 @@ from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.front_door import tell_strays
-from hqgs.scene.sfm.run import run_colmap
+from hqgs.scene.sfm.run import AUTO, run_colmap
 from hqgs.scene.sfm.tracks import sureness
 
 UP = np.array([0.0, -1.0, 0.0])  # in the world of photos alone, as in an upright camera's frame
@@ -36,14 +36,27 @@ class FoundCameras:
 
 
 def find_cameras(
-    root: Path, photos: BarePhotos, keep: Path | None = None, on_stage: OnStage = silent, coarse: bool = False
+    root: Path,
+    photos: BarePhotos,
+    keep: Path | None = None,
+    on_stage: OnStage = silent,
+    coarse: bool = False,
+    features: str = AUTO,
 ) -> FoundCameras:
     """Cameras and points of photos that are readable, by COLMAP, as `read_photos` has them."""
     names = photos.colmap_names
     files = {name: file for file, name in reversed(names.items())}  # of a panorama its first face
     try:
         ran = run_colmap(
-            list(names), photos.contents(), photos.guess(), photos.write, keep, on_stage, coarse, names
+            list(names),
+            photos.contents(),
+            photos.guess(),
+            photos.write,
+            keep,
+            on_stage,
+            coarse,
+            names,
+            features,
         )
         poses = {names[file]: viewmat for file, viewmat in ran.poses().items() if file in files.values()}
     except ValueError as error:
@@ -70,29 +83,35 @@ def find_cameras(
         first_pass=ran.first_pass,
         advice=ran.advice(),
         lost=ran.lost(),
+        learned=ran.learned,
         sure_px=_together(sureness(model), names),
     )
     return FoundCameras(photos, model, report)
 
 
 def read_photos(
-    root: Path, photos: BarePhotos, keep: Path | None = None, on_stage: OnStage = silent, coarse: bool = False
+    root: Path,
+    photos: BarePhotos,
+    keep: Path | None = None,
+    on_stage: OnStage = silent,
+    coarse: bool = False,
+    features: str = AUTO,
 ) -> Capture:
     """Cameras and points of a folder of photos, from all of them, by COLMAP.
 
-    Photos of one size share a camera (SIMPLE_RADIAL), unless EXIF tells cameras or zooms apart; it is found
-    as well, from the focal length in EXIF where that has one. Held-out views are among the photos: without
-    them they would have no pose. The report says so, and names the photos that have no place. The world is
-    turned so that the photos' mean up is -y; up is what EXIF says of how each was held. `keep`: a folder for
-    the reconstruction; `coarse`: a first look, for small pictures; see `run_colmap`. ValueError where COLMAP
-    cannot make a model of half of the photos.
+    Photos of one size share a camera (SIMPLE_RADIAL), unless EXIF tells cameras or zooms apart; it is
+    found as well, from the focal length in EXIF where that has one. Held-out views are among the photos:
+    without them they would have no pose. The report says so, and names the photos that have no place. The
+    world is turned so that the photos' mean up is -y; up is what EXIF says of how each was held. `keep`:
+    a folder for the reconstruction; `coarse`: a first look, for small pictures; `features`: their kind;
+    see `run_colmap`. ValueError where COLMAP cannot make a model of half of the photos.
     """
     photos = readable(photos, on_stage)
     masks = {name: find_mask(root, name) for name in photos.names}
     for name, size in zip(photos.names, photos.sizes, strict=True):
         if (mask := masks[name]) is not None:
             check_mask(mask, *size)
-    cameras = find_cameras(root, photos, keep, on_stage, coarse)
+    cameras = find_cameras(root, photos, keep, on_stage, coarse, features)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     sizes = dict(zip(cameras.photos.names, cameras.photos.sizes, strict=True))

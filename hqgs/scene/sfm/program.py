@@ -16,11 +16,12 @@ that each panorama has in `names`, one after the other. The first pass matches t
 photos, where it has some; else all, or of many photos those that are alike. Where it has `coarse`, photos
 rich in detail are looked at coarsely, and again finely where too few find a place. Where too few do then,
 smoothed versions of the photos are looked at, first one and then all together. Where few photos have a place
-yet, another, more tolerant pass follows, with every pair; the better of the two counts. In the end
-observations are moved to where the photos agree. `facts.json` says what both came to, `stage.json` what is
-being done now, which is read from COLMAP's log: the caller sends the output to `log.txt`. A second call in
-the same DIRECTORY goes on with the features and matches that the first one left. The program ends when its
-standard input does.
+yet, another, more tolerant pass follows, with every pair; the better of the two counts. Where it has
+`learned`, networks look at the photos where too few have a place by then; where that is true, nothing else
+does. In the end observations are moved to where the photos agree. `facts.json` says what all came to,
+`stage.json` what is being done now, which is read from COLMAP's log: the caller sends the output to
+`log.txt`. A second call in the same DIRECTORY goes on with the features and matches that the first one left.
+The program ends when its standard input does.
 """
 
 from __future__ import annotations
@@ -79,6 +80,23 @@ def reconstruct(directory: Path, threads: int) -> None:
     the order of numbers. Mapping has one thread and the seed 0.
     """
     given = _given(directory)
+    passes = [] if given.get("learned", False) else _by_sift(directory, given, threads)
+    if not passes or ("learned" in given and passes[0].registered < ALMOST * len(given["names"])):
+        learned = Attempt(directory, given, threads, learned=True)
+        learned.run()
+        passes[:1] = [max([*passes[:1], learned], key=lambda one: one.registered)]
+    best = max(passes, key=lambda one: (one.registered, -one.tolerant))
+    best.sharpen()
+    facts = json.dumps({"passes": [one.facts() for one in passes]})
+    (directory / "facts.json").write_text(facts, encoding="utf-8")
+    if best.model is not None:
+        (directory / "model").mkdir(exist_ok=True)
+        best.model.write_binary(directory / "model")
+        (directory / "model" / "facts.json").write_text(facts, encoding="utf-8")
+
+
+def _by_sift(directory: Path, given: dict[str, Any], threads: int) -> list[Attempt]:
+    """The best of the passes, and a tolerant one where it was made."""
     passes = [Attempt(directory, given, threads, coarse="coarse" in given)]
     passes[0].run()
     plain = passes[0].database
@@ -96,14 +114,7 @@ def reconstruct(directory: Path, threads: int) -> None:
     if passes[0].registered < ENOUGH * len(given["names"]):
         passes.append(Attempt(directory, given, threads, tolerant=True))
         passes[1].run()
-    best = max(passes, key=lambda one: (one.registered, -one.tolerant))
-    best.sharpen()
-    facts = json.dumps({"passes": [one.facts() for one in passes]})
-    (directory / "facts.json").write_text(facts, encoding="utf-8")
-    if best.model is not None:
-        (directory / "model").mkdir(exist_ok=True)
-        best.model.write_binary(directory / "model")
-        (directory / "model" / "facts.json").write_text(facts, encoding="utf-8")
+    return passes
 
 
 def _given(directory: Path) -> dict[str, Any]:

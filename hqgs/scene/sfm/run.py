@@ -24,13 +24,15 @@ from hqgs.base.files import keep_folder, lock_folder
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
-from hqgs.scene.sfm import likely
+from hqgs.scene.sfm import learned, likely
 from hqgs.scene.sfm.failure import Pass, counts, what_to_take, why_few, why_lost, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
 IMPORTED = (
     "attempt",
     "database",
+    "facts",
+    "learned",
     "likely",
     "matching",
     "sharpen",
@@ -38,6 +40,7 @@ IMPORTED = (
     "versions",
 )  # by PROGRAM, of this folder
 PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED)]
+FEATURES = (AUTO, SIFT, LEARNED) = ("auto", "sift", "learned")  # what COLMAP sees of photos
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
@@ -85,6 +88,11 @@ class Model:
         return poses
 
     @property
+    def learned(self) -> bool:
+        """Whether features of networks made it."""
+        return self._chosen.learned
+
+    @property
     def _chosen(self) -> Pass:
         """The pass whose model it is."""
         return max(self.passes, key=lambda one: (one.registered, -one.tolerant))
@@ -99,6 +107,10 @@ class Model:
     def advice(self) -> str | None:
         """What to do about photos that have no place; None: there is none."""
         told = self._to_take()
+        if told and not learned.is_there():
+            told += (
+                ". Networks may know more of them again: pip install 'hqgs[learned]', and the same command"
+            )
         return f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else None
 
     def _to_take(self) -> str:
@@ -169,6 +181,7 @@ def run_colmap(
     on_stage: OnStage = silent,
     coarse: bool = False,
     called: Mapping[str, str] | None = None,
+    features: str = AUTO,
 ) -> Model:
     """COLMAP's largest model of photos.
 
@@ -184,6 +197,8 @@ def run_colmap(
         coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
             placed.
         called: what the user calls the photos of those names.
+        features: "sift", "learned" (by networks, the extra `learned`), or "auto": those where SIFT finds
+            a place for too few photos, if the extra is there.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
@@ -206,6 +221,9 @@ def run_colmap(
         given["Ks"] = np.stack([camera.K for camera in cameras])
     if coarse:
         given["coarse"] = np.array(True)
+    check_features(features)
+    if "rotations" not in given and (features == LEARNED or (features == AUTO and learned.is_there())):
+        given["learned"] = np.array(features == LEARNED)
     kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
         return _read(kept, called or {})
@@ -232,6 +250,14 @@ def run_colmap(
         if kept is not None:
             keep_folder(directory / "model", kept)
         return _read(directory / "model", called or {})
+
+
+def check_features(features: str) -> None:
+    """ValueError for an unknown kind of features, or one whose extra is missing."""
+    if features not in FEATURES:
+        raise ValueError(f"features is {features!r}, wanted one of: {', '.join(FEATURES)}")
+    if features == LEARNED and not learned.is_there():
+        raise ValueError("learned features need the extra 'learned': pip install 'hqgs[learned]'")
 
 
 @contextmanager
@@ -296,6 +322,7 @@ def _tell(file: Path, on_stage: OnStage) -> None:
         return
     again = ", second and more tolerant pass" if now["tolerant"] else ""
     again = ", with smoothed photos" if now["smoothed"] else again
+    again = ", learned" if now["learned"] else again
     on_stage(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
 
 
@@ -314,7 +341,7 @@ def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArr
         digest.update(part.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
-    for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations"):
+    for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations", "learned"):
         if part in given:
             digest.update(given[part].tobytes())
     return digest.hexdigest()[:16]
