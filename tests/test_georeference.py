@@ -10,8 +10,10 @@ from fixtures_scenes import make_truth, write_colmap
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from hqgs.photos.exif import Exif, read_exif
 from hqgs.scene.georeference import Gps, georeference
 from hqgs.scene.load import load_scene
+from hqgs.scene.sfm.bare_photos import ups
 
 NORTH, EAST = 48.5, 9.06
 METRES = 111_194.0, 73_780.0  # of a degree there; 0.2 % off, by a sphere
@@ -67,7 +69,45 @@ def test_photos_with_gps_say_where_the_scene_is(tmp_path: Path) -> None:
             photo.save(root / "images" / name, exif=tags)
     scene = load_scene(root)
     assert scene.place is not None
+    assert scene.world.place == scene.place
     assert scene.place.scale == pytest.approx(5, rel=0.01)
     assert scene.place.origin == pytest.approx([NORTH, EAST, 320], abs=0.1)
     np.testing.assert_allclose(scene.place.up, [0, -1, 0], atol=0.05)
     assert scene.notes[-1].startswith("GPS of 9 of 9 photos: a unit is 5")
+
+
+def xmp(above: float, pitch: float, roll: float = 0.0) -> bytes:
+    """As DJI's drones write it."""
+    return (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description rdf:about="DJI Meta Data" '
+        f'drone-dji:AbsoluteAltitude="+151.2" drone-dji:RelativeAltitude="{above:+.2f}" '
+        f'drone-dji:GimbalRollDegree="{roll:+.2f}" drone-dji:GimbalPitchDegree="{pitch:+.2f}"/></x:xmpmeta>'
+    ).encode()
+
+
+def test_drones_tell_their_height_and_how_the_camera_was_held(tmp_path: Path) -> None:
+    """GPS heights are 20 m off in turn; the barometer's are right."""
+    truth = make_truth(12, ".jpg")
+    root = write_colmap(truth, tmp_path, binary=False)
+    for k, (name, viewmat) in enumerate(zip(truth.names, truth.viewmats, strict=True)):
+        x, y, z = (-viewmat[:3, :3].T @ viewmat[:3, 3]).tolist()
+        tags = Image.Exif()
+        north, east = NORTH + 50 * z / METRES[0], EAST + 50 * x / METRES[1]
+        height = 320 - 50 * y + 20 * (-1) ** k
+        place = {1: "N", 2: (north, 0.0, 0.0), 3: "E", 4: (east, 0.0, 0.0), 5: b"\0", 6: height}
+        tags.get_ifd(0x8825).update(place)
+        with Image.open(root / "images" / name) as photo:
+            photo.save(root / "images" / name, exif=tags, xmp=xmp(80 - 50 * y, -37.5))
+    found = read_exif(root / "images" / truth.names[0])
+    assert found.pitch == -37.5
+    place = load_scene(root).place
+    assert place is not None
+    assert place.scale == pytest.approx(50, rel=3e-3)
+    assert place.residual < 1
+    np.testing.assert_allclose(place.up, [0, -1, 0], atol=3e-3)
+    level, steep, down = ups([Exif(), Exif(pitch=-30.0), Exif(pitch=-90.0)])
+    np.testing.assert_allclose(level, [0, -1, 0])
+    np.testing.assert_allclose(steep, [0, -np.cos(np.pi / 6), -0.5])
+    np.testing.assert_allclose(down, [0, 0, -1], atol=1e-12)  # ahead is down
+    Image.new("RGB", (64, 48)).save(tmp_path / "rolled.jpg", xmp=xmp(80, -37.5, 12))
+    assert read_exif(tmp_path / "rolled.jpg").pitch is None

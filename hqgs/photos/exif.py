@@ -19,6 +19,10 @@ _NORTH_OR_SOUTH, _LATITUDE, _EAST_OR_WEST, _LONGITUDE, _BELOW_SEA, _ALTITUDE = r
 _MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
 _DIAGONAL = math.hypot(36, 24)  # mm, of 35 mm film
 _TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}  # quarter turns clockwise that show a photo upright
+_DRONE = re.compile(
+    rb'drone-dji:(RelativeAltitude|GimbalPitchDegree|GimbalRollDegree)(?:="|>)\s*([+-]?\d+\.?\d*)'
+)
+_LEVEL = 5.0  # degrees of roll that a gimbal may leave
 _SHORTEST, _LONGEST = 0.2, 20.0  # focal length in longer sides; what lies beyond is a mistake
 
 
@@ -31,6 +35,8 @@ class Exif:
     focal: float = 0.0  # px of the stored photo
     gps: tuple[float, float, float] | None = None  # degrees north and east, m up; nan: no altitude
     panorama: bool = False  # its XMP data (GPano) say that it is equirectangular
+    above: float = math.nan  # m above where a drone took off, by its barometer
+    pitch: float | None = None  # degrees above level that its gimbal held the camera, upright
 
 
 def read_exif(path: Path) -> Exif:
@@ -52,7 +58,8 @@ def read_exif(path: Path) -> Exif:
     lens = f"{_number(more, _FOCAL):g} {_number(more, _FOCAL_35MM):g}"
     known = any(names) or focal > 0
     xmp = xmp.encode(errors="replace") if isinstance(xmp, str) else bytes(xmp)
-    return Exif(turn, (*names, lens) if known else (), focal, gps, _PANORAMA.search(xmp) is not None)
+    panorama = _PANORAMA.search(xmp) is not None
+    return Exif(turn, (*names, lens) if known else (), focal, gps, panorama, *_of_drone(xmp))
 
 
 def _focal(more: dict[int, Any], width: int, height: int) -> float:
@@ -77,6 +84,17 @@ def _position(tags: dict[int, Any]) -> tuple[float, float, float] | None:
     if tags.get(_BELOW_SEA) in (b"\1", 1):
         up = -up
     return north, east, up if math.isfinite(up) else math.nan
+
+
+def _of_drone(xmp: bytes) -> tuple[float, float | None]:
+    """Metres above the start, nan, and the camera's pitch, None, of the XMP that DJI's drones write.
+
+    The gimbal holds cameras upright: one that does not (a roll) is not believed.
+    """
+    values = {name.decode(): float(value) for name, value in _DRONE.findall(xmp)}
+    pitch, roll = values.get("GimbalPitchDegree"), values.get("GimbalRollDegree", 0.0)
+    upright = pitch is not None and abs(pitch) <= 90 and abs(roll) <= _LEVEL
+    return values.get("RelativeAltitude", math.nan), pitch if upright else None
 
 
 def _degrees(parts: Any, side: Any, negative: str) -> float:

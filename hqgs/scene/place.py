@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
-from hqgs.photos.exif import read_exif
+from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.constants import FAR_OFF, LOOKED_AT, SHOWN
@@ -101,12 +101,19 @@ def placed(capture: Capture, notes: list[str]) -> Capture:
 
 def located(capture: Capture) -> Georeference | None:
     """Where on Earth the frame of the capture's files is, by the GPS of its photos; None: nothing tells."""
-    gps = [read_exif(photo.path).gps for photo in capture.photos]
-    rows = [k for k, place in enumerate(gps) if place is not None]
-    if len(rows) < LEAST:
+    found = [(k, tags.gps, tags.above) for k, tags in enumerate(map(_tags, capture.photos)) if tags.gps]
+    if len(found) < LEAST:
         return None
-    centers = capture.world.out(_centers(capture))[rows].astype(np.float64)
-    return georeference(centers, [place for place in gps if place is not None])
+    rows, gps, above = zip(*found, strict=True)
+    centers = capture.world.out(_centers(capture))[[*rows]].astype(np.float64)
+    places = np.array(gps)
+    if np.isfinite(above).all():  # a barometer tells heights better than GPS, but for where they begin
+        places[:, 2] = np.array(above) + np.median(places[:, 2] - above)
+    return georeference(centers, [(north, east, up) for north, east, up in places.tolist()])
+
+
+def _tags(photo: Photo) -> Exif:
+    return read_exif(photo.path)
 
 
 def _without(capture: Capture, gone: set[str]) -> Capture:

@@ -194,9 +194,15 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     )
 
 
-def ups(turns: Sequence[int]) -> np.ndarray:
-    """Unit vectors [V, 3] that point up in each photo's camera frame, for quarter turns clockwise [V]."""
-    return np.array([[0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]], np.float64)[np.asarray(turns)]
+def ups(exif: Sequence[Exif]) -> np.ndarray:
+    """Unit vectors [V, 3] that point up in each photo's camera frame: as it was held, or its gimbal says."""
+    held = np.array([[0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]], np.float64)
+    found = held[[tags.quarter_turns for tags in exif]]
+    for k, tags in enumerate(exif):
+        if tags.pitch is not None:
+            pitch = np.radians(tags.pitch)
+            found[k] = np.cos(pitch) * found[k] + np.sin(pitch) * np.array([0, 0, 1.0])
+    return found
 
 
 def _photos_in(folder: Path) -> list[str]:

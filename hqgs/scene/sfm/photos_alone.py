@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.stages import OnStage, silent
+from hqgs.photos.exif import Exif
 from hqgs.photos.files import check_mask
 from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
 from hqgs.scene.faces import around
@@ -62,8 +63,8 @@ def find_cameras(
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
     model = ran.found
-    turns = {name: exif.quarter_turns for name, exif in zip(photos.names, photos.exif, strict=True)}
-    upright = _upright(np.stack(list(poses.values())), [turns[name] for name in poses])
+    tags = dict(zip(photos.names, photos.exif, strict=True))
+    upright = _upright(np.stack(list(poses.values())), [tags[name] for name in poses])
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
     report = SfmReport(
         photos=len(files),
@@ -82,7 +83,7 @@ def find_cameras(
         unreadable=photos.unreadable,
         first_pass=ran.first_pass,
         advice=ran.advice(),
-        lost=ran.lost(),
+        lost={name: why for name, why in ran.lost().items() if name not in poses},
         learned=ran.learned,
         sure_px=_together(sureness(model), names),
     )
@@ -157,9 +158,9 @@ def _together(sure: dict[str, float], names: dict[str, str]) -> dict[str, float]
     }
 
 
-def _upright(viewmats: NDArray[np.float64], turns: list[int]) -> NDArray[np.float64]:
+def _upright(viewmats: NDArray[np.float64], exif: list[Exif]) -> NDArray[np.float64]:
     """The rotation [3, 3] that takes the cameras' mean up to UP; the unit where they agree on none."""
-    mean = np.einsum("nji,nj->ni", viewmats[:, :3, :3], ups(turns)).mean(0)
+    mean = np.einsum("nji,nj->ni", viewmats[:, :3, :3], ups(exif)).mean(0)
     length = float(np.linalg.norm(mean))
     if length < LEAST_AGREED:
         return np.eye(3)
