@@ -32,6 +32,7 @@ FPS = 30.0
 CRF = "18"  # of x264: no difference that an eye finds
 SAMPLES = 8  # frames that say which depths a film shows
 OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
+AROUND = 8  # Gaussians that tell how thick a surface is
 DEPTHS = (2, 98)  # percentiles of the depths that get the ends of the colour scale
 SAMPLED, BOUNDS, BITS = (
     100_000,
@@ -182,6 +183,19 @@ class Activated:
                 means, quats, scales, opacities, none, *_of(camera), render_mode="ED", **self._how
             )
         return image[0, ..., 0].float().numpy(), alpha[0, ..., 0].float().numpy()
+
+    @torch.no_grad()
+    def thickness(self, at: NDArray[np.float64], ahead: NDArray[np.float64]) -> float:
+        """Standard deviation along a direction, unit [3], of the Gaussians around a point [3]: the median."""
+        from scipy.spatial.transform import Rotation  # here: only clicks need it
+
+        means, quats, scales, *_ = self._tensors
+        apart = (means - torch.from_numpy(at).to(means)).square().sum(1)
+        rows = apart.topk(min(AROUND, len(means)), largest=False).indices
+        turns = Rotation.from_quat(np.roll(quats[rows].double().numpy(), -1, axis=1))
+        return float(
+            np.median(np.linalg.norm(turns.apply(ahead, inverse=True) * scales[rows].numpy(), axis=1))
+        )
 
 
 def depth_range(

@@ -24,6 +24,7 @@ from hqgs.scene.scene import Camera
 from hqgs.show.frames import Activated
 from hqgs.show.viewer.client import SHARP, Client
 from hqgs.show.viewer.guard import PORT, start_server
+from hqgs.show.viewer.measure import Ruler
 from hqgs.show.viewer.pictures import Pose, beside, same_view, shown
 from hqgs.show.viewer.splats import browser_splats
 
@@ -75,6 +76,7 @@ class Viewer:
         scene = Activated(copy)
         with self._lock:
             self._gaussians, self._scene = copy, scene
+            self.ruler.world = copy.world
             if first:
                 self._start_view(copy)
             for client in self._clients.values():
@@ -123,6 +125,7 @@ class Viewer:
             picture = shown(self._scene, camera, self._show.value)
             client.took(time.perf_counter() - started, camera.height, sharp)
             picture = self._compared(picture, camera)
+            picture = self.ruler.over(picture, camera) if sharp else picture
         except ValueError:  # a camera that no scene can be seen from, such as 1e300 away
             return
         with warnings.catch_warnings():  # of viser, where the page was closed meanwhile
@@ -195,6 +198,7 @@ class Viewer:
             self._length = gui.add_slider("Seconds", 1, 60, 1, 8)
             play, keep = gui.add_button("Play"), gui.add_button("Save")
             self._told = gui.add_markdown("No view yet.")
+        self.ruler: Ruler = Ruler(self._server, lambda: self._scene, self._refresh)
         for handle in (self._show, self._detail, self._split):
             handle.on_update(self._refresh)
         self._drawn.on_update(self._change_drawn)
