@@ -46,7 +46,7 @@ def picked(scene: Activated, origin: Sequence[float], direction: Sequence[float]
     right = np.cross(ahead, np.eye(3)[int(np.argmin(np.abs(ahead)))])
     right /= np.linalg.norm(right)
     K = np.array([[1 / PIXEL, 0, SIDE / 2], [0, 1 / PIXEL, SIDE / 2], [0, 0, 1]])
-    R = np.stack([right, np.cross(ahead, right), ahead])
+    R = np.stack([right, np.cross(ahead, right), ahead]).astype(np.float64)
     depth, alpha = scene.depth(Camera(SIDE, SIDE, K, view_matrix(R, eye)))
     middle = SIDE // 2
     if not alpha[middle, middle] >= SOLID:
@@ -131,7 +131,7 @@ class Ruler:
         self._marks.append(ball)
         self.told.content = "Click the second point."
         if len(self._points) == 2:
-            self.told.content = told_distance(*self._points, self.world)
+            self.told.content = told_distance(self._points[0], self._points[1], self.world)
 
     def _switch(self, _: object) -> None:
         self._clear()
