@@ -69,7 +69,7 @@ def test_intervals_of_psnr_cover_the_room() -> None:
         blurred = gaussian_filter(photo / 255.0, (1.2, 1.2, 0)) + rng.normal(0, 0.02, photo.shape)
         values.append(psnr(blurred, photo))
     pool = np.array(values, float)
-    for photos in (4, 6, 10):
+    for photos in (6, 10, 20):
         hits = 0
         for _ in range(200):
             drawn = rng.choice(pool, photos, replace=False)

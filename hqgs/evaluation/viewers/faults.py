@@ -17,7 +17,8 @@ RIGHT = "right"
 ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float32 a little more
 WHOLLY = 0.5  # of the difference to the right picture: an imitation that leaves more explains nothing
 APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not told apart
-FAR_STEPS = 12  # far planes that are tried, at quantiles of the depths
+FAR = "far clip"
+FAR_STEPS, FAR_ROUNDS = 8, 3  # far planes that are tried between two, and how often closer together
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,8 @@ class Verdict:
         return f"{self.fault}{form}: {self.off:.2f} levels off, {self.left:.2f} left where it is imitated"
 
 
-def imitations(scene: Arrays, cameras: Sequence[Camera]) -> list[tuple[str, str, Ways]]:
-    """Faults, their forms, and how they render."""
+def imitations(scene: Arrays) -> list[tuple[str, str, Ways]]:
+    """Faults, their forms, and how they render; all but the far clip."""
     flag = bool(scene.get("antialiased", False))
     order, degree = "wrong order", int(np.sqrt(scene["shN"].shape[1] + 1)) - 1
     found = [
@@ -68,13 +69,14 @@ def imitations(scene: Arrays, cameras: Sequence[Camera]) -> list[tuple[str, str,
         found.append(("flipped axes", f"of the harmonics, {form}", Ways(directions=directions)))
     for form, picture in {"left to right": (1, -1), "upside down": (-1, 1), "both": (-1, -1)}.items():
         found.append(("flipped axes", f"picture {form}", Ways(picture=picture)))
-    depths = np.concatenate([scene["means"] @ c.viewmat[2, :3] + c.viewmat[2, 3] for c in cameras])
-    steps = np.quantile(depths[depths > 0], np.linspace(0.3, 1, FAR_STEPS, endpoint=False))
-    gaps = np.sort(depths[depths > 0])
-    widest = np.argsort(-np.diff(np.log(gaps)))[:3]
-    for far in sorted({*steps.tolist(), *(float(np.sqrt(gaps[k] * gaps[k + 1])) for k in widest)}):
-        found.append(("far clip", f"at {far:.3g}", Ways(far=far)))
     return found
+
+
+def far_depths(scene: Arrays, cameras: Sequence[Camera]) -> tuple[float, float]:
+    """Between which depths a far plane would be seen."""
+    depths = np.concatenate([scene["means"] @ c.viewmat[2, :3] + c.viewmat[2, 3] for c in cameras])
+    depths = depths[depths > 0]
+    return float(np.median(depths)), float(depths.max())
 
 
 def _coarse(means: Floats) -> dict[str, Callable[[Floats], Floats]]:
@@ -96,8 +98,8 @@ class Imitations:
 
     def __init__(self, scene: Arrays, cameras: Sequence[Camera]) -> None:
         self._scene, self._cameras = scene, cameras
-        self._ways = imitations(scene, cameras)
-        self._kept: dict[tuple[int, int], NDArray[np.uint8]] = {}
+        self._faults = imitations(scene)
+        self._kept: dict[tuple[Ways, int], NDArray[np.uint8]] = {}
 
     def verdict(self, pictures: Mapping[int, NDArray[np.uint8]]) -> Verdict:
         """The fault that the pictures [H, W, 3], by the number of their camera, show together.
@@ -111,39 +113,50 @@ class Imitations:
                 raise ValueError(
                     f"picture {number} is {size} px, its camera wants {wanted}, at one px a pixel"
                 )
-        first = min(pictures)
-        forms: dict[str, tuple[float, int]] = {}  # the best form of each fault, in one picture
-        for k, (fault, _, _) in enumerate(self._ways):
-            left = _rms([self._apart(k, first, pictures[first])])
-            if fault not in forms or left < forms[fault][0]:
-                forms[fault] = left, k
-        lefts = {
-            fault: (_rms([self._apart(k, number, shot) for number, shot in pictures.items()]), k)
-            for fault, (_, k) in forms.items()
-        }
-        off = lefts[RIGHT][0]
-        nearest = min(lefts, key=lambda fault: lefts[fault][0])
-        left, k = lefts[nearest]
-        others = [one for fault, (one, _) in lefts.items() if fault not in (nearest, RIGHT)]
+        first = dict([min(pictures.items(), key=lambda item: item[0])])
+        best: dict[str, tuple[float, str, Ways]] = {}  # the form of each fault that is best in one picture
+        for fault, form, ways in self._faults:
+            left = self._left(ways, first)
+            if fault not in best or left < best[fault][0]:
+                best[fault] = left, form, ways
+        best[FAR] = self._far(pictures)
+        lefts = {fault: self._left(ways, pictures) for fault, (_, _, ways) in best.items()}
+        off, nearest = lefts[RIGHT], min(lefts, key=lambda fault: lefts[fault])
+        left = lefts[nearest]
+        others = [one for fault, one in lefts.items() if fault not in (nearest, RIGHT)]
         fault = nearest if nearest != RIGHT and left <= min(WHOLLY * off, APART * min(others)) else None
         if off <= ROUNDED:
             fault = RIGHT
-        return Verdict(fault, self._ways[k][1], off, left, nearest, self._worst(pictures))
+        return Verdict(fault, best[nearest][1], off, left, nearest, self._worst(pictures))
 
-    def _apart(self, k: int, number: int, picture: NDArray[np.uint8]) -> Floats:
-        if (k, number) not in self._kept:
-            made = render(self._scene, self._cameras[number], self._ways[k][2])
-            self._kept[k, number] = to_uint8(made.astype(np.float32))
-        return picture.astype(np.float64) - self._kept[k, number]
+    def _far(self, pictures: Mapping[int, NDArray[np.uint8]]) -> tuple[float, str, Ways]:
+        """The best far plane: looked for closer and closer around the best."""
+        low, high = far_depths(self._scene, self._cameras)
+        found: list[tuple[float, float]] = []
+        for _ in range(FAR_ROUNDS):
+            steps = np.geomspace(low, high, FAR_STEPS + 2).tolist()
+            tried = [(self._left(Ways(far=far), pictures), far) for far in steps[1:-1]]
+            found.append(min(tried))
+            middle = tried.index(found[-1]) + 1
+            low, high = steps[middle - 1], steps[middle + 1]
+        left, far = min(found)
+        return left, f"at {far:.3g}", Ways(far=far)
+
+    def _left(self, ways: Ways, pictures: Mapping[int, NDArray[np.uint8]]) -> float:
+        """Levels, root mean square, between pictures and an imitation."""
+        apart = [np.square(self._apart(ways, number, shot)).mean() for number, shot in pictures.items()]
+        return float(np.sqrt(np.mean(apart)))
+
+    def _apart(self, ways: Ways, number: int, picture: NDArray[np.uint8]) -> Floats:
+        if (ways, number) not in self._kept:
+            made = render(self._scene, self._cameras[number], ways)
+            self._kept[ways, number] = to_uint8(made.astype(np.float32))
+        return picture.astype(np.float64) - self._kept[ways, number]
 
     def _worst(self, pictures: Mapping[int, NDArray[np.uint8]]) -> tuple[int, int, int]:
         found = []
         for number, picture in pictures.items():
-            apart = np.abs(self._apart(0, number, picture)).sum(-1)
+            apart = np.abs(self._apart(Ways(), number, picture)).sum(-1)
             row, column = np.unravel_index(int(apart.argmax()), apart.shape)
             found.append((float(apart.max()), (number, int(row), int(column))))
         return max(found)[1]
-
-
-def _rms(apart: Sequence[Floats]) -> float:
-    return float(np.sqrt(np.mean([np.square(one).mean() for one in apart])))
