@@ -32,10 +32,12 @@ WORDS = {  # tyro's, and ours
     r"Error parsing (\S+): invalid literal for int.*?: '(.*?)'": r"\1 is \2, wanted INT",
     r"Error parsing (\S+): could not convert string to float: '(.*?)'": r"\1 is \2, wanted FLOAT",
     r"wanted INT INT": "wanted two whole numbers",
+    r"wanted STR STR FLOAT": "wanted two names and a number",
+    r"', '(?=[^']*, wanted (?:two|three))": " ",  # between values that were given
+    r"(\d)', '(?=[\d.-])": r"\1 ",
     r"wanted FLOAT FLOAT FLOAT": "wanted three numbers",
     r"wanted INT": "wanted a whole number",
     r"wanted FLOAT": "wanted a number",
-    r"(\d)', '(?=[\d.-])": r"\1 ",  # between numbers that were given
     r"Error parsing \S+: (?!no type)": "",
 }
 GPU = ("--device", "--cuda", "--gpu", "--gpus")

@@ -101,7 +101,8 @@ def render_frames(
         with atomic_path(out) as tmp:
             Image.fromarray(next(pictures)).save(tmp)
     else:
-        if suffix in OTHERS or (out.exists() and not out.is_dir()):
+        known = suffix[1:].isalpha() or suffix in OTHERS
+        if (known or out.exists()) and not out.is_dir():
             raise ValueError(f"{out} is no folder; films are .mp4 or .gif, a single picture is .png")
         places = [f"{k:05}" for k in range(len(cameras))] if names is None else names
         for name, picture in zip(places, pictures, strict=True):

@@ -103,6 +103,5 @@ def scene_file(path: str | Path) -> Path:
     if path.is_dir() and not file.is_file() and (path / "meta.json").is_file():
         file = path / "meta.json"
     if not file.is_file():
-        wanted = ": give the folder of a run, or a scene file" if path.is_dir() else ""
-        raise FileNotFoundError(f"there is no {file}{wanted}")
+        raise FileNotFoundError(f"there is no {file}: give the folder of a run, or a scene file")
     return file

@@ -1,0 +1,99 @@
+"""Mistakes of the first ten minutes: each one sentence that says what to do, and nothing is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixtures_scenes import make_truth, write_photos, write_transforms
+
+from hqgs.cli.main import main
+from hqgs.model.gaussians import Gaussians
+
+TRAIN = "train scene --out run"
+MISTAKES = {
+    "trian scene --out run": "did you mean 'train'?",
+    "train": "missing: SCENE --out DIR",
+    "train scene": "missing: --out DIR",
+    "train scnee --out run": "did you mean {root}/scene?",
+    "train embeded --out run": "did you mean the built-in embedded?",
+    "train photos.zip --out run": "is an archive: unpack it, and give the folder with the photos",
+    "train photos/view_00.png --out run": "is a file, a scene is a folder with photos, or a film",
+    "train empty --out run": "is empty: give a folder with photos",
+    "train texts --out run": "holds no photos (.png, ",
+    "train two --out run": "needs at least 3 photos, got 2: 20 to 100 that overlap make a good scene",
+    "train scene more --out run": "one argument too many: more",
+    "train scene --out scene": "is the folder of the photos: name another for the run",
+    "train scene --out notes.txt": "is a file: name a folder for the run",
+    "train scene --out others": "holds config.json, of no run, which a run would write over: name another",
+    f"{TRAIN} --overwrte": "there is no option --overwrte - did you mean --overwrite",
+    f"{TRAIN} --gpu": "there is no --gpu: hqgs trains on the CPU, leave it out",
+    f"{TRAIN} --iterations 0": "iterations is 0, wanted at least 1",
+    f"{TRAIN} --iterations 1e4": "--iterations is 1e4, wanted a whole number",
+    f"{TRAIN} --iterations 9 --seconds 5": "only one of --iterations and --seconds can be given",
+    f"{TRAIN} --preset fast": "--preset is fast, wanted one of: 'quick', 'standard', 'best'",
+    f"{TRAIN} --method gaussian": "unknown method 'gaussian'; the methods are: ",
+    f"{TRAIN} --downscale 0.5": "downscale must be at least 1, got 0.5",
+    f"{TRAIN} --degrade jpg:10": "unknown degradation 'jpg'; there are: jpeg, ",
+    f"{TRAIN} --degrade jpeg:1000": "jpeg is 1000, wanted a quality, an integer in 1..95",
+    f"{TRAIN} --distance view_00.png 2": "is view_00.png 2, wanted two names and a number",
+    f"{TRAIN} --distance view_00 view_77 2": "no photo with a camera is called 'view_77'; the most similar",
+    f"{TRAIN} --tag-size 0": "tag_size: 0 m; it must be more than 0",
+    f"{TRAIN} --frames 9": "frames is for films, and scene is none: each of its photos is used",
+    f"{TRAIN} --features surf": "wanted one of: 'auto', 'sift', 'learned'",
+    f"{TRAIN} --test-every 1": "all 9 views are test views, none is left to train on",
+    f"{TRAIN} --leave-out phtos": "there is no 'phtos'; there are: auto, none, or some of photos, ",
+    f"{TRAIN} --config missing.json": "there is no configuration missing.json",
+    f"{TRAIN} --restore missing.pth": "there is no file of weights missing.pth",
+    "view nowhere": "there is no nowhere: give the folder of a run, or a scene file",
+    "view photos": "there is no photos/scene.ply: give the folder of a run, or a scene file",
+    "view a.ply --port 99999": "port is 99999, wanted 0..65535",
+    "render a.ply --out film.txt": "film.txt is no folder; films are .mp4 or .gif, a single picture is .png",
+    "render a.ply --out b.png --path round": "no such file, and none of: cameras, orbit",
+    "export a.ply --out a.ply": "is the source a.ply itself; what is left out would be lost",
+    "export a.ply --out a.obj": "the suffix says no format; wanted .ply, ",
+    "export half.ply --out b.ply": "half.ply: not a PLY file",
+    "eval a.ply": "--scene names the photos to measure it with",
+    "clean a.ply --out b.ply": "--photos names the photos to measure it with",
+    "degrade scene --kind noise:25 --out photos": "photos exists and is not an empty folder",
+    "diagnose nowhere": "there is no scene folder {root}/nowhere",
+    "sfm photos --out others": "others exists and is not an empty folder",
+}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a newcomer's folder may hold."""
+    root = tmp_path_factory.mktemp("first")
+    write_transforms(make_truth(), root / "scene")
+    write_photos(make_truth(), root / "photos")
+    write_photos(make_truth(2), root / "two")
+    for name in ("empty", "texts", "others"):
+        (root / name).mkdir()
+    for name in ("texts/a.txt", "notes.txt", "photos.zip", "half.ply", "others/config.json"):
+        (root / name).write_text("ply")
+    points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    Gaussians.from_points(points, np.zeros((9, 3), np.uint8), 0).save(root / "a.ply")
+    return root
+
+
+@pytest.mark.parametrize(("command", "told"), MISTAKES.items(), ids=MISTAKES)
+def test_a_mistake_is_one_sentence_and_nothing_is_written(
+    command: str,
+    told: str,
+    root: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(root)
+    before = sorted(root.rglob("*"))
+    try:
+        code = main(command.split())
+    except SystemExit as end:
+        code = end.code
+    line = capsys.readouterr().err.splitlines()[-1]  # COLMAP's photos are counted before it
+    assert code == 2
+    assert line.startswith("hqgs: ")
+    assert told.format(root=root) in line
+    assert sorted(root.rglob("*")) == before
