@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from hqgs.model.discs import THINNEST, as_discs
+from hqgs.model.constants import THINNEST
+from hqgs.model.discs import as_discs
 from hqgs.model.gaussians import Gaussians
 from tests.reference import rotation_matrices
 

@@ -33,8 +33,9 @@ from hqgs.evaluation.report import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import resized
+from hqgs.show.constants import MAX_MESSAGE
 from hqgs.show.viewer import guard
-from hqgs.show.viewer.guard import MAX_MESSAGE, allowed, start_server
+from hqgs.show.viewer.guard import allowed, start_server
 from hqgs.show.viewer.pictures import Pose, beside, same_view
 from hqgs.show.viewer.splats import browser_splats
 from hqgs.show.viewer.viewer import BROWSER, RASTERIZER, Viewer

@@ -100,7 +100,7 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     from hqgs.model.orbit import orbit
     from hqgs.scene.camera_files import load_path, moved
     from hqgs.scene.paths import UP, camera_path
-    from hqgs.show.frames import FPS
+    from hqgs.show.constants import FPS
 
     source, views, path, frames = options.source, options.views, options.path, options.frames
     known = _known(source)

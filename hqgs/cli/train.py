@@ -27,7 +27,8 @@ from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.names import KEPT
-from hqgs.show.viewer.guard import PORT, check
+from hqgs.show.constants import PORT
+from hqgs.show.viewer.guard import check
 from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
 from hqgs.training.settings import (
     PRESETS,

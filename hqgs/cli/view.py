@@ -15,7 +15,8 @@ import tyro
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.scenes import tell_read
 from hqgs.model.formats.files import scene_file
-from hqgs.show.viewer.guard import ELSEWHERE, PORT, check
+from hqgs.show.constants import PORT
+from hqgs.show.viewer.guard import ELSEWHERE, check
 
 if TYPE_CHECKING:
     from hqgs.scene.scene import Scene

@@ -11,16 +11,12 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
 
 from hqgs import _rust
+from hqgs.model.constants import AGREE_LONGEST, AGREE_SMOOTH, AGREED, AGREEING, ASKED
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
-
-LONGEST = 800  # px: larger photos are looked at in a smaller copy
-SMOOTH = 1.0  # px, before patches are compared: of noise there is less then
-NEIGHBOURS, AGREEING = 4, 2  # photos that are asked, and how many of them must agree
-AGREED = 0.6  # correlation of the patches
 
 
 @dataclass(frozen=True)
@@ -35,10 +31,10 @@ class SmallPhoto:
     @classmethod
     def of(cls, view: View) -> SmallPhoto:
         whole = view.camera
-        if (factor := max(whole.width, whole.height) / LONGEST) > 1:
+        if (factor := max(whole.width, whole.height) / AGREE_LONGEST) > 1:
             view = resized(view, *(max(1, round(side / factor)) for side in (whole.width, whole.height)))
         camera, grey = view.camera, as_floats(view.image).mean(2, dtype=np.float32)
-        smooth = np.ascontiguousarray(gaussian_filter(grey, SMOOTH), np.float32)
+        smooth = np.ascontiguousarray(gaussian_filter(grey, AGREE_SMOOTH), np.float32)
         scale = np.array([camera.width / whole.width, camera.height / whole.height])
         return cls(camera, smooth, view.mask, scale)
 
@@ -59,7 +55,7 @@ class Agreement:
     def depths(self, number: int, pixels: Floats, ranges: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where others agree."""
         order = np.argsort(-self._shared[number], kind="stable")
-        others = [int(k) for k in order[: min(NEIGHBOURS, len(order) - 1)]]
+        others = [int(k) for k in order[: min(ASKED, len(order) - 1)]]
         if len(others) < AGREEING:
             return ranges[:, 0], np.zeros(len(ranges), bool)
         look = self.looks[number]

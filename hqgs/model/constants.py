@@ -3,3 +3,20 @@
 SH_C0 = 0.28209479177387814  # the constant basis function: 1 / (2 sqrt(pi))
 MAX_SH_DEGREE = 3
 BACKGROUND = (0.0, 0.0, 0.0)  # RGB
+
+# The first Gaussians.
+INITIAL_OPACITY = 0.1  # Kerbl et al. 2023
+MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
+NEAREST, NEAREST_OF_DISCS = 3, 5  # neighbours whose distances give a point's scale; that tell directions
+THINNEST = (1.0, 0.2, 0.1)  # of a disc's three axes, of the longest: few neighbours tell no more
+
+# First points along edges, and photos that agree on their depth; chosen on held-back photos.
+FLAT = 0.2  # share of the points that all pixels alike get
+# Points of a view, the nearest, that tell a pixel's range of depths; what widens it; and how many a view needs.
+AROUND, WIDENED, LEAST_AROUND = 6, 1.6, 3
+AGREE_LONGEST, AGREE_SMOOTH = 800, 1.0  # px: of a smaller copy; of noise there is less then
+ASKED, AGREEING, AGREED = 4, 2, 0.6  # photos that are asked, that must agree, and the correlation of patches
+
+# What there is to see of a scene: the share within the radius of `content`; how far from the middle, in such
+# radii, a camera sees it fill the picture, and how high above it; Gaussians that tell the size.
+CONTENT_SHARE, CONTENT_DISTANCE, CONTENT_RAISED, CONTENT_SAMPLED = 0.8, 2.2, 0.35, 4096

@@ -9,10 +9,8 @@ import torch
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from hqgs.model.constants import NEAREST_OF_DISCS, THINNEST
 from hqgs.model.gaussians import Gaussians
-
-NEIGHBORS = 5  # that tell the directions
-THINNEST = (1.0, 0.2, 0.1)  # of the three axes, of the longest: few neighbours tell no more
 
 
 def as_discs(gaussians: Gaussians) -> Gaussians:
@@ -23,7 +21,7 @@ def as_discs(gaussians: Gaussians) -> Gaussians:
     Round Gaussians become such discs by training, which takes hundreds of steps.
     """
     means = gaussians.means.detach().numpy().astype(np.float64)
-    _, nearest = KDTree(means).query(means, min(NEIGHBORS + 1, len(means)))  # the first is itself
+    _, nearest = KDTree(means).query(means, min(NEAREST_OF_DISCS + 1, len(means)))  # the first is itself
     away = means[np.asarray(nearest)[:, 1:]] - means[:, None]
     away /= np.maximum(np.linalg.norm(away, axis=2, keepdims=True), np.finfo(float).tiny)
     squares, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))

@@ -11,13 +11,10 @@ from scipy.spatial import KDTree
 
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement, SmallPhoto
+from hqgs.model.constants import AROUND, FLAT, LEAST_AROUND, WIDENED
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import View
-
-FLAT = 0.2  # share of the points that all pixels alike get
-AROUND, BEYOND = 6, 1.6  # the nearest points tell the range of depths, which is widened by a factor
-LEAST = 3  # points of a view that tell it
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
@@ -91,8 +88,8 @@ def _ranges(
     there are too few."""
     where, depths = project(view.camera, points)
     where, depths = where[depths > 0], depths[depths > 0]
-    if len(depths) < LEAST:
+    if len(depths) < LEAST_AROUND:
         return None
     _, nearest = KDTree(where).query(pixels, min(AROUND, len(depths)))
     around = depths[nearest]
-    return np.stack([around.min(1) / BEYOND, around.max(1) * BEYOND], axis=1)
+    return np.stack([around.min(1) / WIDENED, around.max(1) * WIDENED], axis=1)

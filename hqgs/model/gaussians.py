@@ -15,7 +15,15 @@ from torch import Tensor
 from hqgs._rust import EPS2D, NEAR_PLANE
 from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE, SH_C0
+from hqgs.model.constants import (
+    BACKGROUND,
+    CONTENT_SAMPLED,
+    INITIAL_OPACITY,
+    MAX_SH_DEGREE,
+    MIN_SQUARE_DISTANCE,
+    NEAREST,
+    SH_C0,
+)
 from hqgs.model.content import around
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.files import format_of, read_scene, scene_file, write_scene
@@ -26,11 +34,6 @@ from hqgs.scene.constants import SMALLEST, USUAL
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
-
-MIN_SQUARE_DISTANCE = 1e-7  # points that coincide get this one, so that log(scale) stays finite
-INITIAL_OPACITY = 0.1
-SAMPLED = 4096  # Gaussians that tell how large a scene is
-NEIGHBORS = 3  # a point's first scale comes from its 3 nearest neighbours
 
 
 @dataclass(repr=False)
@@ -118,7 +121,7 @@ class Gaussians:
 
     def near_plane(self) -> float:
         """What is nearer to a camera than this is not rendered: less in a scene of small units."""
-        few = self.means.detach()[:: max(1, len(self) // SAMPLED)].double().numpy()
+        few = self.means.detach()[:: max(1, len(self) // CONTENT_SAMPLED)].double().numpy()
         few = few[np.isfinite(few).all(1)]
         return near_for(few)
 
@@ -281,8 +284,8 @@ class Gaussians:
             colors: [P, 3], uint8.
             sh_degree: degree of the coefficients that are allocated, 0..3.
         """
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) <= NEIGHBORS:
-            raise ValueError(f"points has shape {list(points.shape)}, wanted [P, 3] with P > {NEIGHBORS}")
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) <= NEAREST:
+            raise ValueError(f"points has shape {list(points.shape)}, wanted [P, 3] with P > {NEAREST}")
         if colors.shape != points.shape or colors.dtype != np.uint8:
             raise ValueError(
                 f"colors is {colors.dtype} {list(colors.shape)}, wanted uint8 {list(points.shape)}"
@@ -319,5 +322,5 @@ def mean_square_distance(points: NDArray[np.floating]) -> NDArray[np.float64]:
     from scipy.spatial import KDTree  # here: to render or to read a file needs no scipy
 
     xyz = points.astype(np.float64)
-    distances, _ = KDTree(xyz).query(xyz, k=NEIGHBORS + 1)  # the first is the point itself
+    distances, _ = KDTree(xyz).query(xyz, k=NEAREST + 1)  # the first is the point itself
     return np.square(distances[:, 1:]).mean(axis=1)

@@ -25,15 +25,13 @@ from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.video import pyav
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
+from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, FPS
 
 SHOWN = ("color", "depth", "alpha")
 FILMS = (".mp4", ".gif")
-FPS = 30.0
 CRF = "18"  # of x264: no difference that an eye finds
-SAMPLES = 8  # frames that say which depths a film shows
 OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
 AROUND = 8  # Gaussians that tell how thick a surface is
-DEPTHS = (2, 98)  # percentiles of the depths that get the ends of the colour scale
 SAMPLED, BOUNDS, BITS = (
     100_000,
     (0.02, 0.98),
@@ -127,7 +125,7 @@ def frames(
     elif show == "alpha":
         yield from (_grey(prepared.depth(camera)[1]) for camera in cameras)
     else:
-        places = evenly(len(cameras), SAMPLES)
+        places = evenly(len(cameras), DEPTH_SAMPLES)
         low_high = depth_range([prepared.depth(cameras[k]) for k in places])
         yield from (depth_picture(*prepared.depth(camera), low_high) for camera in cameras)
 
@@ -206,7 +204,7 @@ def depth_range(
     seen = np.concatenate([depth[alpha > 0.5] for depth, alpha in samples])
     if not seen.size:
         return 1.0, 2.0
-    low, high = (max(float(value), 1e-6) for value in np.percentile(seen, DEPTHS))
+    low, high = (max(float(value), 1e-6) for value in np.percentile(seen, DEPTH_PERCENTILES))
     return low, max(high, low * 1.001)
 
 

@@ -27,16 +27,12 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
+from hqgs.show.constants import LEARNED_SIDE, PAGE_QUALITY, PAGE_VIEWS, PAIR_SIDE, PAIRS
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
 
 TEMPLATES = Path(__file__).parent / "templates"
 SCRIPTS = ("splat_shaders.js", "splats.js")
-PAIRS = 8  # pictures of photo and render: the best, the worst, and some between
-PAIR_SIDE = 720  # px
-LEARNED_SIDE = 1080  # px
-QUALITY = 82  # of JPEG
-VIEWS = 200  # cameras to jump to
 CHARTS = (
     ("Held-out PSNR", "dB", "psnr", "#2f7fc4"),
     ("Held-out SSIM", "", "ssim", "#d0672a"),
@@ -161,7 +157,7 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
 
 def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
     packed = pack_scene(gaussians)
-    views = [*scene.test, *scene.train][:VIEWS]
+    views = [*scene.test, *scene.train][:PAGE_VIEWS]
     cameras = [view.camera for view in views]
     middle = focus([view.camera for view in scene.train])
     note = (
@@ -223,7 +219,7 @@ def pair(view: RenderedView, metrics: Mapping[str, Any] | None) -> dict[str, str
 def jpeg(picture: Image.Image, side: int = PAIR_SIDE) -> str:
     picture, file = picture.copy(), io.BytesIO()
     picture.thumbnail((side, side), Image.Resampling.LANCZOS)
-    picture.save(file, "JPEG", quality=QUALITY)
+    picture.save(file, "JPEG", quality=PAGE_QUALITY)
     return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-REST = 0.2  # seconds without a move: then the picture gets sharp
-SHARP, COARSEST = 800, 96  # px, heights
-GOAL = 0.06  # seconds for a picture while the camera moves
+from hqgs.show.constants import COARSEST, GOAL, REST, SHARP
 
 
 class Client:

@@ -12,10 +12,9 @@ from PIL import Image
 
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
+from hqgs.show.constants import MOVED, STREAMED_SIDE
 from hqgs.show.frames import Activated, depth_picture, depth_range
 
-MAX_SIDE = 2048  # px of a streamed picture
-MOVED = 0.02  # radians, and of the distance: a camera nearer than that to a photo's sees the same
 Picture = NDArray[np.uint8]
 
 
@@ -50,8 +49,8 @@ class Pose:
 
     def camera(self, height: int) -> Camera:
         """The pinhole camera of a picture of that height."""
-        height = min(max(height, 16), MAX_SIDE)
-        width = min(max(round(height * self.aspect), 16), MAX_SIDE)
+        height = min(max(height, 16), STREAMED_SIDE)
+        width = min(max(round(height * self.aspect), 16), STREAMED_SIDE)
         focal = height / (2 * math.tan(self.fov / 2))
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
         return Camera(width, height, K, view_matrix(self.R.T, self.position))

@@ -21,15 +21,14 @@ from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
+from hqgs.show.constants import FRUSTUMS, PORT, SHARP, THUMB
 from hqgs.show.frames import Activated
-from hqgs.show.viewer.client import SHARP, Client
-from hqgs.show.viewer.guard import PORT, start_server
+from hqgs.show.viewer.client import Client
+from hqgs.show.viewer.guard import start_server
 from hqgs.show.viewer.measure import Ruler
 from hqgs.show.viewer.pictures import Pose, beside, same_view, shown
 from hqgs.show.viewer.splats import browser_splats
 
-FRUSTUMS = 150  # training cameras that are drawn, evenly chosen
-THUMB = 160  # px, of the photos at the cameras
 FREE = "(free)"
 BLACK = np.zeros((1, 1, 3), np.uint8)  # what is behind the Gaussians
 RASTERIZER, BROWSER = "rasterizer", "browser"  # who draws
