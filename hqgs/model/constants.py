@@ -12,7 +12,7 @@ THINNEST = (1.0, 0.2, 0.1)  # of a disc's three axes, of the longest: few neighb
 
 # First points along edges, and photos that agree on their depth; chosen on held-back photos.
 FLAT = 0.2  # share of the points that all pixels alike get
-# Points of a view, the nearest, that tell a pixel's range of depths; what widens it; and how many a view needs.
+# Nearest points of a view that tell a range of depths; what widens it; and how many points a view needs.
 AROUND, WIDENED, LEAST_AROUND = 6, 1.6, 3
 AGREE_LONGEST, AGREE_SMOOTH = 800, 1.0  # px: of a smaller copy; of noise there is less then
 ASKED, AGREEING, AGREED = 4, 2, 0.6  # photos that are asked, that must agree, and the correlation of patches
