@@ -175,9 +175,10 @@ class SfmReport:
         if self.learned:
             text += "; by features of networks (ALIKED, LightGlue) in place of SIFT"
         if self.not_registered:
-            text += f"; {len(self.not_registered)} left out, as COLMAP found no place for them: " + ", ".join(
-                name + (f" ({self.lost[name]})" * (name in self.lost)) for name in self.not_registered
-            )
+            names = [
+                f"{name} ({self.lost[name]})" if name in self.lost else name for name in self.not_registered
+            ]
+            text += f"; {len(names)} left out, as COLMAP found no place for them: {', '.join(names)}"
         if self.sure_px:
             name, least = max(self.sure_px.items(), key=lambda item: item[1])
             usual = float(np.median(list(self.sure_px.values())))
