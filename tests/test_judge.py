@@ -103,6 +103,16 @@ def test_two_scenes_are_compared_photo_by_photo(
     assert "(not sure)" in capsys.readouterr().out
 
 
+def test_what_poses_cost_is_set_aside(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert judge(run, "--fit-cameras", "--out", tmp_path) == 0
+    assert "cameras fitted" in capsys.readouterr().out
+    one = json.loads((tmp_path / "judge.json").read_text())["scene"]
+    assert one["fitted"]["mean"]["psnr"] > one["mean"]["psnr"]
+    assert one["causes"]["pose"] > 0
+    assert sum(one["causes"].values()) == pytest.approx(1)
+    assert all(view["moved_px"] >= 0 for view in one["fitted"]["views"].values())
+
+
 def test_the_page_is_one_file(run: Path, tmp_path: Path) -> None:
     assert judge(run, "--against", run / "scene.ply", "--out", tmp_path) == 0
     page = (tmp_path / "judge.html").read_text()
@@ -156,6 +166,8 @@ def test_mistakes_get_a_sentence(run: Path, tmp_path: Path, capsys: pytest.Captu
         ([foreign, *photos, "--views", "x.png"], "has no photo 'x.png'"),
         ([foreign, *photos, "--against", tmp_path / "no.json"], "is no judge.json"),
         ([tmp_path / "away.ply", *photos], "none of its"),
+        ([run, "--test-every", "4"], "another size or split needs them named"),
+        ([], "missing: SOURCE"),
     ]
     for arguments, words in cases:
         assert judge(*arguments) == 2, arguments

@@ -150,7 +150,7 @@ def test_the_plain_renderer_is_right() -> None:
 
 @cache
 def imitated(seed: int, views: int, flagged: bool = False) -> Imitations:
-    scene: Arrays = {**kit_scene(seed), **({"antialiased": True} if flagged else {})}
+    scene: Arrays = {**kit_scene(seed), "antialiased": flagged}
     return Imitations(scene, cameras()[:views])
 
 

@@ -163,6 +163,10 @@ def read_photos(
     from hqgs.scene.source import load, load_again
 
     if photos is None:
+        if downscale is not None or test_every is not None:
+            raise ValueError(
+                f"{source} is measured on its own photos: another size or split needs them named"
+            )
         return load_again(source, on_stage=screen.stage)
     run = source if source.is_dir() else source.parent
     run = run if (run / CONFIG).is_file() else None

@@ -40,6 +40,7 @@ def told(found: dict[str, Any]) -> str:
     shown = [name for name in LABELS if one["mean"][name] is not None]
     lines = [markdown_table(title, ["", *(LABELS[name] for name in shown)], table_rows(found, shown)), ""]
     lines += [interval_words(one)] if count > 1 else []
+    lines += not_measured(one)
     lines.append(scene_words(one) + ("" if against is None else f"; against {scene_words(against)}"))
     lines += [f"the error comes from: {cause_words(one['causes'])}", *worst(one)]
     word, why = verdict(one["mean"]["psnr"])
@@ -65,6 +66,11 @@ def interval_words(one: dict[str, Any]) -> str:
     return (
         f"± half the {one['confidence']:.0%} interval of the mean over such photos; of a difference, by photo"
     )
+
+
+def not_measured(one: dict[str, Any]) -> list[str]:
+    """Which metrics there are not, and why."""
+    return [f"no {LABELS[metric]}: {why}" for metric, why in one["reasons"].items()]
 
 
 def photo_table(title: str, of: dict[str, Any]) -> str:

@@ -58,7 +58,7 @@ def protocol_of(
 def told_which(scene: Scene, which: str) -> str:
     """Which photos were measured on, in words."""
     every = (scene.origin or {}).get("test_every", 0)
-    rule = f"every {every}th by name, unless the scene has a split" if every else "as the scene has them"
+    rule = f"one of {every} by name, unless the scene has a split" if every else "as the scene has them"
     return {
         HELD_OUT: f"held out ({rule})",
         TRAINED: "those that are trained on",

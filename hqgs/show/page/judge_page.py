@@ -21,6 +21,7 @@ from hqgs.evaluation.judge_words import (
     LABELS,
     cause_words,
     interval_words,
+    not_measured,
     scene_words,
     table_rows,
 )
@@ -54,7 +55,10 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         heads=["", *(LABELS[name] for name in shown)],
         rows=table_rows(found, shown),
         sure=interval_words(one),
-        sizes=[f"{of['name']}: {scene_words(of)}" for of in (one, against) if of is not None],
+        sizes=[
+            *(f"{of['name']}: {scene_words(of)}" for of in (one, against) if of is not None),
+            *not_measured(one),
+        ],
         parts=[
             {
                 "name": CAUSES[part][0],
@@ -72,12 +76,15 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         pairs_left=len(order) - len(chosen),
         photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "the error comes from"],
         photos=[_row(name, one["views"][name], shown) for name in order],
-        protocol=[
-            (key, value)
-            for key, value in (protocol | protocol["rules"]).items()
-            if key not in ("rules", "names")
-        ],
+        protocol=_protocol(protocol),
     )
+
+
+def _protocol(known: dict[str, Any]) -> list[tuple[str, str]]:
+    """Its lines; sizes that are equal once."""
+    sizes = dict.fromkeys(f"{width} x {height} px" for width, height in known["sizes"])
+    told = known | {"sizes": ", ".join(sizes), "names": ", ".join(known["names"])} | known["rules"]
+    return [(key.replace("_", " "), str(value)) for key, value in told.items() if key != "rules"]
 
 
 def _row(name: str, view: dict[str, Any], shown: Sequence[str]) -> list[str]:
