@@ -65,8 +65,9 @@ def face_name(name: str, face: str) -> str:
 def faces_of(camera: pycolmap.Camera) -> tuple[Face, ...]:
     """The faces that a camera sees; none where a flat picture holds what it sees.
 
-    A face has as many pixels a radian in its middle as the photo in its own. It is cut down to what the photo
-    shows of it.
+    A whole face has as many pixels from edge to edge as the photo has for a right angle: in its middle it is
+    a little coarser than the photo, at its edges finer, where more would only be blurred. It is cut down to
+    what the photo shows of it.
     """
     return _faces(camera.model.name, tuple(camera.params), camera.width, camera.height)
 
@@ -75,13 +76,14 @@ def faces_of(camera: pycolmap.Camera) -> tuple[Face, ...]:
 def _faces(model: str, params: tuple[float, ...], width: int, height: int) -> tuple[Face, ...]:
     camera = pycolmap.Camera(model=model, params=params, width=width, height=height)
     if model == AROUND:
-        focal, limit = width / (2 * math.pi), math.pi
+        radian, limit = width / (2 * math.pi), math.pi
     else:
         if model.endswith("PINHOLE") or not np.isfinite(params).all():
             return ()
-        focal, (degrees, limit) = float(camera.focal_length_x), _sees(camera)
+        radian, (degrees, limit) = float(camera.focal_length_x), _sees(camera)
         if degrees < WIDE:
             return ()
+    focal = radian * math.pi / 4
     if (side := 2 * round(focal)) < LEAST_SIDE:
         return ()
     nodes = (np.arange(LATTICE) + 0.5) * (2 / LATTICE) - 1
