@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from hqgs.model.constants import THINNEST
-from hqgs.model.discs import as_discs
 from hqgs.model.gaussians import Gaussians
+from hqgs.model.shapes import as_discs
 from tests.reference import rotation_matrices
 
 

@@ -26,9 +26,8 @@ from hqgs.training.config import DensifyConfig, ESFGConfig, PaperConfig
 from hqgs.training.constants import SCS_CACHE_BYTES
 from hqgs.training.densify import Densifier
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.paper import VARIANTS, PaperHQGS
+from hqgs.training.methods.paper import VARIANTS, PaperHQGS, scs_loss
 from hqgs.training.methods.photometric import photometric_loss
-from hqgs.training.methods.scs import scs_loss
 from hqgs.training.trainer import Trainer
 
 SMALL = 20  # F: more than once in the 40 points of the tiny scene

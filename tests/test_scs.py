@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hqgs.photos.edges import edge_magnitude
 from hqgs.training.constants import DIMMEST
-from hqgs.training.methods.scs import ScsWeights, scs_loss, weighted_scs_loss
+from hqgs.training.methods.paper import ScsWeights, scs_loss, weighted_scs_loss
 
 
 def images(

@@ -7,7 +7,7 @@ import torch
 from tiny_scene import tiny_scene
 
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.smoothing import enlarge
+from hqgs.model.shapes import enlarge
 
 
 def test_variances_add_and_the_gradient_is_that_of_the_sum() -> None:

@@ -53,7 +53,7 @@ RULES: dict[str, object] = {  # what a result depends on beside the configuratio
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Outcome:
     """What is decided after a step."""
 
     decisions: Decisions
@@ -93,14 +93,14 @@ class Frugality:
         self._shown, self._psnr = shown, psnr
         self._seconds: deque[float] = deque(maxlen=50)  # of the last steps
 
-    def after_step(self, state: TrainState, refused: int, seconds: float) -> Verdict:
+    def after_step(self, state: TrainState, refused: int, seconds: float) -> Outcome:
         """Note what the step did, and decide what is due at this iteration.
 
         `refused`: Gaussians that were too fine to grow. `seconds`: of the step.
         """
         self._seconds.append(seconds)
         self.memory.refused += refused
-        verdict = Verdict(state.decisions)
+        verdict = Outcome(state.decisions)
         if not self.schedule.items:
             return verdict
         started = time.perf_counter()
@@ -137,7 +137,7 @@ class Frugality:
         """The run goes on after its end: no iterations are left out."""
         self.memory.records = [one for one in self.memory.records if one["item"] != "iterations"]
 
-    def _of_held_photos(self, state: TrainState) -> Verdict:
+    def _of_held_photos(self, state: TrainState) -> Outcome:
         """What the held-back photos say, and whether they come back."""
         schedule, iteration, decisions = self.schedule, state.iteration, state.decisions
         tries = iteration % CHECKS == 0 and not schedule.is_coarse(iteration)
@@ -149,7 +149,7 @@ class Frugality:
             why = "early enough that the scene can grow where only they look"
             row = PlanRow("photos held back", "back", why, "", "held_photos", iteration)
             state.rows.append(row)
-        return Verdict(decisions)
+        return Outcome(decisions)
 
     def _length(self, state: TrainState, shown: Gaussians) -> int | None:
         """Of the run, where the held-back photos have stopped improving; None: they have not."""

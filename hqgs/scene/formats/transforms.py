@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.base.ply import read_vertices
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import (
     Capture,
@@ -24,7 +25,6 @@ from hqgs.scene.capture import (
     viewmat_from_pose,
 )
 from hqgs.scene.constants import MOST_SIDE
-from hqgs.scene.formats.ply_points import read_ply_points
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named, below
 
@@ -241,3 +241,22 @@ def _text(value: object, key: str, where: object) -> str:
     if not isinstance(value, str) or not value:
         raise ValueError(f"{where}: {key} must be a path, got {value!r:.80}")
     return value
+
+
+def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Points [P, 3] and colours [P, 3] of the PLY's `vertex` element; grey where it has no red, green, blue.
+
+    Raises ValueError that names the file.
+    """
+    vertex = read_vertices(path)
+    try:
+        points = np.stack([vertex[k].astype(np.float64) for k in ("x", "y", "z")], -1)
+        colors = np.full((len(points), 3), 128, np.uint8)
+        if {"red", "green", "blue"} <= set(vertex.dtype.names or ()):
+            colors = np.stack([vertex[k] for k in ("red", "green", "blue")], -1)
+            if colors.dtype.kind == "f":
+                colors = np.rint(np.nan_to_num(colors) * 255)
+            colors = colors.clip(0, 255).astype(np.uint8)
+    except (ValueError, KeyError, TypeError, OverflowError) as e:
+        raise ValueError(f"cannot read the points in {path}: {e}") from e
+    return points, colors

@@ -14,7 +14,7 @@ from hqgs.model.gaussians import Gaussians
 Floats = NDArray[np.float32]
 
 
-class Splats(NamedTuple):
+class BrowserSplats(NamedTuple):
     """What `viser` draws, in the order of its arguments."""
 
     centers: Floats  # [N, 3]
@@ -23,7 +23,7 @@ class Splats(NamedTuple):
     opacities: Floats  # [N, 1]
 
 
-def browser_splats(gaussians: Gaussians) -> Splats:
+def browser_splats(gaussians: Gaussians) -> BrowserSplats:
     """The Gaussians as the browser draws them.
 
     Colours are those of the constant harmonic alone: the same from every side. Gaussians with a value
@@ -43,7 +43,7 @@ def browser_splats(gaussians: Gaussians) -> Splats:
     factors = rotations * g.activated_scales()[:, None]
     colors = (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1)
     found = g.means, factors @ factors.mT, colors, g.activated_opacities()[:, None]
-    return Splats(*(tensor.numpy().astype(np.float32) for tensor in found))
+    return BrowserSplats(*(tensor.numpy().astype(np.float32) for tensor in found))
 
 
 def _columns(g: Gaussians) -> list[torch.Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.smoothing import enlarge
+from hqgs.model.shapes import enlarge
 from hqgs.photos.formula import LEARNED, OWN
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.gaussians import Gaussians
@@ -14,11 +15,10 @@ from hqgs.photos.edges import edge_magnitude
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import ESFGConfig, PaperConfig
-from hqgs.training.constants import SCS_CACHE_BYTES, SCS_WEIGHT
+from hqgs.training.constants import DIMMEST, SCS_CACHE_BYTES, SCS_WEIGHT
 from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.esfg import ESFG
 from hqgs.training.methods.photometric import LAMBDA_DSSIM, photometric_loss
-from hqgs.training.methods.scs import ScsWeights, weighted_scs_loss
 from hqgs.training.state import TrainState
 
 VARIANTS = {
@@ -119,3 +119,112 @@ class PaperHQGS(Method[ScsTarget]):
 def _scs_weights(photo: Tensor, mask: Tensor | None) -> ScsWeights:
     with one_torch_thread():
         return ScsWeights.of(photo, edge_magnitude(photo, mask), mask)
+
+
+@dataclass(frozen=True)
+class ScsWeights:
+    """What does not change while a photo is trained on."""
+
+    weights: Tensor  # [H, W, C]: 1 - g, and 0 where the photo does not count
+    target_norm: float  # |T_S|, the Euclidean norm of weights * target, in the target's units
+
+    @classmethod
+    def of(
+        cls, target: Tensor, g: Tensor, mask: Tensor | None = None, dtype: torch.dtype = torch.float32
+    ) -> ScsWeights:
+        """See `scs_loss` for the arguments and the errors; `dtype` is the render's."""
+        if target.ndim != 3 or target.dtype not in (torch.uint8, torch.float32, torch.float64):
+            raise ValueError(
+                f"target: must be [H, W, C], uint8 or float, got {target.dtype} {list(target.shape)}"
+            )
+        if g.shape not in (target.shape, target.shape[:2]):
+            wanted = f"{list(target.shape)} or {list(target.shape[:2])}"
+            raise ValueError(f"g: must be {wanted} as the target, got {list(g.shape)}")
+        if mask is not None and (mask.dtype != torch.bool or mask.shape != target.shape[:2]):
+            wanted = list(target.shape[:2])
+            raise ValueError(
+                f"mask: must be bool {wanted} as the target, got {mask.dtype} {list(mask.shape)}"
+            )
+        weights = 1 - g.detach().to(dtype)
+        weights = (weights[..., None] if g.ndim == 2 else weights).expand(target.shape)
+        if mask is not None:
+            weights = torch.where(mask[..., None], weights, 0.0)
+        weights = weights.contiguous()
+        return cls(weights, _norm(weights * target.detach()))
+
+
+def scs_loss(render: Tensor, target: Tensor, g: Tensor, mask: Tensor | None = None) -> Tensor:
+    """1 - cos(R_S, T_S) of a render and its photo, a scalar in [0, 2] (HQGS, the equation of L_SCS).
+
+    R_S = (1 - g) * render and T_S = (1 - g) * target, the parts without edges. The cosine is over all
+    elements, so that neither the brightness of the whole render nor what lies on edges changes the loss.
+
+    It is computed as |R_S / |R_S| - T_S / |T_S||^2 / 2, which keeps its digits where the two agree, with sums
+    in double precision; same bits for any number of threads. Limits: a black (or wholly masked) target has
+    no direction, so the loss and its gradient are 0. Where |R_S| < 0.01 |T_S|, 0.01 |T_S| stands for |R_S| in
+    the cosine: a black render has loss 1 and the finite gradient -(1 - g) T_S / (0.01 |T_S|^2). NaN or Inf in
+    the render gives NaN.
+
+    Args:
+        render: [H, W, C], float32 or float64, not clamped.
+        target: [H, W, C], uint8 (divided by 255) or float. It gets no gradient.
+        g: [H, W, C] or [H, W], in [0, 1]: the target's `edge_magnitude`. It gets no gradient.
+        mask: bool [H, W], True where the photo counts.
+
+    Raises:
+        ValueError: a wrong shape or dtype, with its name.
+    """
+    return weighted_scs_loss(render, target, ScsWeights.of(target, g, mask, render.dtype))
+
+
+def weighted_scs_loss(render: Tensor, target: Tensor, fixed: ScsWeights) -> Tensor:
+    """`scs_loss` with what depends on the target alone computed before."""
+    if render.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"render: must be float32 or float64, got {render.dtype}")
+    if render.shape != target.shape or target.shape != fixed.weights.shape:
+        raise ValueError(
+            f"render: must have the shape of the target, {list(target.shape)}, and of the weights, "
+            f"{list(fixed.weights.shape)}, got {list(render.shape)}"
+        )
+    if fixed.weights.dtype != render.dtype:
+        raise ValueError(f"weights: must be {render.dtype} as the render, got {fixed.weights.dtype}")
+    return _Scs.apply(render, target, fixed)
+
+
+class _Scs(torch.autograd.Function):
+    """With a = w R, b = w T and e = b - (|b| / |a|) a: L = |e / |b||^2 / 2 and
+    dL/dR = -w (e + L (|b| / |a|) a) / (|a| |b|).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, target: Tensor, fixed: ScsWeights) -> Tensor:
+        if fixed.target_norm == 0:
+            ctx.scale = 0.0
+            ctx.save_for_backward(torch.zeros_like(render))
+            return render.new_tensor(0.0)
+        white = 255 if target.dtype == torch.uint8 else 1  # T keeps its units: they cancel
+        a = fixed.weights * render
+        norm = _norm(a)
+        length = max(norm, DIMMEST * fixed.target_norm / white)  # NaN stays NaN
+        ratio = fixed.target_norm / length
+        e = target.to(render.dtype, copy=True).mul_(fixed.weights).sub_(a, alpha=ratio)
+        # The last term is 0 unless the floor holds; there the gradient is -w b / (length |b|).
+        loss = 0.5 * ((_norm(e) / fixed.target_norm) ** 2 + 1 - (norm / length) ** 2)
+        along = loss if length == norm else 1.0
+        ctx.scale = -1 / (length * fixed.target_norm)
+        ctx.save_for_backward(e.add_(a, alpha=along * ratio).mul_(fixed.weights))
+        return render.new_tensor(loss)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's own is too general)
+        ctx: Any, v_loss: Tensor
+    ) -> tuple[Tensor, None, None]:
+        (grad,) = ctx.saved_tensors
+        return grad * (v_loss * ctx.scale), None, None
+
+
+def _norm(x: Tensor) -> float:
+    """Euclidean norm, summed in double precision in an order of its own."""
+    with one_torch_thread():
+        return float(torch.linalg.vector_norm(x, dtype=torch.float64))
