@@ -225,6 +225,9 @@ class TrainConfig:
     dropout: float | None = (
         None  # share of Gaussians left out of a step, at the end of the run; None: likewise
     )
+    averaged: float | None = (
+        None  # share of the steps, the last ones, whose mean is the scene; None: likewise
+    )
     adam_eps: float = 1e-15
     leave_out: tuple[str, ...] = AUTOMATIC  # of ITEMS: what the run may do without, where it pays
     background: tuple[float, float, float] = BACKGROUND  # RGB
@@ -243,7 +246,7 @@ class TrainConfig:
             raise ValueError(f"seconds is {self.seconds}, wanted a positive number")
         if self.turn is not None and not (len(self.turn) == 2 and 0 < self.turn[0] < self.turn[1]):
             raise ValueError(f"turn is {self.turn}, wanted an iteration and a larger length")
-        for name in ("opacity_decay", "dropout"):
+        for name in ("opacity_decay", "dropout", "averaged"):
             if (share := getattr(self, name)) is not None and not 0 <= share < 1:
                 raise ValueError(f"{name} is {share}, wanted at least 0 and below 1")
         if not 0 <= self.sh_degree <= MAX_SH_DEGREE:

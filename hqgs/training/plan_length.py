@@ -1,11 +1,18 @@
-"""How many iterations a run has: as many as pay, or as fit into its seconds."""
+"""How many iterations a run has, as many as pay, or as fit into its seconds; and what of its end is shown."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from hqgs.training.constants import DENSE, FEWEST_ITERATIONS, MOST_ITERATIONS, SLOWER, SLOWER_DENSE
-from hqgs.training.plan import StepSeconds
+from hqgs.training.constants import (
+    DENSE,
+    FEWEST_ITERATIONS,
+    MOST_ITERATIONS,
+    SHOWN_PART,
+    SLOWER,
+    SLOWER_DENSE,
+)
+from hqgs.training.plan import Choice, Draft, StepSeconds
 
 
 def fitting(
@@ -29,3 +36,14 @@ def fitting(
         middle = (few + many) // 2
         few, many = (middle, many) if needed(middle) <= seconds else (few, middle)
     return few
+
+
+def shown(draft: Draft) -> Sequence[Choice]:
+    asked = draft.asked.averaged
+    if asked is not None or not draft.formed:
+        return (
+            [] if asked is None else [Choice(f"the mean over the last {asked:.0%} of the steps", "asked for")]
+        )
+    why = "each step serves one photo, and their mean serves all"
+    value = f"the mean over the last {SHOWN_PART:.0%} of the steps"
+    return [Choice(value, why, changes={"averaged": SHOWN_PART})]

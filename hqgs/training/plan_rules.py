@@ -29,7 +29,7 @@ from hqgs.training.constants import (
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import first_points_wanted, gaussians_determined, kept_gradient, sharp_pixels
 from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
-from hqgs.training.plan_length import fitting
+from hqgs.training.plan_length import fitting, shown
 from hqgs.training.schedule import half_size_end
 from hqgs.training.settings import with_iterations
 
@@ -336,6 +336,7 @@ RULES = (
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
     Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {WHERE}"),
     Rule("dropout of Gaussians", dropout, f"DropGaussian, Park et al. 2025; {WHERE}"),
+    Rule("scene at the end", shown, "Polyak and Juditsky 1992; 0.0 to 0.3 dB in 11 runs on 10 captures"),
     Rule("learning rates", rates, "learning_rates in schedule.py; " + CHOSEN),
     Rule("rates under noise", noise_rates, f"white noise of a pixel tells nothing of the next; {CHOSEN}"),
     Rule("left out where needless", needless, "half the time and a third of the bytes on four scenes"),

@@ -56,6 +56,7 @@ class StepPlan:
     observes: bool  # its gradients count for growth
     densifies: bool  # Gaussians are added and removed after it
     finest: float | None  # px of the photo that sees a Gaussian best: finer ones do not grow; None: any may
+    averages: bool  # the scene after it counts in the mean that is shown at the end
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,8 @@ class Schedule:
             observes=iteration < stop,
             densifies=densify.start < iteration < stop and iteration % densify.every == 0,
             finest=FINEST * (COARSE_FACTOR if smaller_part else 1) if "growth" in self.items else None,
+            averages=iteration >= stop
+            and self.part(iteration, decisions) > 1 - (self.config.averaged or 0.0),
         )
 
     def batch(self, iteration: int, decisions: Decisions) -> list[StepPlan]:

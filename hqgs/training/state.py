@@ -14,6 +14,7 @@ from hqgs.base.typed import build
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import Adam
+from hqgs.training.average import Average
 from hqgs.training.checkpoint import part
 from hqgs.training.densify import Densifier
 from hqgs.training.guard import Guard
@@ -31,6 +32,7 @@ class TrainState:
     decisions: Decisions
     iteration: int = 0  # steps done
     seconds: float = 0.0  # spent in steps
+    average: Average = field(default_factory=Average)
     guard: Guard = field(default_factory=Guard)
     history: list[HistoryEntry] = field(default_factory=list)  # of the held-out means
     rows: list[PlanRow] = field(default_factory=list)  # what was decided after the plan was made
@@ -46,6 +48,7 @@ class TrainState:
     def tensors(self) -> dict[str, Tensor]:
         """All of its tensors by name, for a checkpoint."""
         tensors = {f"gaussians.{name}": tensor for name, tensor in self.gaussians.named().items()}
+        tensors |= {f"average.{name}": tensor for name, tensor in self.average.means.items()}
         tensors |= {f"densify.{name}": tensor for name, tensor in self.densifier.state_dict().items()}
         for prefix, param in _moments(self.optimizer):
             for key, value in self.optimizer.state.get(param, {}).items():
@@ -57,6 +60,7 @@ class TrainState:
         return {
             "iteration": self.iteration,
             "seconds": self.seconds,
+            "averaged": self.average.count,
             "history": self.history,
             "guard": asdict(self.guard),
             "decisions": asdict(self.decisions),
@@ -84,8 +88,12 @@ class TrainState:
                     f"wanted {like.dtype} {list(like.shape)}"
                 )
 
+        average = Average(values["averaged"], part("average.", tensors))
         for name, tensor in self.gaussians.named().items():
-            check(name, tensors[f"gaussians.{name}"], tensor.new_empty((n, *tensor.shape[1:])))
+            like = tensor.new_empty((n, *tensor.shape[1:]))
+            check(name, tensors[f"gaussians.{name}"], like)
+            if average.count:
+                check(f"average.{name}", average.means[name], like)
         gaussians = Gaussians(**part("gaussians.", tensors))
         optimizer = optimizer_of(gaussians)
         for prefix, param in _moments(optimizer):
@@ -105,6 +113,7 @@ class TrainState:
             decisions,
             values["iteration"],
             values["seconds"],
+            average,
             Guard(**values["guard"]),
             values["history"],
             [PlanRow(**row) for row in values["rows"]],

@@ -148,15 +148,17 @@ class Trainer:
                     state, self.prepared.training_views.target(plan.view, plan.coarse)[0], noted
                 )
             self._leave_out(densified, (time.perf_counter() - started) / len(plans))
+            if last.averages:
+                state.average.add(state.gaussians)
 
         state.seconds += time.perf_counter() - started
         state.decisions = self._turned()
         return step
 
     def shown(self) -> Gaussians:
-        """The Gaussians that are rasterized, without a gradient history."""
+        """The Gaussians that are rasterized, without a gradient history; near the end the mean of steps."""
         with one_torch_thread(), torch.no_grad():
-            return self.method.modulate(self.state.gaussians).detached()
+            return self.method.modulate(self.state.average.of(self.state.gaussians)).detached()
 
     def left_out(self) -> list[LeftOut]:
         """What the run did without so far."""
@@ -220,6 +222,7 @@ class Trainer:
             if longer:
                 self.lengthened = done
                 self.frugality.forget_end()
+                state.average.clear()
                 why = "a longer run was asked for after its end"
                 state.rows.append(PlanRow("length", f"{more:,} iterations", why, "", "restore", done))
             self.method.load_state_dict(checkpoint.part("method.", tensors))
@@ -280,6 +283,7 @@ class Trainer:
     def _remove(self, rows: Tensor) -> None:
         """Remove the Gaussians of these rows, bool [N]."""
         state = self.state
+        state.average.clear()
         self.method.rows_changed(state, state.densifier.remove(rows, state.gaussians, state.optimizer))
 
     def _turned(self) -> Decisions:
