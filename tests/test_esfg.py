@@ -26,7 +26,7 @@ from hqgs.training.config import DensifyConfig, ESFGConfig, PaperConfig
 from hqgs.training.constants import SCS_CACHE_BYTES
 from hqgs.training.densify import Densifier
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.paper import VARIANTS, PaperHQGS, scs_loss
+from hqgs.training.methods.paper import VARIANTS, PaperHQGS, ScsWeights, scs_loss
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 
@@ -439,7 +439,8 @@ def test_the_losses() -> None:
         image = torch.from_numpy(found.image)
         counted = None if found.mask is None else torch.from_numpy(found.mask)
         l1 = photometric_loss(render, image, counted, 0.0).item()
-        scs = scs_loss(render, image, edge_magnitude(image, counted), counted).item()
+        fixed = ScsWeights.of(image, edge_magnitude(image, counted), counted, render.dtype)
+        scs = scs_loss(render, image, fixed).item()
         assert scs > 0.01
         expected = {
             "l1": l1,

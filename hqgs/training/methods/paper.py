@@ -87,7 +87,7 @@ class PaperHQGS(Method[ScsTarget]):
         loss = photometric_loss(image, target.photo, target.mask, dssim)
         if self.config.loss == "l1+scs":
             weights = target.weights or _scs_weights(target.photo, target.mask)
-            loss = loss + SCS_WEIGHT * weighted_scs_loss(image, target.photo, weights)
+            loss = loss + SCS_WEIGHT * scs_loss(image, target.photo, weights)
         return loss
 
     def rows_changed(self, state: TrainState, parents: Tensor) -> None:
@@ -132,7 +132,10 @@ class ScsWeights:
     def of(
         cls, target: Tensor, g: Tensor, mask: Tensor | None = None, dtype: torch.dtype = torch.float32
     ) -> ScsWeights:
-        """See `scs_loss` for the arguments and the errors; `dtype` is the render's."""
+        """Of a target [H, W, C], uint8 or float, and its `edge_magnitude` g [H, W, C] or [H, W].
+
+        `mask`: bool [H, W], True where the photo counts; `dtype`: the render's. ValueError as `scs_loss`.
+        """
         if target.ndim != 3 or target.dtype not in (torch.uint8, torch.float32, torch.float64):
             raise ValueError(
                 f"target: must be [H, W, C], uint8 or float, got {target.dtype} {list(target.shape)}"
@@ -153,7 +156,7 @@ class ScsWeights:
         return cls(weights, _norm(weights * target.detach()))
 
 
-def scs_loss(render: Tensor, target: Tensor, g: Tensor, mask: Tensor | None = None) -> Tensor:
+def scs_loss(render: Tensor, target: Tensor, fixed: ScsWeights) -> Tensor:
     """1 - cos(R_S, T_S) of a render and its photo, a scalar in [0, 2] (HQGS, the equation of L_SCS).
 
     R_S = (1 - g) * render and T_S = (1 - g) * target, the parts without edges. The cosine is over all
@@ -167,18 +170,11 @@ def scs_loss(render: Tensor, target: Tensor, g: Tensor, mask: Tensor | None = No
 
     Args:
         render: [H, W, C], float32 or float64, not clamped.
-        target: [H, W, C], uint8 (divided by 255) or float. It gets no gradient.
-        g: [H, W, C] or [H, W], in [0, 1]: the target's `edge_magnitude`. It gets no gradient.
-        mask: bool [H, W], True where the photo counts.
+        target: [H, W, C], uint8 (divided by 255) or float, as `fixed` was made of. It gets no gradient.
 
     Raises:
         ValueError: a wrong shape or dtype, with its name.
     """
-    return weighted_scs_loss(render, target, ScsWeights.of(target, g, mask, render.dtype))
-
-
-def weighted_scs_loss(render: Tensor, target: Tensor, fixed: ScsWeights) -> Tensor:
-    """`scs_loss` with what depends on the target alone computed before."""
     if render.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"render: must be float32 or float64, got {render.dtype}")
     if render.shape != target.shape or target.shape != fixed.weights.shape:
