@@ -111,3 +111,18 @@ def test_a_step_decays_what_it_trains_once_for_each_view() -> None:
     for batch in (1, 3):
         ratio = after_a_step(0.1, batch) / after_a_step(0.0, batch)
         torch.testing.assert_close(ratio, torch.full_like(ratio, 0.9**batch), rtol=1e-5, atol=0)
+
+
+def test_more_iterations_end_better_where_photos_are_few() -> None:
+    def at_the_end(iterations: int) -> float:
+        trainer = Trainer(tiny_scene(4), run_config(iterations=iterations, method="hqgs", formation="none"))
+        while trainer.iteration < trainer.length:
+            trainer.step()
+        trainer.evaluate()
+        found = trainer.history[-1]["psnr"]
+        assert found is not None
+        return found
+
+    short, longer, long = map(at_the_end, (40, 120, 360))
+    assert short + 1 < longer
+    assert longer + 1 < long
