@@ -52,15 +52,20 @@ class Agreement:
         self._shared: NDArray[np.intp] = (sees @ sees.T).toarray()
         np.fill_diagonal(self._shared, -1)
 
-    def depths(self, number: int, pixels: Floats, ranges: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where others agree."""
+    def depths(
+        self, number: int, pixels: Floats, ranges: Floats, grey: NDArray[np.float32] | None = None
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where others agree.
+
+        `grey`: what is compared with the other photos in place of the view's own, [h, w] of its small photo.
+        """
         order = np.argsort(-self._shared[number], kind="stable")
         others = [int(k) for k in order[: min(ASKED, len(order) - 1)]]
         if len(others) < AGREEING:
             return ranges[:, 0], np.zeros(len(ranges), bool)
         look = self.looks[number]
         depths, scores = _rust.agreed_depths(
-            look.grey,
+            look.grey if grey is None else grey,
             [self.looks[k].grey for k in others],
             np.stack([_map(look.camera, self.looks[k].camera) for k in others]),
             np.ascontiguousarray(pixels * look.scale),

@@ -40,6 +40,8 @@ class Facts:
         None  # share of pixels along edges on whose depth photos agree; None: not looked at
     )
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
+    passed: int | None = None  # photos in which somebody passes by; None: not looked at
+    passing: float = 0.0  # share of all pixels that these cover
     # What the method tells of the photos (`Method.facts`):
     as_photographed: bool = False  # renders are compared with photos as they are, of any size
     sizes: tuple[tuple[int, int], ...] = ()  # height and width of each photo as it was taken
@@ -178,12 +180,12 @@ def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
 
 
 ESSENTIAL = ("method", "formation", "loss", "budget", "first points", "length")
-OF_FEW_PHOTOS = ("opacity decay", "dropout of Gaussians")  # essential where they are used
+WHERE_USED = ("passers-by", "opacity decay", "dropout of Gaussians")  # essential where they are
 
 
 def essential(plan: RunPlan) -> str:
     """The rows that a user should know of before the run, as lines."""
-    used = [row.what for row in plan.rows if row.what in OF_FEW_PHOTOS and row.value != "none"]
+    used = [row.what for row in plan.rows if row.what in WHERE_USED and row.value != "none"]
     return plan_table([row for row in plan.rows if row.what in (*ESSENTIAL, *used)])
 
 

@@ -30,17 +30,12 @@ from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds,
 from hqgs.training.plan_budget import first_points_wanted, gaussians_determined, kept_gradient, sharp_pixels
 from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
 from hqgs.training.plan_length import fitting, shown
+from hqgs.training.plan_photos import passersby, photos
 from hqgs.training.schedule import half_size_end
 from hqgs.training.settings import with_iterations
 
 LINEAR = ("blur", "defocus", "motion", "lowres")
 CHOSEN = "measured on held-back photos of fern, fox and horns at half size"
-
-
-def photos(draft: Draft) -> Sequence[Choice]:
-    return [
-        Choice("left out", item.why, item.evidence or "", item.what, item.what) for item in draft.facts.unused
-    ]
 
 
 def method(draft: Draft) -> Sequence[Choice]:
@@ -297,9 +292,9 @@ def needless(draft: Draft) -> Sequence[Choice]:
     items, facts, has = set(draft.settings.leave_out), draft.facts, draft.kinds
     rows: list[Choice] = []
     if has & set(LEARNED):
-        items &= {"photos"}
+        items &= {"photos", "passersby"}
     elif not facts.as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
-        items &= {"photos", "iterations"}
+        items &= {"photos", "passersby", "iterations"}
     left = tuple(item for item in ITEMS if item in items)
     if "growth" in items:
         why = "no photo shows more than that"
@@ -321,6 +316,7 @@ def held_photos(draft: Draft) -> Sequence[Choice]:
 
 RULES = (
     Rule("a photo", photos, "what a broken or an empty photo teaches is wrong"),
+    Rule("passers-by", passersby, "hqgs/training/passersby.py, limits beside what chose them"),
     Rule("method", method, "the default of hqgs train", of_photos=True),
     Rule("formation", formation, "hqgs/diagnosis/, thresholds beside each measurement", of_photos=True),
     Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN, of_photos=True),

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.threads import one_torch_thread
@@ -20,6 +21,7 @@ from hqgs.training.config import AUTO, FORMATION, TrainConfig
 from hqgs.training.forward import TrainingViews
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
+from hqgs.training.passersby import without_passersby
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_rules import RULES, plan_run
 
@@ -34,9 +36,15 @@ class Prepared:
         unused = list[LeftOut]()
         if "photos" in asked.leave_out:
             scene, unused = choose_photos(scene)
+        self.passersby: dict[str, NDArray[np.bool_]] = {}  # by the photo's name, [H, W]: where they are
+        if "passersby" in asked.leave_out:
+            scene, self.passersby = without_passersby(scene, asked.seed, inspector.on_stage)
         self.scene: Scene = scene
         self.asked: TrainConfig = asked
         facts = facts_of(scene, unused)
+        if "passersby" in asked.leave_out:
+            passing = sum(int(mask.sum()) for mask in self.passersby.values())
+            facts = replace(facts, passed=len(self.passersby), passing=passing / facts.pixels)
         self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
         settings = plan_run(facts, self.diagnosis, asked).settings
         self.method: Method[Any] = make_method(scene, settings, inspector)

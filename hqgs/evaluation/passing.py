@@ -1,0 +1,49 @@
+"""What was taken for passers-by: masks for other programs, and a picture to look at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from hqgs.base.files import atomic_path
+from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.scene.capture import inside
+from hqgs.scene.photo_files import MASKS
+from hqgs.scene.scene import View
+
+MOST, COLUMNS, SIDE, GAP = 12, 4, 260, 6  # photos, and side by side; px: of a photo, and between two
+RED, PAINT = (220, 30, 30), 0.6  # of the masked part, and its share
+
+
+def save_masks(folder: Path, views: Sequence[View]) -> None:
+    """Write `masks/NAME.png` of each view, as COLMAP takes them: white counts, black does not. Atomically."""
+    for view in views:
+        mask = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+        with atomic_path(inside(folder / MASKS, f"{view.name}.png", "the photo's name")) as tmp:
+            Image.fromarray(mask.astype(np.uint8) * 255).save(tmp, "PNG")
+
+
+def passing_picture(views: Sequence[View], passing: Mapping[str, NDArray[np.bool_]]) -> Image.Image:
+    """Up to 12 photos, those first of which most was masked, with that part in red."""
+    shown = [view for view in views if view.name in passing]
+    shown = sorted(shown, key=lambda view: -passing[view.name].mean())[:MOST]
+    tiles = [_tile(view, passing[view.name]) for view in shown]
+    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
+    columns = min(COLUMNS, len(tiles))
+    sheet = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
+    for k, tile in enumerate(tiles):
+        sheet.paste(tile, (k % columns * width, k // columns * height))
+    return sheet
+
+
+def _tile(view: View, passing: NDArray[np.bool_]) -> Image.Image:
+    photo = to_uint8(as_floats(view.image)).astype(np.float64)
+    photo[passing] += PAINT * (np.array(RED) - photo[passing])
+    tile = Image.fromarray(photo.astype(np.uint8))
+    tile.thumbnail((SIDE, SIDE))
+    return tile

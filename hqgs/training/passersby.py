@@ -1,0 +1,172 @@
+"""What stands in one photo while others contradict it: people who walk through, cars, a shadow.
+
+A small scene is trained from small copies of the photos, from points that photos agree on, for so few steps
+that it never comes to show what a single photo does (RobustSplat, Fu et al. 2025, lets growth begin late for
+that). Where a photo differs from it, in a region as a whole, other photos are asked: patches around the
+scene's depth either look as in the scene, and then somebody was passing by, or as in the photo, and then the
+scene is wrong there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.threads import one_torch_thread
+from hqgs.model.consistency import SMOOTH, Agreement
+from hqgs.model.constants import BACKGROUND
+from hqgs.model.discs import as_discs
+from hqgs.model.first_points import points_along_edges
+from hqgs.model.gaussians import Gaussians
+from hqgs.model.render import nearness_map, render_view
+from hqgs.photos.pixels import as_floats
+from hqgs.scene.geometry import resized
+from hqgs.scene.scene import Scene, View
+from hqgs.training.adam import Adam
+from hqgs.training.config import TrainConfig
+from hqgs.training.methods.base import photo_tensors
+from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.schedule import learning_rates
+
+FEWEST = 3  # photos: one, and two that contradict it
+LONGEST, CELL = 160, 2  # px: of the copies, and of the cells whose mean colours are compared
+STEPS, FOR_EACH_PHOTO = 200, 4  # of the small scene: so many, or so many for each photo where that is more
+PIXELS_A_POINT, DEGREE = 50, 1  # of the copies, for each first point; of the harmonics
+EDGE, HEART = 0.06, 0.12  # of white: differences that count, and those that a region must reach
+SMALLEST = 8  # cells of a region
+DEPTHS = 0.92, 1.08  # of the scene's: between them other photos are asked
+CONTRADICTED = 0.3  # of a region's cells: so many more agree with the scene than with the photo
+DARK = 0.02  # of white: below, gains are not told
+NEIGHBOURS = np.ones((3, 3))
+# Chosen on walkers in the room, fern and horns (seed 0): regions of walkers score 0.3 to 0.9, all but a few
+# of those that differ for other reasons below 0.2, in five captures without walkers.
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tuple[Scene, dict[str, Mask]]:
+    """The scene with masks that leave out who passes by, and by the photo's name where that is, [H, W].
+
+    Photos in which nobody does are not named, and stay as they are. Nothing is found in fewer than 3 photos,
+    or where the scene does not tell which points they see.
+    """
+    if len(scene.train) < FEWEST or scene.seen is None:
+        return scene, {}
+    on_stage(Stage("passers-by", 0, 0, "looking for what other photos contradict"))
+    views = [_small(view) for view in scene.train]
+    agreement = Agreement(views, scene.seen)
+    gaussians = _trained(scene, views, agreement, seed)
+    train, found = [], dict[str, Mask]()
+    for k, (small, view) in enumerate(zip(views, scene.train, strict=True)):
+        with one_torch_thread(), torch.no_grad():
+            render = render_view(gaussians, small.camera, DEGREE, BACKGROUND)[0].numpy()
+            near = nearness_map(gaussians, small.camera, CELL).numpy().astype(np.float64)
+        cells = _contradicted(agreement, k, render, near, _regions(_unlike(small, render)))
+        if cells.any():
+            found[view.name] = passing = _enlarged(cells, *view.image.shape[:2])
+            view = replace(view, mask=~passing if view.mask is None else view.mask & ~passing)
+        train.append(view)
+    return replace(scene, train=train), found
+
+
+def _small(view: View) -> View:
+    camera = view.camera
+    factor = max(1.0, max(camera.width, camera.height) / LONGEST)
+    return resized(view, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))
+
+
+def _trained(scene: Scene, views: Sequence[View], agreement: Agreement, seed: int) -> Gaussians:
+    """The small scene, without a gradient history."""
+    wanted = sum(view.camera.width * view.camera.height for view in views) // PIXELS_A_POINT
+    more = points_along_edges(views, scene.points, scene.seen or {}, wanted, seed, agreement)
+    points, colors = np.concatenate([scene.points, more[0]]), np.concatenate([scene.point_colors, more[1]])
+    gaussians = as_discs(Gaussians.from_points(points, colors, DEGREE))
+    named = gaussians.named().items()
+    groups = [{"name": name, "params": [tensor.requires_grad_()]} for name, tensor in named]
+    steps = max(STEPS, FOR_EACH_PHOTO * len(views))
+    config = TrainConfig(iterations=steps, faster_rates=True)
+    optimizer = Adam(groups, lr=0.0, eps=config.adam_eps)
+    targets, rng = [photo_tensors(view) for view in views], np.random.default_rng(seed)
+    order = list[int]()
+    with one_torch_thread():
+        for step in range(steps):
+            if not order:
+                order = rng.permutation(len(views)).tolist()
+            k = order.pop()
+            rates = learning_rates(config, scene.extent, step / steps, scene.reach)
+            for group in optimizer.param_groups:
+                group["lr"] = rates[group["name"]]
+            image, _ = render_view(gaussians, views[k].camera, DEGREE, BACKGROUND)
+            optimizer.zero_grad()
+            photometric_loss(image, *targets[k]).backward()
+            optimizer.step()
+    return gaussians.detached()
+
+
+def _unlike(view: View, render: NDArray[np.float32]) -> Floats:
+    """How far each cell of a photo is from what the render shows there or one cell aside, in the worst
+    channel; 0 where the photo does not count. Gains of the whole photo do not count either.
+    """
+    photo, own = _cells(as_floats(view.image)), _cells(render)
+    own *= np.median(photo / np.maximum(own, DARK), axis=(0, 1))
+    low, high = (f(own, size=(3, 3, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
+    unlike = np.maximum(np.maximum(low - photo, photo - high), 0).max(-1)
+    return unlike if view.mask is None else np.where(_cells(view.mask[..., None])[..., 0] == 1, unlike, 0)
+
+
+def _cells(image: NDArray[np.floating] | Mask) -> Floats:
+    """The means over cells, [ceil(H / CELL), ceil(W / CELL), C]."""
+    height, width, channels = image.shape
+    padded = np.pad(image, ((0, -height % CELL), (0, -width % CELL), (0, 0)), mode="edge").astype(np.float64)
+    return padded.reshape(-(-height // CELL), CELL, -(-width // CELL), CELL, channels).mean((1, 3))
+
+
+def _regions(unlike: Floats) -> NDArray[np.intp]:
+    """Connected cells that differ, numbered from 1, where a region differs much somewhere; without holes."""
+    weak = unlike > EDGE
+    weak |= np.asarray(ndimage.binary_closing(np.pad(weak, 2), NEIGHBOURS), bool)[2:-2, 2:-2]
+    labels = _numbered(weak)
+    numbers = np.arange(1, labels.max() + 1)
+    hearts = np.asarray(ndimage.maximum(ndimage.uniform_filter(unlike, 3), labels, numbers))
+    large = np.bincount(labels.ravel())[1:] >= SMALLEST
+    kept = np.isin(labels, numbers[(hearts > HEART) & large])
+    return _numbered(np.asarray(ndimage.binary_fill_holes(kept), bool))
+
+
+def _numbered(cells: Mask) -> NDArray[np.intp]:
+    labels = np.zeros(cells.shape, np.intp)
+    ndimage.label(cells, NEIGHBOURS, output=labels)
+    return labels
+
+
+def _contradicted(
+    agreement: Agreement, number: int, render: NDArray[np.float32], near: Floats, regions: NDArray[np.intp]
+) -> Mask:
+    """The cells of those regions of a photo in which other photos show what the scene does."""
+    lines, columns = np.nonzero(regions)
+    if not len(lines):
+        return np.zeros(regions.shape, bool)
+    pixels = (np.stack([columns, lines], -1).astype(np.float64) + 0.5) * CELL
+    ranges = 1 / np.maximum(near[lines, columns, None], np.finfo(float).tiny) * DEPTHS
+    grey = np.ascontiguousarray(ndimage.gaussian_filter(render.mean(2), SMOOTH), np.float32)
+    _, of_photo = agreement.depths(number, pixels, ranges)
+    _, of_scene = agreement.depths(number, pixels, ranges, grey)
+    numbers = np.arange(1, regions.max() + 1)
+    more = ndimage.mean(of_scene.astype(float) - of_photo, regions[lines, columns], numbers)
+    return np.isin(regions, numbers[np.asarray(more) >= CONTRADICTED])
+
+
+def _enlarged(cells: Mask, height: int, width: int) -> Mask:
+    """The cells as pixels of the photo."""
+    rows, columns = (
+        ((np.arange(side) + 0.5) * count / side).astype(np.intp)
+        for side, count in zip((height, width), cells.shape, strict=True)
+    )
+    return cells[rows[:, None], columns]
