@@ -28,7 +28,7 @@ from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
-from hqgs.evaluation.learned import learned_picture
+from hqgs.evaluation.passing import save_masks
 from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord, WorldRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
@@ -39,14 +39,12 @@ from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
-from hqgs.training.notes import learned_record, run_notes
+from hqgs.training.notes import learned_record, run_notes, run_pictures
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import essential
 from hqgs.training.progress import OnProgress, progress_of
 from hqgs.training.settings import config_values, plan_values
 from hqgs.training.trainer import Trainer
-
-LEARNED = "learned.png"  # what was learned of the photos' cameras
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ def train(
         method: "auto" or "hqgs" (the photos' degradation in the loss, none where they show none), "3dgs" or
             "srgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
-            photos, growth, weight, resolution, iterations, with commas.
+            photos, passersby, growth, weight, resolution, iterations, with commas.
         seed: of everything random.
         max_gaussians: growth stops there; bounds the memory.
         guidance: of hqgs: "formation", or "paper", its published form.
@@ -237,6 +235,8 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     with deferred_interrupt() as interrupted:
         if out is not None:
             save_cameras(out, trainer.scene)
+            if trainer.prepared.passersby:
+                save_masks(out, trainer.scene.train)
         while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):
             before = trainer.iteration
             step = trainer.step()
@@ -337,14 +337,13 @@ def _report(
         photos=[] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
         ranks=ranks,
     )
-    learned = None
-    if out is not None and result.learned:
-        learned = learned_picture([view.image for view in scene.train], result.learned)
-        with atomic_path(out / LEARNED) as tmp:
-            learned.save(tmp)
+    pictures = {} if out is None else run_pictures(trainer, result.learned)
+    for name, picture in pictures.items():
+        with atomic_path(cast(Path, out) / name) as tmp:
+            picture.save(tmp)
     if out is not None and config.seconds is not None:
         write_json(out / PLAN, plan_values(config, rows))
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
-        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, learned))
+        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, pictures))
     return report

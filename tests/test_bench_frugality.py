@@ -26,7 +26,7 @@ def test_the_rows() -> None:
 
     assert config("none").leave_out == ()
     assert config("iterations").leave_out == ("iterations",)
-    assert config("auto", 3).leave_out == ("photos", "growth", "weight")
+    assert config("auto", 3).leave_out == ("photos", "passersby", "growth", "weight")
     assert config("auto", 3).seed == 3
     assert all(config(label) == TrainConfig(
         7_000, "3dgs", leave_out=config(label).leave_out).scaled() for label in protocol.labels)  # fmt: skip

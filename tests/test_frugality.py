@@ -37,7 +37,7 @@ def bits(trainer: Trainer) -> dict[str, bytes]:
 
 
 def test_the_items_by_name() -> None:
-    assert parse_leave_out("auto") == ("photos", "growth", "weight")
+    assert parse_leave_out("auto") == ("photos", "passersby", "growth", "weight")
     assert parse_leave_out("none") == ()
     assert parse_leave_out("weight, photos") == ("photos", "weight")
     with pytest.raises(ValueError, match="there is no 'colour'; there are: auto, none, or some of photos"):
@@ -73,9 +73,9 @@ def test_few_photos_are_never_held_back() -> None:
 
 
 def test_degraded_photos_have_a_budget_of_their_own() -> None:
-    scene, items = tiny_scene(VIEWS), ("photos", "growth", "weight", "resolution", "iterations")
+    scene, items = tiny_scene(VIEWS), ("photos", "passersby", "growth", "weight", "resolution", "iterations")
     noisy = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:20"), leave_out=items)
-    assert Trainer(scene, noisy).schedule.items == {"photos", "iterations"}
+    assert Trainer(scene, noisy).schedule.items == {"photos", "passersby", "iterations"}
     clean = replace(noisy, hqgs=HQGSConfig(formation="none"))
     assert Trainer(scene, clean).schedule.items == set(items) - {"resolution"}  # too small for that
 

@@ -16,6 +16,7 @@ from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
+from hqgs.base.files import LEARNED
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
 from hqgs.show.page.page import Page, page_text, told_verdict
@@ -109,7 +110,7 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
     ]
     report: Any = {**run.report, "learned": learned}
     sheet = Image.new("RGB", (2000, 100), "white")
-    text = page_text(page_of(run, report=report, learned=sheet))
+    text = page_text(page_of(run, report=report, pictures={LEARNED: sheet}))
     cells = "".join(
         f"<td>{cell}</td>"
         for cell in ("a&lt;b&gt;.png", "4.0 px", "sharp", "+0.33", "+0.67", "+0.67", "-1.33")

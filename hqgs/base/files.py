@@ -16,6 +16,7 @@ from filelock import FileLock, Timeout
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
+LEARNED, PASSERSBY = "learned.png", "passersby.png"  # of the photos' cameras; of who was masked
 PLAN = "plan.json"  # what a number of seconds came to
 
 

@@ -8,7 +8,7 @@ DEPTH_SAMPLES, DEPTH_PERCENTILES = (
 )  # frames that say which depths a film shows; ends of its colours
 
 # report.html.
-PAIRS, PAIR_SIDE, LEARNED_SIDE = 8, 720, 1080  # pictures of photo and render, best, worst and between; px
+PAIRS, PAIR_SIDE, SHEET_SIDE = 8, 720, 1080  # pictures of photo and render, best, worst and between; px
 PAGE_QUALITY, PAGE_VIEWS = 82, 200  # of JPEG; cameras to jump to
 
 # The viewer.

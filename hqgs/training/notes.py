@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
+import numpy as np
+from PIL import Image
+
+from hqgs.base.files import LEARNED, PASSERSBY
+from hqgs.evaluation.learned import learned_picture
+from hqgs.evaluation.passing import passing_picture
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.evaluation.verdict import overdone
 from hqgs.training.methods.cameras import LearnedCamera
@@ -56,6 +62,17 @@ def run_notes(trainer: Trainer) -> list[str]:
         if gains.any():
             notes.append(f"photos are up to {np.abs(gains).max():.2f} stops brighter or darker than the mean")
     return notes
+
+
+def run_pictures(trainer: Trainer, learned: Sequence[LearnedRecord]) -> dict[str, Image.Image]:
+    """Pictures of what was learned of the photos' cameras and of who passed by, by file name; none where
+    there is nothing to show."""
+    views, passing, pictures = trainer.scene.train, trainer.prepared.passersby, dict[str, Image.Image]()
+    if learned:
+        pictures[LEARNED] = learned_picture([view.image for view in views], learned)
+    if passing:
+        pictures[PASSERSBY] = passing_picture(views, passing)
+    return pictures
 
 
 def learned_record(learned: LearnedCamera) -> LearnedRecord:

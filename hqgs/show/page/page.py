@@ -27,7 +27,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
-from hqgs.show.constants import LEARNED_SIDE, PAGE_QUALITY, PAGE_VIEWS, PAIR_SIDE, PAIRS
+from hqgs.show.constants import PAGE_QUALITY, PAGE_VIEWS, PAIR_SIDE, PAIRS, SHEET_SIDE
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
 
@@ -50,7 +50,7 @@ class Page:
     gaussians: Gaussians | None
     views: Sequence[RenderedView] = field(repr=False)
     diagnosis: Diagnosis | None = None
-    learned: Image.Image | None = None  # what was learned of the photos' cameras
+    pictures: Mapping[str, Image.Image] = field(default_factory=dict)  # by file name, as the run wrote them
 
 
 def told_verdict(report: Report) -> str:
@@ -116,7 +116,7 @@ def page_text(page: Page) -> str:
         if diagnosis is None
         else [_row(p.name, photo_words(photo_record(p))) for p in diagnosis.photos],
         learned=[_row(record["name"], learned_words(record)) for record in report["learned"]],
-        learned_picture=None if page.learned is None else jpeg(page.learned, LEARNED_SIDE),
+        pictures={Path(name).stem: jpeg(picture, SHEET_SIDE) for name, picture in page.pictures.items()},
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
