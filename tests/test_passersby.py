@@ -107,7 +107,7 @@ def test_differences_that_do_not_count(crowd: WildRoom) -> None:
     assert passersby._unlike(view, np.float32(0.5) * render).max() < 1e-6  # a gain of the whole photo
     other = render.copy()
     other[40:60, 50:80] = 1 - other[40:60, 50:80]
-    found = passersby._unlike(view, other) > passersby.EDGE
+    found = passersby._unlike(view, other) > passersby.DIFFERS
     assert found[20:30, 25:40].mean() > 0.5
     found[19:31, 24:41] = False
     assert not found.any()

@@ -30,22 +30,26 @@ from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
+from hqgs.training.constants import (
+    CONTRADICTED,
+    DEPTHS_ASKED,
+    DIFFERS,
+    DIFFERS_MUCH,
+    FEWEST_SCOUTED,
+    SCOUT_CELL,
+    SCOUT_DEGREE,
+    SCOUT_PIXELS,
+    SCOUT_SIDE,
+    SCOUT_STEPS,
+    SCOUT_STEPS_EACH,
+    SMALLEST_PASSING,
+    TOO_DARK,
+)
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.schedule import learning_rates
 
-FEWEST = 3  # photos: one, and two that contradict it
-LONGEST, CELL = 160, 2  # px: of the copies, and of the cells whose mean colours are compared
-STEPS, FOR_EACH_PHOTO = 200, 4  # of the small scene: so many, or so many for each photo where that is more
-PIXELS_A_POINT, DEGREE = 50, 1  # of the copies, for each first point; of the harmonics
-EDGE, HEART = 0.06, 0.12  # of white: differences that count, and those that a region must reach
-SMALLEST = 20  # cells of a region
-DEPTHS = 0.92, 1.08  # of the scene's: between them other photos are asked
-CONTRADICTED = 0.3  # of a region's cells: so many more agree with the scene than with the photo
-DARK = 0.02  # of white: below, gains are not told
-NEIGHBOURS = np.ones((3, 3))
-# Chosen on walkers in the room, fern and horns (seed 0): regions of walkers score 0.3 to 0.9, all but a few
-# of those that differ for other reasons below 0.2, in five captures without walkers.
+NEIGHBOURS = np.ones((3, 3))  # a cell's, the corners among them
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,7 +61,7 @@ def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tu
     Photos in which nobody does are not named, and stay as they are. Nothing is found in fewer than 3 photos,
     or where the scene does not tell which points they see.
     """
-    if len(scene.train) < FEWEST or scene.seen is None:
+    if len(scene.train) < FEWEST_SCOUTED or scene.seen is None:
         return scene, {}
     on_stage(Stage("passers-by", 0, 0, "looking for what other photos contradict"))
     views = [_small(view) for view in scene.train]
@@ -66,8 +70,8 @@ def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tu
     train, found = [], dict[str, Mask]()
     for k, (small, view) in enumerate(zip(views, scene.train, strict=True)):
         with one_torch_thread(), torch.no_grad():
-            render = render_view(gaussians, small.camera, DEGREE, BACKGROUND)[0].numpy()
-            near = nearness_map(gaussians, small.camera, CELL).numpy().astype(np.float64)
+            render = render_view(gaussians, small.camera, SCOUT_DEGREE, BACKGROUND)[0].numpy()
+            near = nearness_map(gaussians, small.camera, SCOUT_CELL).numpy().astype(np.float64)
         cells = _contradicted(agreement, k, render, near, _regions(_unlike(small, render)))
         if cells.any():
             found[view.name] = passing = _enlarged(cells, *view.image.shape[:2])
@@ -78,19 +82,19 @@ def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tu
 
 def _small(view: View) -> View:
     camera = view.camera
-    factor = max(1.0, max(camera.width, camera.height) / LONGEST)
+    factor = max(1.0, max(camera.width, camera.height) / SCOUT_SIDE)
     return resized(view, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))
 
 
 def _trained(scene: Scene, views: Sequence[View], agreement: Agreement, seed: int) -> Gaussians:
     """The small scene, without a gradient history."""
-    wanted = sum(view.camera.width * view.camera.height for view in views) // PIXELS_A_POINT
+    wanted = sum(view.camera.width * view.camera.height for view in views) // SCOUT_PIXELS
     more = points_along_edges(views, scene.points, scene.seen or {}, wanted, seed, agreement)
     points, colors = np.concatenate([scene.points, more[0]]), np.concatenate([scene.point_colors, more[1]])
-    gaussians = as_discs(Gaussians.from_points(points, colors, DEGREE))
+    gaussians = as_discs(Gaussians.from_points(points, colors, SCOUT_DEGREE))
     named = gaussians.named().items()
     groups = [{"name": name, "params": [tensor.requires_grad_()]} for name, tensor in named]
-    steps = max(STEPS, FOR_EACH_PHOTO * len(views))
+    steps = max(SCOUT_STEPS, SCOUT_STEPS_EACH * len(views))
     config = TrainConfig(iterations=steps, faster_rates=True)
     optimizer = Adam(groups, lr=0.0, eps=config.adam_eps)
     targets, rng = [photo_tensors(view) for view in views], np.random.default_rng(seed)
@@ -103,7 +107,7 @@ def _trained(scene: Scene, views: Sequence[View], agreement: Agreement, seed: in
             rates = learning_rates(config, scene.extent, step / steps, scene.reach)
             for group in optimizer.param_groups:
                 group["lr"] = rates[group["name"]]
-            image, _ = render_view(gaussians, views[k].camera, DEGREE, BACKGROUND)
+            image, _ = render_view(gaussians, views[k].camera, SCOUT_DEGREE, BACKGROUND)
             optimizer.zero_grad()
             photometric_loss(image, *targets[k]).backward()
             optimizer.step()
@@ -115,28 +119,32 @@ def _unlike(view: View, render: NDArray[np.float32]) -> Floats:
     channel; 0 where the photo does not count. Gains of the whole photo do not count either.
     """
     photo, own = _cells(as_floats(view.image)), _cells(render)
-    own *= np.median(photo / np.maximum(own, DARK), axis=(0, 1))
+    own *= np.median(photo / np.maximum(own, TOO_DARK), axis=(0, 1))
     low, high = (f(own, size=(3, 3, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
     unlike = np.maximum(np.maximum(low - photo, photo - high), 0).max(-1)
     return unlike if view.mask is None else np.where(_cells(view.mask[..., None])[..., 0] == 1, unlike, 0)
 
 
 def _cells(image: NDArray[np.floating] | Mask) -> Floats:
-    """The means over cells, [ceil(H / CELL), ceil(W / CELL), C]."""
+    """The means over cells, [ceil(H / SCOUT_CELL), ceil(W / SCOUT_CELL), C]."""
     height, width, channels = image.shape
-    padded = np.pad(image, ((0, -height % CELL), (0, -width % CELL), (0, 0)), mode="edge").astype(np.float64)
-    return padded.reshape(-(-height // CELL), CELL, -(-width // CELL), CELL, channels).mean((1, 3))
+    padded = np.pad(image, ((0, -height % SCOUT_CELL), (0, -width % SCOUT_CELL), (0, 0)), mode="edge").astype(
+        np.float64
+    )
+    return padded.reshape(
+        -(-height // SCOUT_CELL), SCOUT_CELL, -(-width // SCOUT_CELL), SCOUT_CELL, channels
+    ).mean((1, 3))
 
 
 def _regions(unlike: Floats) -> NDArray[np.intp]:
     """Connected cells that differ, numbered from 1, where a region differs much somewhere; without holes."""
-    weak = unlike > EDGE
+    weak = unlike > DIFFERS
     weak |= np.asarray(ndimage.binary_closing(np.pad(weak, 2), NEIGHBOURS), bool)[2:-2, 2:-2]
     labels = _numbered(weak)
     numbers = np.arange(1, labels.max() + 1)
     hearts = np.asarray(ndimage.maximum(ndimage.uniform_filter(unlike, 3), labels, numbers))
-    large = np.bincount(labels.ravel())[1:] >= SMALLEST
-    kept = np.isin(labels, numbers[(hearts > HEART) & large])
+    large = np.bincount(labels.ravel())[1:] >= SMALLEST_PASSING
+    kept = np.isin(labels, numbers[(hearts > DIFFERS_MUCH) & large])
     return _numbered(np.asarray(ndimage.binary_fill_holes(kept), bool))
 
 
@@ -153,8 +161,8 @@ def _contradicted(
     lines, columns = np.nonzero(regions)
     if not len(lines):
         return np.zeros(regions.shape, bool)
-    pixels = (np.stack([columns, lines], -1).astype(np.float64) + 0.5) * CELL
-    ranges = 1 / np.maximum(near[lines, columns, None], np.finfo(float).tiny) * DEPTHS
+    pixels = (np.stack([columns, lines], -1).astype(np.float64) + 0.5) * SCOUT_CELL
+    ranges = 1 / np.maximum(near[lines, columns, None], np.finfo(float).tiny) * DEPTHS_ASKED
     grey = np.ascontiguousarray(ndimage.gaussian_filter(render.mean(2), SMOOTH), np.float32)
     _, of_photo = agreement.depths(number, pixels, ranges)
     _, of_scene = agreement.depths(number, pixels, ranges, grey)

@@ -316,7 +316,7 @@ def held_photos(draft: Draft) -> Sequence[Choice]:
 
 RULES = (
     Rule("a photo", photos, "what a broken or an empty photo teaches is wrong"),
-    Rule("passers-by", passersby, "hqgs/training/passersby.py, limits beside what chose them"),
+    Rule("passers-by", passersby, "limits and what chose them: hqgs/training/constants.py"),
     Rule("method", method, "the default of hqgs train", of_photos=True),
     Rule("formation", formation, "hqgs/diagnosis/, thresholds beside each measurement", of_photos=True),
     Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN, of_photos=True),
