@@ -19,8 +19,8 @@ from scipy import ndimage
 
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.consistency import SMOOTH, Agreement
-from hqgs.model.constants import BACKGROUND
+from hqgs.model.consistency import Agreement
+from hqgs.model.constants import AGREE_SMOOTH, BACKGROUND
 from hqgs.model.discs import as_discs
 from hqgs.model.first_points import points_along_edges
 from hqgs.model.gaussians import Gaussians
@@ -163,7 +163,7 @@ def _contradicted(
         return np.zeros(regions.shape, bool)
     pixels = (np.stack([columns, lines], -1).astype(np.float64) + 0.5) * SCOUT_CELL
     ranges = 1 / np.maximum(near[lines, columns, None], np.finfo(float).tiny) * DEPTHS_ASKED
-    grey = np.ascontiguousarray(ndimage.gaussian_filter(render.mean(2), SMOOTH), np.float32)
+    grey = np.ascontiguousarray(ndimage.gaussian_filter(render.mean(2), AGREE_SMOOTH), np.float32)
     _, of_photo = agreement.depths(number, pixels, ranges)
     _, of_scene = agreement.depths(number, pixels, ranges, grey)
     numbers = np.arange(1, regions.max() + 1)
