@@ -21,10 +21,10 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.consistency import Agreement
 from hqgs.model.constants import AGREE_SMOOTH, BACKGROUND
-from hqgs.model.discs import as_discs
 from hqgs.model.first_points import points_along_edges
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map, render_view
+from hqgs.model.shapes import as_discs
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
