@@ -257,6 +257,8 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
     elif ranks.local > 1:
         hqgs.set_num_threads(max(1, hqgs.get_num_threads() // ranks.local))
     ready(options.scene)
+    from hqgs.scene.next_photos import told_next  # here: it loads scenes
+
     asked = ranks.tell(_asked(options, config) if ranks.first else None)[0]
     with LoadingScreen() as screen:
         if not ranks.first:
@@ -292,6 +294,8 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
             on_stage=bar.stage,
             ranks=ranks,
         )
+    for line in told_next(scene) if ranks.first else []:
+        print(line)
     return done, live, screen, bar, loaded
 
 

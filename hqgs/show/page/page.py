@@ -25,11 +25,13 @@ from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMet
 from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
+from hqgs.scene.next_photos import next_photos
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
 from hqgs.show.constants import PAGE_QUALITY, PAGE_VIEWS, PAIR_SIDE, PAIRS, SHEET_SIDE
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
+from hqgs.show.page.places import places_chart
 
 TEMPLATES = Path(__file__).parent / "templates"
 SCRIPTS = ("splat_shaders.js", "splats.js")
@@ -120,6 +122,10 @@ def page_text(page: Page) -> str:
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
+        places=places_chart(page.scene),
+        spots=[spot.told for spot in next_photos(page.scene)],
+        sure=_sure(report),
+        lost=[*((report.get("sfm") or {}).get("lost") or {}).items()],
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
@@ -132,6 +138,12 @@ def rendered(template: str, **values: Any) -> str:
     loader = FileSystemLoader(TEMPLATES)
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.get_template(template).render(**values)
+
+
+def _sure(report: Report) -> list[tuple[str, str]]:
+    """How sure each photo's pose is, the loosest first."""
+    sure = (report.get("sfm") or {}).get("sure_px") or {}
+    return [(name, f"{px:.2f} px") for name, px in sorted(sure.items(), key=lambda item: -item[1])]
 
 
 def _line(history: Sequence[HistoryEntry], key: str) -> list[tuple[float, float]]:

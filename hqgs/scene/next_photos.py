@@ -1,0 +1,117 @@
+"""Where another photo would help most: gaps between cameras, loose poses, what few photos show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.scene.paths import focus, scene_up
+from hqgs.scene.scene import Scene, View
+
+FEWEST = 5  # photos: of fewer nothing is told but that they are few
+GAP, WIDER = 20.0, 2.5  # degrees around the middle between neighbours, and times the usual: a gap
+LOOSE, LOOSER = 0.5, 3.0  # px that a pose may be off, and times the usual: a loose one
+ALONE, LONELIER = 0.5, 2.0  # of a photo's points that no third photo shows, and times the usual
+MOST = 3  # places that are told
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A place to photograph from."""
+
+    at: Array  # [3], world
+    told: str  # in words
+
+
+def next_photos(scene: Scene) -> list[Spot]:
+    """The places where another photo would help most, the most helpful first; none: nothing stands out."""
+    views = sorted([*scene.train, *scene.test], key=lambda view: view.name)
+    if len(views) < FEWEST:
+        return []
+    centers = np.stack([view.camera.center for view in views])
+    return [*_gaps(scene, views, centers), *_loose(scene, views, centers), *_alone(scene, views, centers)][
+        :MOST
+    ]
+
+
+def told_next(scene: Scene) -> list[str]:
+    """That in a sentence, or nothing."""
+    spots = next_photos(scene)
+    return [f"photograph here next: {'; '.join(spot.told for spot in spots)}"] if spots else []
+
+
+def around(scene: Scene) -> tuple[Array, Array]:
+    """The point that the photos look at [3], and axes [2, 3] of the plane that is level there."""
+    up = scene_up(scene)
+    first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    first /= np.linalg.norm(first)
+    plane = np.stack([first, np.cross(up, first)]).astype(np.float64)
+    return focus([view.camera for view in scene.train]), plane
+
+
+def _gaps(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
+    """Between neighbours around the middle that stand much farther apart than others do."""
+    middle, plane = around(scene)
+    flat = (centers - middle) @ plane.T
+    angles = np.arctan2(flat[:, 1], flat[:, 0])
+    order = np.argsort(angles, kind="stable")
+    steps = np.degrees(np.diff(angles[order], append=angles[order[0]] + 2 * np.pi))
+    # What lies behind a capture of one side is no gap.
+    widest = int(np.argmax(steps))
+    usual = float(np.median(steps))
+    found = []
+    for k in np.argsort(-steps, kind="stable").tolist():
+        if steps[k] < max(GAP, WIDER * usual) or (k == widest and steps[k] > 180):
+            continue
+        a, b = order[k], order[(k + 1) % len(order)]
+        half = angles[a] + np.radians(steps[k]) / 2
+        far = np.linalg.norm(flat[[a, b]], axis=1).mean()
+        height = (centers[[a, b]] - middle).mean(0)
+        at = middle + far * (np.cos(half) * plane[0] + np.sin(half) * plane[1])
+        at = at + height - plane.T @ (plane @ height)
+        names = sorted((views[a].name, views[b].name))
+        found.append(Spot(at, f"between {names[0]} and {names[1]}, which are {steps[k]:.0f} degrees apart"))
+    return found
+
+
+def _loose(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
+    """Beside photos whose poses are loose."""
+    sure = {} if scene.sfm is None else scene.sfm.sure_px
+    if not sure:
+        return []
+    most = max(LOOSE, LOOSER * float(np.median([*sure.values()])))
+    loose = sorted((name for name, px in sure.items() if px > most), key=lambda name: -sure[name])
+    places = {view.name: center for view, center in zip(views, centers, strict=True)}
+    return [
+        Spot(places[name], f"beside {name}, whose place is sure to {sure[name]:.1f} px only")
+        for name in loose
+        if name in places
+    ]
+
+
+def _alone(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
+    """Beside photos that show much that no third photo does."""
+    if scene.seen is None or not len(scene.points):
+        return []
+    counts = np.zeros(len(scene.points), np.int64)
+    for rows in scene.seen.values():
+        counts[rows] += 1
+    shares = np.array(
+        [
+            float((counts[scene.seen[v.name]] < 3).mean()) if len(scene.seen.get(v.name, ())) else 0.0
+            for v in views
+        ]
+    )
+    most = max(ALONE, LONELIER * float(np.median(shares)))
+    found = np.flatnonzero(shares > most)
+    return [
+        Spot(
+            centers[k],
+            f"beside {views[k].name}: {shares[k]:.0%} of what it shows is in one other photo at most",
+        )
+        for k in found[np.argsort(-shares[found], kind="stable")].tolist()
+    ]
