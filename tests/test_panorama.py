@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
+from test_diagnose import clean_photo
 
 from hqgs.base.stages import Stage
+from hqgs.diagnosis.constants import TURNED
+from hqgs.diagnosis.differences import unlike_sharpness
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene.builtin.panorama import panorama_room
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
@@ -255,6 +258,24 @@ def test_faces_of_one_photo_are_no_pair() -> None:
     some = pairs_of_faces(18, 6, np.array([[0, 1], [0, 13]]))
     alike = {(k, k + 6 * n) for k in range(18) for n in (1, 2) if k + 6 * n < 18}
     assert {(a, b) for a, b in some.tolist()} == alike | {(0, 13)}
+
+
+def test_faces_that_were_resampled_differently_are_not_shaken() -> None:
+    """Each face lost the fine details of one direction, as all of its direction did."""
+    views = []
+    for k in range(12):
+        sigma = (1.2, 0.1, 0) if k % 2 else (0.1, 1.2, 0)
+        image = (
+            np.rint(gaussian_filter(clean_photo(k).astype(np.float64), sigma)).clip(0, 255).astype(np.uint8)
+        )
+        camera = Camera(image.shape[1], image.shape[0], np.diag([100.0, 100, 1]), np.eye(4))
+        views.append(View(f"{k}.png", camera, image, face=("front", "up")[k % 2]))
+    scene = Scene("s", views, [], np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "photos")
+    found = unlike_sharpness(scene)
+    shaken = unlike_sharpness(replace(scene, train=[replace(view, face="") for view in views]))
+    assert found is not None
+    assert shaken is not None
+    assert found.direction < TURNED < shaken.direction
 
 
 def test_the_room_as_panoramas() -> None:

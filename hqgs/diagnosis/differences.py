@@ -28,7 +28,8 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     What happens to all photos alike (blur, noise, JPEG, shrinking) moves them together: sharpness differs by
     less than 0.15 then, and by 0.25 to 1.3 where each photo was shaken in its own way. Shake takes the fine
     details of one direction, so that the direction differs by 0.5 and more; where photos are out of focus by
-    different amounts it does not.
+    different amounts it does not. Faces of panoramas are compared with those of their direction: each was
+    resampled in its own way.
     """
     if len(scene.train) < UNLIKE_FEWEST:
         return None
@@ -36,9 +37,15 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     rings = [found for found in looks if found is not None]
     if len(rings) < len(looks):
         return None
-    coarse, *finer = Sharpness(rings).quarters().std(axis=1)
+    quarters = Sharpness(rings).quarters()
     directions = np.stack([_directions(view.image) for view in scene.train])
-    directions -= np.median(directions, axis=0)
+    faces = np.array([view.face for view in scene.train])
+    for face in np.unique(faces):
+        alike = faces == face
+        if not alike.all():
+            quarters[:, alike] -= np.median(quarters[:, alike], axis=1, keepdims=True)
+        directions[alike] -= np.median(directions[alike], axis=0)
+    coarse, *finer = quarters.std(axis=1)
     directions -= directions.mean(1, keepdims=True)
     return Unlike(float(max(finer) - coarse), float(directions.std()))
 

@@ -162,9 +162,8 @@ def _load_view(
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
     film = photo.film if downscale <= FILM_SHRUNK else None
-    return View(
-        photo.name, camera_now, image, mask, quarter_turns=read_exif(photo.path).quarter_turns, film=film
-    )
+    turns = read_exif(photo.path).quarter_turns
+    return View(photo.name, camera_now, image, mask, quarter_turns=turns, film=film, face=face)
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def panorama_room(
         for face, flat in faces.items()
     }
     note = f"training views are faces of {len(names)} ray-cast panoramas of {width} x {width // 2} px"
-    train = [replace(view, image=photos[view.name]) for view in clean.train]
+    train = [replace(view, image=photos[view.name], face=view.name.split(".")[1]) for view in clean.train]
     return WildRoom(replace(clean, train=train, notes=[*clean.notes, note]), clean, {})
 
 
