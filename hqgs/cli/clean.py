@@ -54,7 +54,7 @@ def run(options: Clean) -> int:
         kept = len(done.gaussians)
         words = (
             f"{sum(done.before) / len(done.before):.2f} -> {sum(done.after) / len(done.after):.2f} dB on "
-            f"{len(done.after)} held-out photos ({done.gain:+.2f} +- {done.scatter:.2f})"
+            f"{len(done.after)} held-out photos ({done.gain:+.2f} ± {done.interval:.2f})"
         )
         if not done.pays:
             held = (

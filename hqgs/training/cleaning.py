@@ -17,6 +17,7 @@ from hqgs._rust import ALPHA_MIN
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.held_out import held_out_renders
+from hqgs.evaluation.intervals import half_width
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
@@ -44,15 +45,15 @@ class Cleaned:
         return float(np.mean(np.subtract(self.after, self.before)))
 
     @property
-    def scatter(self) -> float:
-        """Standard error of the gain, dB; infinite for one photo."""
-        gains = np.subtract(self.after, self.before)
-        return float(np.std(gains, ddof=1) / math.sqrt(len(gains))) if len(gains) > 1 else math.inf
+    def interval(self) -> float:
+        """Half that of the gain, paired by photo, dB; infinite for one photo."""
+        half = half_width(np.subtract(self.after, self.before).tolist())
+        return math.inf if half is None else half
 
     @property
     def pays(self) -> bool:
-        """Whether the gain exceeds its scatter."""
-        return self.gain > self.scatter
+        """Whether the gain exceeds its interval."""
+        return self.gain > self.interval
 
 
 def clean(
@@ -65,7 +66,9 @@ def clean(
     """
     if len(scene.test) < 2:
         held = f"{scene.name} has {len(scene.test)} held-out photos"
-        raise ValueError(f"{held}, wanted at least 2: the scatter of their gains tells whether cleaning pays")
+        raise ValueError(
+            f"{held}, wanted at least 2: the interval of their gains tells whether cleaning pays"
+        )
     if steps < 1:
         raise ValueError(f"steps is {steps}, wanted at least 1")
     before = _held_out(gaussians, scene)
