@@ -37,6 +37,7 @@ FAULTS = {
     "far": "far clip",
     "positions": "quantised positions",
     "axes": "flipped axes",
+    "view": "another field of view",
 }
 
 
@@ -124,6 +125,10 @@ def seeded(scene: Arrays, camera: Camera, fault: str) -> NDArray[np.uint8]:
     elif fault == "positions":
         coarse: Arrays = {**scene, "means": scene["means"].astype(np.float16).astype(np.float32)}
         image = drawn(coarse, camera)
+    elif fault == "view":
+        K = camera.K.copy()
+        K[:2, :2] *= 0.6
+        image = drawn(scene, replace(camera, K=K))
     elif fault == "axes":
         image = drawn(scene, camera)[::-1]
     else:

@@ -18,7 +18,8 @@ ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float
 WHOLLY = 0.5  # of the difference to the right picture: an imitation that leaves more explains nothing
 APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not told apart
 FAR = "far clip"
-FAR_STEPS, FAR_ROUNDS = 8, 3  # far planes that are tried between two, and how often closer together
+ZOOM, ZOOMS = "another field of view", (0.4, 2.5)
+STEPS, ROUNDS = 6, 4  # values that are tried between two, and how often closer together
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Verdict:
 
 
 def imitations(scene: Arrays) -> list[tuple[str, str, Ways]]:
-    """Faults, their forms, and how they render; all but the far clip."""
+    """Faults, their forms, and how they render; all but those of which a number is looked for."""
     flag = bool(scene.get("antialiased", False))
     order, degree = "wrong order", int(np.sqrt(scene["shN"].shape[1] + 1)) - 1
     found = [
@@ -55,6 +56,7 @@ def imitations(scene: Arrays) -> list[tuple[str, str, Ways]]:
             Ways(antialiased=not flag),
         ),
         *(("harmonics cut", f"to degree {k}", Ways(sh_degree=k)) for k in range(degree)),
+        ("harmonics cut", "to degree 0, clamped to white", Ways(sh_degree=0, brightest=1.0)),
         ("harmonics clamped", "to white", Ways(brightest=1.0)),
         ("blended in linear light", "", Ways(linear=True)),
         ("8-bit accumulation", "from the front", Ways(bits="front")),
@@ -119,7 +121,10 @@ class Imitations:
             left = self._left(ways, first)
             if fault not in best or left < best[fault][0]:
                 best[fault] = left, form, ways
-        best[FAR] = self._far(pictures)
+        if min(left for left, _, _ in best.values()) > ROUNDED:  # or else nothing is left to look for
+            far = far_depths(self._scene, self._cameras)
+            best[FAR] = self._search("at {:.3g}", lambda value: Ways(far=value), far, pictures)
+            best[ZOOM] = self._search("focal lengths x {:.3g}", lambda value: Ways(zoom=value), ZOOMS, first)
         lefts = {fault: self._left(ways, pictures) for fault, (_, _, ways) in best.items()}
         off, nearest = lefts[RIGHT], min(lefts, key=lambda fault: lefts[fault])
         left = lefts[nearest]
@@ -129,18 +134,24 @@ class Imitations:
             fault = RIGHT
         return Verdict(fault, best[nearest][1], off, left, nearest, self._worst(pictures))
 
-    def _far(self, pictures: Mapping[int, NDArray[np.uint8]]) -> tuple[float, str, Ways]:
-        """The best far plane: looked for closer and closer around the best."""
-        low, high = far_depths(self._scene, self._cameras)
+    def _search(
+        self,
+        words: str,
+        ways: Callable[[float], Ways],
+        between: tuple[float, float],
+        pictures: Mapping[int, NDArray[np.uint8]],
+    ) -> tuple[float, str, Ways]:
+        """The form of a fault with the best value: looked for closer and closer around the best."""
+        low, high = between
         found: list[tuple[float, float]] = []
-        for _ in range(FAR_ROUNDS):
-            steps = np.geomspace(low, high, FAR_STEPS + 2).tolist()
-            tried = [(self._left(Ways(far=far), pictures), far) for far in steps[1:-1]]
+        for _ in range(ROUNDS):
+            steps = np.geomspace(low, high, STEPS + 2).tolist()
+            tried = [(self._left(ways(value), pictures), value) for value in steps[1:-1]]
             found.append(min(tried))
             middle = tried.index(found[-1]) + 1
             low, high = steps[middle - 1], steps[middle + 1]
-        left, far = min(found)
-        return left, f"at {far:.3g}", Ways(far=far)
+        left, value = min(found)
+        return left, words.format(value), ways(value)
 
     def _left(self, ways: Ways, pictures: Mapping[int, NDArray[np.uint8]]) -> float:
         """Levels, root mean square, between pictures and an imitation."""

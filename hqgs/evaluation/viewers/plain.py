@@ -39,6 +39,7 @@ class Ways:
     order: Literal["depth", "reversed", "file", "distance"] = "depth"
     far: float = np.inf  # depth beyond which nothing is shown
     positions: Callable[[Floats], Floats] | None = None  # what becomes of the means [N, 3]
+    zoom: float = 1.0  # focal lengths of the viewer's camera to those that were asked for
     picture: tuple[int, int] = (1, 1)  # -1: rows, columns the other way round
 
 
@@ -65,7 +66,8 @@ def project(scene: Arrays, camera: Camera, ways: Ways) -> Splats:
     means = scene["means"].astype(np.float64)
     if ways.positions is not None:
         means = ways.positions(means)
-    K, R, width, height = camera.K, camera.viewmat[:3, :3], camera.width, camera.height
+    R, width, height = camera.viewmat[:3, :3], camera.width, camera.height
+    K = camera.K * np.array([[ways.zoom, 1, 1], [1, ways.zoom, 1], [1, 1, 1]])
     x, y, z = (means @ R.T + camera.viewmat[:3, 3]).T
     seen = (z >= NEAR_PLANE) & (z <= ways.far)
     means, x, y, z = means[seen], x[seen], y[seen], z[seen]
