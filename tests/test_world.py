@@ -233,6 +233,36 @@ def test_training_decides_the_same(tmp_path: Path) -> None:
         assert (shown - models[0][1]).abs().mean() < 1e-3
 
 
+def run_of(truth: Truth, root: Path) -> tuple[list[tuple[str, str]], list[int], Gaussians]:
+    """The rows of a run's plan, its numbers of Gaussians while it grows, and what it came to."""
+    scene = hqgs.load(write_colmap(truth, root, binary=False), test_every=0)
+    run = hqgs.train(scene, iterations=60, method="3dgs", leave_out="growth")
+    rows = [(row["what"], row["value"]) for row in run.report["plan"]]
+    return rows, [entry["gaussians"] for entry in run.history], run.model
+
+
+def test_in_units_a_power_of_two_apart_a_run_has_the_same_bits(tmp_path: Path) -> None:
+    wanted = run_of(make_truth(), tmp_path / "own")
+    for k in (-10, 10):
+        rows, counts, model = run_of(placed(make_truth(), 2.0**k, np.zeros(3)), tmp_path / str(k))
+        assert (rows, counts) == wanted[:2]
+        for name, tensor in wanted[2].named().items():
+            assert torch.equal(model.named()[name], tensor), name
+
+
+@pytest.mark.parametrize("strayed", [False, True], ids=["whole", "a camera far off"])
+def test_a_run_is_planned_alike_in_any_frame(strayed: bool, tmp_path: Path) -> None:
+    """Growth is not asked: rounding differs in a frame that is turned."""
+    truth = make_truth()
+    if strayed:
+        truth.viewmats[4][0, 3] += 1e4
+    rows, _, _ = run_of(truth, tmp_path / "own")
+    rng = np.random.default_rng(int(strayed))
+    for k in range(4):
+        moved = placed(truth, 10 ** rng.uniform(-3, 3), rng.normal(size=3) * 5e6, seed=k)
+        assert run_of(moved, tmp_path / str(k))[0] == rows
+
+
 def test_a_walk_away_from_most_photos_is_no_mistake(tmp_path: Path) -> None:
     """Without points nothing tells that a camera far off is wrong."""
     truth = make_truth(9)
