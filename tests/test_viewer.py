@@ -34,6 +34,8 @@ from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import resized
 from hqgs.show.constants import MAX_MESSAGE
+from hqgs.show.frames import trust_picture
+from hqgs.show.trust import learn_trust
 from hqgs.show.viewer import guard
 from hqgs.show.viewer.guard import allowed, start_server
 from hqgs.show.viewer.pictures import Pose, beside, same_view
@@ -279,7 +281,14 @@ def test_the_page_in_a_browser(folder: Path, capsys: pytest.CaptureFixture[str])
         assert np.abs(photo - render).mean() > 6
         # Depth.
         viewer._show.value = "depth"
-        assert np.abs(shown() - render).mean() > 15
+        depth = shown()
+        assert np.abs(depth - render).mean() > 15
+        # What the photos say of it.
+        viewer.offer_trust()
+        viewer._show.value = "trust"
+        picture = trust_picture(learn_trust(model, known).bound(camera))[190:395, 5:270]
+        assert np.abs(shown() - picture).mean() < 10  # JPEG blurs such colours
+        assert np.abs(depth - picture).mean() > 15
         assert [text for text in wrong if "deprecated" not in text] == []
         assert str(viewer._numbers.content).endswith("| Gaussians | many |")
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
     from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Camera
+    from hqgs.show.trust import Trust
 
 PATHS = ("cameras", "orbit")
 FRAMES = 240
@@ -43,8 +44,8 @@ class Render:
     """Frames per second (30, or what the path file says)."""
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
     """In pixels (as the cameras have)."""
-    show: Literal["color", "depth", "alpha"] = "color"
-    """What the pictures show."""
+    show: Literal["color", "depth", "alpha", "trust"] = "color"
+    """What the pictures show. trust: the error that 9 of 10 pixels stay below, by the run's photos."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Behind everything; 1 is white."""
     up: Annotated[
@@ -72,6 +73,7 @@ def run(options: Render) -> int:
             cameras = [resized(camera, *size) for camera in cameras]
         if out.suffix.lower() == ".png" and options.views is None:
             cameras = cameras[:1]
+        trust = _trust(options, gaussians) if options.show == "trust" else None
         started = time.perf_counter()
         render_frames(
             gaussians,
@@ -82,6 +84,7 @@ def run(options: Render) -> int:
             background=options.background,
             names=names,
             progress=_progress if sys.stderr.isatty() else None,
+            trust=trust,
         )
     except BAD_INPUT as error:
         return fail(2, error)
@@ -122,6 +125,20 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     up = known.up if options.up is None else options.up
     made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count)
     return None, made, FPS
+
+
+def _trust(options: Render, gaussians: Gaussians) -> Trust:
+    """What the photos of the run say; prints how right that is on held-out ones."""
+    from hqgs.show.trust import learn_trust, measure_trust
+
+    known = _known(options.source)
+    if known is None:
+        raise ValueError(f"--show trust: {options.source} has no cameras.json and photos/, as a run has")
+    trust = learn_trust(gaussians, known)
+    measured = measure_trust(trust, known)
+    if measured is not None:
+        print(f"trust: {measured}")
+    return trust
 
 
 def _known(source: Path) -> RunCameras | None:

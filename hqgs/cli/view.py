@@ -63,6 +63,7 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
     try:
         tell_read(gaussians)
         viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
+        viewer.offer_trust()
         viewer.set_facts({} if report is None else facts_of_photos(report))
         _tell(viewer.url, options.open)
         viewer.serve(seconds)

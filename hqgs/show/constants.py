@@ -7,6 +7,9 @@ DEPTH_SAMPLES, DEPTH_PERCENTILES = (
     (2, 98),
 )  # frames that say which depths a film shows; ends of its colours
 
+# Maps of trust.
+DOUBTFUL = 64.0  # levels of error of the reddest pixel
+
 # report.html.
 PAIRS, PAIR_SIDE, SHEET_SIDE = 8, 720, 1080  # pictures of photo and render, best, worst and between; px
 PAGE_QUALITY, PAGE_VIEWS = 82, 200  # of JPEG; cameras to jump to

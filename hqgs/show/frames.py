@@ -25,9 +25,10 @@ from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.video import pyav
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, FPS
+from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, DOUBTFUL, FPS
+from hqgs.show.trust import Trust
 
-SHOWN = ("color", "depth", "alpha")
+SHOWN = ("color", "depth", "alpha", "trust")
 FILMS = (".mp4", ".gif")
 CRF = "18"  # of x264: no difference that an eye finds
 OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
@@ -51,6 +52,7 @@ def render_frames(
     background: Sequence[float] = BACKGROUND,
     names: Sequence[str] | None = None,
     progress: OnFrame | None = None,
+    trust: Trust | None = None,
 ) -> Path:
     """Render what cameras see into a file, which appears when it is complete, or into a folder of pictures.
 
@@ -60,17 +62,20 @@ def render_frames(
         out: ends in .mp4 (H.264, with the extra `video`; odd sides lose a pixel), .gif, or .png for a single
             camera; any other path is a folder, made if it is missing, for one PNG of each camera.
         fps: frames per second of a film.
-        show: "color", "depth" (near is red, far is blue; one scale for all) or "alpha" (white is opaque).
+        show: "color", "depth" (near is red, far is blue; one scale for all), "alpha" (white is opaque) or
+            "trust" (the error that 9 of 10 pixels stay below: from blue, none, to red, 64 levels of 255).
         background: R, G, B behind everything, 1 is white.
         names: of the pictures in a folder, without .png; None: 00000, 00001, ...
         progress: is called after each frame with how many are done and how many there are.
+        trust: for "trust", of `hqgs.show.trust.learn_trust`.
 
     Returns:
         `out`.
 
     Raises:
         ValueError: no camera, a film or picture of another kind, several cameras for a .png, several sizes
-            for a film, an unknown `show`, a background that is no three numbers, or .mp4 without PyAV.
+            for a film, an unknown `show`, no `trust` where it is shown, a background that is no three
+            numbers, or .mp4 without PyAV.
         OSError: a file cannot be written; what was there before stays.
     """
     out = Path(out)
@@ -80,7 +85,7 @@ def render_frames(
         raise ValueError(f"show is {show!r}, wanted one of: {', '.join(SHOWN)}")
     if not 0 < fps <= 1000:
         raise ValueError(f"fps is {fps}, wanted a number above 0 and at most 1000")
-    pictures = _counted(frames(gaussians, cameras, show, background), len(cameras), progress)
+    pictures = _counted(frames(gaussians, cameras, show, background, trust), len(cameras), progress)
     suffix = out.suffix.lower()
     if suffix in FILMS:
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
@@ -114,6 +119,7 @@ def frames(
     cameras: Sequence[Camera],
     show: str = "color",
     background: Sequence[float] = BACKGROUND,
+    trust: Trust | None = None,
 ) -> Iterator[Picture]:
     """What each camera sees, [H, W, 3], in turn; see `render_frames`."""
     if len(background) != 3:
@@ -122,6 +128,10 @@ def frames(
         prepared = Activated(gaussians)
     if show == "color":
         yield from (prepared.color(camera, background) for camera in cameras)
+    elif show == "trust":
+        if trust is None:
+            raise ValueError("show is 'trust', which needs what the photos say of the Gaussians")
+        yield from (trust_picture(trust.bound(camera)) for camera in cameras)
     elif show == "alpha":
         yield from (_grey(prepared.depth(camera)[1]) for camera in cameras)
     else:
@@ -160,6 +170,7 @@ class Activated:
             "rasterize_mode": "antialiased" if g.antialiased else "classic",
             "packed": False,
         }
+        self.gaussians = g
         self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
 
     @torch.no_grad()
@@ -212,14 +223,23 @@ def depth_picture(
     depth: NDArray[np.float32], alpha: NDArray[np.float32], low_high: tuple[float, float]
 ) -> Picture:
     """Depths [H, W] as colours: 1 / depth from red (near) to blue (far), black where nothing is."""
-    from matplotlib import colormaps  # here: it takes a while to load
-
     low, high = low_high
     with np.errstate(divide="ignore", invalid="ignore"):
         near = (1 / depth - 1 / high) / (1 / low - 1 / high)
-    level = np.rint(np.nan_to_num(near, nan=0.0).clip(0, 1) * 255).astype(np.intp)
+    return _colored(np.nan_to_num(near, nan=0.0), alpha[..., None].clip(0, 1))
+
+
+def trust_picture(bound: NDArray[np.float32]) -> Picture:
+    """Levels of error [H, W] as colours: from blue, none, to red, DOUBTFUL."""
+    return _colored(bound / DOUBTFUL, 1.0)
+
+
+def _colored(share: NDArray[np.floating], light: NDArray[np.float32] | float) -> Picture:
+    """Shares [H, W] as colours from blue, 0, to red, 1, each channel times `light`."""
+    from matplotlib import colormaps  # here: it takes a while to load
+
     table = np.asarray(colormaps["turbo"](np.arange(256)))[:, :3]
-    return np.rint(255 * table[level] * alpha[..., None].clip(0, 1)).astype(np.uint8)
+    return np.rint(255 * table[np.rint(share.clip(0, 1) * 255).astype(np.intp)] * light).astype(np.uint8)
 
 
 def _grey(alpha: NDArray[np.float32]) -> Picture:

@@ -62,7 +62,7 @@ def read_sog(path: str | Path) -> Arrays:
         LookupError,
         TypeError,
         ArithmeticError,
-        RecursionError,
+        RuntimeError,  # zipfile's, of a newer version or a password; of JSON too deep
     ) as error:
         if isinstance(error, FileNotFoundError) and not path.exists():
             raise

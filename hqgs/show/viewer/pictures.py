@@ -13,7 +13,8 @@ from PIL import Image
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.show.constants import MOVED, STREAMED_SIDE
-from hqgs.show.frames import Activated, depth_picture, depth_range
+from hqgs.show.frames import Activated, depth_picture, depth_range, trust_picture
+from hqgs.show.trust import LazyTrust
 
 Picture = NDArray[np.uint8]
 
@@ -56,8 +57,10 @@ class Pose:
         return Camera(width, height, K, view_matrix(self.R.T, self.position))
 
 
-def shown(scene: Activated, camera: Camera, show: str) -> Picture:
-    """The picture of a camera, [H, W, 3]: "color", "depth" or "alpha"."""
+def shown(scene: Activated, camera: Camera, show: str, trust: LazyTrust) -> Picture:
+    """The picture of a camera, [H, W, 3]: "color", "depth", "alpha" or "trust"."""
+    if show == "trust":
+        return trust_picture(trust.of(scene.gaussians).bound(camera))
     if show == "color":
         return scene.color(camera)
     depth, alpha = scene.depth(camera)

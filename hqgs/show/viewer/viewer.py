@@ -23,6 +23,7 @@ from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
 from hqgs.show.constants import FRUSTUMS, PORT, SHARP, THUMB
 from hqgs.show.frames import Activated
+from hqgs.show.trust import LazyTrust
 from hqgs.show.viewer.client import Client
 from hqgs.show.viewer.guard import start_server
 from hqgs.show.viewer.measure import Ruler
@@ -45,6 +46,7 @@ class Viewer:
         self._lock = threading.RLock()
         self._known, self._folder = known, folder
         self._views: dict[str, KnownCamera] = {} if known is None else {v.name: v for v in known.views}
+        self._trust = LazyTrust(known)
         self._gaussians: Gaussians | None = None
         self._scene: Activated | None = None  # they, ready to be rendered
         self._reach = 1.0
@@ -90,6 +92,11 @@ class Viewer:
         self._facts = facts
         self._tell_photo()
 
+    def offer_trust(self) -> None:
+        """Let pages show it, of a scene that stays as it is, where the run has photos."""
+        if self._trust.possible:
+            self._show.options = (*self._show.options, "trust")
+
     def pump(self) -> bool:
         """Render what pages wait for; whether there was anything."""
         worked = False
@@ -121,7 +128,7 @@ class Viewer:
         camera = pose.camera(height)
         started = time.perf_counter()
         try:
-            picture = shown(self._scene, camera, self._show.value)
+            picture = shown(self._scene, camera, self._show.value, self._trust)
             client.took(time.perf_counter() - started, camera.height, sharp)
             picture = self._compared(picture, camera)
             picture = self.ruler.over(picture, camera) if sharp else picture
@@ -184,7 +191,7 @@ class Viewer:
                 (RASTERIZER, BROWSER),
                 hint="The browser moves smoothly and needs a graphics card; it leaves out the harmonics.",
             )
-            self._show = gui.add_dropdown("Show", ("color", "depth", "alpha"))
+            self._show: Any = gui.add_dropdown("Show", ("color", "depth", "alpha"))
             self._detail = gui.add_slider("Height, px", 200, 1600, 50, SHARP, hint="of the sharp picture")
         with gui.add_folder("Photos", visible=bool(self._views)):
             names = [v.name for v in sorted(self._views.values(), key=lambda v: not v.held_out)]
