@@ -307,7 +307,9 @@ def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.training.methods.hqgs.REFRESH", 4)  # some of it between the save and the end
+    monkeypatch.setattr(
+        "hqgs.training.methods.hqgs.SIZES_REFRESH", 4
+    )  # some of it between the save and the end
     config = tiny_config(20, method="hqgs", hqgs=fixed("blur:1"))
     whole, first, second = (Trainer(tiny_scene(), config) for _ in range(3))
     for _ in range(20):
