@@ -9,6 +9,7 @@ use crate::{
         lanes, splat as splat_lanes,
         vec3::V3,
     },
+    uninit::prefetch_all,
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
 
@@ -92,6 +93,17 @@ impl<T: Real> Coefficients<T> {
             }
         }
         rgb
+    }
+
+    /// Send for the coefficients of the group from `first` on.
+    #[inline(always)]
+    pub fn prefetch(h: &Harmonics<T>, first: usize) {
+        let (row, rest_row) = h.rows();
+        for (data, row) in [(h.coefficients, row), (h.rest.unwrap_or(&[]), rest_row)] {
+            if let Some(rows) = data.get(first * row..(first + GROUP) * row) {
+                prefetch_all(rows);
+            }
+        }
     }
 
     /// The coefficients in use of the Gaussians `first..`.

@@ -284,6 +284,10 @@ fn forward_chunk<S: Simd, T: Real>(
     for start in (0..count).step_by(GROUP) {
         let rows = GROUP.min(count - start);
         let first = begin + start;
+        if let Colors::Harmonics(ref h) = colors {
+            // A processor fetches ahead within a page, of which a group takes the most part.
+            Coefficients::prefetch(h, first + GROUP);
+        }
         inputs.read(simd, gaussians, first);
         let mut keep = group.project(simd, &inputs, camera, &camera_lanes, options, directed);
         if rows < GROUP {
