@@ -2,7 +2,11 @@
 //! overlaps among them.
 
 use crate::error::BindingResult;
-use hqgs::internals::{Error, simd::Real};
+use hqgs::internals::{
+    Error,
+    memory::{self, with_capacity},
+    simd::Real,
+};
 use numpy::{
     Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
     PyUntypedArrayMethods,
@@ -248,18 +252,6 @@ pub(crate) fn is_f32(name: &str, value: &Bound<'_, PyAny>) -> BindingResult<bool
     }
 }
 
-/// Room for `len` elements of what `name` says.
-fn with_capacity<T>(len: usize, name: &str) -> Result<Vec<T>, Error> {
-    let mut vector = Vec::new();
-    match vector.try_reserve_exact(len) {
-        Ok(()) => Ok(vector),
-        Err(_) => Err(Error::OutOfMemory {
-            name: name.into(),
-            bytes: (len as u64).saturating_mul(size_of::<T>() as u64),
-        }),
-    }
-}
-
 /// The elements of what `name` says.
 pub(crate) fn filled<T>(
     elements: impl ExactSizeIterator<Item = T>,
@@ -272,10 +264,7 @@ pub(crate) fn filled<T>(
 
 /// A gradient to be filled, with no elements if it is not `wanted`.
 pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> Result<Vec<T>, Error> {
-    let len = if wanted { len } else { 0 };
-    let mut gradient = with_capacity(len, "gradient")?;
-    gradient.resize(len, T::ZERO);
-    Ok(gradient)
+    memory::filled(T::ZERO, if wanted { len } else { 0 }, "gradient")
 }
 
 /// One array of every camera's outputs, one after the other, [C, ...].

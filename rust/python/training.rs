@@ -7,7 +7,7 @@ use hqgs::{Error, Real};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
     loss::{self, LossOptions, LossScratch, Sample},
-    rows::{self, ViewColors, ViewRows},
+    views::{self, ViewColors, ViewRows},
 };
 use numpy::{Element, IntoPyArray, PyArrayDyn};
 use pyo3::prelude::*;
@@ -218,7 +218,7 @@ fn adam_step_as<T: Real + Element>(
     Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
 }
 
-/// See [`rows::add`]: `(rows [M] i32, values [M, W] f32)` of each view are added to `sums [N, W]`, f32.
+/// See [`views::add`]: `(rows [M] i32, values [M, W] f32)` of each view are added to `sums [N, W]`, f32.
 #[pyfunction]
 fn add_rows(
     views: Vec<(Bound<'_, PyAny>, Bound<'_, PyAny>)>,
@@ -246,13 +246,13 @@ fn add_rows(
     let target = held.slice()?;
     Ok(sums
         .py()
-        .detach(|| threads::install(|| rows::add(&views, target, width, scale)))??)
+        .detach(|| threads::install(|| views::add(&views, target, width, scale)))??)
 }
 
 /// `(rows [M] i32, colors [M, 3] f32, centre, degree)`
 type ColorsOfView<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, [f64; 3], usize);
 
-/// See [`rows::add_harmonics`]. Everything but the rows' numbers is f32.
+/// See [`views::add_harmonics`]. Everything but the rows' numbers is f32.
 #[pyfunction]
 fn add_harmonics(
     views: Vec<ColorsOfView<'_>>,
@@ -287,7 +287,7 @@ fn add_harmonics(
     let (high, means_of) = (high.slice()?, means_of.slice()?);
     Ok(means
         .py()
-        .detach(|| threads::install(|| rows::add_harmonics(&views, means_of, high, scale)))??)
+        .detach(|| threads::install(|| views::add_harmonics(&views, means_of, high, scale)))??)
 }
 
 /// The numbers `[M, width]` of a view's rows `[M]`.

@@ -9,9 +9,9 @@ use hqgs_training::{
     exposure::{Frame, Photograph, Warp},
     jpeg_cells,
     loss::{self, Images, LossOptions, LossScratch},
-    rows::{self, ViewColors, ViewRows},
     separable::{Dense, Separable},
     stereo::{Other, Picture, Sweep},
+    views::{self, ViewColors, ViewRows},
 };
 use std::time::Duration;
 
@@ -173,7 +173,7 @@ fn views(c: &mut Criterion) {
             .iter()
             .map(|rows| ViewRows { rows, values: &low })
             .collect();
-        b.iter(|| rows::add(&views, &mut sums, 12, 0.25).expect("right lengths"));
+        b.iter(|| views::add(&views, &mut sums, 12, 0.25).expect("right lengths"));
     });
     group.bench_function("harmonics", |b| {
         let views: Vec<_> = shown
@@ -187,7 +187,7 @@ fn views(c: &mut Criterion) {
                 degree: 3,
             })
             .collect();
-        b.iter(|| rows::add_harmonics(&views, &means, &mut high, 0.25).expect("right lengths"));
+        b.iter(|| views::add_harmonics(&views, &means, &mut high, 0.25).expect("right lengths"));
     });
     group.finish();
 }
