@@ -59,8 +59,8 @@ struct ForwardChunk<'a, T> {
     colors: PieceWriter<'a, T>,
     slopes: PieceWriter<'a, Slopes<T>>,
     clamped: PieceWriter<'a, [u16; 3]>,
-    /// Whether colours, and how they change, are asked for.
-    asked: [bool; 3],
+    /// Whether what no image needs is asked for, the colours, and how they change.
+    asked: [bool; 4],
 }
 
 /// The colours of a group and how they change.
@@ -91,16 +91,19 @@ impl<T: Real> ForwardChunk<'_, T> {
             self.splats.put(slice::from_ref(&splat));
         }
         self.keys.put(&kept::<f64>(&group.depth, keep)[..rows]);
+        let mut radii = [0; 2 * GROUP];
+        let (x, y) = (kept(&group.radii[0], keep), kept(&group.radii[1], keep));
+        groups::write([&integers(&x), &integers(&y)], &mut radii);
+        self.radii.put(&radii[..2 * rows]);
+        if !self.asked[0] {
+            return;
+        }
         self.depths.put(&kept::<T>(&group.depth, keep)[..rows]);
         self.opacities.put(&kept::<T>(&group.opacity, keep)[..rows]);
         let mut pairs = [T::ZERO; 2 * GROUP];
         let (x, y) = (kept(&group.mean[0], keep), kept(&group.mean[1], keep));
         groups::write([&x, &y], &mut pairs);
         self.means2d.put(&pairs[..2 * rows]);
-        let mut radii = [0; 2 * GROUP];
-        let (x, y) = (kept(&group.radii[0], keep), kept(&group.radii[1], keep));
-        groups::write([&integers(&x), &integers(&y)], &mut radii);
-        self.radii.put(&radii[..2 * rows]);
         let mut conics = [T::ZERO; 3 * GROUP];
         let [a, b, c] = &group.conic;
         groups::write(
@@ -115,17 +118,19 @@ impl<T: Real> ForwardChunk<'_, T> {
     fn put_none(&mut self, rows: usize) {
         self.splats.put(&[Splat::default(); GROUP][..rows]);
         self.keys.put(&[0.0; GROUP][..rows]);
-        self.depths.put(&[T::ZERO; GROUP][..rows]);
-        self.opacities.put(&[T::ZERO; GROUP][..rows]);
-        self.means2d.put(&[T::ZERO; 2 * GROUP][..2 * rows]);
         self.radii.put(&[0; 2 * GROUP][..2 * rows]);
-        self.conics.put(&[T::ZERO; 3 * GROUP][..3 * rows]);
+        if self.asked[0] {
+            self.depths.put(&[T::ZERO; GROUP][..rows]);
+            self.opacities.put(&[T::ZERO; GROUP][..rows]);
+            self.means2d.put(&[T::ZERO; 2 * GROUP][..2 * rows]);
+            self.conics.put(&[T::ZERO; 3 * GROUP][..3 * rows]);
+        }
     }
 
     /// Give out the colours of the next `rows` Gaussians, where they are asked for.
     #[inline(always)]
     fn put_colors(&mut self, shaded: &Shaded<T>, rows: usize) {
-        let [colors, clamped, slopes] = self.asked;
+        let [_, colors, clamped, slopes] = self.asked;
         if colors {
             self.colors.put(&shaded.colors[..3 * rows]);
         }
@@ -163,7 +168,30 @@ pub fn forward<T: Real>(
     camera: &Camera,
     options: &RenderOptions,
 ) -> Result<Projected<T>, Error> {
-    let n = gaussians.len();
+    project(gaussians, colors, camera, options, true)
+}
+
+/// [`forward`] of what an image needs: `means2d`, `depths`, `conics` and `opacities` are empty.
+///
+/// # Errors
+/// As for [`forward`].
+pub fn forward_for_image<T: Real>(
+    gaussians: &Gaussians<T>,
+    colors: Colors<T>,
+    camera: &Camera,
+    options: &RenderOptions,
+) -> Result<Projected<T>, Error> {
+    project(gaussians, colors, camera, options, false)
+}
+
+fn project<T: Real>(
+    gaussians: &Gaussians<T>,
+    colors: Colors<T>,
+    camera: &Camera,
+    options: &RenderOptions,
+    all: bool,
+) -> Result<Projected<T>, Error> {
+    let (n, all) = (gaussians.len(), usize::from(all));
     options.check()?;
     let level = options.level.map_or_else(simd::level, Ok)?;
     gaussians.check()?;
@@ -179,19 +207,21 @@ pub fn forward<T: Real>(
     let groups = n.div_ceil(GROUP);
     let name = "splats";
     let (mut splats, mut keys) = (UninitVec::new(n, name)?, UninitVec::new(n, name)?);
-    let [mut means2d, mut depths, mut conics, mut opacities, mut rgb] =
-        UninitVec::several([2 * n, n, 3 * n, n, channels * n], name)?;
+    let [mut means2d, mut depths, mut conics, mut opacities, mut rgb] = UninitVec::several(
+        [2 * all * n, all * n, 3 * all * n, all * n, channels * n],
+        name,
+    )?;
     let mut radii = UninitVec::new(2 * n, name)?;
     let mut slopes = UninitVec::new(sloped * groups, name)?;
     let mut clamps = UninitVec::new(clamped_rows * groups, name)?;
     let jobs: Vec<_> = chunks(&mut splats, n, 1)
         .into_iter()
         .zip(chunks(&mut keys, n, 1))
-        .zip(chunks(&mut means2d, n, 2))
-        .zip(chunks(&mut depths, n, 1))
-        .zip(chunks(&mut conics, n, 3))
+        .zip(chunks(&mut means2d, n, 2 * all))
+        .zip(chunks(&mut depths, n, all))
+        .zip(chunks(&mut conics, n, 3 * all))
         .zip(chunks(&mut radii, n, 2))
-        .zip(chunks(&mut opacities, n, 1))
+        .zip(chunks(&mut opacities, n, all))
         .zip(chunks(&mut rgb, n, channels))
         .zip(group_chunks(&mut slopes, n, sloped))
         .zip(group_chunks(&mut clamps, n, clamped_rows))
@@ -221,7 +251,7 @@ pub fn forward<T: Real>(
                     colors: rgb.writer(),
                     slopes: slopes.writer(),
                     clamped: clamped.writer(),
-                    asked: [channels, clamped_rows, sloped].map(|row| row > 0),
+                    asked: [all, channels, clamped_rows, sloped].map(|row| row > 0),
                 };
                 dispatch!(level.token, simd => forward_chunk(
                     simd, gaussians, colors, camera, options, chunk * PROJECT_CHUNK, n, out
@@ -299,7 +329,7 @@ fn forward_chunk<S: Simd, T: Real>(
         match colors {
             Colors::Harmonics(ref h) if keep != 0 => {
                 counts.harmonics += (rows * sh::count(h.degree)) as u64;
-                let [_, clamped, sloped] = out.asked;
+                let [_, _, clamped, sloped] = out.asked;
                 counts.slopes += if sloped { rows as u64 } else { 0 };
                 let slopes = sloped.then_some(&mut shaded.slopes);
                 let clamped = clamped.then_some(&mut shaded.clamped);

@@ -120,7 +120,7 @@ pub fn forward<'a, T: Real>(
         colors: shaded,
         shading,
         ..
-    } = project::forward(&gaussians, colors, camera, options)?;
+    } = project::forward_for_image(&gaussians, colors, camera, options)?;
     let (harmonics, given) = match colors {
         Colors::Harmonics(_) => (true, &shaded[..]),
         Colors::Channels(data, _) => (false, data),
