@@ -57,6 +57,17 @@ def test_the_first_step_is_the_learning_rate() -> None:
     torch.testing.assert_close(param.detach(), torch.tensor([-0.1, 0.1, 0.0]))
 
 
+@pytest.mark.parametrize("used", [0, 3, 8, 15])
+def test_of_rows_that_are_used_in_part_the_first_are_updated(used: int) -> None:
+    """Harmonics [N, K, 3] of a degree that training has not reached."""
+    (whole, part), start = (tensors(torch.float32)[2:3] for _ in range(2)), tensors(torch.float32)[2]
+    for params, given in ((whole, {}), (part, {"used": used})):
+        set_grads(params, 1)
+        Adam([{"params": params, **given}], lr=0.1).step()
+    assert torch.equal(part[0][:, :used], whole[0][:, :used])
+    assert torch.equal(part[0][:, used:], start[:, used:])
+
+
 def test_parameters_without_a_gradient_are_left_alone() -> None:
     a, b = tensors(torch.float32)[:2]
     before = b.detach().clone()

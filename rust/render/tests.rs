@@ -342,11 +342,27 @@ struct Inputs {
     background: Vec<f64>,
     viewmat: [f64; 16],
     harmonics: bool,
+    antialiased: bool,
 }
 
 impl Inputs {
-    fn new(harmonics: bool) -> Self {
-        let scene = Synthetic::<f64>::new(12, 23, 18, 4).unwrap();
+    fn new(harmonics: bool, antialiased: bool) -> Self {
+        let mut scene = Synthetic::<f64>::new(12, 23, 18, 4).unwrap();
+        // The first one lies where the Jacobian is that of the border, the second one is opaque up to the cap.
+        let k = scene.camera.k();
+        for (i, (ratio, opacity)) in [(2.0 * k[2] / k[0], 0.7), (0.0, 0.999)]
+            .into_iter()
+            .enumerate()
+        {
+            let depth = scene.means[3 * i + 2];
+            scene.means[3 * i] = ratio * depth;
+            scene.scales[3 * i..3 * i + 3].copy_from_slice(&[
+                0.5 * depth,
+                0.4 * depth,
+                0.3 * depth,
+            ]);
+            scene.opacities[i] = opacity;
+        }
         let wave = |n: usize| (0..n).map(|i| 0.5 + 0.4 * (i as f64 * 1.7).sin()).collect();
         let (colors, background) = if harmonics {
             (scene.harmonics.clone(), wave(3))
@@ -360,6 +376,7 @@ impl Inputs {
             background,
             viewmat,
             harmonics,
+            antialiased,
         }
     }
 
@@ -385,6 +402,7 @@ impl Inputs {
                 transmittance_min: 0.0,
                 ..AccuracyKnobs::default()
             },
+            antialiased: self.antialiased,
             ..RenderOptions::default()
         };
         let background = Some(&self.background[..]);
@@ -415,10 +433,89 @@ impl Inputs {
     }
 }
 
+/// A grey Gaussian on the axis of a camera, of opacity 0.8.
+fn alone(depth: f64) -> Synthetic<f64> {
+    let mut s = Synthetic::<f64>::new(1, 32, 24, 0).unwrap();
+    s.means = vec![0.0, 0.0, depth];
+    s.scales = vec![0.2; 3];
+    s.opacities = vec![0.8];
+    s
+}
+
+#[test]
+fn a_border_of_what_is_shown_belongs_to_one_side() {
+    let s = alone(2.0);
+    let radius = |change: fn(&mut RenderOptions, f64), value: f64| {
+        let mut options = RenderOptions::default();
+        change(&mut options, value);
+        f64::from(render_with(&s, &options).radii[0])
+    };
+    let near = |o: &mut RenderOptions, x| o.near_plane = x;
+    let far = |o: &mut RenderOptions, x| o.far_plane = x;
+    let clip = |o: &mut RenderOptions, x| o.radius_clip = x;
+    let whole = radius(near, 2.0);
+    assert!(whole > 0.0 && radius(near, 2f64.next_up()) == 0.0);
+    assert!(radius(far, 2.0) == whole && radius(far, 2f64.next_down()) == 0.0);
+    assert!(radius(clip, whole - 0.5) == whole && radius(clip, whole) == 0.0);
+}
+
+#[test]
+fn depths_that_f32_does_not_tell_apart_are_ordered() {
+    let mut s = alone(2.0 + 1e-9);
+    let nearer = alone(2.0);
+    for (all, one) in [
+        (&mut s.means, nearer.means),
+        (&mut s.quats, nearer.quats),
+        (&mut s.scales, nearer.scales),
+        (&mut s.opacities, nearer.opacities),
+    ] {
+        all.extend(one);
+    }
+    let colors = [1.0, 0.0];
+    let colors = Colors::Channels(&colors, 1); // the farther one is white, the nearer one black
+    let r = forward(
+        s.gaussians(),
+        colors,
+        None,
+        &s.camera,
+        &RenderOptions::default(),
+    )
+    .unwrap();
+    let middle = 12 * 32 + 16;
+    assert!(r.alphas[middle] > 0.9 && r.image[middle] < 0.25);
+}
+
+#[test]
+fn what_no_layer_hides_shows_the_background() {
+    let s = Synthetic::<f64>::room(20_000, 150, 100, 1).unwrap();
+    let plain = render(levels()[0], &s);
+    let given = harmonics(&s);
+    let background = [3.0, 5.0, 7.0];
+    let colors = Colors::Harmonics(given);
+    let options = RenderOptions::default();
+    let r = forward(
+        s.gaussians(),
+        colors,
+        Some(&background),
+        &s.camera,
+        &options,
+    )
+    .unwrap();
+    for (pixel, alpha) in r.alphas.iter().enumerate() {
+        for (c, behind) in background.iter().enumerate() {
+            let expected = plain.image[3 * pixel + c] + (1.0 - alpha) * behind;
+            assert!(
+                (r.image[3 * pixel + c] - expected).abs() < 1e-12,
+                "pixel {pixel}"
+            );
+        }
+    }
+}
+
 #[test]
 fn gradients_are_those_of_finite_differences() {
-    for harmonics in [false, true] {
-        let mut inputs = Inputs::new(harmonics);
+    for (harmonics, antialiased) in [(false, true), (true, false)] {
+        let mut inputs = Inputs::new(harmonics, antialiased);
         let (_, g) = inputs.loss(Some(Wanted::ALL));
         let viewmat = g.viewmat.unwrap();
         assert_eq!(viewmat[12..], [0.0; 4]);
@@ -453,7 +550,7 @@ fn gradients_are_those_of_finite_differences() {
 #[test]
 fn what_is_not_wanted_is_empty_and_changes_no_bit_of_the_rest() {
     for harmonics in [false, true] {
-        let inputs = Inputs::new(harmonics);
+        let inputs = Inputs::new(harmonics, false);
         let (_, all) = inputs.loss(Some(Wanted::ALL));
         let none = Wanted::default();
         for (k, wanted) in [
