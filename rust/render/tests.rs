@@ -436,8 +436,9 @@ impl Inputs {
 /// A grey Gaussian on the axis of a camera, of opacity 0.8.
 fn alone(depth: f64) -> Synthetic<f64> {
     let mut s = Synthetic::<f64>::new(1, 32, 24, 0).unwrap();
+    s.camera = Camera::at_origin(30.0, 32, 24).unwrap();
     s.means = vec![0.0, 0.0, depth];
-    s.scales = vec![0.2; 3];
+    s.scales = vec![0.4; 3];
     s.opacities = vec![0.8];
     s
 }
