@@ -116,7 +116,7 @@ def reduce_gaussians(gaussians: Gaussians, options: ExportOptions) -> list[Reduc
         )
         g = _cut(g, degree)
         steps.append(Reduction(g, f"harmonics of {bands}", why, evidence))
-    if options.format in ("spz", "sog"):  # zeros save nothing in the others
+    if options.format == "spz":  # zeros save nothing in the others, and in SOG little: 4 % of a file for 6 dB
         fewer = _without_bands(g, degrees)
         if changed := int((fewer.shN != g.shN).flatten(1).any(dim=1).sum()):
             why = f"they change a colour by at most {options.band_tolerance:g}"
