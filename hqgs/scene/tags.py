@@ -116,7 +116,7 @@ def _opencv() -> Any:
     try:
         import cv2  # here: only tags need it
     except ImportError as error:
-        raise ValueError("tag_size needs the extra 'tags': pip install 'hqgs[tags]'") from error
+        raise ValueError(f"tag_size needs the extra 'tags': pip install 'hqgs[tags]' ({error})") from error
     return cv2
 
 

@@ -332,7 +332,11 @@ RULES = (
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
     Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {WHERE}"),
     Rule("dropout of Gaussians", dropout, f"DropGaussian, Park et al. 2025; {WHERE}"),
-    Rule("scene at the end", shown, "Polyak and Juditsky 1992; 0.0 to 0.3 dB in 11 runs on 10 captures"),
+    Rule(
+        "scene at the end",
+        shown,
+        "Polyak and Juditsky 1992; +0.1 dB on held-back training photos, mean of 12 runs, 11 better",
+    ),
     Rule("learning rates", rates, "learning_rates in schedule.py; " + CHOSEN),
     Rule("rates under noise", noise_rates, f"white noise of a pixel tells nothing of the next; {CHOSEN}"),
     Rule("left out where needless", needless, "half the time and a third of the bytes on four scenes"),
