@@ -76,6 +76,23 @@ def test_photos_that_agree_on_no_more_points_have_the_rules_of_few() -> None:
     assert (plan.discs, plan.half_size_until) == (False, 0)
 
 
+@pytest.mark.parametrize("left", ["passersby", "photos", ""])
+def test_without_an_item_of_the_photos_a_run_is_planned_as_before(left: str) -> None:
+    def plan(items: str) -> RunPlan:
+        return Prepared(
+            textured_scene(8, 64), run_config(method="hqgs", formation="none", leave_out=items)
+        ).plan()
+
+    all_of_it, some = plan("photos,passersby,growth,weight"), plan(f"{left},growth,weight".strip(","))
+    assert some.half_size_until == all_of_it.half_size_until > 0
+    kept = [
+        [row for row in p.rows if row.what not in ("passers-by", "left out at most")]
+        for p in (some, all_of_it)
+    ]
+    assert [(row.what, row.why) for row in kept[0]] == [(row.what, row.why) for row in kept[1]]
+    assert not plan("photos,passersby,growth").half_size_until
+
+
 def test_a_rule_is_one_entry() -> None:
     def seed(draft: Draft) -> list[Choice]:
         return [Choice("7", "for luck", changes={"seed": 7, "densify.every": 3})] if draft.formed else []

@@ -27,6 +27,7 @@ ITEMS = {
 }
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
+OF_PHOTOS = ("photos", "passersby")  # what is left out before a run starts; the rest is left out of the run
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 Loss = Literal["l1", "l1+dssim", "l1+scs"]
 

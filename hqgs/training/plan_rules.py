@@ -13,7 +13,7 @@ from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.photos.formula import LEARNED, parse_formation
-from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, TrainConfig
+from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
     COARSE_FACTOR,
     ENOUGH,
@@ -175,7 +175,7 @@ def smallest(draft: Draft) -> Sequence[Choice]:
 
 def half_size(draft: Draft) -> Sequence[Choice]:
     items, facts = set(draft.settings.leave_out), draft.facts
-    if draft.formed and facts.as_photographed and draft.dense and set(AUTOMATIC) <= items:
+    if draft.formed and facts.as_photographed and draft.dense and set(AUTOMATIC) - set(OF_PHOTOS) <= items:
         items.add("resolution")
     if not facts.as_photographed or facts.shortest_side < COARSE_FACTOR * SMALLEST_SIDE:
         items.discard("resolution")
@@ -292,9 +292,9 @@ def needless(draft: Draft) -> Sequence[Choice]:
     items, facts, has = set(draft.settings.leave_out), draft.facts, draft.kinds
     rows: list[Choice] = []
     if has & set(LEARNED):
-        items &= {"photos", "passersby"}
+        items &= set(OF_PHOTOS)
     elif not facts.as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
-        items &= {"photos", "passersby", "iterations"}
+        items &= {*OF_PHOTOS, "iterations"}
     left = tuple(item for item in ITEMS if item in items)
     if "growth" in items:
         why = "no photo shows more than that"
