@@ -99,6 +99,23 @@ def test_where_the_scene_is_wrong_nobody_passes_by(crowd: WildRoom) -> None:
     np.testing.assert_array_equal(passersby._contradicted(turned, 3, right, near, regions), regions == 1)
 
 
+@pytest.mark.parametrize(
+    ("scene", "photo", "passing"), [(0.4, 0.0, False), (0.6, 0.0, True), (0.6, 0.2, True), (0.6, 0.4, False)]
+)
+def test_most_of_a_region_is_borne_out_by_others(
+    scene: float, photo: float, passing: bool, crowd: WildRoom, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def depths(*asked: object) -> tuple[NDArray[np.float64], Mask]:
+        return np.ones(100), np.arange(100) < 100 * (scene if len(asked) > 4 else photo)
+
+    monkeypatch.setattr(Agreement, "depths", depths)
+    regions = np.zeros((48, 64), np.intp)
+    regions[10:20, 10:20] = 1
+    agreement, render = Agreement(crowd.clean.train, {}), as_floats(crowd.clean.train[0].image)
+    found = passersby._contradicted(agreement, 0, render, np.ones((48, 64)), regions)
+    np.testing.assert_array_equal(found, (regions == 1) & passing)
+
+
 def test_differences_that_do_not_count(crowd: WildRoom) -> None:
     view = crowd.clean.train[0]
     render: NDArray[np.float32] = as_floats(view.image)

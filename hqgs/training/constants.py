@@ -55,6 +55,7 @@ DIFFERS, DIFFERS_MUCH = 0.06, 0.12  # of white: what counts, and what a region m
 SMALLEST_PASSING = 20  # cells of a region
 DEPTHS_ASKED = 0.92, 1.08  # of the scene's: between them other photos are asked
 CONTRADICTED = 0.3  # of a region's cells: so many more look as in the scene than as in the photo
+BORNE_OUT = 0.5  # of them: most look as in the scene; where neither is borne out, photos only fail to agree
 TOO_DARK = 0.02  # of white: below, gains are not told
 
 # The guard. Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.

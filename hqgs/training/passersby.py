@@ -31,6 +31,7 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
 from hqgs.training.constants import (
+    BORNE_OUT,
     CONTRADICTED,
     DEPTHS_ASKED,
     DIFFERS,
@@ -167,8 +168,10 @@ def _contradicted(
     _, of_photo = agreement.depths(number, pixels, ranges)
     _, of_scene = agreement.depths(number, pixels, ranges, grey)
     numbers = np.arange(1, regions.max() + 1)
-    more = ndimage.mean(of_scene.astype(float) - of_photo, regions[lines, columns], numbers)
-    return np.isin(regions, numbers[np.asarray(more) >= CONTRADICTED])
+    scene, photo = (
+        np.asarray(ndimage.mean(agreed, regions[lines, columns], numbers)) for agreed in (of_scene, of_photo)
+    )
+    return np.isin(regions, numbers[(scene - photo >= CONTRADICTED) & (scene >= BORNE_OUT)])
 
 
 def _enlarged(cells: Mask, height: int, width: int) -> Mask:
