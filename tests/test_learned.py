@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from test_sfm import cards  # noqa: F401
 import hqgs
 from hqgs.base.stages import Stage
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm import learned
+from hqgs.scene.sfm import learned, run
 from hqgs.scene.sfm.folder import write_colmap_folder
 from hqgs.scene.sfm.learned import FEW
 from hqgs.scene.sfm.likely import partners
@@ -93,5 +94,26 @@ def test_features_that_are_not_there_are_told_before_work(
     ):
         with pytest.raises(ValueError, match=r"pip install 'hqgs\[learned\]'"):
             ask()
-    with pytest.raises(ValueError, match=r"features is 'surf', wanted one of: auto, sift, learned"):
+    with pytest.raises(ValueError, match=r"features is 'surf', wanted one of: sift, learned"):
         hqgs.load(tmp_path, features="surf")
+
+
+def test_what_is_kept_depends_on_what_was_asked_for_alone(
+    cards: Scene,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not on what is installed."""
+    keys = list[str]()
+
+    def stop(directory: Path, _: object) -> None:
+        keys.append(directory.name)
+        raise ValueError("stopped")
+
+    monkeypatch.setattr(run, "_run_program", stop)
+    asked: list[tuple[bool, dict[str, Any]]] = [(False, {}), (True, {}), (True, {"features": "learned"})]
+    for there, options in asked:
+        monkeypatch.setattr(learned, "is_there", lambda there=there: there)
+        with pytest.raises(ValueError, match="stopped"):
+            sfm_scene(cards, tmp_path, **options)
+    assert keys[0] == keys[1] != keys[2]

@@ -28,10 +28,8 @@ Factor = Annotated["float | None", tyro.conf.arg(metavar="F", help_behavior_hint
 Number = Annotated["int | None", tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Apart = Annotated["tuple[str, str, float] | None", tyro.conf.arg(metavar="A B METRES", help_behavior_hint="")]
 Features = Annotated[
-    Literal["auto", "sift", "learned"],
-    tyro.conf.arg(
-        help="Of photos, to find cameras; learned: by networks, hqgs[learned]; auto: where SIFT fails."
-    ),
+    Literal["sift", "learned"],
+    tyro.conf.arg(help="Of photos, to find cameras; learned: by networks, of the extra hqgs[learned]."),
 ]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 KINDS = (

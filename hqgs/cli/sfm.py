@@ -18,7 +18,7 @@ class Sfm:
     """A folder with photos, or a film."""
     out: Folder
     """Folder for the scene; missing or empty. It gets images and sparse/0, as COLMAP names them."""
-    features: Features = "auto"
+    features: Features = "sift"
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
 

@@ -92,7 +92,7 @@ class Train(Photos):
     """Begin anew in a folder that holds a run."""
     sfm: Flag = False
     """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
-    features: Features = "auto"
+    features: Features = "sift"
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
     distance: Apart = None

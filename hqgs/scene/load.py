@@ -30,7 +30,7 @@ from hqgs.scene.random_points import random_points
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
-from hqgs.scene.sfm.run import AUTO
+from hqgs.scene.sfm.run import SIFT
 from hqgs.scene.views import load_views
 from hqgs.scene.wide import with_faces
 
@@ -46,7 +46,7 @@ def load_scene(
     longest: int | None = None,
     on_stage: OnStage = silent,
     sfm: bool = False,
-    features: str = AUTO,
+    features: str = SIFT,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 

@@ -25,7 +25,7 @@ from hqgs.scene.names import KEPT, is_film, is_room
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
-from hqgs.scene.sfm.run import AUTO, check_features
+from hqgs.scene.sfm.run import SIFT, check_features
 from hqgs.scene.tags import by_tags, check_tag_size
 
 
@@ -35,7 +35,7 @@ def load(
     downscale: float = 1.0,
     test_every: int = 8,
     sfm: bool = False,
-    features: str = AUTO,
+    features: str = SIFT,
     degrade: str = "none",
     seed: int = 0,
     restore: str | Path | None = None,
@@ -59,7 +59,7 @@ def load(
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
         sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
         features: of photos, to find cameras: "sift"; "learned", which networks recognise under noise and
-            codecs (the extra `learned`); "auto": those where SIFT places too few photos, if it is there.
+            codecs (the extra `learned`).
         degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
         seed: of the degradation, and of what a built-in camera does.
         restore: weights of an image network that the training photos go through at last.

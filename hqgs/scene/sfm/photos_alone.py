@@ -20,7 +20,7 @@ from hqgs.scene.formats.colmap import model_points, registered, seen_points
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.front_door import tell_strays
-from hqgs.scene.sfm.run import AUTO, run_colmap
+from hqgs.scene.sfm.run import SIFT, run_colmap
 from hqgs.scene.sfm.tracks import sureness
 
 UP = np.array([0.0, -1.0, 0.0])  # in the world of photos alone, as in an upright camera's frame
@@ -42,7 +42,7 @@ def find_cameras(
     keep: Path | None = None,
     on_stage: OnStage = silent,
     coarse: bool = False,
-    features: str = AUTO,
+    features: str = SIFT,
 ) -> FoundCameras:
     """Cameras and points of photos that are readable, by COLMAP, as `read_photos` has them."""
     names = photos.colmap_names
@@ -96,7 +96,7 @@ def read_photos(
     keep: Path | None = None,
     on_stage: OnStage = silent,
     coarse: bool = False,
-    features: str = AUTO,
+    features: str = SIFT,
 ) -> Capture:
     """Cameras and points of a folder of photos, from all of them, by COLMAP.
 

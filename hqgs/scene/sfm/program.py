@@ -17,8 +17,8 @@ photos, where it has some; else all, or of many photos those that are alike. Whe
 rich in detail are looked at coarsely, and again finely where too few find a place. Where too few do then,
 smoothed versions of the photos are looked at, first one and then all together. Where few photos have a place
 yet, another, more tolerant pass follows, with every pair; the better of the two counts. Where it has
-`learned`, networks look at the photos where too few have a place by then; where that is true, nothing else
-does. In the end observations are moved to where the photos agree. `facts.json` says what all came to,
+`learned`, networks look at the photos in place of all that.
+In the end observations are moved to where the photos agree. `facts.json` says what all came to,
 `stage.json` what is being done now, which is read from COLMAP's log: the caller sends the output to
 `log.txt`. A second call in the same DIRECTORY goes on with the features and matches that the first one left.
 The program ends when its standard input does.
@@ -80,11 +80,11 @@ def reconstruct(directory: Path, threads: int) -> None:
     the order of numbers. Mapping has one thread and the seed 0.
     """
     given = _given(directory)
-    passes = [] if given.get("learned", False) else _by_sift(directory, given, threads)
-    if not passes or ("learned" in given and passes[0].registered < ALMOST * len(given["names"])):
-        learned = Attempt(directory, given, threads, learned=True)
-        learned.run()
-        passes[:1] = [max([*passes[:1], learned], key=lambda one: one.registered)]
+    if "learned" in given:
+        passes = [Attempt(directory, given, threads, learned=True)]
+        passes[0].run()
+    else:
+        passes = _by_sift(directory, given, threads)
     best = max(passes, key=lambda one: (one.registered, -one.tolerant))
     best.sharpen()
     facts = json.dumps({"passes": [one.facts() for one in passes]})

@@ -16,12 +16,12 @@ from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import model_points, seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
 from hqgs.scene.sfm.align import Observations, align, camera_centers, pose_auc, refine, rotation_angles
-from hqgs.scene.sfm.run import AUTO, run_colmap
+from hqgs.scene.sfm.run import SIFT, run_colmap
 from hqgs.scene.sfm.tracks import sureness
 
 
 def sfm_scene(
-    scene: Scene, keep: Path | None = None, on_stage: OnStage = silent, features: str = AUTO
+    scene: Scene, keep: Path | None = None, on_stage: OnStage = silent, features: str = SIFT
 ) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
 

@@ -40,7 +40,7 @@ IMPORTED = (
     "versions",
 )  # by PROGRAM, of this folder
 PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED)]
-FEATURES = (AUTO, SIFT, LEARNED) = ("auto", "sift", "learned")  # what COLMAP sees of photos
+FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
@@ -107,10 +107,8 @@ class Model:
     def advice(self) -> str | None:
         """What to do about photos that have no place; None: there is none."""
         told = self._to_take()
-        if told and not learned.is_there():
-            told += (
-                ". Networks may know more of them again: pip install 'hqgs[learned]', and the same command"
-            )
+        if told and not self.learned:
+            told += ". Networks may know more of them again: --features learned, of the extra hqgs[learned]"
         return f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else None
 
     def _to_take(self) -> str:
@@ -181,7 +179,7 @@ def run_colmap(
     on_stage: OnStage = silent,
     coarse: bool = False,
     called: Mapping[str, str] | None = None,
-    features: str = AUTO,
+    features: str = SIFT,
 ) -> Model:
     """COLMAP's largest model of photos.
 
@@ -197,8 +195,7 @@ def run_colmap(
         coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
             placed.
         called: what the user calls the photos of those names.
-        features: "sift", "learned" (by networks, the extra `learned`), or "auto": those where SIFT finds
-            a place for too few photos, if the extra is there.
+        features: "sift", or "learned": by networks (the extra `learned`); of panoramas it is always SIFT.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
@@ -222,8 +219,8 @@ def run_colmap(
     if coarse:
         given["coarse"] = np.array(True)
     check_features(features)
-    if "rotations" not in given and (features == LEARNED or (features == AUTO and learned.is_there())):
-        given["learned"] = np.array(features == LEARNED)
+    if features == LEARNED and "rotations" not in given:
+        given["learned"] = np.array(True)
     kept = None if keep is None else keep / _key(names, contents, given)
     if kept is not None and kept.is_dir():
         return _read(kept, called or {})
@@ -341,7 +338,7 @@ def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArr
         digest.update(part.read_bytes())
     for name, content in zip(names, contents, strict=True):
         digest.update(f"{name} {len(content)} ".encode() + content)
-    for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations", "learned"):
+    for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations"):
         if part in given:
             digest.update(given[part].tobytes())
     return digest.hexdigest()[:16]
