@@ -12,6 +12,7 @@ from scenes import random_scene
 from torch import Tensor
 
 import hqgs
+from hqgs.base.threads import one_torch_thread
 from hqgs.model.gsplat_kernels import relocation
 
 F32, F64 = torch.float32, torch.float64
@@ -73,6 +74,7 @@ def test_relocation_keeps_alpha_along_a_line(opacity: float, count: int) -> None
     assert many.sum() == pytest.approx(one.sum(), rel=1e-6)
 
 
+@one_torch_thread()
 def fit(name: str, packed: bool, steps: int = 240) -> tuple[list[float], list[int], Tensor]:
     """Losses, numbers of Gaussians and last means of a loop as gsplat's example has it."""
     gsplat = pytest.importorskip("gsplat")

@@ -182,7 +182,7 @@ def wanted(faults: list[str]) -> dict[str, str | None]:
 
 
 def test_seeded_faults_are_named_in_one_picture() -> None:
-    faults = [name for name in FAULTS if name != "antialias"]
+    faults = ["low-pass", "cut", "axes"]  # the rest, in more pictures and scenes: the slow test below
     assert verdicts(0, faults, 1) == wanted(faults)
 
 
