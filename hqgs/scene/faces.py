@@ -62,18 +62,18 @@ def face_name(name: str, face: str) -> str:
     return str(path.with_name(f"{path.stem}.{face}{path.suffix}"))
 
 
-def faces_of(camera: pycolmap.Camera) -> tuple[Face, ...]:
+def faces_of(camera: pycolmap.Camera, finer: float = 1.0) -> tuple[Face, ...]:
     """The faces that a camera sees; none where a flat picture holds what it sees.
 
     A whole face has as many pixels from edge to edge as the photo has for a right angle: in its middle it is
     a little coarser than the photo, at its edges finer, where more would only be blurred. It is cut down to
-    what the photo shows of it.
+    what the photo shows of it. `finer`: times as many pixels.
     """
-    return _faces(camera.model.name, tuple(camera.params), camera.width, camera.height)
+    return _faces(camera.model.name, tuple(camera.params), camera.width, camera.height, finer)
 
 
 @lru_cache(maxsize=64)
-def _faces(model: str, params: tuple[float, ...], width: int, height: int) -> tuple[Face, ...]:
+def _faces(model: str, params: tuple[float, ...], width: int, height: int, finer: float) -> tuple[Face, ...]:
     camera = pycolmap.Camera(model=model, params=params, width=width, height=height)
     if model == AROUND:
         radian, limit = width / (2 * math.pi), math.pi
@@ -83,7 +83,7 @@ def _faces(model: str, params: tuple[float, ...], width: int, height: int) -> tu
         radian, (degrees, limit) = float(camera.focal_length_x), _sees(camera)
         if degrees < WIDE:
             return ()
-    focal = radian * math.pi / 4
+    focal = finer * radian * math.pi / 4
     if (side := 2 * round(focal)) < LEAST_SIDE:
         return ()
     nodes = (np.arange(LATTICE) + 0.5) * (2 / LATTICE) - 1

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
-from hqgs.scene.sfm.facts import apart, counts, placed_names
+from hqgs.scene.sfm.facts import apart, borne_out, counts, placed_names
 from hqgs.scene.sfm.learned import look_learned
 from hqgs.scene.sfm.likely import MANY, likely_pairs, pairs_of_faces
 from hqgs.scene.sfm.matching import extract, match, pipeline_options
@@ -117,6 +117,7 @@ class Attempt:
         self._tell("verify", 0)
         verifier = pycolmap.GeometricVerifierOptions()
         verifier.num_threads = self.threads
+        verifier.rig_verification = self.faces > 1  # one geometry for all faces of two photos: floors repeat
         pycolmap.geometric_verification(self.database, verifier, two_view_geometry_options=self._geometry())
         models = pycolmap.incremental_mapping(
             self.database,
@@ -222,6 +223,8 @@ class Attempt:
         """What `Pass` holds of it."""
         placed = set() if self.model is None else placed_names(self.model)
         own = {"tolerant": self.tolerant, "registered": self.registered, "learned": self.learned}
+        if self.model is not None and self.faces > 1:
+            own["borne_out"] = borne_out(self.database, self.model)
         return {**own, "apart": self.apart, **counts(self.database, placed)}
 
     def _geometry(self) -> pycolmap.TwoViewGeometryOptions:

@@ -24,11 +24,11 @@ from hqgs.photos.files import (
     needs_heic,
 )
 from hqgs.scene.capture import photo_folder
-from hqgs.scene.faces import CUBE, around, face_name, faces_of
+from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.names import FRAMES
 from hqgs.scene.photo_files import MASKS, is_run
 from hqgs.scene.sfm.front_door import copies, films_beside, photos_below, strays, understood
-from hqgs.scene.sfm.panoramas import all_around, write_faces
+from hqgs.scene.sfm.panoramas import all_around, colmap_faces, write_faces
 from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
@@ -72,7 +72,7 @@ class BarePhotos:
         """
         if self.around:
             sizes = list(dict.fromkeys(self.sizes))
-            front = [faces_of(around(*size))[0] for size in sizes]
+            front = [colmap_faces(*size)[0] for size in sizes]
             of_photo = [sizes.index(size) for size in self.sizes for _ in CUBE]
             return Guess(
                 [(face.width, face.height) for face in front],

@@ -8,7 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
+
+NEAR = 4.0  # px from its epipolar line that COLMAP lets a match be
 
 
 def counts(database: Path, placed: set[str]) -> dict[str, Any]:
@@ -36,6 +39,33 @@ def counts(database: Path, placed: set[str]) -> dict[str, Any]:
         "inliers": sorted(inliers.values(), reverse=True),
         "best": best,
     }
+
+
+def borne_out(database: Path, model: pycolmap.Reconstruction) -> float:
+    """The share of the matches between photos with a place, of those that a geometry of their pair bears out,
+    that the places bear out as well: within NEAR of their epipolar lines (Sampson's distance)."""
+    images = {k: model.images[k] for k in model.reg_image_ids()}
+    cameras = {k: model.cameras[image.camera_id] for k, image in images.items()}
+    rays, agree, total = dict[int, Any](), 0, 0
+    with pycolmap.Database.open(database) as db:
+        for k in images:
+            at = np.asarray(db.read_keypoints(k), np.float64).reshape(-1, 6)[:, :2]
+            rays[k] = np.column_stack([np.asarray(cameras[k].cam_from_img(at)), np.ones(len(at))])
+        pairs, geometries = db.read_two_view_geometries()
+    for pair, geometry in zip(pairs, geometries, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(pair)
+        matches = np.asarray(geometry.inlier_matches)
+        if a not in images or b not in images or len(matches) == 0:
+            continue
+        moved = images[b].cam_from_world() * images[a].cam_from_world().inverse()
+        E = np.cross(moved.translation, moved.rotation.matrix(), axisb=0, axisc=0)
+        x, y = rays[a][matches[:, 0]], rays[b][matches[:, 1]]
+        slopes = np.column_stack([(x @ E.T)[:, :2], (y @ E)[:, :2]])
+        focal = min(cameras[k].mean_focal_length() for k in (a, b))
+        off = np.abs((y @ E * x).sum(1)) * focal
+        agree += int((off <= NEAR * np.linalg.norm(slopes, axis=1)).sum())
+        total += len(matches)
+    return agree / max(total, 1)
 
 
 def placed_names(model: pycolmap.Reconstruction) -> set[str]:

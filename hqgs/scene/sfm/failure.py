@@ -12,6 +12,7 @@ from hqgs.base.text import some
 FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
 POOR = 0.25  # of the features of the others: the same
 AGREE = 15  # matches that agree, which COLMAP asks of a pair
+BORNE_OUT = 0.85  # of the matches between panoramas: 0.90 to 0.96 at right places, 0.57 to 0.79 at wrong ones
 ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
 
 
@@ -28,6 +29,7 @@ class Pass:
     # those that a geometry bears out, and the same with a photo that has a place
     apart: list[list[str]] = field(default_factory=list)  # photos that fit each other, and no others
     learned: bool = False  # by features of networks
+    borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
 def why_no_model(photos: int, passes: Sequence[Pass]) -> str:
@@ -103,6 +105,17 @@ def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[
             between += [f"{other} and {name}" for other in near if other not in lost][:1]
         said.append(f"take photos between {some(between)}")
     return "; ".join(said)
+
+
+def why_doubtful(one: Pass) -> str:
+    """That the places of panoramas may be wrong, and what to do; empty where nothing says so."""
+    if one.borne_out is None or one.borne_out >= BORNE_OUT:
+        return ""
+    return (
+        f"Places may be wrong: they bear out only {one.borne_out:.0%} of the matches between panoramas "
+        f"(right ones {BORNE_OUT:.0%} and more). Give the panoramas at their full size, or take more, closer "
+        "together, where floors and walls repeat less"
+    )
 
 
 def counts(photos: int, passes: Sequence[Pass]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,14 @@ from hqgs.base.evenly import evenly
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode
-from hqgs.scene.faces import around, faces_of
+from hqgs.scene.faces import Face, around, faces_of
 from hqgs.scene.views import to_pinhole
 
 LEAST = 3  # photos of a scene: one alone shows no depth
 LOOKED_AT = 8  # photos of which the files do not tell
 SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of a panorama are neighbours
 POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
+FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo, so that SIFT sees all of it
 PLAIN = 0.25  # the same: a border with less shows nothing
 
 
@@ -74,12 +76,17 @@ def _closes(path: Path) -> bool:
     )
 
 
+def colmap_faces(width: int, height: int) -> tuple[Face, ...]:
+    """The faces of a panorama that COLMAP sees."""
+    return faces_of(around(width, height), FINER)
+
+
 def write_faces(path: Path, targets: list[Path], quality: int) -> None:
-    """The faces of a panorama as JPEG files, in the order of `faces_of`."""
+    """The faces of a panorama as JPEG files, in the order of `colmap_faces`."""
     pixels, _ = decode(path)
     height, width = pixels.shape[:2]
     camera = around(width, height)
-    for face, target in zip(faces_of(camera), targets, strict=True):
+    for face, target in zip(colmap_faces(width, height), targets, strict=True):
         target.parent.mkdir(parents=True, exist_ok=True)
         view = to_pinhole(camera, width, height, face=face)
         Image.fromarray(view.picture(pixels)).save(target, quality=quality, subsampling=0)

@@ -25,7 +25,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import learned, likely
-from hqgs.scene.sfm.failure import Pass, counts, what_to_take, why_few, why_lost, why_no_model
+from hqgs.scene.sfm.failure import Pass, counts, what_to_take, why_doubtful, why_few, why_lost, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
 IMPORTED = (
@@ -105,11 +105,12 @@ class Model:
         return dict(sorted(lost.items()))
 
     def advice(self) -> str | None:
-        """What to do about photos that have no place; None: there is none."""
+        """What to do about photos that have no place, or places in doubt; None: there are none."""
         told = self._to_take()
         if told and not self.learned:
             told += ". Networks may know more of them again: --features learned, of the extra hqgs[learned]"
-        return f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else None
+        told = f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else ""
+        return ". ".join(filter(None, (told, why_doubtful(self._chosen)))) or None
 
     def _to_take(self) -> str:
         names = sorted(set(map(self._name, self._chosen.features)))
