@@ -23,6 +23,9 @@ LEAST_SIDE = (
     8  # px of a face; a focal length that gives less is a mistake, which whoever reads the photo names
 )
 LEAST_SHOWN = 0.02  # of a face; one that shows less is left out
+LEAST_SPAN = (
+    0.1  # of a face's side that what it shows must span: a thinner strip would have no pixels when scaled
+)
 THETAS = 1024  # angles at which a lens is asked whether its picture still grows
 DARK = 12  # of 255: corners outside of the circle that a fisheye throws
 # rotations, face from camera: x, y and z of each face in the camera's frame (x right, y down, z forward)
@@ -94,6 +97,8 @@ def _faces(model: str, params: tuple[float, ...], width: int, height: int, finer
         if shown.mean() < LEAST_SHOWN:
             continue
         (left, right), (top, bottom) = (_span(shown, axis, side) for axis in (0, 1))
+        if min(right - left, bottom - top) < max(LEAST_SIDE, LEAST_SPAN * side):
+            continue
         K = np.array([[focal, 0, side / 2 - left], [0, focal, side / 2 - top], [0, 0, 1]])
         found.append(Face(name, rotation, right - left, bottom - top, K, limit))
     return tuple(found)

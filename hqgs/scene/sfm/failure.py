@@ -12,7 +12,9 @@ from hqgs.base.text import some
 FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
 POOR = 0.25  # of the features of the others: the same
 AGREE = 15  # matches that agree, which COLMAP asks of a pair
-BORNE_OUT = 0.85  # of the matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
+BORNE_OUT = (
+    0.85  # of the matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
+)
 ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
 
 
