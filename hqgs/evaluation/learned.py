@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,10 +11,10 @@ from PIL import Image, ImageDraw
 
 from hqgs.base.evenly import evenly
 from hqgs.evaluation.records import LearnedRecord
+from hqgs.evaluation.sheet import MOST, SIDE, sheet_of
 from hqgs.photos.pixels import as_floats, to_uint8
 
-MOST, COLUMNS = 12, 4  # photos of a picture, and side by side
-SIDE, LINE, GAP = 260, 18, 6  # px: of a photo, a caption, and between photos
+LINE = 18  # px, of a caption
 LARGER = 4  # times: trajectories are drawn so much larger than the photo
 
 
@@ -28,12 +27,7 @@ def learned_picture(
     order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"] - 2 * learned[k]["defocus_px"])
     chosen = [order[k] for k in evenly(len(order), MOST)]
     tiles = [_tile(photos[k], learned[k]) for k in chosen]
-    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
-    columns = min(COLUMNS, len(tiles))
-    sheet = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
-    for k, tile in enumerate(tiles):
-        sheet.paste(tile, (k % columns * width, k // columns * height))
-    return sheet
+    return sheet_of(tiles)
 
 
 def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord) -> Image.Image:

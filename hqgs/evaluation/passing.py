@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,12 +10,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import atomic_path
+from hqgs.evaluation.sheet import MOST, SIDE, sheet_of
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.capture import inside
 from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import View
 
-MOST, COLUMNS, SIDE, GAP = 12, 4, 260, 6  # photos, and side by side; px: of a photo, and between two
 RED, PAINT = (220, 30, 30), 0.6  # of the masked part, and its share
 
 
@@ -33,12 +32,7 @@ def passing_picture(views: Sequence[View], passing: Mapping[str, NDArray[np.bool
     shown = [view for view in views if view.name in passing]
     shown = sorted(shown, key=lambda view: -passing[view.name].mean())[:MOST]
     tiles = [_tile(view, passing[view.name]) for view in shown]
-    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
-    columns = min(COLUMNS, len(tiles))
-    sheet = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
-    for k, tile in enumerate(tiles):
-        sheet.paste(tile, (k % columns * width, k // columns * height))
-    return sheet
+    return sheet_of(tiles)
 
 
 def _tile(view: View, passing: NDArray[np.bool_]) -> Image.Image:
