@@ -20,7 +20,8 @@ LIST_BYTES = 1 << 24  # of a list of names
 MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
 COARSE = 640  # px: cameras for photos whose longer side is scaled down to no more need not be finer than that
 
-# From photos on disk to views.
+# From photos on disk to views, and to photos that are stored for COLMAP.
+JPEG_QUALITY = 95
 STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is not resampled
 SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
 BAND = 1 << 20  # pixels mapped at a time, to bound memory

@@ -20,11 +20,11 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 from hqgs.photos.video import pyav
+from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
 LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
-QUALITY = 95  # of the JPEG files
 
 
 def film_frames(
@@ -52,7 +52,7 @@ def film_frames(
             details: dict[str, float] = {}
             for number, frame in _sharpest(av, path, count, on_stage):
                 file = new / f"{number:06d}.jpg"
-                Image.fromarray(frame).save(file, quality=QUALITY, subsampling=0)
+                Image.fromarray(frame).save(file, quality=JPEG_QUALITY, subsampling=0)
                 details[file.name] = fine_detail(frame.astype(np.float64))
             write_details(new, details)
             new.rename(target)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from hqgs.base.evenly import middles
 from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import largest_weights
@@ -39,7 +40,7 @@ from hqgs.training.constants import (
     WEIGHTS,
 )
 from hqgs.training.plan import PlanRow
-from hqgs.training.schedule import Decisions, Schedule, spread
+from hqgs.training.schedule import Decisions, Schedule
 from hqgs.training.state import TrainState
 
 RULES: dict[str, object] = {  # what a result depends on beside the configuration
@@ -170,7 +171,7 @@ class Frugality:
 
     def _faint(self, state: TrainState) -> Tensor | None:
         """The Gaussians that no photo shows, bool [N]; None: all are needed."""
-        tried = spread(range(len(self.views)), TRIED)
+        tried = middles(len(self.views), TRIED)
         fewer = fewest_gaussians(self._shown(), self.views, lambda g: self._psnr(g, tried))
         if fewer is None:
             return None

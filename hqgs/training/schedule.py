@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
 from hqgs._rust import EPS2D
+from hqgs.base.evenly import middles
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
@@ -29,8 +28,6 @@ from hqgs.training.constants import (
     TAIL_PART,
 )
 from hqgs.training.plan import RunPlan
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,7 @@ class Schedule:
     @classmethod
     def of(cls, run: RunPlan, num_views: int) -> Schedule:
         """Of a run on so many training views."""
-        return cls(run, num_views, tuple(spread(range(num_views), run.held_photos)))
+        return cls(run, num_views, tuple(middles(num_views, run.held_photos)))
 
     @property
     def config(self) -> TrainConfig:
@@ -221,7 +218,7 @@ def on_the_way(scene: Scene, every: int) -> list[int]:
     trained = every * np.mean([view.camera.width * view.camera.height for view in scene.train])
     pixels = np.sort([view.camera.width * view.camera.height for view in scene.test])[::-1]
     count = int((np.cumsum(pixels) <= EVALUATED * trained).sum())
-    return spread(range(len(scene.test)), max(count, 1))
+    return middles(len(scene.test), max(count, 1))
 
 
 def smaller(view: View) -> View:
@@ -241,9 +238,3 @@ def low_pass(coarse: bool) -> float:
         return EPS2D
     own = 1 / COARSE_FACTOR**2  # a pixel of the full size, px^2 of the smaller one
     return own * EPS2D + (1 - own) / 12
-
-
-def spread(items: Sequence[T], count: int) -> list[T]:
-    """`count` of the items at most, evenly spread."""
-    count = min(count, len(items))
-    return [items[k] for k in np.linspace(0, len(items), 2 * count + 1)[1::2].astype(int)]

@@ -24,6 +24,7 @@ from hqgs.photos.files import (
     needs_heic,
 )
 from hqgs.scene.capture import photo_folder
+from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.names import FRAMES
 from hqgs.scene.photo_files import MASKS, is_run
@@ -33,7 +34,6 @@ from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
-QUALITY = 95  # of JPEG, of a converted photo
 WORKERS = 2
 
 
@@ -95,13 +95,13 @@ class BarePhotos:
         if self.around:
             targets = [folder / target for target in self.colmap_names]
             for k, name in enumerate(self.names):
-                write_faces(self.folder / name, targets[k * len(CUBE) : (k + 1) * len(CUBE)], QUALITY)
+                write_faces(self.folder / name, targets[k * len(CUBE) : (k + 1) * len(CUBE)], JPEG_QUALITY)
             return
         for target, name in self.colmap_names.items():
             path = folder / target
             path.parent.mkdir(parents=True, exist_ok=True)
             if target != name:
-                Image.fromarray(decode(self.folder / name)[0]).save(path, quality=QUALITY, subsampling=0)
+                Image.fromarray(decode(self.folder / name)[0]).save(path, quality=JPEG_QUALITY, subsampling=0)
                 continue
             try:
                 path.symlink_to(self.folder / name)

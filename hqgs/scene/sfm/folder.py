@@ -12,10 +12,11 @@ from PIL import Image
 
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import decode
+from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.film import check_film, film_frames, frame_details, write_details
 from hqgs.scene.names import existing_folder, is_film
 from hqgs.scene.scene import SfmReport
-from hqgs.scene.sfm.bare_photos import FOR_COLMAP, QUALITY, bare_photos, readable
+from hqgs.scene.sfm.bare_photos import FOR_COLMAP, bare_photos, readable
 from hqgs.scene.sfm.photos_alone import find_cameras
 from hqgs.scene.sfm.run import SIFT, check_features
 
@@ -62,7 +63,7 @@ def write_colmap_folder(
                 shutil.copyfile(found.photos.folder / original, target)
             else:
                 pixels = decode(found.photos.folder / original)[0]
-                Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
+                Image.fromarray(pixels).save(target, quality=JPEG_QUALITY, subsampling=0)
         if kept:
             write_details(images, kept)
         (out / "sparse" / "0").mkdir(parents=True)

@@ -25,6 +25,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import learned, likely
+from hqgs.scene.sfm.attempt import LARGEST
 from hqgs.scene.sfm.failure import Pass, counts, what_to_take, why_doubtful, why_few, why_lost, why_no_model
 
 PROGRAM = Path(__file__).with_name("program.py")
@@ -44,7 +45,6 @@ FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
 NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
-LARGEST = 1600  # px a side of what COLMAP looks at, as `attempt.py` has it
 LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
 AGAIN = 4  # times the first pass, that all passes take at most
 LISTEN = 0.25  # s between looks at what COLMAP is doing
