@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
-from hqgs.evaluation.intervals import CONFIDENCE, difference, half_width, with_half
+from hqgs.evaluation.constants import CONFIDENCE
+from hqgs.evaluation.intervals import difference, half_width, with_half
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene.builtin import render_view
 from hqgs.scene.builtin.sparse import ARC, HIGH, LOW, camera_on_arc

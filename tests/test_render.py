@@ -13,9 +13,9 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 
 import hqgs
 from hqgs.cli import main as cli
+from hqgs.model.formats.rows import curve_order
 from hqgs.scene.camera_files import load_cameras, save_path
 from hqgs.scene.paths import resized
-from hqgs.show.frames import _along_a_curve
 
 
 @pytest.fixture(scope="module")
@@ -176,8 +176,8 @@ def test_neighbours_come_together_whatever_lies_far_out() -> None:
     torch.manual_seed(0)
     points = torch.rand(4096, 3)
     points[7], points[8] = 1e6, torch.nan
-    order = _along_a_curve(points)
+    order = torch.from_numpy(curve_order(points.numpy()))
     assert torch.equal(order.sort().values, torch.arange(4096))
     steps = points[order].diff(dim=0).norm(dim=1).nanmedian()
     assert steps < 0.2 * points.diff(dim=0).norm(dim=1).nanmedian()  # 4,096 fill a cube at a spacing of 1/16
-    assert not len(_along_a_curve(torch.zeros(0, 3)))
+    assert not len(curve_order(np.zeros((0, 3))))

@@ -18,10 +18,10 @@ from benchmarks.quality.rivals import RIVALS
 from benchmarks.study import Cell
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
+from hqgs.evaluation.constants import AMPLIFICATION, MASKED
 from hqgs.evaluation.fit_cameras import fit_cameras
 from hqgs.evaluation.held_out import held_out_renders, measured
 from hqgs.evaluation.metrics import evaluate_view, mean_metrics, psnr
-from hqgs.evaluation.report import AMPLIFICATION, MASKED
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.photos.sheet import printable, sheet

@@ -11,9 +11,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TypedDict
 
-LARGE = 4 << 20  # bytes of an array
-KEPT_AT_THE_END = 64 << 20  # bytes of the heap's end that stay when they are free: glibc's own most
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 
@@ -121,8 +118,8 @@ def keep_large_arrays_apart() -> None:
     By itself it soon keeps those of up to 32 MB, between what stays: new ones do not fit into the holes, and
     memory grows.
     """
-    for parameter, size in ((MMAP_THRESHOLD, LARGE), (TRIM_THRESHOLD, KEPT_AT_THE_END)):
-        _of_glibc("mallopt", parameter, size)
+    _of_glibc("mallopt", -3, 4 << 20)  # M_MMAP_THRESHOLD, bytes
+    _of_glibc("mallopt", -1, 64 << 20)  # M_TRIM_THRESHOLD, which would else follow: its own most
 
 
 def give_back_memory() -> None:

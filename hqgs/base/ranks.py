@@ -29,7 +29,6 @@ HEARTBEAT = 5.0  # s: a rank that has nothing to say yet says so as often
 SILENCE = 25.0
 PIECE = 1 << 24  # bytes that are sent at once: on a slow network a long message is no silence
 NOTHING, DATA, FAILED, END = range(4)  # what a rank has to say in a round
-TORCHRUN = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")  # what it sets
 
 
 class RankError(RuntimeError):
@@ -124,7 +123,7 @@ class _Joined(Ranks):
 
         super().__init__()
         self._dist, self._torch = dist, torch
-        for name in TORCHRUN:
+        for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
             if not os.environ.get(name):
                 raise ValueError(f"{name} is not set: start several processes with torchrun")
         store, self.rank, self.count = next(rendezvous("env://", timeout=timedelta(seconds=SILENCE)))

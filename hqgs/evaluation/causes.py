@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from hqgs.base.evenly import evenly
 from hqgs.diagnosis.noise import estimate_noise
+from hqgs.evaluation.constants import BEFORE, FEW, FINE, FOG, MOST_VIEWS, PATCH
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import color_factors
 from hqgs.model.gaussians import Gaussians
@@ -28,13 +29,6 @@ from hqgs.scene.scene import Camera, View
 Floats = NDArray[np.float64]
 
 PARTS = ("color", "pose", "edge", "fog", "noise", "detail", "broad")
-PATCH = 32  # px, of the map of errors
-FINE = 2.0  # px: what a Gaussian of this deviation smooths away is fine detail
-FEW = 3  # training photos: a pixel that fewer show is at the edge of the capture
-MOST_VIEWS = 100  # training views that are asked what they show
-BEFORE = 0.75  # of the depth in its pixel: a Gaussian nearer than that hangs before the surface
-FOG = 0.1  # of a pixel's colour from such Gaussians, and it lies behind fog
-WHITE = 255.0  # levels
 
 
 @dataclass(frozen=True)
@@ -128,7 +122,7 @@ def causes(seen: RenderedView, maps: Maps, noise: float, fitted: RenderedView | 
 def noise_of(view: View) -> float:
     """Standard deviation of a photo's own noise, white is 1; 0 where texture could be it."""
     found = estimate_noise(to_levels(view.image, f"photo {view.name!r}"))
-    return found.level / WHITE if found is not None and found.level > found.limit else 0.0
+    return found.level / 255 if found is not None and found.level > found.limit else 0.0
 
 
 def shares(of: Sequence[Causes]) -> dict[str, float]:
@@ -160,4 +154,4 @@ def _patches(error: Floats, counted: NDArray[np.bool_]) -> Floats:
         return np.add.reduceat(np.add.reduceat(values, starts[0], 0), starts[1], 1)
 
     with np.errstate(invalid="ignore"):
-        return WHITE * np.sqrt(sums(np.where(counted, error, 0.0)) / sums(counted.astype(np.float64)))
+        return 255 * np.sqrt(sums(np.where(counted, error, 0.0)) / sums(counted.astype(np.float64)))

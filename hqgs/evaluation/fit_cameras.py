@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from hqgs._rust import NEAR_PLANE
 from hqgs.base.threads import one_torch_thread
+from hqgs.evaluation.constants import DAMPING, DIFFERENCE, FIT_STEPS, GIVEN_UP, SETTLED, SMOOTHED
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats
@@ -25,12 +26,6 @@ from hqgs.scene.geometry import project
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
-
-SMOOTHED = (3.0, 1.0, 0.0)  # px; coarse to fine, so that a camera may be several pixels off
-STEPS = 10  # of Gauss-Newton at each of them, at most
-DIFFERENCE = 0.3  # px by which a camera is moved to see what that changes
-SETTLED = 1e-4  # of the squared error; less gained ends a level
-DAMPING, GIVEN_UP = 1e-3, 1e4  # of the normal matrix's diagonal, at first and at most
 
 
 @dataclass(frozen=True)
@@ -130,7 +125,7 @@ def _level(
     """Levenberg's steps with photo and renders smoothed by `sigma` px."""
     render = seen(camera)
     cost, damping = _cost(render, photo, counted, sigma), DAMPING
-    for _ in range(STEPS):
+    for _ in range(FIT_STEPS):
         moves = DIFFERENCE * np.diag(units)
         slopes = np.stack([_smooth(seen(_moved(camera, move)) - render, sigma) for move in moves])
         off = _smooth(render - photo, sigma)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-CONFIDENCE = 0.9  # of every interval that the project prints
+from hqgs.evaluation.constants import CONFIDENCE
 
 
 def half_width(values: Sequence[float | None]) -> float | None:

@@ -14,9 +14,10 @@ from hqgs._rust import get_num_threads
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.causes import Causes, causes, json_of, noise_of, pixel_maps, shares, shown_by
+from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.fit_cameras import Fitted, fit_cameras
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView, held_out_renders, measured
-from hqgs.evaluation.intervals import CONFIDENCE, difference, half_widths
+from hqgs.evaluation.intervals import difference, half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians

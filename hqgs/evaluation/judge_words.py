@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from hqgs.base.text import markdown_table
+from hqgs.evaluation.constants import FEW, FINE, FOG, LEAST, WORST
 from hqgs.evaluation.intervals import with_half
 from hqgs.evaluation.verdict import verdict
 
-WORST, LEAST = 3, 0.005  # photos that the screen names; share of the error that is named
 LABELS = {
     "psnr": "PSNR (dB)",
     "psnr_aligned": "colours aligned (dB)",
@@ -20,14 +20,13 @@ LABELS = {
     "lpips_vgg": "LPIPS (VGG)",
 }
 FORMS = dict.fromkeys(LABELS, ".4f") | {"psnr": ".2f", "psnr_aligned": ".2f"}
-DOWN = ("lpips", "lpips_vgg")  # less is better
 CAUSES = {
     "color": ("colour", "what one factor for each channel of each photo sets right"),
     "pose": ("pose", "what fitting each camera sets right; without --fit-cameras it counts as detail"),
-    "edge": ("edge of the capture", "pixels whose Gaussians fewer than 3 training photos have in view"),
-    "fog": ("fog", "pixels with a tenth or more of their colour from far before the surface"),
+    "edge": ("edge of the capture", f"pixels whose Gaussians fewer than {FEW} training photos have in view"),
+    "fog": ("fog", f"pixels with more than {FOG:.0%} of their colour from far before the surface"),
     "noise": ("noise of the photos", "in no scene, where it can be told from texture"),
-    "detail": ("missing detail", "what is finer than some 4 px"),
+    "detail": ("missing detail", f"what is finer than some {2 * FINE:.0f} px"),
     "broad": ("shape and shading", "the rest: broad errors"),
 }
 
@@ -134,4 +133,5 @@ def word_for(metric: str, apart: dict[str, Any]) -> str:
     """Whether a difference is one: better, worse, or within its interval."""
     if not apart["sure"]:
         return "not sure"
-    return "better" if (apart["mean"] > 0) != (metric in DOWN) else "worse"
+    less_is_better = metric in ("lpips", "lpips_vgg")
+    return "better" if (apart["mean"] > 0) != less_is_better else "worse"

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from hqgs.base.evenly import evenly
+from hqgs.evaluation.constants import CAPTION, LARGER, SHEET_PHOTOS, TILE_SIDE
 from hqgs.evaluation.records import LearnedRecord
-from hqgs.evaluation.sheet import MOST, SIDE, sheet_of
+from hqgs.evaluation.sheet import sheet_of
 from hqgs.photos.pixels import as_floats, to_uint8
-
-LINE = 18  # px, of a caption
-LARGER = 4  # times: trajectories are drawn so much larger than the photo
 
 
 def learned_picture(
@@ -25,24 +23,24 @@ def learned_picture(
     disc out of focus (four times as large) in its middle and its gain in the caption.
     """
     order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"] - 2 * learned[k]["defocus_px"])
-    chosen = [order[k] for k in evenly(len(order), MOST)]
+    chosen = [order[k] for k in evenly(len(order), SHEET_PHOTOS)]
     tiles = [_tile(photos[k], learned[k]) for k in chosen]
     return sheet_of(tiles)
 
 
 def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord) -> Image.Image:
     picture = Image.fromarray(to_uint8(as_floats(photo)))
-    scale = SIDE / max(picture.size)
+    scale = TILE_SIDE / max(picture.size)
     picture = picture.resize((max(round(picture.width * scale), 1), max(round(picture.height * scale), 1)))
-    tile = Image.new("RGB", (picture.width, picture.height + LINE), "white")
-    tile.paste(picture, (0, LINE))
+    tile = Image.new("RGB", (picture.width, picture.height + CAPTION), "white")
+    tile.paste(picture, (0, CAPTION))
     draw = ImageDraw.Draw(tile)
     stops = float(np.log2(record["gains"]).mean())
     facts = [f"{record['shake_px']:.1f} px" if record["shake_px"] else "still"]
     facts += [f"focus {record['defocus_px']:.1f} px"] if record["defocus_px"] else []
     facts += [f"{stops:+.2f} stops"] if np.ptp(record["gains"]) or stops else []
     draw.text((2, 3), f"{Path(record['name']).stem[-16:]}  {', '.join(facts)}", fill=(25, 25, 25))
-    middle = np.array([picture.width / 2, LINE + picture.height / 2])
+    middle = np.array([picture.width / 2, CAPTION + picture.height / 2])
     trajectory = [tuple(middle + LARGER * scale * np.array(point)) for point in record["trajectory_px"]]
     if record["defocus_px"]:
         radius = LARGER * scale * record["defocus_px"]

@@ -27,14 +27,12 @@ from numpy.typing import NDArray
 
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
+from hqgs.evaluation.constants import HAARPSI_MIN_SIZE, LPIPS_MIN_SIZE
 
 METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg", "psnr_aligned")
 
 # The files that torchvision keeps its ImageNet weights in; the name ends in the start of the file's SHA-256.
 LPIPS_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
-
-HAARPSI_MIN_SIZE = 16  # pixels; the coarsest Haar filter
-LPIPS_MIN_SIZE = 63  # pixels; AlexNet's smallest input
 
 
 @dataclass(frozen=True)

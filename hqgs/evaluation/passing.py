@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import atomic_path
-from hqgs.evaluation.sheet import MOST, SIDE, sheet_of
+from hqgs.evaluation.constants import PAINT, RED, SHEET_PHOTOS, TILE_SIDE
+from hqgs.evaluation.sheet import sheet_of
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.capture import inside
 from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import View
-
-RED, PAINT = (220, 30, 30), 0.6  # of the masked part, and its share
 
 
 def save_masks(folder: Path, views: Sequence[View]) -> None:
@@ -30,7 +29,7 @@ def save_masks(folder: Path, views: Sequence[View]) -> None:
 def passing_picture(views: Sequence[View], passing: Mapping[str, NDArray[np.bool_]]) -> Image.Image:
     """Up to 12 photos, those first of which most was masked, with that part in red."""
     shown = [view for view in views if view.name in passing]
-    shown = sorted(shown, key=lambda view: -passing[view.name].mean())[:MOST]
+    shown = sorted(shown, key=lambda view: -passing[view.name].mean())[:SHEET_PHOTOS]
     tiles = [_tile(view, passing[view.name]) for view in shown]
     return sheet_of(tiles)
 
@@ -39,5 +38,5 @@ def _tile(view: View, passing: NDArray[np.bool_]) -> Image.Image:
     photo = to_uint8(as_floats(view.image)).astype(np.float64)
     photo[passing] += PAINT * (np.array(RED) - photo[passing])
     tile = Image.fromarray(photo.astype(np.uint8))
-    tile.thumbnail((SIDE, SIDE))
+    tile.thumbnail((TILE_SIDE, TILE_SIDE))
     return tile

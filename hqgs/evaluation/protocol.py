@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hqgs._rust import EPS2D
-from hqgs.evaluation.intervals import CONFIDENCE
+from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.scene.scene import Scene, View
 
 HELD_OUT, TRAINED, ALL = "test", "train", "all"

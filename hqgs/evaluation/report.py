@@ -18,8 +18,9 @@ from PIL import Image
 from hqgs.base.files import atomic_path, write_json
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import machine_facts, version_facts
+from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED, PNG_LEVEL
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
-from hqgs.evaluation.intervals import CONFIDENCE, half_widths
+from hqgs.evaluation.intervals import half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.evaluation.records import (
     GuardRecord,
@@ -46,13 +47,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 REPORT, CHART, PICTURES = "report.json", "error_vs_time.png", "comparison"
-AMPLIFICATION = 4  # of the difference in the pictures
-PNG_LEVEL = 2  # a tenth larger than zlib's default makes it, in two thirds of the time
-MASKED = (
-    150,
-    158,
-    170,
-)  # difference panel where the mask leaves the photo out: no grey that a difference has
 
 
 @dataclass(frozen=True)

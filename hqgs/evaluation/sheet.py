@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 from PIL import Image
 
-MOST, COLUMNS, SIDE, GAP = 12, 4, 260, 6  # photos, and side by side; px: of a photo, and between two
+from hqgs.evaluation.constants import SHEET_COLUMNS, TILE_GAP
 
 
 def sheet_of(tiles: Sequence[Image.Image]) -> Image.Image:
-    """One or more tiles in rows of COLUMNS, on white."""
-    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
-    columns = min(COLUMNS, len(tiles))
+    """One or more tiles in rows of SHEET_COLUMNS, on white."""
+    width, height = (max(getattr(tile, side) for tile in tiles) + TILE_GAP for side in ("width", "height"))
+    columns = min(SHEET_COLUMNS, len(tiles))
     sheet = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
     for k, tile in enumerate(tiles):
         sheet.paste(tile, (k % columns * width, k // columns * height))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hqgs.evaluation.constants import SCATTER
 from hqgs.evaluation.intervals import with_half
 from hqgs.evaluation.records import HistoryEntry
-
-SCATTER = 0.1  # dB that a run may end below its best: no more than what two seeds differ by
 
 _LEVELS = (
     (

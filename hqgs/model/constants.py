@@ -3,6 +3,7 @@
 SH_C0 = 0.28209479177387814  # the constant basis function: 1 / (2 sqrt(pi))
 MAX_SH_DEGREE = 3
 BACKGROUND = (0.0, 0.0, 0.0)  # RGB
+LEAST_SCALE = 1e-30  # that files are read with: a scale of 0 has no log
 
 # The first Gaussians.
 INITIAL_OPACITY = 0.1  # Kerbl et al. 2023

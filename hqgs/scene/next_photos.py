@@ -78,17 +78,19 @@ def _gaps(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
     return found
 
 
-def _loose(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
-    """Beside photos whose poses are loose."""
+def loose_photos(scene: Scene) -> dict[str, float]:
+    """Photos whose poses are loose, the loosest first, and what each may be off, px."""
     sure = {} if scene.sfm is None else scene.sfm.sure_px
-    if not sure:
-        return []
-    most = max(LOOSE, LOOSER * float(np.median([*sure.values()])))
-    loose = sorted((name for name, px in sure.items() if px > most), key=lambda name: -sure[name])
+    most = max(LOOSE, LOOSER * float(np.median([*sure.values()]))) if sure else 0.0
+    return dict(sorted(((name, px) for name, px in sure.items() if px > most), key=lambda item: -item[1]))
+
+
+def _loose(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
+    """Beside them."""
     places = {view.name: center for view, center in zip(views, centers, strict=True)}
     return [
-        Spot(places[name], f"beside {name}, whose place is sure to {sure[name]:.1f} px only")
-        for name in loose
+        Spot(places[name], f"beside {name}, whose place is sure to {px:.1f} px only")
+        for name, px in loose_photos(scene).items()
         if name in places
     ]
 

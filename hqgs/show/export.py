@@ -25,9 +25,8 @@ from hqgs.model.formats.sog_writer import encode_sog
 from hqgs.model.formats.spz import encode_spz, write_spz
 from hqgs.model.formats.world_file import keep_world
 from hqgs.model.gaussians import Gaussians
+from hqgs.show.constants import BAND_SHARE
 from hqgs.show.export_options import ExportOptions
-
-BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
+from hqgs.base.evenly import evenly
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import CAMERAS, load_cameras
 from hqgs.scene.paths import resized
 from hqgs.scene.scene import Camera
-
-VIEWS, SIDE = 4, 800  # as many are rendered, of at most so many px
+from hqgs.show.constants import CHANGE_SIDE, CHANGE_VIEWS
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,13 @@ def _cameras(gaussians: Gaussians, run: Path | None) -> tuple[str, list[tuple[st
         views = load_cameras(run).views
         kind = "held-out views" if any(view.held_out for view in views) else "training views"
         views = [view for view in views if view.held_out] or views
-        chosen = [
-            views[round(k * (len(views) - 1) / max(1, VIEWS - 1))] for k in range(min(VIEWS, len(views)))
-        ]
+        chosen = [views[k] for k in evenly(len(views), CHANGE_VIEWS)]
         return f"renders of {len(chosen)} {kind}", [(view.name, _small(view.camera)) for view in chosen]
-    return f"renders of {VIEWS} cameras around the scene", [
-        (f"camera {k + 1}", camera) for k, camera in enumerate(orbit(gaussians, VIEWS))
+    return f"renders of {CHANGE_VIEWS} cameras around the scene", [
+        (f"camera {k + 1}", camera) for k, camera in enumerate(orbit(gaussians, CHANGE_VIEWS))
     ]
 
 
 def _small(camera: Camera) -> Camera:
-    share = min(1.0, SIDE / max(camera.width, camera.height))
+    share = min(1.0, CHANGE_SIDE / max(camera.width, camera.height))
     return resized(camera, max(1, round(share * camera.width)), max(1, round(share * camera.height)))

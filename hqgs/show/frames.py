@@ -13,31 +13,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from hqgs.base.evenly import evenly
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND
+from hqgs.model.formats.rows import curve_order
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.video import pyav
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, DOUBTFUL, FPS
+from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, FPS, THICKNESS_OF, WORST_SHOWN
 from hqgs.show.trust import Trust
 
 SHOWN = ("color", "depth", "alpha", "trust")
 FILMS = (".mp4", ".gif")
 CRF = "18"  # of x264: no difference that an eye finds
 OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
-AROUND = 8  # Gaussians that tell how thick a surface is
-SAMPLED, BOUNDS, BITS = (
-    100_000,
-    (0.02, 0.98),
-    10,
-)  # points, quantiles and bits of an axis that make the curve's cells
 Picture = NDArray[np.uint8]
 OnFrame = Callable[[int, int], None]
 
@@ -140,21 +134,6 @@ def frames(
         yield from (depth_picture(*prepared.depth(camera), low_high) for camera in cameras)
 
 
-def _along_a_curve(means: Tensor) -> Tensor:
-    """Indices of points in the order of a curve that visits together what lies together (Morton 1966)."""
-    points = means.double().nan_to_num()
-    few = points[:: max(len(points) // SAMPLED, 1)]
-    if not len(few):
-        return torch.arange(0)
-    low, high = torch.quantile(few, torch.tensor(BOUNDS, dtype=torch.float64), dim=0)
-    cells = ((points - low) / (high - low).clamp(min=1e-12)).clamp(0, 1).mul(2**BITS - 1).long()
-    code = torch.zeros(len(points), dtype=torch.long)
-    for bit in range(BITS):
-        for axis in range(3):
-            code |= (cells[:, axis] >> bit & 1) << 3 * bit + axis
-    return code.argsort(stable=True)
-
-
 class Activated:
     """Gaussians that are rendered many times: activated once, without a gradient history, and neighbours
     together, so that a camera passes over whole groups that it does not see."""
@@ -162,7 +141,7 @@ class Activated:
     def __init__(self, gaussians: Gaussians) -> None:
         g = gaussians.detached()
         with one_torch_thread():
-            g = g.rows(_along_a_curve(g.means))
+            g = g.rows(torch.from_numpy(curve_order(g.means.numpy())))
         self.degree: int = g.sh_degree
         colors = (g.sh0, g.shN) if g.sh_degree else g.sh0
         self._how: dict[str, Any] = {
@@ -201,7 +180,7 @@ class Activated:
 
         means, quats, scales, *_ = self._tensors
         apart = (means - torch.from_numpy(at).to(means)).square().sum(1)
-        rows = apart.topk(min(AROUND, len(means)), largest=False).indices
+        rows = apart.topk(min(THICKNESS_OF, len(means)), largest=False).indices
         turns = Rotation.from_quat(np.roll(quats[rows].double().numpy(), -1, axis=1))
         return float(
             np.median(np.linalg.norm(turns.apply(ahead, inverse=True) * scales[rows].numpy(), axis=1))
@@ -230,8 +209,8 @@ def depth_picture(
 
 
 def trust_picture(bound: NDArray[np.float32]) -> Picture:
-    """Levels of error [H, W] as colours: from blue, none, to red, DOUBTFUL."""
-    return _colored(bound / DOUBTFUL, 1.0)
+    """Levels of error [H, W] as colours: from blue, none, to red, WORST_SHOWN."""
+    return _colored(bound / WORST_SHOWN, 1.0)
 
 
 def _colored(share: NDArray[np.floating], light: NDArray[np.float32] | float) -> Picture:

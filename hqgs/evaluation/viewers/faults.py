@@ -8,18 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.evaluation.constants import APART, ROUNDED, SEARCH_ROUNDS, SEARCH_STEPS, WHOLLY
 from hqgs.evaluation.viewers.plain import Floats, Ways, render
 from hqgs.model.formats.arrays import Arrays
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.scene import Camera
 
 RIGHT = "right"
-ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float32 a little more
-WHOLLY = 0.5  # of the difference to the right picture: an imitation that leaves more explains nothing
-APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not told apart
 FAR = "far clip"
 ZOOM, ZOOMS = "another field of view", (0.4, 2.5)
-STEPS, ROUNDS = 6, 4  # values that are tried between two, and how often closer together
 
 
 @dataclass(frozen=True)
@@ -144,8 +141,8 @@ class Imitations:
         """The form of a fault with the best value: looked for closer and closer around the best."""
         low, high = between
         found: list[tuple[float, float]] = []
-        for _ in range(ROUNDS):
-            steps = np.geomspace(low, high, STEPS + 2).tolist()
+        for _ in range(SEARCH_ROUNDS):
+            steps = np.geomspace(low, high, SEARCH_STEPS + 2).tolist()
             tried = [(self._left(ways(value), pictures), value) for value in steps[1:-1]]
             found.append(min(tried))
             middle = tried.index(found[-1]) + 1

@@ -22,7 +22,6 @@ from hqgs.scene.scene import Camera
 Floats = NDArray[np.float64]
 
 JACOBIAN_CLAMP = 0.3  # of half the picture, beyond its border (docs/conventions.md)
-BITS = 255.0
 
 
 @dataclass(frozen=True)
@@ -164,4 +163,4 @@ def _blended_in_bits(splats: Splats, camera: Camera, ways: Ways) -> Floats:
 
 
 def _rounded(values: Floats) -> Floats:
-    return np.rint(np.clip(values, 0, 1) * BITS) / BITS
+    return np.rint(np.clip(values, 0, 1) * 255) / 255

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.files import atomic_path
-from hqgs.model.constants import MAX_SH_DEGREE
+from hqgs.model.constants import LEAST_SCALE, MAX_SH_DEGREE
 from hqgs.model.formats.arrays import Arrays, Floats
 from hqgs.model.formats.gltf_nodes import BIN, JSON, MAGIC, VERSION, content_of, placed_meshes
 from hqgs.model.formats.rows import finite_rows, pick, to_logits, to_opacities
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 NAME = "KHR_gaussian_splatting"
 FLOAT, POINTS = 5126, 0
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-SMALLEST = 1e-30  # a scale of 0 has no log
 STEP = 2.0**-24  # of opacities near 1
 
 
@@ -190,7 +189,7 @@ def _gaussians(content: Any, buffers: list[bytes], primitive: Any) -> Arrays:
     rest = [FLIP_SH[k] * values(_harmonic(k), "VEC3") for k in range(higher)]
     return {
         "means": FLIP_MEANS * means,
-        "scales": np.log(np.maximum(scales, SMALLEST)).astype(np.float32),
+        "scales": np.log(np.maximum(scales, LEAST_SCALE)).astype(np.float32),
         "quats": np.roll(FLIP_QUATS * values(f"{NAME}:ROTATION", "VEC4"), 1, axis=1).astype(np.float32),
         "opacities": to_logits(values(f"{NAME}:OPACITY", "SCALAR")[:, 0], STEP),
         "sh0": values(f"{NAME}:SH_DEGREE_0_COEF_0", "VEC3")[:, None].astype(np.float32),

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.model.constants import SH_C0
+from hqgs.model.constants import LEAST_SCALE, SH_C0
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.rows import to_logits, whole_rows
 
 HEADER, SECTION = 4096, 1024
-SMALLEST = 1e-20  # a scale of 0 has no log
 _HARMONICS = (0, 9, 24, 45)  # values of a splat, by degree
 _BANDS = (3, 5, 7)  # coefficients of a channel in each
 
@@ -92,7 +91,7 @@ def _read(data: bytes) -> Arrays:
         raise ValueError("scales are below 0")
     arrays: Arrays = {
         "means": g["means"].astype(np.float32),
-        "scales": np.log(np.maximum(g["scales"], SMALLEST)).astype(np.float32),
+        "scales": np.log(np.maximum(g["scales"], LEAST_SCALE)).astype(np.float32),
         "quats": g["quats"].astype(np.float32),
         "opacities": to_logits(g["colors"][:, 3] / 255, 1 / 255),
         "sh0": ((g["colors"][:, None, :3] / 255 - 0.5) / SH_C0).astype(np.float32),

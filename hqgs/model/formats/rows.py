@@ -40,7 +40,7 @@ def curve_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
     """The order of points [N, 3] along a Morton curve."""
     if not len(means):
         return np.zeros(0, np.intp)
-    points = means.astype(np.float64)
+    points = np.nan_to_num(means.astype(np.float64))
     low, high = np.quantile(points, [0.01, 0.99], axis=0)  # a few far ones must not make the cells large
     cells = (points - low) / np.maximum(high - low, np.finfo(np.float64).tiny) * (2**CURVE_BITS - 1)
     cells = cells.clip(0, 2**CURVE_BITS - 1).astype(np.int64)

@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from hqgs.base.files import atomic_path
-from hqgs.model.constants import SH_C0
+from hqgs.model.constants import LEAST_SCALE, SH_C0
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.rows import finite_rows, pick, to_logits, to_opacities
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
-SMALLEST = 1e-20  # a scale of 0 has no log
 
 
 def write_splat(path: str | Path, arrays: Arrays) -> int:
@@ -63,7 +62,7 @@ def read_splat(path: str | Path) -> Arrays:
             )
     return {
         "means": rows["means"].astype(np.float32),
-        "scales": np.log(np.maximum(rows["scales"], SMALLEST)).astype(np.float32),
+        "scales": np.log(np.maximum(rows["scales"], LEAST_SCALE)).astype(np.float32),
         "quats": ((rows["quats"].astype(np.float64) - 128) / 128).astype(np.float32),
         "opacities": to_logits(rows["colors"][:, 3] / 255, 1 / 255),
         "sh0": ((rows["colors"][:, None, :3] / 255 - 0.5) / SH_C0).astype(np.float32),

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.model.constants import LEAST_SCALE
 from hqgs.model.formats.arrays import Arrays
 
 SAME = 1e-9  # of a map's linear part, from a rotation times a number: then rotations are only turned
-LEAST = 1e-30  # a scale of 0 has no log
 Array = NDArray[np.float64]
 
 
@@ -32,7 +32,7 @@ def mapped(arrays: Arrays, linear: Array, shift: Array) -> Arrays:
         factor = linear @ matrices(quats) * np.exp(logs)[:, None, :]
         axes, lengths, _ = np.linalg.svd(factor)
         axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
-        quats, logs = _quat(axes), np.log(np.maximum(lengths, LEAST))
+        quats, logs = _quat(axes), np.log(np.maximum(lengths, LEAST_SCALE))
     return {
         **arrays,
         "means": means,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import write_text
-from hqgs.evaluation.causes import PATCH
+from hqgs.evaluation.constants import PATCH
 from hqgs.evaluation.judge import Judged
 from hqgs.evaluation.judge_words import (
     CAUSES,
@@ -27,11 +27,9 @@ from hqgs.evaluation.judge_words import (
 )
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.pixels import upright
+from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_PAIRS, WORST_SHOWN
 from hqgs.show.page.page import pair, rendered
 
-PAIRS = 12  # photos with pictures: the worst ones
-WHITE = 64.0  # levels: the map's brightest
-APART = 16.0  # levels of difference between two scenes: the deepest blue and red
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
 
 
@@ -47,7 +45,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
     psnr = one["mean"]["psnr"]
     word, why = verdict(psnr)
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
-    chosen = [judged[0].names.index(name) for name in order[:PAIRS]]
+    chosen = [judged[0].names.index(name) for name in order[:WORST_PAIRS]]
     return rendered(
         "judge.html.j2",
         title=f"{Path(one['name']).name} on {protocol['photos']} photos",
@@ -69,7 +67,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
             for (part, share), color in zip(one["causes"].items(), COLORS, strict=True)
         ],
         patch=PATCH,
-        white=int(WHITE),
+        white=int(WORST_SHOWN),
         one=Path(one["name"]).name,
         other=None if against is None else Path(against["name"]).name,
         pairs=[_pair(judged, number, one["views"], against) for number in chosen],
@@ -104,11 +102,12 @@ def _pair(
     maps, causes = list[str](), measured["causes"]
     if causes is not None:
         levels = _levels(causes)
-        grey = np.rint(255 * np.clip(levels / WHITE, 0, 1))
+        grey = np.rint(255 * np.clip(levels / WORST_SHOWN, 0, 1))
         maps.append(_png(np.repeat(grey[..., None], 3, 2), view.quarter_turns))
         other = None if against is None else against["views"][view.name]["causes"]
         if other is not None:
-            apart = np.clip((_levels(other) - levels) / APART, -1, 1)[..., None]  # above 0: the one is nearer
+            apart = (_levels(other) - levels)[..., None] / DIFFERENCE_SHOWN  # above 0: the one is nearer
+            apart = apart.clip(-1, 1)
             tint = np.where(apart > 0, np.array([47, 127, 196]), np.array([200, 60, 50]))
             maps.append(_png(255 + np.abs(apart) * (tint - 255), view.quarter_turns))
     height, width = view.photo.shape[:2][:: 1 - 2 * (view.quarter_turns % 2)]

@@ -30,13 +30,11 @@ from numpy.typing import NDArray
 from hqgs.model.constants import SH_C0
 from hqgs.model.formats.codebooks import palette
 from hqgs.model.gaussians import Gaussians
+from hqgs.show.constants import BAND_COVERED, GAUSSIANS_A_SET, MOST_SETS, PAGE_GAUSSIANS
 from hqgs.show.export import along_a_curve
 
-MOST = 400_000  # Gaussians in a page
-GAUSSIANS_A_SET, MOST_SETS = 8, 1 << 13  # of harmonics
 COLORS = (-0.25, 1.25)
 LEVELS = 127
-SHARE = 0.999  # of a band's coefficients that its largest value covers
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class PackedScene:
         return len(self.data)
 
 
-def pack_scene(gaussians: Gaussians, most: int = MOST) -> PackedScene:
+def pack_scene(gaussians: Gaussians, most: int = PAGE_GAUSSIANS) -> PackedScene:
     """Quantise the Gaussians, or of more than `most` those that show most; NaN, Inf and invisible ones go.
 
     What shows most has the largest opacity times area. Many Gaussians share a set of harmonics, so that the
@@ -118,5 +116,5 @@ def _planes(values: NDArray[Any]) -> bytes:
 
 
 def _top(values: NDArray[np.float64]) -> float:
-    top = float(np.quantile(np.abs(values), SHARE)) if values.size else 0.0
+    top = float(np.quantile(np.abs(values), BAND_COVERED)) if values.size else 0.0
     return top if math.isfinite(top) and top > 0 else 1.0

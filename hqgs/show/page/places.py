@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
-from hqgs.scene.next_photos import around, next_photos
+from hqgs.scene.next_photos import around, loose_photos, next_photos
 from hqgs.scene.scene import Scene
 
 WIDTH, HEIGHT, BORDER = 640, 420, 24  # px
@@ -13,7 +13,6 @@ DOTS = 300  # points that are drawn
 INNER = 90.0  # percent of the points that the picture has room for
 ARROW = 9.0  # px, of a camera
 SURE, LOOSE, NEXT = "#2f7fc4", "#d0672a", "#c03030"
-BAD = 3.0  # times the usual: a place that is drawn as loose
 
 
 def places_chart(scene: Scene) -> Markup | None:
@@ -43,7 +42,7 @@ def places_chart(scene: Scene) -> Markup | None:
         return round(float(x), 1), round(float(y), 1)
 
     sure = {} if scene.sfm is None else scene.sfm.sure_px
-    usual = float(np.median([*sure.values()])) if sure else 0.0
+    loose = loose_photos(scene)
     parts = [
         Markup('<svg viewBox="0 0 {} {}" role="img"><title>cameras from above</title>').format(WIDTH, HEIGHT)
     ]
@@ -55,7 +54,7 @@ def places_chart(scene: Scene) -> Markup | None:
         ahead = ahead / length * ARROW if length > 1e-6 else np.zeros(2)
         x, y = at(place)
         px = sure.get(view.name)
-        color = LOOSE if px is not None and px > BAD * usual else SURE
+        color = LOOSE if view.name in loose else SURE
         words = view.name if px is None else f"{view.name}: sure to {px:.2f} px"
         mark = Markup(
             '<g stroke="{}"><circle cx="{}" cy="{}" r="3" fill="{}"><title>{}</title></circle>'

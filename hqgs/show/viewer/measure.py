@@ -14,15 +14,9 @@ from PIL import Image, ImageDraw, ImageFont
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
+from hqgs.show.constants import BAR, BAR_MARGIN, BAR_TEXT, BAR_THICK, CLICK_ERROR, CLICKED, SOLID
 from hqgs.show.frames import Activated
 from hqgs.show.viewer.pictures import Picture
-
-SIDE = 3  # px of the little picture around a click
-PIXEL = 1e-3  # radians: what a click is off
-SOLID = 0.5  # alpha, least, of something that is clicked
-BAR = 0.25  # of the picture's width that the bar takes at most
-MARGIN, THICK, TEXT = 16, 4, 16  # px
-SURE = 1.96  # deviations: 95 %
 
 
 @dataclass(frozen=True)
@@ -45,21 +39,21 @@ def picked(scene: Activated, origin: Sequence[float], direction: Sequence[float]
     ahead /= length
     right = np.cross(ahead, np.eye(3)[int(np.argmin(np.abs(ahead)))])
     right /= np.linalg.norm(right)
-    K = np.array([[1 / PIXEL, 0, SIDE / 2], [0, 1 / PIXEL, SIDE / 2], [0, 0, 1]])
+    K = np.array([[1 / CLICK_ERROR, 0, CLICKED / 2], [0, 1 / CLICK_ERROR, CLICKED / 2], [0, 0, 1]])
     R = np.stack([right, np.cross(ahead, right), ahead]).astype(np.float64)
-    depth, alpha = scene.depth(Camera(SIDE, SIDE, K, view_matrix(R, eye)))
-    middle = SIDE // 2
+    depth, alpha = scene.depth(Camera(CLICKED, CLICKED, K, view_matrix(R, eye)))
+    middle = CLICKED // 2
     if not alpha[middle, middle] >= SOLID:
         return None
     far = float(depth[middle, middle])
     at = eye + far * ahead
-    return Point(at, math.hypot(PIXEL * far, scene.thickness(at, ahead)))
+    return Point(at, math.hypot(CLICK_ERROR * far, scene.thickness(at, ahead)))
 
 
 def told_distance(a: Point, b: Point, world: World) -> str:
     """The distance of two points in words, with half of its 95 % interval."""
     length = world.unit * float(np.linalg.norm(a.at - b.at))
-    error = SURE * world.unit * math.hypot(a.error, b.error)
+    error = 1.96 * world.unit * math.hypot(a.error, b.error)
     error = math.hypot(error, length * (world.error or 0.0))
     digits = max(0, 1 - math.floor(math.log10(error))) if error > 0 else 3
     unit, scale = ("m", "") if world.metres else ("units", "; nothing tells how long a unit is")
@@ -78,11 +72,11 @@ def with_bar(picture: Picture, camera: Camera, depth: float, world: World) -> Pi
     pixels = length / world.unit / depth * camera.K[0, 0]
     shown = Image.fromarray(picture)
     draw = ImageDraw.Draw(shown)
-    x, y = MARGIN, picture.shape[0] - MARGIN
-    draw.rectangle((x - 1, y - THICK - 1, x + pixels + 1, y + 1), fill=(0, 0, 0))
-    draw.rectangle((x, y - THICK, x + pixels, y), fill=(255, 255, 255))
+    x, y = BAR_MARGIN, picture.shape[0] - BAR_MARGIN
+    draw.rectangle((x - 1, y - BAR_THICK - 1, x + pixels + 1, y + 1), fill=(0, 0, 0))
+    draw.rectangle((x, y - BAR_THICK, x + pixels, y), fill=(255, 255, 255))
     text = f"{length:g} {'m' if world.metres else 'units'}"
-    place, font = (x, y - THICK - TEXT - 6), ImageFont.load_default(TEXT)
+    place, font = (x, y - BAR_THICK - BAR_TEXT - 6), ImageFont.load_default(BAR_TEXT)
     draw.text(place, text, fill=(255, 255, 255), font=font, stroke_width=2, stroke_fill=(0, 0, 0))
     return np.array(shown)
 

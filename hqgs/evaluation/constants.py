@@ -1,0 +1,44 @@
+"""The numbers of measuring, by what they are for: what each means, its unit and where it comes from.
+
+Where no source is named they were set by hand: what parts an error has is a convention, and pictures were
+chosen by eye.
+"""
+
+# Means over photos.
+CONFIDENCE = 0.9  # of every interval of a metric
+SCATTER = 0.1  # dB that a run may end below its best: no more than what two seeds differ by
+HAARPSI_MIN_SIZE = 16  # px: the coarsest Haar filter
+LPIPS_MIN_SIZE = 63  # px: AlexNet's smallest input
+KEPT_BYTES = 256e6  # of renders that are held; 12 of 1600 x 1067 px
+
+# Where an error comes from.
+PATCH = 32  # px, of the map of errors
+FINE = 2.0  # px: what a Gaussian of this deviation smooths away is fine detail
+FEW = 3  # training photos: a pixel that fewer show is at the edge of the capture
+MOST_VIEWS = 100  # training views that are asked what they show
+BEFORE = 0.75  # of the depth in its pixel: a Gaussian nearer than that hangs before the surface
+FOG = 0.1  # of a pixel's colour from such Gaussians, and it lies behind fog
+WORST, LEAST = 3, 0.005  # photos that the screen names; share of the error that is named
+
+# Fitted cameras, by Levenberg's steps: those turned by 1.5 degrees come home (`tests/test_fit_cameras.py`).
+SMOOTHED = (3.0, 1.0, 0.0)  # px; coarse to fine, so that a camera may be several pixels off
+FIT_STEPS = 10  # of Gauss-Newton at each of them, at most
+DIFFERENCE = 0.3  # px by which a camera is moved to see what that changes
+SETTLED = 1e-4  # of the squared error; less gained ends a level
+DAMPING, GIVEN_UP = 1e-3, 1e4  # of the normal matrix's diagonal, at first and at most
+
+# Faults of viewers: with these all are told apart in five scenes (`tests/test_viewers.py`).
+ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float32 a little more
+WHOLLY = 0.5  # of the difference to the right picture: an imitation that leaves more explains nothing
+APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not told apart
+SEARCH_STEPS, SEARCH_ROUNDS = 6, 4  # values that are tried between two, and how often closer together
+
+# Pictures.
+AMPLIFICATION = 4  # of the difference
+PNG_LEVEL = 2  # a tenth larger than zlib's default makes it, in two thirds of the time
+MASKED = 150, 158, 170  # difference where the mask leaves the photo out: no grey that a difference has
+SHEET_PHOTOS, SHEET_COLUMNS = 12, 4  # on a sheet, at most; side by side
+TILE_SIDE, TILE_GAP = 260, 6  # px: of a photo on a sheet, and between two
+CAPTION = 18  # px
+LARGER = 4  # times: trajectories are drawn so much larger than the photo
+RED, PAINT = (220, 30, 30), 0.6  # of the masked part, and its share
