@@ -28,6 +28,7 @@ KEYS: dict[str, Sequence[str]] = {  # of each table's lines
     **dict.fromkeys(("quality", "time", "frugality", "features", "endurance"), RUN),
     "poses": ("scene", "degradation", "seed", "downscale"),
     "export": ("scene", "file"),
+    "intervals": ("scene", "photos"),
     "accuracy": ("inputs", "knob", "value"),
     "speed": ("part", "case", "threads"),
     "stability": ("case", "dtype"),

@@ -345,5 +345,5 @@ def _report(
         write_json(out / PLAN, plan_values(config, rows))
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
-        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, pictures))
+        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, pictures, out))
     return report

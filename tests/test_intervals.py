@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.ndimage import gaussian_filter
 
-from hqgs.evaluation.constants import CONFIDENCE
+from hqgs.evaluation.constants import CONFIDENCE, SPREAD_LOGS, SPREADS
 from hqgs.evaluation.intervals import difference, half_width, with_half
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene.builtin import render_view
@@ -20,6 +20,25 @@ def test_it_is_the_interval_of_student() -> None:
     half = half_width(values.tolist())
     assert half is not None
     assert (values.mean() - half, values.mean() + half) == pytest.approx((low, high))
+
+
+def test_photos_that_happen_to_agree_are_held_against_other_scenes() -> None:
+    """Against draws of a scene's deviation, of a mean, and of photos, weighted by what the photos show."""
+    rng, count, seen = np.random.default_rng(3), 3, 0.4
+    sigmas = SPREADS["psnr"] * np.exp(rng.normal(0, SPREAD_LOGS, 400_000))
+    weights = sigmas ** -(count - 1.0) * np.exp(-(count - 1) * (seen / sigmas) ** 2 / 2)
+    away = np.abs(rng.normal(0, sigmas / np.sqrt(count)))
+    order = np.argsort(away)
+    shares = np.cumsum(weights[order]) / weights.sum()
+    wanted = away[order][np.searchsorted(shares, CONFIDENCE)]
+    values = (25 + seen * np.array([-1, 0, 1])).tolist()
+    assert half_width(values, "psnr") == pytest.approx(wanted, rel=0.02)
+    student = half_width(values)
+    assert student is not None
+    assert student < wanted
+    assert half_width(values, "lpips") == student
+    many = rng.normal(25, 2, 40).tolist()
+    assert half_width(many, "psnr") == pytest.approx(half_width(many), rel=0.02)
 
 
 def test_there_is_none_where_photos_do_not_tell() -> None:

@@ -56,7 +56,7 @@ def test_loose_poses_and_what_one_other_photo_shows_are_told() -> None:
     assert loose.told == "beside 07.jpg, whose place is sure to 2.5 px only"
     np.testing.assert_array_equal(loose.at, scene.train[7].camera.center)
     assert alone.told == "beside 11.jpg: 67% of what it shows is in one other photo at most"
-    chart = places_chart(scene)
+    chart = places_chart(scene, next_photos(scene))
     assert chart is not None
     assert len(re.findall(r"<g stroke", chart)) == 24
     assert "07.jpg: sure to 2.50 px" in chart
@@ -67,7 +67,7 @@ def test_loose_poses_and_what_one_other_photo_shows_are_told() -> None:
 def test_names_are_escaped_in_the_picture() -> None:
     scene = ring([0, 20, 40])
     scene = replace(scene, train=[replace(scene.train[0], name="<b>.jpg"), *scene.train[1:]])
-    chart = places_chart(scene)
+    chart = places_chart(scene, next_photos(scene))
     assert chart is not None
     assert "<b>" not in chart
-    assert places_chart(replace(scene, train=scene.train[:1])) is None
+    assert places_chart(replace(scene, train=scene.train[:1]), []) is None

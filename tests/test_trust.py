@@ -6,17 +6,33 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import plyfile
 import pytest
 import torch
+from scipy import stats
 from test_ply import random_gaussians
 from tiny_scene import tiny_scene
 
 import hqgs
 from hqgs.cli import main as cli
+from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, save_cameras
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.show.trust import EMPTY, FLOOR, GOOD, _ause, _back, learn_trust, measure_trust
+from hqgs.show.trust import (
+    EMPTY,
+    FLOOR,
+    GOOD,
+    SHARE,
+    Held,
+    Trust,
+    _back,
+    bound_of,
+    calibrated,
+    learn_trust,
+)
+from hqgs.show.trust_measured import SPREAD, SPREAD_PHOTOS, _ause, measure_trust, predict_psnr
+from hqgs.show.trust_next import doubtful_spots
 
 
 def solid() -> Gaussians:
@@ -56,14 +72,78 @@ def test_what_the_photos_show_otherwise_is_not_trusted(tmp_path: Path) -> None:
         doubtful = error > 10
         assert 0.05 < float(doubtful.float().mean()) < 0.95
         assert float(bound[doubtful].mean()) > 2 * float(bound[error < 2].mean())
-    measured = measure_trust(trust, known)
+    measured = measure_trust(trust)
     assert measured is not None
     assert measured.ause < 0.5 * measured.by_photos
     assert measured.right > 0.95
     assert 0.2 < measured.good < 0.8
     assert "AUSE" in str(measured)
     none = replace(known, views=[view for view in known.views if not view.held_out])
-    assert measure_trust(trust, none) is None
+    alone = learn_trust(g, none)
+    assert measure_trust(alone) is None
+    assert alone.factor == 1
+    assert torch.equal(alone.errors * trust.factor, trust.errors)
+
+
+def held(error: np.ndarray, carried: np.ndarray, psnr: float = 25.0) -> Held:
+    one = np.ones_like(error)
+    return Held("a", tiny_scene().test[0].camera, psnr, error, carried, one, one)
+
+
+def test_the_factor_keeps_nine_of_ten_pixels_below_their_bound() -> None:
+    rng = np.random.default_rng(0)
+    carried = rng.uniform(0.001, 0.05, (60, 50)).astype(np.float32)
+    error = (carried * rng.exponential(3.0, carried.shape)).astype(np.float32).clip(0, 1)
+    some = held(error, carried)
+    factor = calibrated([some])
+    below = lambda f: float((255 * error <= bound_of(np.float32(f) * carried, some.alpha)).mean())  # noqa: E731
+    assert below(factor) == pytest.approx(SHARE, abs=0.001)
+    assert calibrated([held(error, carried / 4)]) == pytest.approx(4 * factor, rel=1e-3)
+    assert calibrated([]) == 1
+
+
+def test_the_factor_grows_until_what_is_called_good_is() -> None:
+    """8 % of the pixels are wrong by 60 levels, carried as if by none: 9 of 10 stay below all the same."""
+    error = np.full((100, 100), 0.001, np.float32)
+    error[:8] = 60 / 255
+    carried = np.full_like(error, 0.1)
+    carried[:16] = 0.001
+    some = held(error, carried)
+    factor = calibrated([some])
+    bound = bound_of(np.float32(factor) * carried, some.alpha)
+    good = bound <= GOOD
+    assert (255 * error <= bound).mean() >= SHARE
+    assert not good.any() or (255 * error <= GOOD)[good].mean() >= SHARE
+
+
+def test_psnr_of_a_path_by_hand() -> None:
+    """Photos that are all alike say their own PSNR, with the spread that is known before them."""
+    g, scene = solid(), tiny_scene()
+    carried = np.full((20, 30), 0.02, np.float32)
+    some = tuple(held(carried, carried, psnr) for psnr in (24.0, 25.0, 26.0))
+    trust = Trust(g, torch.full((len(g),), 0.02), torch.zeros(len(g)), 1.0, some)
+    cameras = [view.camera for view in scene.test]
+    found = predict_psnr(trust, cameras, [view.camera for view in scene.train])
+    assert found is not None
+    freedom = SPREAD_PHOTOS + 2
+    spread = np.sqrt((SPREAD_PHOTOS * SPREAD**2 + 2) / freedom)
+    off = found.mean - 25  # what the path shows less well than the held-out photos do, at a slope of 1
+    wanted = stats.t.ppf(0.95, freedom) * spread * np.sqrt(1 + 1 / 3 + off**2 / 5)
+    assert found.half_width == pytest.approx(wanted)
+    assert len(found.each) == len(cameras)
+    assert predict_psnr(Trust(g, trust.errors, trust.photos), cameras, cameras) is None
+
+
+def test_what_is_said_of_held_out_photos_is_so(tmp_path: Path) -> None:
+    g = solid()
+    scene = as_run(tmp_path, g, g.means[:, 0] > g.means[:, 0].median())
+    known = load_cameras(tmp_path)
+    trust = learn_trust(g, known)
+    found = predict_psnr(trust, known.test, known.train)
+    assert found is not None
+    true = [psnr(g.render(v.camera).numpy(), v.image) for v in scene.test]
+    assert np.mean([t for t in true if t is not None]) == pytest.approx(found.mean, abs=found.half_width)
+    assert found.half_width < 6
 
 
 def test_each_gaussian_gets_its_weights_in_the_pixels() -> None:
@@ -121,9 +201,88 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     as_run(tmp_path / "run", g, g.means[:, 0] > 0)
     call = ["render", str(tmp_path / "run"), "--show", "trust", "--out", str(tmp_path / "maps")]
     assert cli.main([*call, "--views", "test"]) == 0
-    assert "trust: on the held-out photos " in capsys.readouterr().out
+    assert "trust: on 1 held-out photo " in capsys.readouterr().out
     assert len([*(tmp_path / "maps").glob("*.png")]) == len(tiny_scene().test)
     g.save(tmp_path / "alone.ply")
     call = ["render", str(tmp_path / "alone.ply"), "--show", "trust", "--out", str(tmp_path / "a.png")]
     assert cli.main(call) == 2
     assert "has no cameras.json and photos/" in capsys.readouterr().err
+
+
+def test_a_path_is_rendered_with_what_photos_of_it_would_show(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    g = solid()
+    as_run(tmp_path, g, g.means[:, 0] > 0)
+    call = ["render", str(tmp_path), "--frames", "3", "--out", str(tmp_path / "frames")]
+    assert cli.main(call) == 0
+    told = capsys.readouterr().out
+    assert "photos from this path would differ from it by a PSNR of" in told
+    assert "90% interval, by 1 held-out photo)" in told
+    (tmp_path / "photos" / "00000.jpg").unlink()
+    assert cli.main(call) == 0
+    assert "would differ" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.full.ply", "a.spz", "a.sog", "a.splat"])
+def test_files_hold_it_or_say_that_they_do_not(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    g = solid()
+    g.opacities[3] = -20.0  # left out
+    as_run(tmp_path / "run", g, g.means[:, 0] > 0)
+    errors = learn_trust(g, load_cameras(tmp_path / "run")).errors.clamp(max=1)
+    call = ["export", str(tmp_path / "run"), "--trust", "--out"]
+    holds = name in ("a.ply", "a.glb")
+    assert cli.main([*call, str(tmp_path / name)]) == (0 if holds else 2)
+    told = capsys.readouterr()
+    if holds:
+        back = Gaussians.load(tmp_path / name)
+        assert back.errors is not None
+        assert torch.equal(back.errors, torch.cat([errors[:3], errors[4:]]))
+        maps = ["render", str(tmp_path / name), "--show", "trust", "--out", str(tmp_path / "map.png")]
+        assert cli.main([*maps, "--size", "40", "30"]) == 0
+        back.save(tmp_path / "again.ply")
+        assert torch.equal(Gaussians.load(tmp_path / "again.ply").errors, back.errors)  # type: ignore[arg-type]
+    else:
+        assert f"--trust: a .{name[2:]} file has no place for it; .ply and .glb files have" in told.err
+        g.errors = errors
+        g.save(tmp_path / "with.ply")
+        assert cli.main(["export", str(tmp_path / "with.ply"), "--out", str(tmp_path / name)]) == 0
+        assert f"left out: trust of the Gaussians: a .{name[2:]} file" in capsys.readouterr().out
+        assert Gaussians.load(tmp_path / name).errors is None
+
+
+def test_where_little_is_known_is_told(tmp_path: Path) -> None:
+    g = solid()
+    scene = as_run(tmp_path, g, g.means[:, 0] > 0)
+    photos = [view for view in load_cameras(tmp_path).views if not view.held_out]
+    trust = Trust(g, torch.full((len(g),), 0.001), torch.zeros(len(g)))
+    found = doubtful_spots(trust, photos)
+    assert found
+    for spot in found:
+        name = next(view.name for view in scene.train if f" {view.name}: " in spot.told)
+        camera = next(view.camera for view in scene.train if view.name == name)
+        x, y, z = camera.viewmat[:3, :3] @ (spot.at - camera.center)
+        assert z == pytest.approx(0, abs=1e-6)
+        side = {"left of": (-1, 0), "right of": (1, 0), "above": (0, -1), "below": (0, 1)}
+        wanted = next(direction for words, direction in side.items() if spot.told.startswith(words))
+        np.testing.assert_allclose(np.sign([x, y]) * (np.abs([x, y]) > 1e-6), wanted)
+    same = Trust(g, torch.full((len(g),), EMPTY), torch.zeros(len(g)))
+    assert doubtful_spots(same, photos) == []
+    assert doubtful_spots(trust, photos[:1]) == []
+
+
+def test_another_reader_finds_the_column(tmp_path: Path) -> None:
+    g = solid()
+    g.errors = torch.linspace(0, 1, len(g))
+    g.save(tmp_path / "a.ply")
+    rows = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"].data
+    np.testing.assert_array_equal(rows["hqgs_error"], g.errors.numpy())
+    rows = rows.copy()
+    rows["hqgs_error"][:3] = np.nan, -1, 7
+    plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(tmp_path / "b.ply")
+    back = Gaussians.load(tmp_path / "b.ply")
+    assert len(back) == len(g)
+    assert back.errors is not None
+    assert back.errors[:3].tolist() == [1, 1, 1]

@@ -12,8 +12,8 @@ from hqgs.base.files import PLY
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Photos, load, ready, tell_read
-from hqgs.model.formats.files import WRITERS, format_of, scene_file
+from hqgs.cli.scenes import Factor, Flag, Photos, cameras_beside, load, ready, tell_read
+from hqgs.model.formats.files import ERRORS, WRITERS, format_of, scene_file
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class ExportScene:
     """SPZ: 3, which more programs read, or 4, which is smaller and which newer ones ask for."""
     band_tolerance: Annotated[float, tyro.conf.arg(metavar="T")] = DEFAULTS.band_tolerance
     """Harmonics that change a colour by no more are left out; white is 1."""
+    trust: Flag = False
+    """Also write the error of what each Gaussian shows, by the photos of the run: PLY, glTF."""
     scene: Annotated[str | None, tyro.conf.arg(metavar="SCENE", help_behavior_hint="")] = None
     """Measure the file on the held-out photos of this scene."""
     downscale: Factor = None
@@ -65,12 +67,19 @@ def run(args: ExportScene) -> int:
         source = scene_file(args.source)
         if args.out.exists() and args.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is left out would be lost")
+        if args.trust and options.format not in ERRORS:
+            places = " and ".join(f".{name}" for name in ERRORS)
+            raise ValueError(f"--trust: a .{options.format} file has no place for it; {places} files have")
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
         from hqgs.model.gaussians import Gaussians
         from hqgs.show.export import export
         from hqgs.show.export_change import measure
 
         gaussians = Gaussians.load(source)
+        if args.trust:
+            from hqgs.show.trust import trust_of
+
+            gaussians.errors = trust_of(gaussians, cameras_beside(args.source)).errors.clamp(max=1)
         scene = None
         if args.scene is not None:
             ready(args.scene)

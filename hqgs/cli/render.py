@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import Factor, Number, tell_read
+from hqgs.cli.scenes import Factor, Number, cameras_beside, tell_read
 from hqgs.model.formats.files import scene_file
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Camera
     from hqgs.show.trust import Trust
+    from hqgs.show.trust_measured import Predicted
 
 PATHS = ("cameras", "orbit")
 FRAMES = 240
@@ -74,6 +75,7 @@ def run(options: Render) -> int:
         if out.suffix.lower() == ".png" and options.views is None:
             cameras = cameras[:1]
         trust = _trust(options, gaussians) if options.show == "trust" else None
+        predicted = _predicted(options, gaussians, cameras, trust)
         started = time.perf_counter()
         render_frames(
             gaussians,
@@ -95,6 +97,8 @@ def run(options: Render) -> int:
     px = f"{kinds[0][0]} x {kinds[0][1]} px" if len(kinds) == 1 else "several sizes"
     many = f"{len(cameras)} frames" if len(cameras) > 1 else "1 frame"
     print(f"{out}: {many}, {px}, {len(gaussians)} Gaussians, {len(cameras) / seconds:.1f} frames/s")
+    if predicted is not None:
+        print(f"photos from this path would differ from it by a PSNR of {predicted}")
     return 0
 
 
@@ -106,7 +110,7 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     from hqgs.show.constants import FPS
 
     source, views, path, frames = options.source, options.views, options.path, options.frames
-    known = _known(source)
+    known = cameras_beside(source)
     count = FRAMES if frames is None else frames
     if views is not None:
         if known is None:
@@ -129,24 +133,38 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
 
 def _trust(options: Render, gaussians: Gaussians) -> Trust:
     """What the photos of the run say; prints how right that is on held-out ones."""
-    from hqgs.show.trust import learn_trust, measure_trust
+    from hqgs.show.trust import trust_of
+    from hqgs.show.trust_measured import measure_trust
 
-    known = _known(options.source)
-    if known is None:
-        raise ValueError(f"--show trust: {options.source} has no cameras.json and photos/, as a run has")
-    trust = learn_trust(gaussians, known)
-    measured = measure_trust(trust, known)
+    known = cameras_beside(options.source)
+    if known is None and gaussians.errors is None:
+        raise ValueError(
+            f"--show trust: {options.source} has no cameras.json and photos/, as a run has, nor errors "
+            "of its Gaussians, as hqgs export --trust writes"
+        )
+    trust = trust_of(gaussians, known)
+    measured = measure_trust(trust)
     if measured is not None:
         print(f"trust: {measured}")
+    elif known is not None:
+        print("trust: not calibrated, as the run held out no photo: bounds are those of other captures")
     return trust
 
 
-def _known(source: Path) -> RunCameras | None:
-    """The cameras of a run's folder, or of the folder that a scene file lies in."""
-    from hqgs.scene.camera_files import CAMERAS, load_cameras
+def _predicted(
+    options: Render, gaussians: Gaussians, cameras: list[Camera], trust: Trust | None
+) -> Predicted | None:
+    """What photos from a path would show of a run that held some out; None of anything else."""
+    from hqgs.show.trust import trust_of
+    from hqgs.show.trust_measured import predict_psnr
 
-    folder = source if source.is_dir() else source.parent
-    return load_cameras(folder) if (folder / CAMERAS).is_file() else None
+    known = cameras_beside(options.source)
+    if options.views is not None or len(cameras) < 2 or known is None:
+        return None
+    kept = [view.held_out for view in known.views if view.photo is not None and view.photo.is_file()]
+    if len(set(kept)) < 2 or len(kept) < len(known.views):
+        return None
+    return predict_psnr(trust_of(gaussians, known) if trust is None else trust, cameras, known.train)
 
 
 def _chosen(known: RunCameras, views: str) -> list[tuple[str, Camera]]:

@@ -20,6 +20,7 @@ from hqgs.scene.names import existing_folder, is_film, is_room
 if TYPE_CHECKING:
     from hqgs.cli.progress import LoadingScreen
     from hqgs.model.gaussians import Gaussians
+    from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Scene
 
 SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -92,6 +93,14 @@ def tell_read(gaussians: Gaussians) -> None:
     """What the reading of a scene file left out or changed."""
     for note in gaussians.notes:
         print(f"read: {note}", flush=True)
+
+
+def cameras_beside(source: Path) -> RunCameras | None:
+    """The cameras of a run's folder, or of the folder that a scene file lies in; None where none are."""
+    from hqgs.scene.camera_files import CAMERAS, load_cameras
+
+    folder = source if source.is_dir() else source.parent
+    return load_cameras(folder) if (folder / CAMERAS).is_file() else None
 
 
 def load(photos: Photos, screen: LoadingScreen) -> Scene:

@@ -6,6 +6,10 @@ chosen by eye.
 
 # Means over photos.
 CONFIDENCE = 0.9  # of every interval of a metric
+# The deviation of photos' values within a scene, its median over nine captures, and the deviation of its log
+# between them: what a few photos that happen to agree are held against.
+SPREADS = {"psnr": 2.0, "psnr_aligned": 2.0, "ssim": 0.025, "haarpsi": 0.04}
+SPREAD_LOGS = 0.7
 SCATTER = 0.1  # dB that a run may end below its best: no more than what two seeds differ by
 HAARPSI_MIN_SIZE = 16  # px: the coarsest Haar filter
 LPIPS_MIN_SIZE = 63  # px: AlexNet's smallest input

@@ -14,18 +14,40 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hqgs.evaluation.constants import CONFIDENCE
+from hqgs.evaluation.constants import CONFIDENCE, SPREAD_LOGS, SPREADS
 
 
-def half_width(values: Sequence[float | None]) -> float | None:
-    """Half the interval of the mean of photos' values; None of fewer than two, or where one is None."""
+def half_width(values: Sequence[float | None], metric: str | None = None) -> float | None:
+    """Half the interval of the mean of photos' values; None of fewer than two, or where one is None.
+
+    Of a few photos that happen to agree Student's is too narrow: of a metric whose spread in other scenes is
+    known, it is no less than what that and the photos say together.
+    """
     known = [value for value in values if value is not None]
     if len(known) < max(2, len(values)):
         return None
     from scipy.special import stdtrit  # here: the command line waits for no scipy
 
     quantile = float(stdtrit(len(known) - 1, (1 + CONFIDENCE) / 2))
-    return quantile * float(np.std(known, ddof=1)) / math.sqrt(len(known))
+    deviation = float(np.std(known, ddof=1))
+    half = quantile * deviation / math.sqrt(len(known))
+    return half if metric not in SPREADS else max(half, _expected(SPREADS[metric], deviation, len(known)))
+
+
+def _expected(usual: float, deviation: float, count: int) -> float:
+    """Half the interval of a mean, of normal values whose log deviation is normal around that of `usual`."""
+    from scipy.special import erf
+
+    away = np.linspace(-4, 4, 161)
+    sigmas = usual * np.exp(SPREAD_LOGS * away)
+    logs = -(count - 1) * (np.log(sigmas) + (deviation / sigmas) ** 2 / 2) - away**2 / 2
+    weights = np.exp(logs - logs.max())
+    low, high = 0.0, 10 * float(sigmas[-1])
+    for _ in range(60):
+        half = (low + high) / 2
+        inside = float(weights @ erf(half * math.sqrt(count / 2) / sigmas) / weights.sum())
+        low, high = (half, high) if inside < CONFIDENCE else (low, half)
+    return high
 
 
 @dataclass(frozen=True)
@@ -52,7 +74,7 @@ def difference(one: Sequence[float | None], other: Sequence[float | None]) -> Di
 
 def half_widths(views: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, float | None]:
     """`half_width` of each metric of these names."""
-    return {name: half_width([view[name] for view in views]) for name in names}
+    return {name: half_width([view[name] for view in views], name) for name in names}
 
 
 def with_half(value: float, half: float | None, form: str) -> str:

@@ -53,6 +53,7 @@ class Gaussians:
     look: Camera | None = field(default=None, init=False, compare=False)  # for notebooks; in no file
     world: World = field(default_factory=World, init=False, compare=False)  # the frame of its files
     antialiased: bool = field(default=False, init=False, compare=False)  # rendered with that compensation
+    errors: Tensor | None = field(default=None, init=False, compare=False)  # [N], of trust, white is 1
     notes: list[str] = field(default_factory=list, init=False, compare=False)  # of the file it was read from
 
     def __post_init__(self) -> None:
@@ -105,6 +106,8 @@ class Gaussians:
             self.antialiased,
             self.notes,
         )
+        if self.errors is not None and len(self.errors) == len(made):
+            made.errors = self.errors
         return made
 
     def in_world(self, world: World) -> Gaussians:
@@ -131,7 +134,9 @@ class Gaussians:
 
     def rows(self, chosen: Tensor) -> Gaussians:
         """Some of them: `chosen` bool [N], or the rows' numbers [M]."""
-        return self.like({name: tensor[chosen] for name, tensor in self.named().items()})
+        made = self.like({name: tensor[chosen] for name, tensor in self.named().items()})
+        made.errors = None if self.errors is None else self.errors[chosen]
+        return made
 
     def arrays(self) -> Arrays:
         """The same values (shared memory) as numpy arrays, by the names of the fields."""
@@ -147,6 +152,8 @@ class Gaussians:
             arrays["world"] = self.world
         if self.antialiased:
             arrays["antialiased"] = True
+        if self.errors is not None:
+            arrays["errors"] = self.errors.numpy()
         return arrays
 
     def activated_scales(self) -> Tensor:
@@ -268,6 +275,8 @@ class Gaussians:
         made.look = first_camera(file.parent) if file.name == PLY else None
         made.world = arrays.get("world", made.world)
         made.antialiased, made.notes = arrays.get("antialiased", False), arrays.get("notes", [])
+        if "errors" in arrays:
+            made.errors = torch.from_numpy(arrays["errors"])
         return made
 
     @classmethod

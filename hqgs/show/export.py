@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
-from hqgs.model.formats.files import ANTIALIASED
+from hqgs.model.formats.files import ANTIALIASED, ERRORS
 from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.sog_writer import encode_sog
 from hqgs.model.formats.spz import encode_spz, write_spz
@@ -68,6 +68,8 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     if gaussians.antialiased and options.format not in ANTIALIASED:
         why = f"a .{options.format} file has no place for it: what is finer than a pixel is shown too opaque"
         left_out.append(LeftOut("the antialias flag", why))
+    if gaussians.errors is not None and options.format not in ERRORS:
+        left_out.append(LeftOut("trust of the Gaussians", f"a .{options.format} file has no place for it"))
     return Export(path, written, len(reduced), reduced.sh_degree, left_out, clipped)
 
 
@@ -168,7 +170,7 @@ def _size(gaussians: Gaussians, options: ExportOptions) -> int | None:
     """Bytes of the file without the text of a header; None where SPZ cannot hold them."""
     n, higher = len(gaussians), 3 * gaussians.shN.shape[1]
     if options.format in ("ply", "glb"):
-        return 4 * n * (3 + 3 + higher + 1 + 3 + 4)
+        return 4 * n * (3 + 3 + higher + 1 + 3 + 4 + (gaussians.errors is not None))
     if options.format == "full.ply":
         return 4 * n * 62
     if options.format == "splat":

@@ -4,12 +4,14 @@ A Gaussian gets the error of the pixels that it shows in: u of the model w u = |
 pixels of all photos, w the blending weights, by expectation maximisation (Richardson 1972, Lucy 1974), which
 keeps u above 0. Rendered as a channel, u is what the photos say of a new pixel; what no photo saw keeps a
 prior. After GS-U and PRIMU (2508.02443), with one value for all directions and one curve for all scenes:
-more features and a fit for each scene did not pay (docs/log.md).
+more features and a fit for each scene did not pay (docs/log.md). One factor on u is fitted for each run, to
+the photos that it held out (`calibrated`): scenes learn their training photos by heart in different degrees.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,17 +27,44 @@ from hqgs.scene.camera_files import KnownCamera, RunCameras
 from hqgs.scene.paths import resized
 from hqgs.scene.scene import Camera
 
-PHOTOS, SIDE = 64, 400  # of the training photos are looked at, at most so many px wide and high
+PHOTOS, LEAST_PHOTOS, SIDE = 64, 4, 400  # training photos that are looked at; px, of their longer side
 ROUNDS = 4  # of the maximisation: more change the order of the pixels by less than its scatter
 PRIOR, PRIOR_PIXELS = 0.1, 1.0  # error of a Gaussian (white is 1), and how many pixels' weight that has
 EMPTY = 0.3  # error of what is behind everything
 FLOOR = 0.002  # keeps ratios of errors finite: half a level
-POWER, SCALE = 0.70, 0.52  # from what is carried to what 9 of 10 pixels of new views stay below: fitted
-GOOD = 20.0  # levels of 255
+POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
+SHARE = 0.9  # of the pixels: what a bound promises
+GOOD = 20.0  # levels of 255: a pixel is called good whose bound is no higher
+LEAST_GOOD = 0.005  # of the pixels: fewer good ones tell nothing
+HELD = 40  # held-out photos that calibrate, at most
 SEEN = 0.5  # pixels' weight that a Gaussian has in a photo that sees it
-STEPS = 50  # of a sparsification curve
 Array = NDArray[np.float32]
 OnPass = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Held:
+    """A held-out photo against its render, with what the training photos say of its pixels, [H, W]."""
+
+    name: str
+    camera: Camera
+    psnr: float  # dB, at the size that it was kept in
+    error: Array  # mean of the channels, white is 1
+    carried: Array  # before calibration
+    alpha: Array
+    seen: Array  # training photos
+
+    def needed(self) -> NDArray[np.floating]:
+        """The factor on what is carried at which each pixel's bound meets its error, flat."""
+        known = np.minimum(self.error, (self.error / SCALE) ** (1 / POWER) - FLOOR)
+        return self._factor(known)
+
+    def good_below(self) -> NDArray[np.floating]:
+        """The largest factor at which each pixel is called good, flat."""
+        return self._factor(np.minimum(GOOD / 255, (GOOD / 255 / SCALE) ** (1 / POWER) - FLOOR))
+
+    def _factor(self, known: NDArray[np.floating] | float) -> NDArray[np.floating]:
+        return ((known - EMPTY * (1 - self.alpha)) / np.maximum(self.carried, 1e-6)).ravel()
 
 
 @dataclass(frozen=True)
@@ -43,27 +72,49 @@ class Trust:
     """What the photos say of each Gaussian, by `learn_trust`."""
 
     gaussians: Gaussians
-    errors: Tensor  # [N], mean over the channels, white is 1
-    photos: Tensor  # [N], how many see it
+    errors: Tensor  # [N], mean over the channels, white is 1; calibrated
+    photos: Tensor  # [N], how many see it; 0 where a file says the errors
+    factor: float = 1.0  # by which the errors were calibrated
+    held: tuple[Held, ...] = ()  # what calibrated them
 
     def bound(self, camera: Camera) -> Array:
         """Levels of 255 that a pixel's error, the mean of its channels, stays below 9 times of 10, [H, W].
 
-        Fitted on other scenes. Of photos that are blurred or noisy, it is the distance from such photos.
+        Of photos that are blurred or noisy, it is the distance from such photos.
         """
-        carried, alpha = self._shown(camera, self.errors)
-        known = carried + EMPTY * (1 - alpha)
-        return (255 * np.maximum(known, SCALE * (known + FLOOR) ** POWER)).clip(0, 255)
+        return bound_of(*self.shown(camera, self.errors))
 
-    def seen(self, camera: Camera) -> Array:
-        """How many photos see what a pixel shows, [H, W]: the measure that the bound is compared with."""
-        return self._shown(camera, self.photos)[0]
-
-    def _shown(self, camera: Camera, values: Tensor) -> tuple[Array, Array]:
+    def shown(self, camera: Camera, values: Tensor) -> tuple[Array, Array]:
+        """Values of the Gaussians, [N], blended as colours are, and alpha, both [H, W]."""
         with one_torch_thread(), torch.no_grad():
             near = self.gaussians.near_plane()
             carried, alpha, _ = self.gaussians.rasterize(camera, values[:, None], near_plane=near)
         return carried[0, ..., 0].numpy(), alpha[0, ..., 0].numpy()
+
+
+def bound_of(carried: Array, alpha: Array) -> Array:
+    """Levels of 255."""
+    known = carried + EMPTY * (1 - alpha)
+    return (255 * np.maximum(known, SCALE * (known + FLOOR) ** POWER)).clip(0, 255)
+
+
+def calibrated(held: Sequence[Held]) -> float:
+    """The factor on what is carried at which SHARE of the photos' pixels stay below their bound, and SHARE
+    of those that are called good are good: the least one. 1 without a photo."""
+    if not held:
+        return 1.0
+    needed = np.concatenate([one.needed() for one in held])
+    below = np.concatenate([one.good_below() for one in held])
+    factor = max(float(np.quantile(needed, SHARE)), 0.0)
+    right = np.concatenate([h.error.ravel() for h in held]) <= GOOD / 255
+    order = np.argsort(-below, kind="stable")
+    shares = np.cumsum(right[order]) / np.arange(1, len(order) + 1)
+    called = int((below >= factor).sum())
+    if called <= LEAST_GOOD * len(order) or shares[called - 1] >= SHARE:
+        return factor
+    enough = np.flatnonzero(shares[:called] >= SHARE)
+    last = int(enough[-1]) if len(enough) and enough[-1] >= LEAST_GOOD * len(order) else 0
+    return float(max(factor, below[order[last]]))
 
 
 class LazyTrust:
@@ -73,31 +124,43 @@ class LazyTrust:
         self._known = known
         self._trust: Trust | None = None
 
-    @property
-    def possible(self) -> bool:
-        """Whether the run has training photos."""
+    def possible(self, gaussians: Gaussians) -> bool:
+        """Whether the run has training photos, or the file of the Gaussians says their errors."""
+        if gaussians.errors is not None:
+            return True
         views = [] if self._known is None else self._known.views
         return any(view.photo is not None for view in views if not view.held_out)
 
     def of(self, gaussians: Gaussians) -> Trust:
         """ValueError where it is not possible."""
         if self._trust is None or self._trust.gaussians is not gaussians:
-            self._trust = learn_trust(gaussians, self._known or RunCameras(np.zeros(3), []))
+            self._trust = trust_of(gaussians, self._known)
         return self._trust
 
 
-def learn_trust(gaussians: Gaussians, known: RunCameras, progress: OnPass | None = None) -> Trust:
-    """What the training photos of a run, in its folder, say of its Gaussians.
+def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
+    """Of a run's photos; or without them, what the file of the Gaussians says. ValueError without either."""
+    photos = known is not None and any(v.photo is not None for v in known.views if not v.held_out)
+    if gaussians.errors is not None and not photos:
+        return Trust(gaussians, gaussians.errors, torch.zeros(len(gaussians)))
+    return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
 
+
+def learn_trust(
+    gaussians: Gaussians, known: RunCameras, progress: OnPass | None = None, photos: int = PHOTOS
+) -> Trust:
+    """What the photos of a run, in its folder, say of its Gaussians.
+
+    The errors are those of at most `photos` training photos, the factor is that of the held-out ones.
     `progress` hears how many passes over a photo are done, and how many there are. ValueError where the run
     has no training photo.
     """
     views = [view for view in known.views if not view.held_out and view.photo is not None]
     if not views:
         raise ValueError("trust needs the photos of a run: give its folder, with cameras.json and photos/")
-    chosen, n = [views[k] for k in evenly(len(views), PHOTOS)], len(gaussians)
+    chosen, n = [views[k] for k in evenly(len(views), photos)], len(gaussians)
     looks, done = list[tuple[Camera, Tensor]](), 0
-    sums, photos = torch.zeros(n, 2), torch.zeros(n)  # sums of weights, and of weights times errors
+    sums, seen = torch.zeros(n, 2), torch.zeros(n)  # sums of weights, and of weights times errors
 
     def tell() -> None:
         nonlocal done
@@ -107,13 +170,13 @@ def learn_trust(gaussians: Gaussians, known: RunCameras, progress: OnPass | None
 
     with one_torch_thread():
         for view in chosen:
-            camera, error = _error(gaussians, view)
+            camera, error, _ = error_of(gaussians, view)
             looks.append((camera, error))
             both = _back(
                 gaussians, camera, torch.zeros(n, 2), torch.stack([torch.ones_like(error), error], -1)
             )
             sums += both
-            photos += both[:, 0] > SEEN
+            seen += both[:, 0] > SEEN
             tell()
         weights, prior = sums[:, 0] + PRIOR_PIXELS, PRIOR * PRIOR_PIXELS
         errors = (sums[:, 1] + prior) / weights
@@ -123,7 +186,14 @@ def learn_trust(gaussians: Gaussians, known: RunCameras, progress: OnPass | None
                 found += _back(gaussians, camera, errors[:, None], error[..., None], ratio=True)[:, 0]
                 tell()
             errors = (errors * found + prior) / weights
-    return Trust(gaussians, errors, photos)
+    carried, held = Trust(gaussians, errors, seen), list[Held]()
+    out = [view for view in known.views if view.held_out and view.photo is not None]
+    for k in evenly(len(out), HELD):
+        camera, error, psnr = error_of(gaussians, out[k])
+        shown = *carried.shown(camera, errors), carried.shown(camera, seen)[0]
+        held.append(Held(out[k].name, camera, psnr, error.numpy(), *shown))
+    factor = calibrated(held)
+    return Trust(gaussians, factor * errors, seen, factor, tuple(held))
 
 
 def _back(
@@ -138,63 +208,27 @@ def _back(
     return values.grad
 
 
-def _error(gaussians: Gaussians, view: KnownCamera) -> tuple[Camera, Tensor]:
-    """A smaller camera of a view, and the error of its render, mean of the channels, [H, W]."""
+def error_of(gaussians: Gaussians, view: KnownCamera) -> tuple[Camera, Tensor, float]:
+    """A smaller camera of a view, the error of its render there, mean of the channels, [H, W], and the PSNR,
+    dB, of a held-out one at the size that the photo was kept in."""
     assert view.photo is not None
     with Image.open(view.photo) as file:
         picture = file.convert("RGB")
+    psnr = None
+    if view.held_out and max(picture.size) > SIDE:
+        psnr = psnr_of(_off(gaussians, view.camera, picture)[1])
     picture.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
-    photo = torch.from_numpy(np.array(picture)).float() / 255
-    camera = resized(view.camera, picture.width, picture.height)
-    with torch.no_grad():
-        render = gaussians.render(camera)
-    return camera, (render.clamp(0, 1) - photo).abs().mean(-1)
+    camera, off = _off(gaussians, view.camera, picture)
+    return camera, off.abs().mean(-1), psnr_of(off) if psnr is None else psnr
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A map of trust against the held-out photos of its run, over all of their pixels."""
-
-    covered: float  # share of the pixels whose error stays below its bound; 0.9 was promised
-    good: float  # share of those with a bound of at most GOOD
-    right: float  # share of the good ones with an error of at most GOOD
-    ause: float  # area between the sparsification curves of trust and of the true error, over the mean error
-    by_photos: float  # the same of the number of photos that see a pixel
-
-    def __str__(self) -> str:
-        return (
-            f"on the held-out photos {100 * self.covered:.1f} % of the pixels stay below their bound; "
-            f"{100 * self.good:.1f} % are called good to {GOOD:.0f} levels, {100 * self.right:.1f} % of them "
-            f"are; AUSE {self.ause:.3f}, by the number of photos that see a pixel {self.by_photos:.3f}"
-        )
+@torch.no_grad()
+def _off(gaussians: Gaussians, camera: Camera, picture: Image.Image) -> tuple[Camera, Tensor]:
+    """The camera of a photo of another size, and render less photo, [H, W, 3]."""
+    camera = resized(camera, picture.width, picture.height)
+    return camera, gaussians.render(camera).clamp(0, 1) - torch.from_numpy(np.array(picture)).float() / 255
 
 
-def measure_trust(trust: Trust, known: RunCameras) -> Measured | None:
-    """None where the run has no held-out photo."""
-    errors, bounds, areas = list[Array](), list[Array](), list[tuple[float, float]]()
-    for view in known.views:
-        if view.held_out and view.photo is not None:
-            camera, error = _error(trust.gaussians, view)
-            errors.append(255 * error.numpy().ravel())
-            bounds.append(trust.bound(camera).ravel())
-            seen = trust.seen(camera).ravel()
-            areas.append((_ause(bounds[-1], errors[-1]), _ause(-seen, errors[-1])))
-    if not errors:
-        return None
-    error, bound = np.concatenate(errors), np.concatenate(bounds)
-    good = bound <= GOOD
-    right = float((error[good] <= GOOD).mean()) if good.any() else 1.0
-    ause, by_photos = np.mean(areas, axis=0).tolist()
-    return Measured(float((error <= bound).mean()), float(good.mean()), right, ause, by_photos)
-
-
-def _ause(doubt: Array, error: Array) -> float:
-    """Area under the mean error of the pixels least in doubt, over all shares of them, less that of those
-    with the least error, over the mean of all."""
-
-    def curve(key: Array) -> NDArray[np.float64]:
-        sums = error[np.argsort(key, kind="stable")].cumsum(dtype=np.float64)
-        ends = np.linspace(0, len(error), STEPS + 1)[1:].astype(int)
-        return sums[ends - 1] / ends
-
-    return float((curve(doubt) - curve(error)).mean() / max(float(error.mean()), 1e-9))
+def psnr_of(off: Tensor) -> float:
+    """dB, of differences where white is 1; 100 where there are none."""
+    return -10 * math.log10(max(float(off.square().mean()), 1e-10))

@@ -18,6 +18,7 @@ class Told(TypedDict, total=False):
     world: World  # the frame of the file, where that is another
     antialiased: bool  # it was trained with, and is to be seen with, the compensation of "antialiased"
     notes: list[str]  # what was left out or changed on reading
+    errors: NDArray[np.float32]  # [N], of the pixels that each shows, white is 1
 
 
 class Arrays(Told):

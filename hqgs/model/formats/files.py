@@ -21,6 +21,7 @@ from hqgs.model.formats.world_file import keep_world, read_world
 from hqgs.scene.world import World
 
 OWN_PLACE = ("ply", "glb", "gltf")  # formats that hold the frame themselves
+ERRORS = ("ply", "glb")  # formats that hold what trust was learned
 ANTIALIASED = ("ply", "full.ply", "spz", "sog")  # formats that are written with that flag
 
 

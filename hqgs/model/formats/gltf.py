@@ -4,7 +4,7 @@ One mesh primitive of points, float32 throughout: POSITION, ROTATION (x y z w), 
 where drafts had logs), OPACITY (0..1), SH_DEGREE_l_COEF_n. glTF has y up and z towards the viewer, here y is
 down and z forward: y and z change their sign as in SPZ files, which is exact. Scales and opacities are
 rounded once by exp and the sigmoid; an opacity that float32 rounds to 0 or 1 is read a quarter of 2^-24
-inwards.
+inwards. Of a scene whose trust was learned, _HQGS_ERROR is the error of the pixels that a Gaussian shows in.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hqgs.base.files import atomic_path
 from hqgs.model.constants import LEAST_SCALE, MAX_SH_DEGREE
 from hqgs.model.formats.arrays import Arrays, Floats
 from hqgs.model.formats.gltf_nodes import BIN, JSON, MAGIC, VERSION, content_of, placed_meshes
-from hqgs.model.formats.rows import finite_rows, pick, to_logits, to_opacities
+from hqgs.model.formats.rows import finite_rows, pick, sound_errors, to_logits, to_opacities
 from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH
 from hqgs.model.formats.turned import mapped
 from hqgs.scene.world import World, world_for
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 NAME = "KHR_gaussian_splatting"
+ERROR = "_HQGS_ERROR"  # glTF keeps names that begin so for applications
 FLOAT, POINTS = 5126, 0
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 STEP = 2.0**-24  # of opacities near 1
@@ -52,6 +53,8 @@ def write_gltf(path: str | Path, arrays: Arrays) -> int:
     }
     for k in range(higher):
         parts[_harmonic(k)] = FLIP_SH[k] * g["shN"][:, k]
+    if "errors" in g:
+        parts[ERROR] = g["errors"][:, None]
     kinds = {width: kind for kind, width in WIDTHS.items()}
     binary, views, accessors = [], [], list[dict[str, Any]]()
     at = 0
@@ -137,6 +140,8 @@ def read_gltf(path: str | Path) -> Arrays:
         "sh0": np.concatenate([part["sh0"] for part in parts]).astype(np.float32),
         "shN": np.concatenate([_widened(part["shN"], most) for part in parts]),
     }
+    if all("errors" in part for part in parts):
+        found["errors"] = np.concatenate([part["errors"] for part in parts if "errors" in part])
     if world != World():
         found["world"] = world
     return found
@@ -187,7 +192,7 @@ def _gaussians(content: Any, buffers: list[bytes], primitive: Any) -> Arrays:
     if (scales < 0).any():
         raise ValueError(f"a scale is below 0; drafts of {NAME} had logs there")
     rest = [FLIP_SH[k] * values(_harmonic(k), "VEC3") for k in range(higher)]
-    return {
+    found: Arrays = {
         "means": FLIP_MEANS * means,
         "scales": np.log(np.maximum(scales, LEAST_SCALE)).astype(np.float32),
         "quats": np.roll(FLIP_QUATS * values(f"{NAME}:ROTATION", "VEC4"), 1, axis=1).astype(np.float32),
@@ -195,6 +200,9 @@ def _gaussians(content: Any, buffers: list[bytes], primitive: Any) -> Arrays:
         "sh0": values(f"{NAME}:SH_DEGREE_0_COEF_0", "VEC3")[:, None].astype(np.float32),
         "shN": (np.stack(rest, axis=1) if rest else np.zeros((count, 0, 3))).astype(np.float32),
     }
+    if ERROR in attributes:
+        found["errors"] = sound_errors(values(ERROR, "SCALAR")[:, 0])
+    return found
 
 
 def _harmonic(k: int) -> str:

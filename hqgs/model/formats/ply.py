@@ -3,6 +3,7 @@
 One vertex per Gaussian, float32: x y z, f_dc_0..2, f_rest_* (all red coefficients, then green, then blue; 0,
 9, 24 or 45 of them for the SH degrees 0 to 3), opacity (logit), scale_0..2 (log), rot_0..3 (w x y z). Readers
 find columns by their names; the normals of 3DGS, which are all zero, are not written (nor does gsplat).
+Where trust was learned, hqgs_error is the error of the pixels that a Gaussian shows in, 0 to 1 (white).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from hqgs.base.files import atomic_path
 from hqgs.base.ply import header_of, read_vertices
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import pick, whole_rows
+from hqgs.model.formats.rows import pick, sound_errors, whole_rows
 from hqgs.scene.world import World, world_for
 
 _REST_COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]  # 0, 9, 24, 45
@@ -29,6 +30,7 @@ _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
+_ERROR = "hqgs_error"
 _WORLD, _ANTIALIASED = "hqgs world ", "hqgs antialiased"  # comments of the header
 MOST_LOGIT = 18.0  # of an opacity that is stored as infinite: float32 rounds its sigmoid to 1 or next to 0
 LEAST_LOG = math.log(1e-20)  # of a scale of 0
@@ -65,6 +67,8 @@ def write_ply(path: str | Path, arrays: Arrays, *, full: bool = False) -> int:
         (_SCALES, scales),
         (_QUATS, arrays["quats"]),
     ]
+    if "errors" in arrays and not full:
+        columns.append(([_ERROR], arrays["errors"][:, None]))
     names = [name for group, _ in columns for name in group]
     with np.errstate(over="ignore"):  # of float64: such a row is left out
         rows = np.concatenate([values for _, values in columns], axis=1, dtype=np.dtype("<f4"))
@@ -147,6 +151,8 @@ def read_ply(path: str | Path) -> Arrays:
         "sh0": columns(_DC)[:, None, :],
         "shN": np.ascontiguousarray(higher),
     }
+    if _ERROR in present:
+        arrays["errors"] = sound_errors(columns([_ERROR])[:, 0])
     keep = whole_rows(arrays)
     if not keep.all():
         if not keep.any():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,7 @@ def whole_rows(arrays: Arrays) -> NDArray[np.bool_]:
 
 def pick(arrays: Arrays, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Arrays:
     """Those rows of each array."""
-    return {
+    picked: Arrays = {
         "means": arrays["means"][rows],
         "scales": arrays["scales"][rows],
         "quats": arrays["quats"][rows],
@@ -34,6 +36,15 @@ def pick(arrays: Arrays, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Arrays:
         "sh0": arrays["sh0"][rows],
         "shN": arrays["shN"][rows],
     }
+    if "errors" in arrays:
+        picked["errors"] = arrays["errors"][rows]
+    return picked
+
+
+def sound_errors(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Errors of Gaussians from a file: what is no number, or out of range, is not to be trusted at all."""
+    with np.errstate(invalid="ignore"):
+        return np.where((values >= 0) & (values <= 1), values, 1).astype(np.float32)
 
 
 def curve_order(means: NDArray[np.floating]) -> NDArray[np.intp]:

@@ -32,6 +32,7 @@ from hqgs.show.constants import PAGE_QUALITY, PAGE_VIEWS, PAIR_SIDE, PAIRS, SHEE
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
 from hqgs.show.page.places import places_chart
+from hqgs.show.page.trust_part import trust_part
 
 TEMPLATES = Path(__file__).parent / "templates"
 SCRIPTS = ("splat_shaders.js", "splats.js")
@@ -53,6 +54,7 @@ class Page:
     views: Sequence[RenderedView] = field(repr=False)
     diagnosis: Diagnosis | None = None
     pictures: Mapping[str, Image.Image] = field(default_factory=dict)  # by file name, as the run wrote them
+    folder: Path | None = None  # of the run, which has written its cameras and photos
 
 
 def told_verdict(report: Report) -> str:
@@ -100,7 +102,10 @@ def page_text(page: Page) -> str:
         for name, unit, key, color in CHARTS
     ]
     measured_some = [h["views"] for h in history if "views" in h]
-    diagnosis = page.diagnosis
+    diagnosis, spots, trust = page.diagnosis, next_photos(page.scene), None
+    if page.folder is not None and page.gaussians is not None and len(page.gaussians):
+        trust = trust_part(page.folder, page.scene, page.gaussians, report["iterations"])
+        spots = [*spots, *trust.spots]
     return rendered(
         "report.html.j2",
         title=f"{report['scene']}, {report['method']}",
@@ -122,8 +127,10 @@ def page_text(page: Page) -> str:
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],
         notes=report["notes"],
-        places=places_chart(page.scene),
-        spots=[spot.told for spot in next_photos(page.scene)],
+        places=places_chart(page.scene, spots),
+        spots=[spot.told for spot in spots],
+        trust=trust,
+        trust_pictures=[] if trust is None else [(what, jpeg(picture)) for what, picture in trust.pictures],
         sure=_sure(report),
         lost=[*((report.get("sfm") or {}).get("lost") or {}).items()],
         environment=_environment(report),

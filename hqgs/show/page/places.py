@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from markupsafe import Markup
 
-from hqgs.scene.next_photos import around, loose_photos, next_photos
+from hqgs.scene.next_photos import Spot, around, loose_photos
 from hqgs.scene.scene import Scene
 
 WIDTH, HEIGHT, BORDER = 640, 420, 24  # px
@@ -15,13 +17,12 @@ ARROW = 9.0  # px, of a camera
 SURE, LOOSE, NEXT = "#2f7fc4", "#d0672a", "#c03030"
 
 
-def places_chart(scene: Scene) -> Markup | None:
-    """A picture; None of photos of one place."""
+def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
+    """A picture, with the spots to photograph next; None of photos of one place."""
     views = [*scene.train, *scene.test]
     if len(views) < 2:
         return None
     middle, plane = around(scene)
-    spots = next_photos(scene)
     cameras = (np.stack([view.camera.center for view in views]) - middle) @ plane.T
     points = (scene.points[:: max(1, len(scene.points) // DOTS)].astype(np.float64) - middle) @ plane.T
     near = np.linalg.norm(points, axis=1)

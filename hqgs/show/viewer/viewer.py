@@ -94,7 +94,7 @@ class Viewer:
 
     def offer_trust(self) -> None:
         """Let pages show it, of a scene that stays as it is, where the run has photos."""
-        if self._trust.possible:
+        if self._gaussians is not None and self._trust.possible(self._gaussians):
             self._show.options = (*self._show.options, "trust")
 
     def pump(self) -> bool:

@@ -1,0 +1,61 @@
+"""What a page says of trust: how far renders of other places can be believed, and where they cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from hqgs.model.gaussians import Gaussians
+from hqgs.photos.pixels import to_uint8, upright
+from hqgs.scene.camera_files import load_cameras
+from hqgs.scene.next_photos import Spot
+from hqgs.scene.paths import camera_path
+from hqgs.scene.scene import Scene
+from hqgs.show.frames import trust_picture
+from hqgs.show.trust import LEAST_PHOTOS, PHOTOS, ROUNDS, Held, learn_trust
+from hqgs.show.trust_measured import FRAMES, measure_trust, predict_psnr
+from hqgs.show.trust_next import doubtful_spots
+
+PASSES = 0.1  # of a run's steps: more views are not passed over again for trust
+
+
+@dataclass(frozen=True)
+class TrustPart:
+    """Sentences, and pictures of the held-out photo that the scene shows worst."""
+
+    lines: list[str]
+    name: str = ""
+    pictures: tuple[tuple[str, Image.Image], ...] = ()  # what they are, and they
+    spots: Sequence[Spot] = ()  # where to photograph next
+
+
+def trust_part(folder: Path, scene: Scene, gaussians: Gaussians, iterations: int) -> TrustPart:
+    """Of a run that has written its cameras and photos into a folder."""
+    known = load_cameras(folder)
+    some = min(max(round(PASSES * iterations / (ROUNDS + 1)), LEAST_PHOTOS), PHOTOS)
+    trust = learn_trust(gaussians, known, photos=some)
+    measured = measure_trust(trust)
+    spots = doubtful_spots(trust, [view for view in known.views if not view.held_out])
+    if measured is None:
+        why = "No photo was held out, so no number says how far renders of other places can be believed."
+        return TrustPart([why], spots=spots)
+    lines = [f"Trust: {measured}. Each photo is judged by a calibration on the others."]
+    path = predict_psnr(trust, camera_path(known.train, FRAMES), known.train)
+    if path is not None:
+        lines.append(f"Photos from the way through the training cameras would have a PSNR of {path}.")
+    worst = min(range(len(trust.held)), key=lambda k: trust.held[k].psnr)
+    turns = {view.name: view.quarter_turns for view in scene.test}
+    one = trust.held[worst]
+    return TrustPart(lines, one.name, _pictures(one, gaussians, trust.bound(one.camera), turns), spots)
+
+
+def _pictures(
+    one: Held, gaussians: Gaussians, bound: np.ndarray, turns: dict[str, int]
+) -> tuple[tuple[str, Image.Image], ...]:
+    render = to_uint8(gaussians.render(one.camera).detach().numpy())
+    maps = ("render", render), ("trust", trust_picture(bound)), ("error", trust_picture(255 * one.error))
+    return tuple((what, Image.fromarray(upright(m, turns.get(one.name, 0)))) for what, m in maps)
