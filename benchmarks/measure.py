@@ -8,13 +8,15 @@ from collections.abc import Callable
 from typing import Any
 
 from hqgs.base.machine import peak_rss_mb, reset_peak_rss
-from hqgs.evaluation.held_out import HeldOutViews
+from hqgs.evaluation.held_out import HeldOutViews, held_out_means
+from hqgs.evaluation.metrics import haarpsi, psnr, ssim
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.trainer import Step, Trainer
 
 Run = dict[str, Any]  # plain JSON values
+MEASURED = {"psnr": psnr, "ssim": ssim, "haarpsi": haarpsi}  # at the moments of a run
 
 
 class Training:
@@ -27,6 +29,7 @@ class Training:
         self.setup_seconds = time.perf_counter() - started
         self.setup_cpu_seconds = time.process_time() - clock
         self.initial_points = len(self.trainer.gaussians)
+        self.moments = list[Run]()  # held-out means on the way, where they were asked for
         self.cpu_seconds = 0.0  # of all threads in the steps; tells a busy machine from a slow method
 
     def steps(self, count: float = math.inf, after: Callable[[Step], None] = lambda step: None) -> None:
@@ -64,14 +67,23 @@ class Training:
         last = self.trainer.history[-1]
         return {"psnr": last["psnr"], "ssim": last["ssim"]} | self.record()
 
+    def look(self) -> None:
+        """Measure all held-out views here, once, by all that the views' table has. Takes no training time."""
+        trainer = self.trainer
+        if not self.moments or self.moments[-1]["moment"] != trainer.iteration:
+            means = held_out_means(list(MEASURED.values()), self.held_out())
+            named = dict(zip(MEASURED, means, strict=True))
+            self.moments.append({"moment": trainer.iteration, "seconds": trainer.seconds} | named)
+
     def history(self) -> dict[str, float]:
         """Held-out PSNR by seconds of training."""
         known = [entry for entry in self.trainer.history if entry["psnr"] is not None]
         return {f"{entry['seconds']:.5g}": float(f"{entry['psnr']:.5g}") for entry in known}
 
 
-def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training:
-    """Train to the end. With `evaluate` the held-out views are measured as the configuration asks and there.
+def train(photos: Scene, config: TrainConfig, evaluate: bool = True, moments: int = 0) -> Training:
+    """Train to the end. With `evaluate` the held-out views are measured as the configuration asks and there;
+    `moments`: so many times, evenly spread, all of them by all metrics (`Training.look`).
 
     Raises ValueError as `Trainer` does, and TrainingError.
     """
@@ -82,8 +94,12 @@ def train(photos: Scene, config: TrainConfig, evaluate: bool = True) -> Training
     def after(_: Step) -> None:
         if evaluate and trainer.iteration % trainer.config.eval_every == 0:
             trainer.evaluate()
+        if moments and trainer.iteration * moments // trainer.length > len(done.moments):
+            done.look()
 
     done.steps(after=after)
     if evaluate:
         trainer.evaluate()
+    if moments:
+        done.look()
     return done

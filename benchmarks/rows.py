@@ -26,6 +26,7 @@ Row = Mapping[str, Any]
 RUN = ("scene", "degradation", "row", "seed", "iterations", "downscale", "poses")  # the key of a training run
 KEYS: dict[str, Sequence[str]] = {  # of each table's lines
     **dict.fromkeys(("quality", "time", "frugality", "features", "endurance"), RUN),
+    "moments": (*RUN, "moment"),
     "poses": ("scene", "degradation", "seed", "downscale"),
     "export": ("scene", "file"),
     "intervals": ("scene", "photos"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.measure import Run, Training, train
+from benchmarks.measure import MEASURED, Run, Training, train
 from benchmarks.protocol import degraded_view
 from benchmarks.quality.rivals import RIVALS
 from benchmarks.study import Cell
@@ -34,15 +34,23 @@ METRICS = ("psnr", "ssim", "haarpsi", "psnr_aligned")  # that the table has
 FITTED = ("psnr_fitted", "ssim_fitted", "moved_px")  # with held-out cameras fitted, and their median move
 
 
-def run_cell(cell: Cell, photos: Scene, pictures: list[Path], fit: bool = False) -> Run:
+def run_cell(
+    cell: Cell,
+    photos: Scene,
+    pictures: list[Path],
+    fit: bool = False,
+    moments: int = 0,
+    keep: Callable[[Sequence[Run]], object] = lambda lines: None,
+) -> Run:
     """Train and measure one cell; the columns of its line. Its first held-out views become `pictures`.
 
     `photos` is what is trained; with `fit` the held-out views are measured a second time, each from the
-    camera from which the trained scene fits its photo best.
+    camera from which the trained scene fits its photo best. Of so many `moments` of the run there are the
+    best too, and `keep` gets a line of each.
     Raises ValueError as `Trainer` does, and TrainingError.
     """
     rival = cell.more.get("rival")
-    done = RIVALS[rival](photos, cell.config) if rival else train(photos, cell.config)
+    done = RIVALS[rival](photos, cell.config) if rival else train(photos, cell.config, moments=moments)
     views = list(done.held_out())
     mean = asdict(mean_metrics([evaluate_view(view.render, view.photo, view.mask) for view in views]))
     for view, path in zip(views, pictures, strict=False):
@@ -52,8 +60,12 @@ def run_cell(cell: Cell, photos: Scene, pictures: list[Path], fit: bool = False)
     if fit:
         fitted = _fitted(done.trainer) if isinstance(done, Training) else {}
         facts |= {name: fitted.get(name) for name in FITTED}
+    if moments and isinstance(done, Training):
+        keep(done.moments)
+        facts |= {f"best_{name}": best_of(done.moments, name) for name in MEASURED}
     history = done.trainer.history if isinstance(done, Training) else done.history
-    run = {name: mean[name] for name in METRICS} | {"fall": fall(history)}
+    fell = {"fall": facts["best_psnr"] - mean["psnr"] if facts.get("best_psnr") else fall(history)}
+    run = {name: mean[name] for name in METRICS} | fell
     return run | done.record() | facts | {"peak_mb": done.peak_rss_mb()}
 
 
@@ -62,6 +74,12 @@ def fall(history: Sequence[Mapping[str, Any]]) -> float | None:
     last = history[-1]
     values = [entry["psnr"] for entry in history if entry.get("views") == last.get("views")]
     return None if None in values else max(values) - last["psnr"]
+
+
+def best_of(moments: Sequence[Run], name: str) -> float | None:
+    """The best mean of a metric at any moment of a run; None where it has no value."""
+    values = [moment[name] for moment in moments]
+    return None if None in values else max(values)
 
 
 def reconstruction(report: SfmReport) -> Run:

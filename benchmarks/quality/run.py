@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.command import Benchmark
+from benchmarks.measure import Run
 from benchmarks.pages.figures import crossed, gains
 from benchmarks.protocol import read_protocols
 from benchmarks.quality.cell import reconstruction, run_cell, write_sheet
@@ -17,7 +19,15 @@ from hqgs.scene.scene import Scene
 
 PROTOCOLS = read_protocols(Path(__file__).parent / "protocols.toml", RivalRow)
 ALSO = {"ssim": ("SSIM", ".3f"), "fall": ("below its best (dB)", ".2f")}
-POSES = "poses.csv"  # the table of what `--sfm` found
+BEST = {
+    f"best_{name}": (f"best {head}", form)
+    for name, (head, form) in (
+        ("psnr", ("PSNR", ".2f")),
+        ("ssim", ("SSIM", ".3f")),
+        ("haarpsi", ("HaarPSI", ".3f")),
+    )
+}
+POSES, MOMENTS = "poses.csv", "moments.csv"  # tables of what `--sfm` found, and of runs at their moments
 
 
 class Quality:
@@ -29,7 +39,13 @@ class Quality:
     def measure(self, cell: Cell, photos: Scene) -> dict[str, Any]:
         keeps = cell.seed == self.protocol.seeds[0]
         pictures = [self.render(cell, number) for number in range(self.args.pictures if keeps else 0)]
-        run = run_cell(cell, photos, pictures, self.args.sfm or self.args.fit_cameras)
+        moments = Table(self.args.out / MOMENTS)
+
+        def keep(lines: Sequence[Run]) -> None:
+            moments.put([cell.key | line | facts() for line in lines])
+
+        fit = self.args.sfm or self.args.fit_cameras
+        run = run_cell(cell, photos, pictures, fit, self.protocol.moments, keep)
         if photos.sfm is not None:
             line = {name: cell.key[name] for name in ("scene", "degradation", "seed", "downscale")}
             Table(self.args.out / POSES).put([line | reconstruction(photos.sfm) | facts()])
@@ -64,12 +80,22 @@ class Quality:
         seeds = ", ".join(map(str, protocol.seeds))
         held = "VALIDATION views (held-out training photos)" if self.args.validate else "held-out views"
         what = f"PSNR (dB) of {held}: {protocol.iterations:,} iterations, photos at 1/{protocol.downscale:g}"
-        found = [f"{what}, seeds {seeds}", crossed(runs, also=ALSO)]
+        also = ALSO | {"haarpsi": ("HaarPSI", ".3f")} | BEST if protocol.moments else ALSO
+        across = "scene" if protocol.moments else "degradation"
+        found = [f"{what}, seeds {seeds}", crossed(runs, also=also, across=across)]
         if "psnr_fitted" in runs:
             found += ["The same with held-out cameras fitted to the scene", crossed(runs, "psnr_fitted")]
         others = [label for label in protocol.labels if label != protocol.baseline]
         if protocol.baseline in set(runs["row"]) and others:
-            found.append(gains(runs, others, protocol.baseline, corner=f"gain over {protocol.baseline} (dB)"))
+            found.append(
+                gains(
+                    runs,
+                    others,
+                    protocol.baseline,
+                    across=across,
+                    corner=f"gain over {protocol.baseline} (dB)",
+                )
+            )
         return found
 
 
