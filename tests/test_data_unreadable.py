@@ -43,8 +43,9 @@ def test_training_photos_are_skipped_and_named(tmp_path: Path, share: float, suf
         np.testing.assert_array_equal(view.image, before.image)
         np.testing.assert_array_equal(view.camera.viewmat, before.camera.viewmat)
     assert scene.notes[:-1] == whole.notes
-    assert scene.notes[-1] == (
-        f"2 of 8 training photos cannot be read and were left out: view_03{suffix}, view_05{suffix}"
+    assert scene.notes[-1].startswith(
+        f"2 of 8 training photos cannot be used and were left out: view_03{suffix}, view_05{suffix}; of the "
+        "first: cannot read the photo "
     )
     with pytest.raises(ValueError, match=rf"cannot read the photo .*view_03\{suffix}"):
         load_scene(tmp_path)
@@ -68,18 +69,25 @@ def test_half_must_remain(tmp_path: Path, gone: int, readable: bool) -> None:
         load_scene(tmp_path, skip_unreadable=True)
 
 
-def test_test_photo_must_be_readable(tmp_path: Path) -> None:
+def test_held_out_photos_are_left_out_while_one_remains(tmp_path: Path) -> None:
     write_colmap(make_truth(10), tmp_path)
     spoil(tmp_path / "images/view_08.png", tmp_path / "images/view_03.png")
-    with pytest.raises(ValueError, match=r"cannot read the photo .*view_08\.png"):
+    scene = load_scene(tmp_path, skip_unreadable=True)
+    assert [view.name for view in scene.test] == ["view_00.png"]
+    assert any(note.startswith("1 of 2 held-out photos cannot be used") for note in scene.notes)
+    spoil(tmp_path / "images/view_00.png")
+    with pytest.raises(ValueError, match=r"cannot read the photo .*view_00\.png"):
         load_scene(tmp_path, skip_unreadable=True)
 
 
-def test_other_faults_stay_errors(tmp_path: Path) -> None:
+def test_a_photo_of_another_shape_is_left_out(tmp_path: Path) -> None:
     write_colmap(make_truth(4), tmp_path)
     Image.new("RGB", (30, 60)).save(tmp_path / "images/view_01.png")
+    scene = load_scene(tmp_path, skip_unreadable=True)
+    assert [view.name for view in scene.train] == ["view_02.png", "view_03.png"]
+    assert "view_01.png' is 30 x 60, but its camera is for 48 x 36: another shape" in scene.notes[-1]
     with pytest.raises(ValueError, match=r"view_01\.png' is 30 x 60, but its camera is for"):
-        load_scene(tmp_path, skip_unreadable=True)
+        load_scene(tmp_path)
 
 
 def test_mask(tmp_path: Path) -> None:
@@ -100,8 +108,7 @@ def test_transforms_without_size(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"cannot read the photo .*view_05\.png"):
         load_scene(tmp_path)
     spoil(tmp_path / "images/view_00.png", share=0.0)
-    with pytest.raises(ValueError, match=r"cannot read the photo .*view_00\.png"):
-        load_scene(tmp_path, skip_unreadable=True)
+    assert names(tmp_path) == (train, ["images/view_08.png"])
 
 
 def test_marker_counts_the_photos_in_the_folder(tmp_path: Path) -> None:

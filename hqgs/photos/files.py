@@ -31,6 +31,10 @@ class UnreadableError(ValueError):
     """A photo or mask that cannot be decoded; the message names the file."""
 
 
+class MisfitError(UnreadableError):
+    """A photo that is no picture of its camera; the message names it."""
+
+
 def open_photo(path: Path) -> Image.Image:
     """Pillow's picture of the file, not decoded yet: by what it holds, whatever its suffix says.
 

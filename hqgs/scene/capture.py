@@ -17,6 +17,8 @@ from hqgs.scene.photo_files import MASKS, Named, below
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.world import World
 
+NO_POSE = np.full((4, 4), np.nan)  # of a photo that its file lists without a place
+
 
 @dataclass(frozen=True)
 class Photo:
@@ -72,15 +74,23 @@ def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: 
     """World-to-camera matrix [4, 4] from the first three rows [3, 4] of a pose in the OpenCV frame.
 
     Poses printed with few digits are a little off a rotation: the nearest rotation (polar factor) is taken.
-    Raises ValueError that names the photo when the pose is not finite, too large, or no rotation.
+    A camera that was scaled with its scene has no other view: its size is left out of `camera_to_world`.
+    Numbers that are not finite, or all 0, say that the photo has no pose: the matrix is `NO_POSE` then.
+    Raises ValueError that names the photo when the pose is too large, or no rotation.
     """
-    if not (np.abs(pose) < LARGEST).all():
-        raise ValueError(f"photo {name!r}: its pose is not finite or beyond {LARGEST:g}: {pose.tolist()}")
     R, t = pose[:, :3], pose[:, 3]
+    if not np.isfinite(pose).all() or not R.any():
+        return NO_POSE.copy()
+    if not (np.abs(pose) < LARGEST).all():
+        raise ValueError(f"photo {name!r}: its pose is beyond {LARGEST:g}: {pose.tolist()}")
+    size = np.cbrt(np.linalg.det(R))
+    if camera_to_world and size > 0:
+        R = R / size
     error = float(np.abs(R @ R.T - np.eye(3)).max())
-    if error > 1e-2 or np.linalg.det(R) < 0:
+    if error > 1e-2 or size < 0:
+        mirrored = ", but mirrors: the frame of its camera or of the world is left-handed" if size < 0 else ""
         raise ValueError(
-            f"photo {name!r}: its pose holds no rotation (R R^T is {error:.3g} off): {R.tolist()}"
+            f"photo {name!r}: its pose holds no rotation{mirrored} (R R^T is {error:.3g} off): {R.tolist()}"
         )
     u, _, vt = np.linalg.svd(R)
     R = u @ vt

@@ -38,6 +38,7 @@ KEPT_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to tra
 FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
 SHOWN, LOOKED_AT = 0.02, 1000  # of a photo's sides, which the points must span at least; of points
 SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
+ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 FAR_ORIGIN = 100.0  # sizes from the origin: from here on the origin is moved
 AXES_PAIRS, AXES_LONGEST = 6, 640  # of neighbours, spread over the photos; px of the copies that are matched
 AXES_RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004)

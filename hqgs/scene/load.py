@@ -12,7 +12,7 @@ import pycolmap
 from hqgs.base.evenly import evenly
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
+from hqgs.photos.files import UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
 from hqgs.scene.constants import COARSE, MOST_BYTES
@@ -22,11 +22,21 @@ from hqgs.scene.formats.colmap import find_models, find_models_below, half_model
 from hqgs.scene.formats.degradation_json import DegradedFolder, read_degraded_folder, with_low
 from hqgs.scene.formats.llff import POSES, hold_marker, read_llff
 from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
+from hqgs.scene.lenses import odd_lenses
 from hqgs.scene.metres import Distance, named_photos
-from hqgs.scene.names import ARCHIVE_SUFFIXES, FILM_SUFFIXES, existing_folder
-from hqgs.scene.photo_files import is_run
-from hqgs.scene.place import BEHIND, cut_outs, located, masks_told, placed, without_missing, without_strays
+from hqgs.scene.names import existing_folder
+from hqgs.scene.place import (
+    BEHIND,
+    cut_outs,
+    located,
+    masks_told,
+    placed,
+    without_missing,
+    without_poseless,
+    without_strays,
+)
 from hqgs.scene.random_points import random_points
+from hqgs.scene.refused import above, broken, nothing
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import read_photos
@@ -70,10 +80,9 @@ def load_scene(
     `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
     where all of them would take more than MOST_BYTES of memory. Cameras for small photos are found coarsely.
 
-    With `skip_unreadable` training photos that cannot be decoded (or whose mask or small photo cannot) are
-    left out, as long as at least half of the training photos remain; `Scene.notes` names them. The other
-    photos are training or test views as if all could be read. A test photo must be readable, or the numbers
-    of two copies of a scene could not be compared.
+    With `skip_unreadable` photos that cannot be decoded (or whose mask or small photo cannot), and those of
+    another shape than their camera, are left out, as long as at least half of the training photos remain, and
+    of the held-out ones; `Scene.notes` names them. The others are training or test views as before.
 
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
@@ -89,11 +98,12 @@ def load_scene(
     degraded = read_degraded_folder(root)
     if degraded is not None:
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
-    notes = [*capture.notes, *masks_told(root, capture)]
+    notes = [*capture.notes, *masks_told(root, capture), *odd_lenses(capture)]
     test_names = held_out_names(root, capture, test_every, notes, degraded)
-    capture = placed(without_strays(without_missing(root, capture, notes), notes), notes)
-    train_names = frozenset(photo.name for photo in capture.photos) - test_names
-    optional = train_names if skip_unreadable else frozenset[str]()
+    capture = without_poseless(root, without_missing(root, capture, notes), notes)
+    capture = placed(without_strays(capture, notes), notes)
+    names = frozenset(photo.name for photo in capture.photos)
+    optional = names if skip_unreadable else frozenset[str]()
     over = BEHIND if cut_outs(capture, notes) else None
     views, unreadable = load_views(capture.photos, capture.downscale, optional, on_stage, over)
     if degraded is not None and downscale == 1:
@@ -103,14 +113,20 @@ def load_scene(
         notes += [] if turned is None else [turned]
     train = [v for v in views if v.name not in test_names]
     test = [v for v in views if v.name in test_names]
-    if not train_names:
+    if not names - test_names:
         raise ValueError(f"{root}: all {len(views)} views are test views, none is left to train on")
-    if unreadable:
-        _check_half(train, unreadable)
-        notes.append(
-            f"{len(unreadable)} of {len(train_names)} training photos cannot be read and were left out: "
-            + ", ".join(sorted(unreadable))
-        )
+    for kept, those, what in (
+        (train, names - test_names, "training"),
+        (test, names & test_names, "held-out"),
+    ):
+        gone = {name: unreadable[name] for name in those if name in unreadable}
+        if len(kept) < len(gone):
+            raise gone[min(gone)]
+        if gone:
+            notes.append(
+                f"{len(gone)} of {len(those)} {what} photos cannot be used and were left out: "
+                f"{some(sorted(gone))}; of the first: {gone[min(gone)]}"
+            )
     points, colors = capture.points.astype(np.float32), capture.point_colors
     if len(points) == 0:
         points, colors, note = random_points(train, capture.near_far)
@@ -206,49 +222,15 @@ def _read(
         return read_transforms(root, downscale)
     if POSES in others:
         return read_llff(root, downscale)
-    if not sfm and (broken := _broken(root)) is not None:
-        raise ValueError(f"{broken}; `--sfm` takes cameras and points from the photos alone")
+    if not sfm and (half := broken(root)) is not None:
+        raise ValueError(f"{half}; `--sfm` takes cameras and points from the photos alone")
     if (photos := bare_photos(root, downscale)) is not None:
-        above = [] if sfm else _above(root)
-        if above:
-            on_stage(Stage("COLMAP", 0, len(photos.names), above[0]))
+        told = [] if sfm else above(root)
+        if told:
+            on_stage(Stage("COLMAP", 0, len(photos.names), told[0]))
         capture = read_photos(root, photos, keep_sfm, on_stage, coarse, features)
-        return replace(capture, notes=[*capture.notes, *above])
-    raise ValueError(_nothing(root))
-
-
-def _above(root: Path) -> list[str]:
-    """That the folder above has cameras, which are not read for a folder of photos; or nothing."""
-    above = root.parent
-    found = [COLMAP] if find_models(above) else []
-    found += [name for name in (SINGLE, TRAIN, POSES) if (above / name).is_file()]
-    which = f"{above} holds cameras and points ({', '.join(found)})"
-    return [f"{which}, which are not read: give that folder to train with them"] if found else []
-
-
-def _broken(root: Path) -> str | None:
-    """What is there of a scene that is not whole; None: nothing."""
-    if (folder := half_model(root)) is not None:
-        return f"{folder} holds half a COLMAP model: cameras, images and points3D are wanted, as .bin or .txt"
-    names = [name for name in (SINGLE, TRAIN, POSES) if (root / name).exists()]
-    return f"{root / names[0]} is no file" if names else None
-
-
-def _nothing(root: Path) -> str:
-    """What is wrong with a folder in which no format is recognised."""
-    if is_run(root):
-        return f"{root} is the folder of a run that hqgs wrote: give the folder with the photos"
-    entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
-    for suffixes, advice in (
-        (ARCHIVE_SUFFIXES, "unpack it, and give the folder with the photos"),
-        (FILM_SUFFIXES, "give the film itself in place of the folder"),
-    ):
-        if found := [name for name in entries if name.lower().endswith(suffixes)]:
-            return f"{root} holds no photos, but {found[0]}: {advice}"
-    return (
-        f"{root} holds no photos ({', '.join(PHOTO_SUFFIXES)}), here or one folder further down, and no "
-        f"scene (a COLMAP model, {SINGLE}, {TRAIN} or {POSES}); it holds {some(entries)}"
-    )
+        return replace(capture, notes=[*capture.notes, *told])
+    raise ValueError(nothing(root))
 
 
 def bound(sizes: list[tuple[int, int]], downscale: float, longest: int) -> float:
@@ -306,12 +288,6 @@ def _with_lows(
                 raise
             unreadable[view.name] = error
     return found
-
-
-def _check_half(train: list[View], unreadable: dict[str, UnreadableError]) -> None:
-    """Raise the first error unless at least half of the training photos can be read."""
-    if len(train) < len(unreadable):
-        raise unreadable[min(unreadable)]
 
 
 def _tracks(capture: Capture, views: list[View]) -> TrackStatistics | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
-from hqgs.scene.constants import FAR_OFF, LOOKED_AT, SHOWN
+from hqgs.scene.constants import FAR_OFF, LOOKED_AT, ONE_PLACE, SHOWN
 from hqgs.scene.georeference import LEAST, Georeference, georeference
 from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import strays
@@ -27,7 +26,7 @@ def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
 
     The places of the others in the split stay what they were. FileNotFoundError where more than half miss.
     """
-    missing = [photo for photo in capture.photos if not os.path.lexists(photo.path)]
+    missing = [photo for photo in capture.photos if not photo.path.exists()]
     if not missing:
         return capture
     names, count = some([photo.name for photo in missing]), len(capture.photos)
@@ -37,6 +36,35 @@ def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
         )
     notes.append(f"{len(missing)} of {count} cameras have no photo any more and were left out: {names}")
     return _without(capture, {photo.name for photo in missing})
+
+
+def without_poseless(root: Path, capture: Capture, notes: list[str]) -> Capture:
+    """The capture without photos that its files give no place; `notes` names them.
+
+    ValueError where more than half have none, or all have the same.
+    """
+    lost = {photo.name for photo in capture.photos if not np.isfinite(photo.viewmat).all()}
+    names, count = some(sorted(lost)), len(capture.photos)
+    if 2 * len(lost) > count:
+        raise ValueError(f"{root}: {len(lost)} of {count} photos have no pose: {names}")
+    if lost:
+        notes.append(
+            f"{len(lost)} of {count} photos have no pose (nan, 0 or null) and were left out: {names}"
+        )
+    found = _without(capture, lost)
+    first = found.photos[0].viewmat
+    if len(found.photos) > 2 and all(np.array_equal(photo.viewmat, first) for photo in found.photos):
+        raise ValueError(
+            f"{root}: all {len(found.photos)} photos have the same pose, so that it is none; `--sfm` finds "
+            "poses"
+        )
+    centers = _centers(found)
+    if len(centers) > 2 and np.ptp(centers, axis=0).max() <= ONE_PLACE * np.abs(centers).max():
+        notes.append(
+            f"all {len(centers)} cameras stand in one place, and nothing tells how far things are: are their "
+            "poses of another kind than the format has (world to camera, camera to world)?"
+        )
+    return found
 
 
 def without_strays(capture: Capture, notes: list[str]) -> Capture:

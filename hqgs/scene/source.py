@@ -63,8 +63,9 @@ def load(
         degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
         seed: of the degradation, and of what a built-in camera does.
         restore: weights of an image network that the training photos go through at last.
-        skip_unreadable: leave out training photos that cannot be read, as long as at least half of them can;
-            `Scene.notes` names them. False: an error.
+        skip_unreadable: leave out photos that cannot be read, or are of another shape than their camera, as
+            long as half of the photos to train on, and of those held out, remain; `Scene.notes` names them.
+            False: an error.
         cache: a folder that keeps what takes long, for the next call: COLMAP's models, the frames of a film,
             the embedded scene.
         longest: px; scale the photos down further where a side is longer, or where all photos together

@@ -35,13 +35,12 @@ from hqgs.scene.constants import (
     FILM_SHRUNK,
     GIVEN_BACK,
     LATTICE,
-    LENS_SHARES,
     MAX_WORKERS,
-    MOST_SIDE,
     SMALLEST_SIDE,
     STRAIGHT,
 )
 from hqgs.scene.faces import AROUND, Face, faces_of, lit, projected
+from hqgs.scene.lenses import check_camera, check_size, fits
 from hqgs.scene.scene import Camera, View
 
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
@@ -120,6 +119,13 @@ def _load_view(
     over: tuple[float, float, float] | None,
 ) -> View:
     camera, stored = photo.camera, stored_size(photo.path)
+    turns, upright = read_exif(photo.path).quarter_turns, 0
+    if turns % 2 and not fits(camera, *stored) and fits(camera, stored[1], stored[0]):
+        stored, turns, upright = (
+            (stored[1], stored[0]),
+            0,
+            turns,
+        )  # the cameras are those of photos as EXIF shows them
     check_size(camera, *stored, photo.name)
     # A mask hides colours that must not be mixed into what it shows: such photos are decoded whole.
     enough = downscale > 1 and photo.mask_path is None
@@ -127,7 +133,10 @@ def _load_view(
         math.ceil(DENSE_SAMPLES * stored[0] / downscale),
         math.ceil(DENSE_SAMPLES * stored[1] / downscale),
     )
-    image, mask = decode(photo.path, least if enough else None, over)
+    image, mask = decode(photo.path, ((least[1], least[0]) if upright else least) if enough else None, over)
+    if upright:
+        image = np.ascontiguousarray(np.rot90(image, -upright))
+        mask = None if mask is None else np.ascontiguousarray(np.rot90(mask, -upright))
     height, width = image.shape[:2]
     if photo.mask_path is not None:
         counts = decode_mask(photo.mask_path, width, height)
@@ -162,7 +171,6 @@ def _load_view(
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
     film = photo.film if downscale <= FILM_SHRUNK else None
-    turns = read_exif(photo.path).quarter_turns
     return View(photo.name, camera_now, image, mask, quarter_turns=turns, film=film, face=face)
 
 
@@ -210,36 +218,6 @@ class Pinhole:
             hidden, self.grid, mode="bilinear", padding_mode="border", align_corners=False
         )
         return (out[0, 0] < 1e-3).numpy() & self.inside
-
-
-def check_camera(camera: pycolmap.Camera, name: str) -> None:
-    """Raise ValueError, naming the photo, when the camera's size or parameters cannot be a camera's."""
-    if not (1 <= camera.width <= MOST_SIDE and 1 <= camera.height <= MOST_SIDE):
-        raise ValueError(f"the camera of photo {name!r} has the size {camera.width} x {camera.height}")
-    if camera.model.name == AROUND:
-        return
-    focals = camera.params[camera.focal_length_idxs()]
-    if len(focals) == 0:
-        raise ValueError(f"photo {name!r}: a {camera.model.name} camera has no pinhole view")
-    shares = np.array([*focals, camera.principal_point_x, camera.principal_point_y])
-    shares = shares / max(camera.width, camera.height)
-    sound = np.isfinite(camera.params).all() and (np.abs(shares) < LENS_SHARES).all()
-    if not (sound and (shares[: len(focals)] > 1 / LENS_SHARES).all()):
-        raise ValueError(
-            f"the camera of photo {name!r} ({camera.model.name}) has the parameters {camera.params.tolist()}"
-        )
-
-
-def check_size(camera: pycolmap.Camera, width: int, height: int, name: str) -> None:
-    """Raise ValueError when a photo of `width` x `height` is no scaled version of what the camera describes.
-
-    Each side may be off by one pixel of rounding.
-    """
-    if abs(width * camera.height - height * camera.width) > camera.width + camera.height:
-        raise ValueError(
-            f"photo {name!r} is {width} x {height}, but its camera is for {camera.width} x {camera.height}: "
-            "another shape (was the photo rotated or cropped after the cameras were computed?)"
-        )
 
 
 def to_pinhole(

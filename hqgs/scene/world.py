@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import FAR_ORIGIN, GREATEST, SMALLEST, USUAL
+from hqgs.scene.constants import FAR_ORIGIN, GREATEST, ONE_PLACE, SMALLEST, USUAL
 from hqgs.scene.georeference import Georeference
 
 Array = NDArray[np.floating[Any]]
@@ -118,7 +118,7 @@ def world_for(centers: Array, points: Array) -> World:
     size = float(np.median(np.linalg.norm(centers - middle, axis=1)))
     if len(points):
         size = max(size, float(np.median(np.linalg.norm(points.astype(np.float64) - middle, axis=1))))
-    if not 0 < size < math.inf:
+    if not ONE_PLACE * float(np.abs(middle).max()) < size < math.inf:
         return World()
     shift = (0.0, 0.0, 0.0)
     if np.abs(middle).max() > FAR_ORIGIN * size:

@@ -7,26 +7,31 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hqgs.base.text import some
 from hqgs.scene.capture import (
+    NO_POSE,
     Capture,
     Photo,
     find_mask,
     keep_finite,
     list_photos,
+    no_points,
     viewmat_from_pose,
 )
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model
-from hqgs.scene.formats.colmap_photos import photos_of, whole_names
+from hqgs.scene.formats.colmap_mended import NEEDED, POINTS, kind_of, mended, whole_names
+from hqgs.scene.formats.colmap_photos import photos_of
+from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.geometry import project
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
 from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
 from hqgs.scene.scene import Camera, TrackStatistics
 
-_FILES = ("cameras", "images", "points3D")
+_POINT_FILES = (f"{POINTS}.ply", "points.ply", "input.ply")  # in place of COLMAP's own
 CALLED = ("colmap", "distorted", "model", "reconstruction")  # folders of a model
 DEEP = 3  # folders below the one named in which a model is looked for
 
@@ -34,8 +39,8 @@ DEEP = 3  # folders below the one named in which a model is looked for
 def find_models(root: Path) -> list[Path]:
     """Folders with a complete COLMAP model: those below `sparse/`, else `sparse` itself, else `root`."""
     sparse = root / "sparse"
-    fragments = sorted(p for p in sparse.iterdir() if _kind(p)) if sparse.is_dir() else []
-    return fragments or [p for p in (sparse, root) if _kind(p)][:1]
+    fragments = sorted(p for p in sparse.iterdir() if kind_of(p)) if sparse.is_dir() else []
+    return fragments or [p for p in (sparse, root) if kind_of(p)][:1]
 
 
 def find_models_below(root: Path) -> list[Path]:
@@ -66,7 +71,9 @@ def half_model(root: Path) -> Path | None:
     folders = [*(sorted(p for p in sparse.iterdir() if p.is_dir()) if sparse.is_dir() else []), sparse, root]
     for folder in folders:
         for kind in ("bin", "txt"):
-            if any((folder / f"{name}.{kind}").exists() for name in _FILES) and not _kind(folder):
+            if any((folder / f"{name}.{kind}").exists() for name in (*NEEDED, POINTS)) and not kind_of(
+                folder
+            ):
                 return folder
     return None
 
@@ -79,10 +86,10 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     has a photo.
     """
     found = find_models(root) or find_models_below(root)
-    models = {path: _read_model(path) for path in found}
+    told: dict[Path, list[str]] = {path: [] for path in found}
+    models = {path: _read_model(path, told[path]) for path in found}
     path = max(models, key=lambda p: (len(_registered(models[p])), models[p].num_points3D()))
-    model = models.pop(path)
-    notes = list[str]()
+    model, notes = models.pop(path), told[path]
     if path not in find_models(root):
         notes.append(f"the COLMAP model is the one in {path.relative_to(root)}")
     if models:
@@ -129,7 +136,7 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     if (split := listed_split([path, root], root)) is not None:
         kept, test_names = held_out(split, names, names_by_any(names), notes)
         photos = [photo for photo in photos if photo.name in kept | test_names]
-    points, colors = keep_finite(*model_points(model), notes)
+    points, colors = keep_finite(*(model_points(model) if model.points3D else _points(path, notes)), notes)
     tracks = _tracks(model, path)
     seen = None
     if tracks is not None and len(points) == model.num_points3D():  # else the rows would not be those
@@ -148,27 +155,32 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     )
 
 
+def _points(folder: Path, notes: list[str]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Points [P, 3] and colours [P, 3] that lie beside a model without any."""
+    path = next((folder / name for name in _POINT_FILES if (folder / name).is_file()), None)
+    if path is None:
+        return no_points()
+    notes.append(f"the model has no points; those of {path.name} beside it are used")
+    return read_ply_points(path)
+
+
 def _tracks(model: pycolmap.Reconstruction, path: Path) -> TrackStatistics | None:
     """How the photos saw the points; None where the model does not tell."""
     try:
-        if not model.compute_num_observations():
+        if not model.points3D or not model.compute_num_observations():
             return None
         return TrackStatistics(model.compute_mean_track_length(), model.compute_mean_reprojection_error())
     except ValueError as e:
         raise ValueError(f"{path}: a point was seen by a photo that the model lacks: {e}") from e
 
 
-def _kind(folder: Path) -> str:
-    """ "bin", "txt" or "" (no complete model). COLMAP itself prefers the binary files."""
-    for kind in ("bin", "txt"):
-        if all((folder / f"{name}.{kind}").is_file() for name in _FILES):
-            return kind
-    return ""
+def _read_model(folder: Path, notes: list[str]) -> pycolmap.Reconstruction:
+    with mended(folder, notes) as place:
+        return _read_whole(place, kind_of(place) == "bin")
 
 
-def _read_model(folder: Path) -> pycolmap.Reconstruction:
+def _read_whole(folder: Path, binary: bool) -> pycolmap.Reconstruction:
     model = pycolmap.Reconstruction()
-    binary = _kind(folder) == "bin"
     if binary:
         check_binary_model(folder)
     try:
@@ -196,12 +208,14 @@ def _registered(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 
 
 def pose_viewmat(pose: pycolmap.Rigid3d, name: str) -> NDArray[np.float64]:
-    """World to camera, [4, 4], of the photo of that name. ValueError for what is no pose."""
-    viewmat = viewmat_from_pose(pose.matrix(), name, camera_to_world=False)
-    quat = pose.rotation.quat
-    if abs(np.linalg.norm(quat) - 1) > 1e-2:  # the matrix does not show it: that of a zero quaternion is I
-        raise ValueError(f"photo {name!r}: its quaternion (x, y, z, w) is not of length 1: {quat.tolist()}")
-    return viewmat
+    """World to camera, [4, 4], of the photo of that name; its quaternion may have any length but 0."""
+    matrix, quat = pose.matrix(), pose.rotation.quat
+    length = np.linalg.norm(quat)
+    if not length > 0:  # the matrix does not show it: that of a zero quaternion is I
+        return NO_POSE.copy()
+    if abs(length - 1) > 1e-2:
+        matrix[:, :3] = Rotation.from_quat(quat).as_matrix()
+    return viewmat_from_pose(matrix, name, camera_to_world=False)
 
 
 def seen_points(model: pycolmap.Reconstruction) -> dict[str, NDArray[np.intp]]:

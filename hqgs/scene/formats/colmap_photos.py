@@ -10,7 +10,6 @@ from hqgs.scene.capture import found_inside, inside, list_photos, photo_folder
 from hqgs.scene.photo_files import MASKS, Named, is_run
 
 INPUT = "input"  # 3DGS's convert.py: photos as they were before they were undistorted
-HEAD = 9  # id, rotation, translation and camera of a photo in images.txt, before its name
 
 
 def photos_of(
@@ -105,21 +104,3 @@ def match_some(names: list[str], root: Path, folder: Path, notes: list[str]) -> 
 def stem(name: str) -> str:
     """The name without its suffix."""
     return name.rsplit(".", 1)[0]
-
-
-def whole_names(path: Path) -> dict[int, str]:
-    """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces.
-
-    Every other line lists what a photo shows, and may be empty. ValueError for a line that is none.
-    """
-    names: dict[int, str] = {}
-    lines = iter(path.read_bytes().decode("utf-8", "surrogateescape").split("\n"))
-    for line in lines:
-        line = line.strip()
-        if not line or line.startswith("#"):
-            continue
-        words = line.split(None, HEAD)
-        if len(words) > HEAD and words[0].isdigit():
-            names[int(words[0])] = words[HEAD]
-        next(lines, None)
-    return names

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.base.ply import read_vertices
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import (
     Capture,
@@ -24,7 +24,9 @@ from hqgs.scene.capture import (
     no_points,
     viewmat_from_pose,
 )
-from hqgs.scene.constants import MOST_SIDE
+from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
+from hqgs.scene.faces import AROUND, around
+from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named, below
 
@@ -34,7 +36,7 @@ TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_
 # Where only the photo tells the size and cannot be read: `load_views` meets the same error, and names it.
 UNKNOWN_CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0.5, 0.5])
 
-_PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+_PERSPECTIVE = {"PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # y up and z back become y down and z forward
 
@@ -48,7 +50,9 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     there keeps its path, for `load_scene` to name. Test views are those of the test file, of the validation
     file where there is none, or what the lists `train_filenames`, `test_filenames` and `val_filenames` say.
 
-    Raises ValueError, FileNotFoundError for a PLY or mask that is missing; both name the file.
+    A photo that appears twice with one pose is one, and points that are not there are none.
+
+    Raises ValueError, FileNotFoundError for a mask that is missing; both name the file.
     """
     notes: list[str] = []
     files = Named(root)
@@ -70,10 +74,8 @@ def read_transforms(root: Path, downscale: float) -> Capture:
         ]
         if unread:
             notes.append(f"not read, as {main} and {split_file} name the views: {', '.join(unread)}")
+    photos = _once(root, photos)
     names = [p.name for p in photos]
-    if len(set(names)) < len(names):
-        twice = next(n for n in names if names.count(n) > 1)
-        raise ValueError(f"{root}: photo {twice!r} appears more than once in the transforms")
     split = lists_in(meta, main, "_filenames") if split_file is None else None
     if split is not None:
         kept, test_names = held_out(split, names, names_by_any(names) | called, notes)
@@ -82,18 +84,19 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     notes += files.note()
     points, colors = no_points()
     ply = meta.get("ply_file_path")
-    if ply is not None:
+    if ply not in (None, ""):
         written = _text(ply, "ply_file_path", root)
         path = found_inside(root, written, "ply_file_path", Named(root, (".ply",)))
         if path is None or not path.is_file():
-            raise FileNotFoundError(f"ply_file_path {ply!r} names no file in {root}")
-        points, colors = keep_finite(*read_ply_points(path), notes)
+            notes.append(f"ply_file_path {ply!r} names no file in {root}")
+        else:
+            points, colors = keep_finite(*read_ply_points(path), notes)
     return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        meta = json.loads(path.read_text(encoding="utf-8-sig"))
+        meta = json.loads(path.read_bytes())  # in UTF-8, or the UTF-16 of PowerShell
     except (ValueError, RecursionError) as e:
         raise ValueError(f"cannot read {path}: {e}") from e
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
@@ -130,6 +133,16 @@ def _read_frames(
             camera = UNKNOWN_CAMERA
         photos.append(Photo(name, path, camera, viewmat, mask_path))
     return photos, called
+
+
+def _once(root: Path, photos: list[Photo]) -> list[Photo]:
+    """The photos without repetitions. ValueError where two poses of one differ."""
+    found: dict[str, Photo] = {}
+    for photo in photos:
+        first = found.setdefault(photo.name, photo)
+        if not np.allclose(first.viewmat, photo.viewmat, equal_nan=True):
+            raise ValueError(f"{root}: photo {photo.name!r} appears more than once, with different poses")
+    return [*found.values()]
 
 
 def _photo_path(root: Path, file_path: str, files: Named) -> Path:
@@ -170,6 +183,9 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
         value = values.get(key, default)
         if value is None:
             return None
+        if isinstance(value, str):
+            with suppress(ValueError):
+                value = float(value)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not -1e300 < value < 1e300:
             raise ValueError(f"{where}: {key} must be a finite number, got {value!r:.80}")
         return float(value)
@@ -177,20 +193,32 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
     def coefficient(key: str) -> float:
         return number(key) or 0.0
 
-    model = values.get("camera_model", "OPENCV")
-    if model not in _PERSPECTIVE | _FISHEYE:
-        raise ValueError(f"{where}: camera_model {model!r:.80} is none of {sorted(_PERSPECTIVE | _FISHEYE)}")
+    told = values.get("camera_model", "OPENCV")
+    model = told.upper() if isinstance(told, str) else told
+    if model not in _PERSPECTIVE | _FISHEYE | {AROUND}:
+        known = sorted(_PERSPECTIVE | _FISHEYE | {AROUND})
+        raise ValueError(f"{where}: camera_model {told!r:.80} is none of {known}")
     width, height = number("w"), number("h")
     if width is None or height is None:
         width, height = stored_size(path)
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"{where}: w, h = {width}, {height} is no photo size")
+    if model == AROUND:
+        return around(round(width), round(height))
     fx = _focal(number("fl_x"), number("camera_angle_x"), width, where)
     fy = _focal(number("fl_y"), number("camera_angle_y"), height, where)
     if fx is None and fy is None:
         raise ValueError(f"{where}: no focal length: looked for fl_x, fl_y, camera_angle_x, camera_angle_y")
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     pinhole = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
+    if (
+        all(value is not None and 0 < value <= 1 for value in pinhole[2:])
+        and min(width, height) > SMALLEST_SIDE
+    ):
+        raise ValueError(
+            f"{where}: cx, cy = {pinhole[2]:g}, {pinhole[3]:g} are shares of w, h = {width:g}, {height:g}: "
+            "multiply fl_x, fl_y, cx and cy by them, px are wanted"
+        )
 
     order = ("k1", "k2", "k3", "k4", "p1", "p2")  # of nerfstudio's list
     listed = values.get("distortion_params")
@@ -225,11 +253,21 @@ def _focal(focal: float | None, angle: float | None, size: float, where: str) ->
 
 
 def _matrix(value: object, where: str) -> NDArray[np.float64]:
-    """Rows of a camera-to-world matrix, [3, 4], from nested lists of 3 or 4 rows."""
+    """Rows of a camera-to-world matrix, [3, 4], from 3 or 4 rows, nested or in one list; nan: null.
+
+    Column by column is seen from where 0 0 0 1 stands.
+    """
+    if value is None:
+        return np.full((3, 4), np.nan)
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as e:
         raise ValueError(f"{where}: transform_matrix must be numbers: {e}") from e
+    if matrix.shape in ((16,), (12,)):
+        matrix = matrix.reshape(-1, 4)
+    last = np.array([0, 0, 0, 1.0])
+    if matrix.shape == (4, 4) and not np.allclose(matrix[3], last) and np.allclose(matrix[:, 3], last):
+        matrix = matrix.T
     if matrix.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"{where}: transform_matrix must be 4 x 4, got shape {list(matrix.shape)}")
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
@@ -241,22 +279,3 @@ def _text(value: object, key: str, where: object) -> str:
     if not isinstance(value, str) or not value:
         raise ValueError(f"{where}: {key} must be a path, got {value!r:.80}")
     return value
-
-
-def read_ply_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Points [P, 3] and colours [P, 3] of the PLY's `vertex` element; grey where it has no red, green, blue.
-
-    Raises ValueError that names the file.
-    """
-    vertex = read_vertices(path)
-    try:
-        points = np.stack([vertex[k].astype(np.float64) for k in ("x", "y", "z")], -1)
-        colors = np.full((len(points), 3), 128, np.uint8)
-        if {"red", "green", "blue"} <= set(vertex.dtype.names or ()):
-            colors = np.stack([vertex[k] for k in ("red", "green", "blue")], -1)
-            if colors.dtype.kind == "f":
-                colors = np.rint(np.nan_to_num(colors) * 255)
-            colors = colors.clip(0, 255).astype(np.uint8)
-    except (ValueError, KeyError, TypeError, OverflowError) as e:
-        raise ValueError(f"cannot read the points in {path}: {e}") from e
-    return points, colors
