@@ -176,7 +176,7 @@ def test_mistakes_get_a_sentence(run: Path, tmp_path: Path, capsys: pytest.Captu
         assert told.splitlines()[-1].startswith("hqgs: ")
 
 
-def test_a_foreign_file_and_a_folder_with_cameras(tmp_path: Path) -> None:
+def test_a_foreign_file_and_a_folder_with_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = make_truth(9)
     rng = np.random.default_rng(1)
     points = rng.uniform(-1.5, 1.5, (150, 3)).astype(np.float32)
@@ -202,6 +202,12 @@ def test_a_foreign_file_and_a_folder_with_cameras(tmp_path: Path) -> None:
     single = json.loads((tmp_path / "one" / "judge.json").read_text())
     assert single["protocol"]["names"] == [one]
     assert single["scene"]["interval"]["psnr"] is None
+    words = "farther from their photo than one flat colour is: the scene file and the photos' cameras are of"
+    assert words not in capsys.readouterr().out
+    replace(model, means=model.means[:, [2, 0, 1]]).save(tmp_path / "turned.ply")
+    assert judge(tmp_path / "turned.ply", "--photos", root, "--out", tmp_path / "turned") == 0
+    assert words in capsys.readouterr().out
+    assert "than one flat colour is" in (tmp_path / "turned" / "judge.html").read_text()
 
 
 def picture(seed: int = 0) -> np.ndarray:

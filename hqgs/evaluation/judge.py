@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -22,6 +23,7 @@ from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
+from hqgs.photos.pixels import as_floats
 from hqgs.scene.scene import Scene, View
 
 Background = tuple[float, float, float]
@@ -42,6 +44,7 @@ class Judged:
     again: list[ViewMetrics]  # with fitted cameras
     causes: list[Causes | None]  # of each photo, None: its mask leaves no pixel; empty where not asked for
     render_seconds: float | None  # of a photo, median, on all threads
+    worse_than_flat: int  # photos to which one colour, their mean, is nearer than the render
 
     @property
     def names(self) -> list[str]:
@@ -61,6 +64,7 @@ class Judged:
             "gaussians": self.gaussians,
             "sh_degree": self.sh_degree,
             "antialiased": self.antialiased,
+            "worse_than_flat": self.worse_than_flat,
             **numbers(self.names, self.each),
         }
         if self.render_seconds is not None:
@@ -141,6 +145,7 @@ def judge(
         again=measured(fitted),
         causes=found,
         render_seconds=median(seconds) if seconds else None,
+        worse_than_flat=sum(_flat(view) > (one.psnr or 0.0) for view, one in zip(views, each, strict=True)),
     )
 
 
@@ -173,6 +178,12 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
         )
         found[metric] = known
     return found
+
+
+def _flat(view: View) -> float:
+    """PSNR of the photo's mean colour, dB; -inf where its mask leaves no pixel."""
+    pixels = as_floats(view.image)[view.mask if view.mask is not None else ...].reshape(-1, 3)
+    return -10 * math.log10(max(float(pixels.var(0).mean()), 1e-10)) if len(pixels) else -math.inf
 
 
 def _seconds(gaussians: Gaussians, view: View, background: Background) -> float:

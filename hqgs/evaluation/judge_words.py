@@ -39,7 +39,7 @@ def told(found: dict[str, Any]) -> str:
     shown = [name for name in LABELS if one["mean"][name] is not None]
     lines = [markdown_table(title, ["", *(LABELS[name] for name in shown)], table_rows(found, shown)), ""]
     lines += [interval_words(one)] if count > 1 else []
-    lines += not_measured(one)
+    lines += [*not_measured(one), *wrong_frame(one)]
     lines.append(scene_words(one) + ("" if against is None else f"; against {scene_words(against)}"))
     lines += [f"the error comes from: {cause_words(one['causes'])}", *worst(one)]
     word, why = verdict(one["mean"]["psnr"])
@@ -65,6 +65,17 @@ def interval_words(one: dict[str, Any]) -> str:
     return (
         f"± half the {one['confidence']:.0%} interval of the mean over such photos; of a difference, by photo"
     )
+
+
+def wrong_frame(one: dict[str, Any]) -> list[str]:
+    """That the scene and the cameras do not fit, where renders show nothing of the photos."""
+    count, photos = one.get("worse_than_flat", 0), len(one["views"])
+    if 2 * count <= photos:
+        return []
+    return [
+        f"{count} of {photos} renders are farther from their photo than one flat colour is: the scene file "
+        "and the photos' cameras are of different captures, or in different frames"
+    ]
 
 
 def not_measured(one: dict[str, Any]) -> list[str]:

@@ -32,7 +32,8 @@ RULES = {
     "haarpsi": "Reisenhofer et al. 2018, in colour; mean over photos",
     "lpips": "v0.1; mean over photos",
     "masks": "masked pixels do not count for PSNR, and are the photo's own for the other metrics",
-    "interval": f"Student's, {CONFIDENCE:.0%}, over photos; of a difference, paired by photo",
+    "interval": f"Student's, {CONFIDENCE:.0%}, over photos, no narrower than other scenes let expect of as "
+    "many; of a difference, paired by photo",
 }
 
 

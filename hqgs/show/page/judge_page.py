@@ -24,6 +24,7 @@ from hqgs.evaluation.judge_words import (
     not_measured,
     scene_words,
     table_rows,
+    wrong_frame,
 )
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.pixels import upright
@@ -56,6 +57,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         sizes=[
             *(f"{of['name']}: {scene_words(of)}" for of in (one, against) if of is not None),
             *not_measured(one),
+            *wrong_frame(one),
         ],
         parts=[
             {
