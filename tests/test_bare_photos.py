@@ -28,8 +28,8 @@ from hqgs.scene.sfm.align import rotation_angles
 from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, what_to_take, why_few, why_lost, why_no_model
-from hqgs.scene.sfm.likely import likely_pairs
-from hqgs.scene.sfm.run import LARGEST, expected_time, film_pairs
+from hqgs.scene.sfm.likely import film_pairs, likely_pairs
+from hqgs.scene.sfm.run import LARGEST, expected_time
 
 ROOT = Path(__file__).parent.parent
 

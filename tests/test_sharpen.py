@@ -12,7 +12,7 @@ from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.sfm import sharpen
+from hqgs.scene.sfm import patches
 from hqgs.scene.sfm.sharpen import sharpened
 from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
 from hqgs.scene.sfm.versions import join, smoothed_copies
@@ -111,7 +111,7 @@ def test_patches_make_poses_and_observations_more_precise(
     assert better.compute_mean_track_length() > model.compute_mean_track_length()
     assert better.num_points3D() > 0.8 * model.num_points3D()
     assert better.compute_mean_reprojection_error() < 0.5 * off
-    monkeypatch.setattr(sharpen, "CANDIDATES", 200)  # what it holds at once changes no bit
+    monkeypatch.setattr(patches, "CANDIDATES", 200)  # what it holds at once changes no bit
     again = sharpened(model, folder, adjust)
     for k in range(1, 9):
         a, b = (m.images[k].cam_from_world().matrix() for m in (better, again))
@@ -124,7 +124,7 @@ def test_large_photos_are_looked_at_smaller(
     model, true, folder = made
     adjust(model, 1.0, True)
     by_features, off = turned(model, true), usual(model)
-    monkeypatch.setattr(sharpen, "SIDE", 100)
+    monkeypatch.setattr(patches, "SIDE", 100)
     better = sharpened(model, folder, adjust)
     assert usual(better) < 0.6 * off
     assert turned(better, true) < 0.6 * by_features

@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from hqgs.scene.sfm.agree import Agreement, agreement, confirmed
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
 from hqgs.scene.sfm.facts import apart, borne_out, counts, placed_names
+from hqgs.scene.sfm.home import brought_home, without
 from hqgs.scene.sfm.learned import look_learned
 from hqgs.scene.sfm.likely import MANY, likely_pairs, pairs_of_faces
 from hqgs.scene.sfm.matching import extract, match, pipeline_options
 from hqgs.scene.sfm.sharpen import sharpened
-from hqgs.scene.sfm.tracks import usual
+from hqgs.scene.sfm.tracks import read_tracks, rebuilt, usual
 from hqgs.scene.sfm.versions import SIGMAS, join, smoothed_copies
 
 LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
@@ -35,6 +37,7 @@ COARSE = 2048  # features of a photo that is looked at coarsely, before those wi
 FAR = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
 ROUNDS = 3  # of leaving those out, which makes the median smaller
 SMALLEST = 3  # photos of a model
+FEW = 16  # photos, whose places are always checked
 EVERY = 0.5  # s between looks into the log
 BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 
@@ -72,9 +75,12 @@ class Attempt:
         named = [directory / name for name, on in names.items() if on]
         self.database: Path = [*named, self.versions[0] if smoothed else self.plain][0]
         self.names: list[str] = given["names"].tolist()
+        self.photos: Path = Path(str(given["photos"]))
         self.faces: int = len(given.get("rotations", [0]))  # of a photo
         self.fixed: bool = "Ks" in given or self.faces > 1
         self.model: pycolmap.Reconstruction | None = None
+        self._sure: set[str] = set(self.names)  # photos that need not be borne out
+        self.agree: Agreement = {}
         self.apart: list[list[str]] = []  # photos that fit each other, and not those of the model
         self._tell("features", 0)
 
@@ -104,7 +110,7 @@ class Attempt:
         extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
         if self.tolerant:
             extraction.sift.peak_threshold /= 4
-        photos = Path(str(self.given["photos"]))
+        photos = self.photos
         if self.coarse:
             self.coarse = self._probe(photos, extraction)
         if self.learned:
@@ -133,23 +139,51 @@ class Attempt:
             self.apart = apart([placed_names(models[k]) for k in order], SMALLEST)
             self._settle(self.model)
 
-    def sharpen(self) -> None:
-        """Move the observations to where the photos agree, and adjust again, where that is more precise."""
-        if self.model is None or self.faces > 1 or self._off(self.model) <= UNSURE:
+    def bring_home(self) -> None:
+        """Place the photos that have no place where weaker evidence tells one."""
+        if self.model is None or self.faces > 1 or self.registered == len(self.names):
             return
-        self._tell("sharpen", 0)
-        mapping = self._mapping()
+        self._tell("home", self.registered, len(self.names))
+        self._sure = placed_names(self.model)
+        folder = self.directory / f"home_{self.database.stem}"
+        self.model = brought_home(self.model, self.database, self.photos, folder, self._mapping)
 
-        def adjust(model: pycolmap.Reconstruction, scale: float, move: bool) -> None:
-            options = mapping.get_global_bundle_adjustment()
-            options.refine_rig_from_world = move
-            if not move:
-                options.refine_focal_length = options.refine_extra_params = False
-            options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-            options.ceres.loss_function_scale = scale
-            pycolmap.bundle_adjustment(model, options)
+    def sharpen(self) -> None:
+        """Move the observations to where the photos agree, and adjust again, where that is more precise.
 
-        self.model = sharpened(self.model, Path(str(self.given["photos"])), adjust)
+        Then what the photos show is compared with what they should show, where that may not be the same;
+        photos that were brought home do not stay where it is not.
+        """
+        if self.model is None or self.faces > 1:
+            return
+        plain, unsure = self.model, self._off(self.model) > UNSURE
+        if unsure:
+            self._tell("sharpen", 0)
+            self.model = sharpened(plain, self.photos, self._adjust)
+        if self.model is plain and not self._sure >= placed_names(plain):
+            self._settle(plain)
+        if not (unsure or self.registered < len(self.names) or len(self.names) < FEW):
+            return
+        self._tell("agree", 0)
+        names, tracks = read_tracks(plain)
+        rest = rebuilt(self.model, names, tracks)
+        self._adjust(rest, usual(plain), False)
+        self.agree = agreement(rest, self.photos)
+        strange = {name for name, counts in self.agree.items() if not confirmed(*counts)} - self._sure
+        if strange:
+            without(self.model, strange)
+            self._adjust(self.model, usual(self.model), True)
+            self.agree = {name: counts for name, counts in self.agree.items() if name not in strange}
+
+    def _adjust(self, model: pycolmap.Reconstruction, scale: float, move: bool) -> None:
+        """Bundle adjustment in which errors from `scale` px on count less; `move`: of the photos as well."""
+        options = self._mapping().get_global_bundle_adjustment()
+        options.refine_rig_from_world = move
+        if not move:
+            options.refine_focal_length = options.refine_extra_params = False
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = scale
+        pycolmap.bundle_adjustment(model, options)
 
     def _look_learned(self, photos: Path) -> None:
         """Features and matches of networks."""
@@ -225,7 +259,7 @@ class Attempt:
         own = {"tolerant": self.tolerant, "registered": self.registered, "learned": self.learned}
         if self.model is not None and self.faces > 1:
             own["borne_out"] = borne_out(self.database, self.model)
-        return {**own, "apart": self.apart, **counts(self.database, placed)}
+        return {**own, "agree": self.agree, "apart": self.apart, **counts(self.database, placed)}
 
     def _geometry(self) -> pycolmap.TwoViewGeometryOptions:
         geometry = pycolmap.TwoViewGeometryOptions()

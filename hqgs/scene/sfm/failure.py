@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hqgs.base.text import some
+from hqgs.scene.sfm.agree import confirmed
 
 FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
 POOR = 0.25  # of the features of the others: the same
@@ -15,6 +16,7 @@ AGREE = 15  # matches that agree, which COLMAP asks of a pair
 BORNE_OUT = (
     0.85  # of the matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
 )
+LOOKED = 20  # points that a photo should show; fewer tell nothing
 ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
 
 
@@ -31,6 +33,8 @@ class Pass:
     # those that a geometry bears out, and the same with a photo that has a place
     apart: list[list[str]] = field(default_factory=list)  # photos that fit each other, and no others
     learned: bool = False  # by features of networks
+    agree: dict[str, list[int]] = field(default_factory=dict)  # of photos with a place, where that was looked
+    # at: points that they should show, those that show, and those that show where only chance puts them
     borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
@@ -109,8 +113,24 @@ def what_to_take(lost: Mapping[str, str], names: Sequence[str], apart: Sequence[
     return "; ".join(said)
 
 
-def why_doubtful(one: Pass) -> str:
-    """That the places of panoramas may be wrong, and what to do; empty where nothing says so."""
+def doubtful(one: Pass) -> list[str]:
+    """Photos whose places are no better than chance: they do not show what they should."""
+    return sorted(
+        name
+        for name, (looked, *found) in one.agree.items()
+        if looked >= LOOKED and not confirmed(looked, *found)
+    )
+
+
+def why_doubtful(one: Pass, called: Callable[[str], str] = str) -> str:
+    """That places may be wrong, and what to do; empty where nothing says so."""
+    if wrong := doubtful(one):
+        looked, agreed, beside = np.median([one.agree[name] for name in wrong], axis=0)
+        return (
+            f"The places of {len(wrong)} photos are in doubt ({some([called(name) for name in wrong])}): of "
+            f"{looked:.0f} points that one should show it shows {agreed:.0f}, chance alone {beside:.0f} "
+            "(medians). Take photos between these and the others, sharper and larger ones"
+        )
     if one.borne_out is None or one.borne_out >= BORNE_OUT:
         return ""
     return (

@@ -15,6 +15,7 @@ MANY = 60  # photos; of fewer each is matched with each
 LOOKED_AT = 256  # features of a photo, the largest, which are seen again from the farthest
 RATIO = 0.8  # of the distances to the nearest and the second feature of another photo, as COLMAP has it
 BEST, NEXT = 20, 4  # partners of a photo: those that are most like it, and those that follow it
+NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 LENGTH = 512  # of COLMAP's descriptors, whole numbers
 BLOCK = 64  # photos that are compared with one at once
 
@@ -48,6 +49,20 @@ def partners(scores: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     first, second = np.triu_indices(count, 1)
     wanted = chosen[first, second] | (second - first <= NEXT)
     return np.stack([first[wanted], second[wanted]], axis=1)
+
+
+def film_pairs(count: int) -> NDArray[np.int64]:
+    """The pairs of frames [P, 2] that are matched, sorted; they do not grow with the frames squared.
+
+    Each frame with the next 10, and with those 16, 32, 64, ... after it, which make tracks long; and for a
+    camera that comes back to a place each with each of 24 frames that are spread over the film.
+    """
+    first, second = np.triu_indices(count, 1)
+    apart = second - first
+    thin = np.isin(np.arange(count), np.linspace(0, count - 1, THIN).round())
+    near = (apart <= NEAR) | ((apart & (apart - 1)) == 0)
+    chosen = near | (thin[first] & thin[second])
+    return np.stack([first[chosen], second[chosen]], axis=1)
 
 
 def pairs_of_faces(count: int, faces: int, some: NDArray[np.int64] | None = None) -> NDArray[np.int64]:

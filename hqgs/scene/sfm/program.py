@@ -16,8 +16,9 @@ that each panorama has in `names`, one after the other. The first pass matches t
 photos, where it has some; else all, or of many photos those that are alike. Where it has `coarse`, photos
 rich in detail are looked at coarsely, and again finely where too few find a place. Where too few do then,
 smoothed versions of the photos are looked at, first one and then all together. Where few photos have a place
-yet, another, more tolerant pass follows, with every pair; the better of the two counts. Where it has
-`learned`, networks look at the photos in place of all that.
+yet, another, more tolerant pass follows, with every pair; the better of the two counts. Photos without a
+place are placed by weaker evidence where others bear that out. Where it has `learned`, networks look at the
+photos in place of all that.
 In the end observations are moved to where the photos agree. `facts.json` says what all came to,
 `stage.json` what is being done now, which is read from COLMAP's log: the caller sends the output to
 `log.txt`. A second call in the same DIRECTORY goes on with the features and matches that the first one left.
@@ -83,6 +84,7 @@ def reconstruct(directory: Path, threads: int) -> None:
     if "learned" in given:
         passes = [Attempt(directory, given, threads, learned=True)]
         passes[0].run()
+        passes[0].bring_home()
     else:
         passes = _by_sift(directory, given, threads)
     best = max(passes, key=lambda one: (one.registered, -one.tolerant))
@@ -111,9 +113,11 @@ def _by_sift(directory: Path, given: dict[str, Any], threads: int) -> list[Attem
         again = Attempt(directory, given, threads, smoothed=smoothed, plain=plain)
         again.run()
         passes = [max(passes[0], again, key=lambda one: one.registered)]
+    passes[0].bring_home()
     if passes[0].registered < ENOUGH * len(given["names"]):
         passes.append(Attempt(directory, given, threads, tolerant=True))
         passes[1].run()
+        passes[1].bring_home()
     return passes
 
 

@@ -26,16 +26,28 @@ from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import learned, likely
 from hqgs.scene.sfm.attempt import LARGEST
-from hqgs.scene.sfm.failure import Pass, counts, what_to_take, why_doubtful, why_few, why_lost, why_no_model
+from hqgs.scene.sfm.failure import (
+    Pass,
+    counts,
+    doubtful,
+    what_to_take,
+    why_doubtful,
+    why_few,
+    why_lost,
+    why_no_model,
+)
 
 PROGRAM = Path(__file__).with_name("program.py")
 IMPORTED = (
+    "agree",
     "attempt",
     "database",
     "facts",
+    "home",
     "learned",
     "likely",
     "matching",
+    "patches",
     "sharpen",
     "tracks",
     "versions",
@@ -44,7 +56,6 @@ PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED)]
 FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
 LEAST_PHOTOS = 3  # of a reconstruction
 LEAST_SHARE = 0.5  # of the photos must find their place in it
-NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
 AGAIN = 4  # times the first pass, that all passes take at most
 LISTEN = 0.25  # s between looks at what COLMAP is doing
@@ -53,6 +64,8 @@ STAGES = {
     "matches": "COLMAP: pairs of photos matched",
     "verify": "COLMAP: matches checked",
     "place": "COLMAP: photos placed",
+    "home": "COLMAP: photos without a place looked for",
+    "agree": "COLMAP: places checked",
     "sharpen": "COLMAP: places made precise",
 }
 
@@ -78,13 +91,16 @@ class Model:
     called: Mapping[str, str] = field(default_factory=dict)  # what the user calls photos, by COLMAP's names
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
-        """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few photos have one."""
+        """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few photos have one, or most
+        are no better than chance."""
         poses, photos = registered(self.found), len(self.passes[0].features)
         if len(poses) < max(LEAST_PHOTOS, LEAST_SHARE * photos):
             raise ValueError(
                 f"COLMAP registered only {len(poses)} of {photos} photos, wanted at least {LEAST_PHOTOS} and "
                 f"{LEAST_SHARE:.0%}. {why_few(photos, self.passes)}. {self._to_take()}".strip()
             )
+        if 2 * len(doubtful(self._chosen)) > len(poses):
+            raise ValueError(f"no pose of these photos can be trusted. {self.advice()}")
         return poses
 
     @property
@@ -110,7 +126,7 @@ class Model:
         if told and not self.learned:
             told += ". Networks may know more of them again: --features learned, of the extra hqgs[learned]"
         told = f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else ""
-        return ". ".join(filter(None, (told, why_doubtful(self._chosen)))) or None
+        return ". ".join(filter(None, (told, why_doubtful(self._chosen, self._name)))) or None
 
     def _to_take(self) -> str:
         names = sorted(set(map(self._name, self._chosen.features)))
@@ -125,20 +141,6 @@ class Model:
     def first_pass(self) -> int | None:
         """Photos that the first pass registered, where a second one was made. None: one was enough."""
         return self.passes[0].registered if len(self.passes) > 1 else None
-
-
-def film_pairs(count: int) -> NDArray[np.int64]:
-    """The pairs of frames [P, 2] that are matched, sorted; they do not grow with the frames squared.
-
-    Each frame with the next 10, and with those 16, 32, 64, ... after it, which make tracks long; and for a
-    camera that comes back to a place each with each of 24 frames that are spread over the film.
-    """
-    first, second = np.triu_indices(count, 1)
-    apart = second - first
-    thin = np.isin(np.arange(count), np.linspace(0, count - 1, THIN).round())
-    near = (apart <= NEAR) | ((apart & (apart - 1)) == 0)
-    chosen = near | (thin[first] & thin[second])
-    return np.stack([first[chosen], second[chosen]], axis=1)
 
 
 def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: bool = False) -> str:
@@ -213,7 +215,7 @@ def run_colmap(
         if cameras.rotations is not None:
             given["rotations"] = cameras.rotations
         if cameras.ordered:
-            given["pairs"] = film_pairs(len(names))
+            given["pairs"] = likely.film_pairs(len(names))
     else:
         given["sizes"] = np.array([(camera.width, camera.height) for camera in cameras])
         given["Ks"] = np.stack([camera.K for camera in cameras])

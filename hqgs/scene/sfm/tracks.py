@@ -34,6 +34,16 @@ class Tracks:
         rows, point = np.unique(self.point[keep], return_inverse=True)
         return Tracks(self.points[rows], self.colors[rows], self.view[keep], point, self.xy[keep])
 
+    def more(self, view: Ints, point: Ints, xy: Floats) -> Tracks:
+        """With more observations of the same points, after these."""
+        return Tracks(
+            self.points,
+            self.colors,
+            np.concatenate([self.view, view]),
+            np.concatenate([self.point, point]),
+            np.concatenate([self.xy, xy]),
+        )
+
     def joined(self, other: Tracks) -> Tracks:
         """These points, then the other ones."""
         return Tracks(

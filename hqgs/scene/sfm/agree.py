@@ -1,0 +1,57 @@
+"""Whether photos show what a model says that they should: a check of their places that needs no truth.
+
+Points that a photo should show are looked for in it by their patches: where its place says that they are,
+whatever features told, and beside it, where only chance lets them agree. It imports of hqgs what needs
+nothing else: `program.py` uses it in COLMAP's process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hqgs.scene.sfm.patches import REACH, PatchView, fitted, read_photo, widened
+from hqgs.scene.sfm.tracks import read_tracks
+
+POINTS = 60  # of each photo that the others are searched for, those that most photos see
+BESIDE = 4 * REACH  # px of the photos that are looked at: there no patch reaches the place
+DEVIATIONS = 3.0  # by which more must agree at the place than beside it
+TIMES = 1.5  # the same, as a ratio
+
+Agreement = dict[str, tuple[int, int, int]]  # of a photo: points looked for, that agree, that agree beside
+
+
+def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
+    """Of each photo with a place, how many points that it should show it shows; photos are in `folder`."""
+    names, tracks = read_tracks(model)
+    length = np.bincount(tracks.point, minlength=len(tracks.points))
+    longest = np.zeros(len(length), bool)
+    for k in range(len(names)):
+        mine = tracks.point[tracks.view == k]
+        longest[mine[np.argsort(-length[mine], kind="stable")[:POINTS]]] = True
+    views = [PatchView(model, name, read_photo(folder / name)) for name in names]
+    chosen = tracks.chosen(longest[tracks.point])
+    should = chosen.xy.copy()
+    for k, view in enumerate(views):
+        mine = chosen.view == k
+        should[mine] = view.project(chosen.points[chosen.point[mine]])[0]
+    some, new = widened(views, chosen)
+    some = some.more(chosen.view, chosen.point, should)
+    new = np.concatenate([new, np.ones(len(should), bool)])
+    sizes, ratios = (np.array([getattr(v, key) for v in views])[some.view] for key in ("size", "ratio"))
+    rows, axis = np.arange(len(new)), np.arange(len(new)) % 2
+    shift = np.zeros(some.xy.shape)
+    towards = np.where(some.xy[rows, axis] < sizes[rows, axis] / 2, BESIDE, -BESIDE)  # stays in the photo
+    shift[rows, axis] = np.where(new, towards / ratios[rows, axis], 0)
+    at, beside = (fitted(views, replace(some, xy=xy), new)[1] for xy in (some.xy, some.xy + shift))
+    counted = [np.bincount(some.view[new & that], minlength=len(names)) for that in (new, at, beside)]
+    return {name: (int(a), int(b), int(c)) for name, a, b, c in zip(names, *counted, strict=True)}
+
+
+def confirmed(looked: int, agreed: int, beside: int) -> bool:
+    """Whether a photo shows more of what it should than chance lets it; where little was looked for, no."""
+    more = agreed - beside
+    return more > DEVIATIONS * (agreed + beside) ** 0.5 and agreed > TIMES * beside

@@ -1,0 +1,109 @@
+"""Photos without a place are placed by weaker evidence, and places are checked by what the photos show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+from test_sfm import cards  # noqa: F401
+from test_sharpen import made  # noqa: F401
+
+from hqgs.scene.scene import Scene
+from hqgs.scene.sfm.agree import agreement, confirmed
+from hqgs.scene.sfm.attempt import Attempt
+from hqgs.scene.sfm.facts import placed_names
+from hqgs.scene.sfm.failure import Pass, doubtful, why_doubtful
+from hqgs.scene.sfm.home import without
+from hqgs.scene.sfm.reconstruct import _write_photos
+from hqgs.scene.sfm.run import Model
+
+Made = tuple[pycolmap.Reconstruction, list[np.ndarray], Path]
+
+
+def test_places_that_photos_bear_out_are_told_from_others(made: Made) -> None:  # noqa: F811
+    """Though features tell nothing of it: the observations of the turned photo follow its place."""
+    model, true, folder = made
+    for k, pose in enumerate(true, 1):
+        model.frames[model.images[k].frame_id].rig_from_world = pycolmap.Rigid3d(pose)
+    right = agreement(model, folder)
+    assert all(confirmed(*counts) for counts in right.values())
+    assert np.mean([agreed / looked for looked, agreed, _ in right.values()]) > 0.9
+    wrong = true[3].copy()
+    wrong[:, :3] = Rotation.from_euler("y", 6, degrees=True).as_matrix() @ wrong[:, :3]  # 16 px
+    model.frames[model.images[4].frame_id].rig_from_world = pycolmap.Rigid3d(wrong)
+    told = agreement(model, folder)
+    assert [name for name, counts in told.items() if not confirmed(*counts)] == ["3.png"]
+    one = Pass(False, 8, {}, [], [], agree={name: list(counts) for name, counts in told.items()})
+    assert doubtful(one) == ["3.png"]
+    looked, agreed, beside = told["3.png"]
+    said = f"The places of 1 photos are in doubt (tree.jpg): of {looked} points that one should show it shows"
+    assert f"{said} {agreed}, chance alone {beside}" in why_doubtful(one, lambda name: "tree.jpg")
+    few = replace(one, agree={"3.png": [19, 0, 9]})
+    assert doubtful(few) == []  # too little was looked for
+
+
+@pytest.fixture
+def attempt(cards: Scene, tmp_path: Path) -> Attempt:  # noqa: F811
+    """A pass over the cards' photos, all of which have a place."""
+    views = {f"{k:05d}.png": view for k, view in enumerate(cards.train)}
+    (tmp_path / "photos").mkdir()
+    _write_photos(tmp_path / "photos", views)
+    cameras = [view.camera for view in cards.train]
+    given = {
+        "names": np.array(list(views)),
+        "sizes": np.array([(camera.width, camera.height) for camera in cameras]),
+        "Ks": np.stack([camera.K for camera in cameras]),
+        "photos": np.array(str(tmp_path / "photos")),
+    }
+    ran = Attempt(tmp_path, given, 1)
+    ran.run()
+    assert ran.registered == 7
+    return ran
+
+
+def test_lost_photos_come_home_and_strange_ones_do_not(attempt: Attempt) -> None:
+    model = attempt.model
+    assert model is not None
+    before = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    lost = {"00002.png", "00005.png"}
+    without(model, lost)
+    assert placed_names(model) == set(before) - lost
+    attempt.bring_home()
+    home = attempt.model
+    assert home is not None
+    assert placed_names(home) == set(before)
+    for image in home.images.values():
+        R = image.cam_from_world().matrix()[:, :3]
+        turned = Rotation.from_matrix(R @ before[image.name][:, :3].T).magnitude()
+        assert np.rad2deg(turned) < 1
+    # Another one that weak evidence put where it does not belong goes again.
+    frame = home.frames[home.images[3].frame_id]
+    assert frame.rig_from_world is not None
+    spin = Rotation.from_euler("x", 25, degrees=True).as_matrix()
+    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(spin), np.zeros(3)) * frame.rig_from_world
+    attempt.sharpen()
+    assert attempt.model is not None
+    assert placed_names(attempt.model) == set(before) - {"00002.png"}
+    assert set(attempt.agree) == set(before) - {"00002.png"}
+    assert all(confirmed(*counts) for counts in attempt.agree.values())
+
+
+def test_a_run_says_that_no_pose_can_be_trusted() -> None:
+    """Where most of the photos do not show what their places say."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=9, height=9, params=[9, 9, 4.5, 4.5])
+    model.add_camera_with_trivial_rig(camera)
+    for k in range(4):
+        image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    features = {f"{k}.png": 500 for k in range(4)}
+    good, bad = [40, 30, 5], [40, 6, 5]
+    one = Pass(False, 4, features, [], [], agree={"0.png": bad, "1.png": bad, "2.png": good, "3.png": good})
+    assert len(Model(model, [one]).poses()) == 4
+    worse = replace(one, agree=one.agree | {"2.png": bad})
+    with pytest.raises(ValueError, match=r"no pose of these photos can be trusted\. The places of 3 photos"):
+        Model(model, [worse]).poses()
