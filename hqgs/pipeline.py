@@ -146,11 +146,12 @@ def train(
     )
     if config is not None and asked != run_config():
         raise ValueError("config is the whole configuration: nothing of it can be given beside it")
-    taken = ranks.first and out is not None and (Path(out) / CHECKPOINT).exists()
+    out = None if out is None else Path(out).expanduser()
+    taken = ranks.first and out is not None and (out / CHECKPOINT).exists()
     if taken and not (resume or overwrite):
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
     if out is not None and ranks.first and not taken:
-        strangers(Path(out))
+        strangers(out)
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
     with open_run(scene, config or asked, out, resume, seconds, on_stage, ranks) as trainer:

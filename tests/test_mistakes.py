@@ -18,6 +18,14 @@ MISTAKES = {
     "train scene": "missing: --out DIR",
     "train scnee --out run": "did you mean {root}/scene?",
     "train embeded --out run": "did you mean the built-in embedded?",
+    "train https://a.b/photos.zip --out run": "is an address: download what it names",
+    "train photos/view_00.png photos/view_01.png --out run": "photos/view_01.png; give their folder",
+    "train scene/transforms.json --out run": "is a folder with photos, or a film: perhaps {root}/scene is",
+    "train a.ply --out run": "is a scene file, trained already: hqgs view shows it",
+    "train raws --out run": "holds no photos, but a.CR2: raw data of a camera: develop them to JPEG",
+    "train films --out run": "holds no photos, but a.mp4, b.MOV: several films: give one of them",
+    "train film --out run": "a.mp4 cannot be read: it is no film, or damaged",
+    "train -s scene -m run": "there is no -s: write hqgs train PHOTOS --out RUN",
     "train photos.zip --out run": "is an archive: unpack it, and give the folder with the photos",
     "train photos/view_00.png --out run": "is a file, a scene is a folder with photos, or a film",
     "train empty --out run": "is empty: give a folder with photos",
@@ -58,6 +66,7 @@ MISTAKES = {
     "clean a.ply --out b.ply": "--photos names the photos to measure it with",
     "degrade scene --kind noise:25 --out photos": "photos exists and is not an empty folder",
     "diagnose nowhere": "there is no scene folder {root}/nowhere",
+    "sfm films --out run": "several films: give one of them",
     "sfm photos --out others": "others exists and is not an empty folder",
 }
 
@@ -69,9 +78,19 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_transforms(make_truth(), root / "scene")
     write_photos(make_truth(), root / "photos")
     write_photos(make_truth(2), root / "two")
-    for name in ("empty", "texts", "others"):
+    for name in ("empty", "texts", "others", "raws", "films", "film"):
         (root / name).mkdir()
-    for name in ("texts/a.txt", "notes.txt", "photos.zip", "half.ply", "others/config.json"):
+    for name in (
+        "texts/a.txt",
+        "notes.txt",
+        "photos.zip",
+        "half.ply",
+        "others/config.json",
+        "raws/a.CR2",
+        "films/a.mp4",
+        "films/b.MOV",
+        "film/a.mp4",
+    ):
         (root / name).write_text("ply")
     points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
     Gaussians.from_points(points, np.zeros((9, 3), np.uint8), 0).save(root / "a.ply")

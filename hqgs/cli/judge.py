@@ -18,7 +18,8 @@ from hqgs.cli.scenes import Factor, Number, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.model.formats.files import format_of, scene_file
 from hqgs.scene.constants import TEST_EVERY
-from hqgs.scene.names import is_film, is_room
+from hqgs.scene.names import is_room
+from hqgs.scene.photo_files import film_at
 from hqgs.training.settings import longest_side
 
 if TYPE_CHECKING:
@@ -170,7 +171,9 @@ def read_photos(
         return load_again(source, on_stage=screen.stage)
     run = source if source.is_dir() else source.parent
     run = run if (run / CONFIG).is_file() else None
-    bare = is_film(photos) or not (is_room(photos) or formats_of(Path(photos).resolve(), downscale or 1.0))
+    bare = film_at(photos) is not None or not (
+        is_room(photos) or formats_of(Path(photos).resolve(), downscale or 1.0)
+    )
     if bare and run is None:
         raise ValueError(
             f"{photos} has no cameras: those that would be found anew are in another frame than {source}; "

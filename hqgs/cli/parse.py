@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
 DEEP = 8  # columns from the border of tyro's boxes on which an option is explained
 WORDS = {  # tyro's, and ours
     r"Unrecognized options?: (?!-)": "one argument too many: ",
+    r"(one argument too many: .*\.(?:jpe?g|png|heic|tiff?|mp4|mov|json|txt)\b.*)": r"\1; give their folder",
     r"Unrecognized options?:": "there is no option",
     r"Missing from hqgs \w+:": "missing:",
     r"Perhaps you meant:": "- did you mean",
@@ -41,12 +43,17 @@ WORDS = {  # tyro's, and ours
     r"Error parsing \S+: (?!no type)": "",
 }
 GPU = ("--device", "--cuda", "--gpu", "--gpus")
+OF_3DGS = ("-s", "--source_path", "-m", "--model_path")
+HOME = re.compile(r"^(--[\w-]+=)?(~(?:/.*)?)$", re.DOTALL)  # which the shell leaves as it is after =
 
 
 def parse(options: type[T], command: str, about: str, arguments: Sequence[str], default: Any = None) -> T:
     """The options that the arguments give. Help and mistakes end the program, mistakes with one sentence."""
     if asked := [a for a in arguments if a.split("=")[0] in GPU]:
         raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs trains on the CPU, leave it out"))
+    if asked := [a for a in arguments if a in OF_3DGS]:
+        raise SystemExit(fail(2, f"there is no {asked[0]}: write hqgs train PHOTOS --out RUN"))
+    arguments = [HOME.sub(lambda m: (m[1] or "") + os.path.expanduser(m[2]), a) for a in arguments]
     more = {} if default is None else {"default": default}
     told = io.StringIO()
     try:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hqgs.cli.errors import fail
-from hqgs.scene.names import existing_folder, is_film, is_room
+from hqgs.scene.names import existing_folder, is_room
+from hqgs.scene.photo_files import film_at
 
 if TYPE_CHECKING:
     from hqgs.cli.progress import LoadingScreen
@@ -55,7 +56,7 @@ class Photos:
 
 def ready(scene: str) -> None:
     """Tell a wrong path at once; then load what takes seconds, after which SIGTERM counts as Ctrl-C."""
-    if not is_room(scene) and not is_film(scene):
+    if not is_room(scene) and film_at(scene) is None:
         existing_folder(scene)
     warnings.filterwarnings(
         "ignore", category=FutureWarning, message=".*torch.jit"

@@ -20,6 +20,9 @@ CHAT_QUALITIES = (40, 70)  # of a messenger's JPEG: the lowest and highest, all 
 # photos have steps of at least 1/255, far above it.
 SOBEL_ROUNDING = 1e-5
 
+# files.py: photo and mask files
+LARGEST = 1 << 28  # px of a photo: more come from damaged files, and would fill the memory
+
 # kernels.py: the kernels of defocus and motion blur
 KERNEL_REACH = 4  # sigmas at which the Gaussian kernel ends
 

@@ -11,8 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from hqgs.photos.constants import LARGEST
+
 HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
-PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC_SUFFIXES)
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe")
+PHOTO_SUFFIXES = (".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".bmp", ".webp", ".avif", ".jp2", *HEIC_SUFFIXES)
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".x3f")
 DECODE_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError),
     MemoryError,  # Pillow reads as many bytes as a chunk says it has
@@ -44,7 +48,12 @@ def open_photo(path: Path) -> Image.Image:
         head = file.read(_HEAD)
     if is_heic(head) and not _register_heic():
         raise OSError("HEIC photos need the extra 'heic': pip install 'hqgs[heic]'")
-    return Image.open(path)
+    if Image.MAX_IMAGE_PIXELS is not None and Image.MAX_IMAGE_PIXELS < LARGEST:
+        Image.MAX_IMAGE_PIXELS = LARGEST  # for the process: phones take 108 and 200 megapixels
+    photo = Image.open(path)
+    if photo.width * photo.height > LARGEST:
+        raise OSError(f"{photo.width} x {photo.height} px are more than {LARGEST / 1e6:.0f} megapixels")
+    return photo
 
 
 def is_heic(head: bytes) -> bool:
@@ -100,7 +109,7 @@ def glance(path: Path) -> Glance:
 def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
     """Width and height that the photo's header promises, for a look before memory is taken for the pixels.
 
-    Pillow refuses more than 179 million of them. Raises UnreadableError.
+    Raises UnreadableError, also for more than LARGEST.
     """
     try:
         with open_photo(path) as photo:

@@ -22,6 +22,7 @@ from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 from hqgs.photos.video import pyav
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
+from hqgs.scene.photo_files import film_at
 
 PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
 LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
@@ -70,7 +71,7 @@ def film_frames(
 
 def check_film(path: str | Path) -> None:
     """ValueError where a number of frames is asked of something else than a film."""
-    if is_room(path) or Path(path).is_dir():
+    if is_room(path) or (Path(path).is_dir() and film_at(path) is None):
         raise ValueError(f"frames is for films, and {path} is none: each of its photos is used")
 
 

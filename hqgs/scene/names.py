@@ -20,6 +20,7 @@ ROOMS = (
 )
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
+SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
 KEPT = "sfm"  # in the folder of a run: what COLMAP found
 FRAMES = "frames.json"  # in a folder of photos: they are frames of a film, named in its order
 
@@ -27,7 +28,9 @@ FRAMES = "frames.json"  # in a folder of photos: they are frames of a film, name
 def existing_folder(path: str | Path) -> Path:
     """The folder of a scene, resolved. FileNotFoundError where there is none, ValueError for a file, or where
     nothing is in it."""
-    folder = Path(path).resolve()
+    if "://" in str(path) or str(path).startswith(("http:/", "https:/")):
+        raise ValueError(f"{path} is an address: download what it names, and give that folder or film")
+    folder = Path(path).expanduser().resolve()
     if not folder.exists():
         near = ""
         if folder.parent.is_dir():
@@ -43,13 +46,11 @@ def existing_folder(path: str | Path) -> Path:
         return folder
     if folder.name.lower().endswith(ARCHIVE_SUFFIXES):
         raise ValueError(f"{folder} is an archive: unpack it, and give the folder with the photos")
-    raise ValueError(f"{folder} is a file, a scene is a folder with photos, or a film")
-
-
-def is_film(path: str | Path) -> bool:
-    """Whether it is a film's file, by its suffix."""
-    path = Path(path)
-    return path.name.lower().endswith(FILM_SUFFIXES) and path.is_file()
+    if folder.name.lower().endswith(SCENE_SUFFIXES):
+        raise ValueError(f"{folder} is a scene file, trained already: hqgs view shows it; photos are wanted")
+    raise ValueError(
+        f"{folder} is a file, a scene is a folder with photos, or a film: perhaps {folder.parent} is meant"
+    )
 
 
 def is_room(name: str | Path) -> bool:

@@ -17,7 +17,7 @@ from urllib.parse import unquote
 from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PAGE, PLAN, PLY
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.scene.names import KEPT
+from hqgs.scene.names import FILM_SUFFIXES, KEPT, is_room
 
 MASKS = "masks"
 _FILES = (
@@ -69,6 +69,17 @@ def below(folder: Path, suffixes: Iterable[str]) -> list[Path]:
             if name[0] != "." and name.lower().endswith(wanted) and (path := Path(place, name)).is_file()
         ]
     return sorted(found)
+
+
+def film_at(path: str | Path) -> Path | None:
+    """The film that a path names: its file, by its suffix, or a folder with that one film and no photo."""
+    path = Path(path).expanduser()
+    if path.is_file():
+        return path if path.name.lower().endswith(FILM_SUFFIXES) else None
+    if is_room(path) or not path.is_dir() or is_run(path) or below(path, PHOTO_SUFFIXES):
+        return None
+    films = below(path, FILM_SUFFIXES)
+    return films[0] if len(films) == 1 else None
 
 
 class Named:

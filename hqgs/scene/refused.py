@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.files import PHOTO_SUFFIXES, RAW_SUFFIXES
 from hqgs.scene.formats.colmap import find_models, half_model
 from hqgs.scene.formats.llff import POSES
 from hqgs.scene.formats.transforms import SINGLE, TRAIN
@@ -36,12 +36,13 @@ def nothing(root: Path) -> str:
         return f"{root} is the folder of a run that hqgs wrote: give the folder with the photos"
     entries = sorted(p.name for p in root.iterdir() if not p.name.startswith("."))
     for suffixes, advice in (
+        (RAW_SUFFIXES, "raw data of a camera: develop them to JPEG, all with the same settings"),
         (ARCHIVE_SUFFIXES, "unpack it, and give the folder with the photos"),
-        (FILM_SUFFIXES, "give the film itself in place of the folder"),
+        (FILM_SUFFIXES, "several films: give one of them in place of the folder"),
     ):
         if found := [name for name in entries if name.lower().endswith(suffixes)]:
-            return f"{root} holds no photos, but {found[0]}: {advice}"
+            return f"{root} holds no photos, but {some(found)}: {advice}"
     return (
-        f"{root} holds no photos ({', '.join(PHOTO_SUFFIXES)}), here or one folder further down, and no "
+        f"{root} holds no photos ({', '.join(PHOTO_SUFFIXES)}), here or in a folder further down, and no "
         f"scene (a COLMAP model, {SINGLE}, {TRAIN} or {POSES}); it holds {some(entries)}"
     )

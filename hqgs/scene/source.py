@@ -21,7 +21,8 @@ from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.load import check_names, load_pictures, load_scene
 from hqgs.scene.metres import distance_of, in_metres
-from hqgs.scene.names import KEPT, is_film, is_room
+from hqgs.scene.names import KEPT, is_room
+from hqgs.scene.photo_files import film_at
 from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
@@ -85,7 +86,7 @@ def load(
         ValueError: anything else that is wrong; the message names the file or the photo.
     """
     origin = {
-        "path": str(path if is_room(path) else Path(path).resolve()),
+        "path": str(path if is_room(path) else Path(path).expanduser().resolve()),
         "downscale": downscale,
         "test_every": test_every,
         "sfm": sfm,
@@ -119,10 +120,10 @@ def load(
     else:
         with ExitStack() as stack:
             notes, name = list[str](), None
-            if is_film(path):
-                name = Path(path).stem
+            if (film := film_at(path)) is not None:
+                name = film.stem
                 folder = kept or Path(stack.enter_context(TemporaryDirectory(prefix="hqgs-film-")))
-                path, note = film_frames(Path(path), folder / "frames", frames, on_stage)
+                path, note = film_frames(film, folder / "frames", frames, on_stage)
                 notes.append(note)
             elif apart is not None:
                 check_names(path, downscale, apart)
@@ -170,9 +171,10 @@ def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = 
     """
     if not is_room(path):
         with TemporaryDirectory(prefix="hqgs-film-") as name:
-            source = film_frames(Path(path), Path(name))[0] if is_film(path) else path
+            film = film_at(path)
+            source = path if film is None else film_frames(film, Path(name))[0]
             if (scene := load_pictures(source, downscale, longest=longest)) is not None:
-                return replace(scene, name=Path(path).stem) if is_film(path) else scene
+                return scene if film is None else replace(scene, name=film.stem)
     return load(path, downscale=downscale, longest=longest, skip_unreadable=False)
 
 

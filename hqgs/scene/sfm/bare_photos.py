@@ -26,15 +26,24 @@ from hqgs.photos.files import (
 from hqgs.scene.capture import photo_folder
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.faces import CUBE, face_name
-from hqgs.scene.names import FRAMES
+from hqgs.scene.names import FRAMES, KEPT
 from hqgs.scene.photo_files import MASKS, is_run
-from hqgs.scene.sfm.front_door import copies, films_beside, photos_below, strays, understood
+from hqgs.scene.sfm.front_door import (
+    cameras_beside,
+    copies,
+    films_beside,
+    photos_and_maps,
+    photos_below,
+    strays,
+    understood,
+)
 from hqgs.scene.sfm.panoramas import all_around, colmap_faces, write_faces
 from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
 WORKERS = 2
+DEEP = 5  # folders below the one named in which photos are looked for: Takeout/Google Photos/Walk
 
 
 @dataclass(frozen=True)
@@ -112,26 +121,34 @@ class BarePhotos:
 def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
     """The photos of a folder, not looked into yet; None without photos.
 
-    Those of `photo_folder`, or in `root` itself, or, where there are none, in the folders of `root`.
+    Those of `photo_folder`, or in `root` itself, or, where there are none, in the nearest folders below.
     """
     if is_run(root):
         return None
     folder, left, notes = photo_folder(root, downscale) or (root, downscale, [])
-    names = _photos_in(folder)
-    below = sorted(p for p in folder.iterdir() if p.is_dir() and p.name != MASKS and p.name[0] != ".")
-    found = {path.name: inside for path in below if not is_run(path) and (inside := _photos_in(path))}
+    names, found = _photos_in(folder), _photos_below(folder)
+    if folder != root and not names and not found:
+        folder, left, notes, names, found = root, downscale, [], _photos_in(root), _photos_below(root)
     if names:
         notes = [*notes, *photos_below(folder, names, found)]
+        if folder != root:
+            beside = {k: v for k, v in _photos_below(root).items() if not (root / k).samefile(folder)}
+            plain = {k: v for k, v in beside.items() if not k.startswith(f"{folder.name}_")}  # at other sizes
+            notes += photos_below(root, [f"{folder.name}/{name}" for name in names], plain)
     else:
+        found, others = photos_and_maps(found)
         names = [f"{inner}/{name}" for inner, inside in found.items() for name in inside]
         inner = [*found]
         if len(inner) == 1:
             folder, names = folder / inner[0], found[inner[0]]
         if inner:
             notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
+        if others:
+            notes.append(f"not taken for photos, by the names of their folders: {some([*others])}")
     if not names:
         return None
-    return BarePhotos(folder, left, names, notes=[*notes, *films_beside(folder, names)])
+    notes += [*films_beside(folder, names), *cameras_beside(root, folder)]
+    return BarePhotos(folder, left, names, notes=notes)
 
 
 def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
@@ -151,6 +168,8 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     unreadable: dict[str, str] = {}
 
     def look(name: str) -> Glance | str:
+        if any("\ud800" <= letter <= "\udfff" for letter in name):
+            return "its name is no text in UTF-8: rename it"
         try:
             return glance(photos.folder / name)
         except UnreadableError as error:
@@ -159,7 +178,7 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     with ThreadPoolExecutor(min(WORKERS, os.cpu_count() or 1)) as pool:
         for k, (name, found) in enumerate(zip(photos.names, pool.map(look, photos.names), strict=True)):
             if isinstance(found, str):
-                unreadable[name] = found
+                unreadable[name.encode(errors="replace").decode()] = found
             else:
                 looked[name] = found
             on_stage(Stage("photos looked at", k + 1, len(photos.names)))
@@ -203,6 +222,17 @@ def ups(exif: Sequence[Exif]) -> np.ndarray:
             pitch = np.radians(tags.pitch)
             found[k] = np.cos(pitch) * found[k] + np.sin(pitch) * np.array([0, 0, 1.0])
     return found
+
+
+def _photos_below(folder: Path) -> dict[str, list[str]]:
+    """The photos in the folders below, by their paths: those of the first level that has any."""
+    level = [folder]
+    for _ in range(DEEP):
+        inner = (p for place in level for p in place.iterdir() if p.is_dir())
+        level = sorted(p for p in inner if p.name not in (MASKS, KEPT) and p.name[0] != "." and not is_run(p))
+        if found := {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}:
+            return found
+    return {}
 
 
 def _photos_in(folder: Path) -> list[str]:

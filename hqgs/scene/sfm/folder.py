@@ -14,7 +14,9 @@ from hqgs.base.stages import OnStage, silent
 from hqgs.photos.files import decode
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.film import check_film, film_frames, frame_details, write_details
-from hqgs.scene.names import existing_folder, is_film
+from hqgs.scene.names import existing_folder
+from hqgs.scene.photo_files import film_at
+from hqgs.scene.refused import nothing
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import FOR_COLMAP, bare_photos, readable
 from hqgs.scene.sfm.photos_alone import find_cameras
@@ -40,12 +42,12 @@ def write_colmap_folder(
     if frames is not None:
         check_film(source)
     with TemporaryDirectory(prefix="hqgs-film-") as name:
-        if is_film(source):
-            source, _ = film_frames(Path(source), Path(name), frames, on_stage)
+        if (film := film_at(source)) is not None:
+            source, _ = film_frames(film, Path(name), frames, on_stage)
         root = existing_folder(source)
         photos = bare_photos(root, 1.0)
         if photos is None:
-            raise ValueError(f"{root} holds no photos")
+            raise ValueError(nothing(root))
         found = find_cameras(root, readable(photos, on_stage), work, on_stage, features=features)
         images = out / "images"
         details = frame_details(found.photos.folder)

@@ -15,6 +15,24 @@ from hqgs.photos.files import Glance, UnreadableError, decode
 from hqgs.scene.names import FILM_SUFFIXES
 
 _BURST = re.compile(r"(.*?)BURST(\d{8,})?", re.IGNORECASE)  # with the time of a burst, or its photos' numbers
+_CAMERAS = {  # files of other programs, by what they are called
+    "Metashape": re.compile(r"^(cameras?|doc|agisoft.*|metashape.*)\.xml$|\.psx$", re.IGNORECASE),
+    "RealityCapture": re.compile(
+        r"\.rcproj$|^(cameras?|registration|internal_?external).*\.csv$", re.IGNORECASE
+    ),
+    "Bundler": re.compile(r"^bundler?.*\.out$", re.IGNORECASE),
+    "VisualSFM": re.compile(r"\.nvm$", re.IGNORECASE),
+    "OpenMVG or Meshroom": re.compile(r"^(sfm_data.*\.(json|bin)|cameras\.sfm|.*\.mg)$", re.IGNORECASE),
+    "OpenSfM": re.compile(r"^reconstruction\.(json|meshed\.json)$"),
+    "Polycam": re.compile(r"^(corrected_)?cameras$|^mesh_info\.json$"),
+    "poses": re.compile(
+        r"^(poses?|trajectory|traj|groundtruth|camera_poses)\.(txt|csv|json|log)$", re.IGNORECASE
+    ),
+}
+_NO_PHOTOS = re.compile(
+    r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
+    re.IGNORECASE,
+)
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
 _OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
 _LEAST = 3  # photos of that camera
@@ -116,6 +134,27 @@ def films_beside(folder: Path, names: Sequence[str]) -> list[str]:
             f"{folder / others[0]} in place of the folder to use that"
         )
     return told
+
+
+def cameras_beside(*folders: Path) -> list[str]:
+    """That files of other programs, which may hold cameras, are not read; or nothing."""
+    found = [path.name for folder in dict.fromkeys(folders) for path in sorted(folder.iterdir())]
+    named = {name: what for name in found for what, known in _CAMERAS.items() if known.search(name)}
+    if not named:
+        return []
+    what = ", ".join(dict.fromkeys(named.values()))
+    return [
+        f"cameras are found from the photos: those in {some([*named])} ({what}) are not read; an export for "
+        "COLMAP or nerfstudio is"
+    ]
+
+
+def photos_and_maps(below: dict[str, list[str]]) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    """Folders of photos, and those of depth maps, masks or thumbnails by their names, if others are there."""
+    maps = {k: v for k, v in below.items() if _NO_PHOTOS.fullmatch(k.rsplit("/", 1)[-1])}
+    return (
+        ({k: v for k, v in below.items() if k not in maps}, maps) if len(maps) < len(below) else (below, {})
+    )
 
 
 def photos_below(folder: Path, names: Sequence[str], below: dict[str, list[str]]) -> list[str]:

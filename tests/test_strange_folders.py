@@ -1,0 +1,144 @@
+"""Folders of photos as people have them: what is a photo, and what of a folder is not read."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import Image, features
+from test_bare_photos import picture
+
+from hqgs.photos.files import LARGEST, UnreadableError, decode, glance
+from hqgs.scene.film import check_film
+from hqgs.scene.names import existing_folder
+from hqgs.scene.photo_files import film_at
+from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
+
+
+def looked_at(folder: Path) -> BarePhotos:
+    found = bare_photos(folder, 1)
+    assert found is not None
+    return readable(found)
+
+
+def pictures(folder: Path, count: int = 3, first: int = 0, suffix: str = ".png") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(first, first + count):
+        picture(k, (64, 48)).save(folder / f"{k}{suffix}")
+
+
+@pytest.mark.parametrize("inner", ["DCIM/100APPLE", "Takeout/Google Photos/Walk", "a/b/c/d/e"])
+def test_photos_far_down_are_found_and_the_folder_is_named(inner: str, tmp_path: Path) -> None:
+    pictures(tmp_path / inner)
+    (tmp_path / "__MACOSX" / inner).mkdir(parents=True)
+    (tmp_path / "__MACOSX" / inner / "._0.png").write_bytes(b"no picture")
+    photos = looked_at(tmp_path)
+    assert (photos.folder, photos.names) == (tmp_path / inner, ["0.png", "1.png", "2.png"])
+    assert f"the photos are those in {inner}, below {tmp_path.name}" in photos.notes
+
+
+def test_maps_beside_photos_are_no_photos(tmp_path: Path) -> None:
+    pictures(tmp_path / "rgb")
+    for k, name in enumerate(("depth", "Confidence", "normal_maps", "thumbs")):
+        pictures(tmp_path / name, first=10 * k)
+    photos = looked_at(tmp_path)
+    assert photos.folder == tmp_path / "rgb"
+    told = "not taken for photos, by the names of their folders: Confidence, depth, normal_maps, thumbs"
+    assert told in photos.notes
+    shutil.rmtree(tmp_path / "rgb")  # what else is there is all that can be meant
+    assert len(looked_at(tmp_path).names) == 12
+
+
+def test_an_empty_folder_of_images_hides_no_photos(tmp_path: Path) -> None:
+    pictures(tmp_path)
+    (tmp_path / "images").mkdir()
+    assert looked_at(tmp_path).names == ["0.png", "1.png", "2.png"]
+
+
+def test_photos_beside_the_folder_of_images_are_told(tmp_path: Path) -> None:
+    pictures(tmp_path / "images")
+    pictures(tmp_path / "images_4")
+    pictures(tmp_path / "second", first=5)
+    photos = looked_at(tmp_path)
+    assert photos.folder == tmp_path / "images"
+    assert photos.notes[1:] == [
+        "3 photos in the folder second: not used; put those of one scene into one folder to use them"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("file", "program"),
+    [
+        ("cameras.xml", "Metashape"),
+        ("registration.csv", "RealityCapture"),
+        ("bundle.out", "Bundler"),
+        ("model.nvm", "VisualSFM"),
+        ("sfm_data.json", "OpenMVG or Meshroom"),
+        ("reconstruction.json", "OpenSfM"),
+        ("mesh_info.json", "Polycam"),
+        ("poses.txt", "poses"),
+    ],
+)
+def test_cameras_of_other_programs_are_told_not_to_be_read(file: str, program: str, tmp_path: Path) -> None:
+    pictures(tmp_path)
+    assert not any("not read" in note for note in looked_at(tmp_path).notes)
+    (tmp_path / file).write_text("something")
+    assert any(f"those in {file} ({program}) are not read" in note for note in looked_at(tmp_path).notes)
+
+
+@pytest.mark.parametrize("suffix", [".jfif", ".jpe", ".avif", ".jp2"])
+def test_photos_of_rarer_suffixes(suffix: str, tmp_path: Path) -> None:
+    if suffix == ".avif" and not features.check("avif"):
+        pytest.skip("this Pillow reads no AVIF")
+    pictures(tmp_path, suffix=suffix)
+    photos = looked_at(tmp_path)
+    assert len(photos.names) == 3
+    photos.write(tmp_path / "for_colmap")
+    for path in (tmp_path / "for_colmap").iterdir():
+        with Image.open(path) as photo:
+            assert (photo.format, photo.size) == ("JPEG", (64, 48))
+
+
+def test_a_name_that_is_no_text(tmp_path: Path) -> None:
+    pictures(tmp_path, 4)
+    try:
+        os.rename(tmp_path / "0.png", os.fsencode(tmp_path) + b"/\xff\xfe.png")
+    except OSError:
+        pytest.skip("this file system has text names alone")
+    photos = looked_at(tmp_path)
+    assert photos.names == ["1.png", "2.png", "3.png"]
+    assert photos.unreadable == {"??.png": "its name is no text in UTF-8: rename it"}
+
+
+def test_two_hundred_megapixels_are_read_and_more_than_memory_are_not(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    Image.new("L", (16320, 12240), 7).save(tmp_path / "a.jpg")
+    assert decode(tmp_path / "a.jpg", (500, 500))[0].shape == (1530, 2040, 3)
+    assert not len(recwarn)
+    Image.new("1", (1 << 15, LARGEST // (1 << 15) + 1)).save(tmp_path / "b.png")
+    with pytest.raises(UnreadableError, match=r"32768 x 8193 px are more than 268 megapixels"):
+        glance(tmp_path / "b.png")
+
+
+def test_a_film_alone_in_a_folder_is_that_film(tmp_path: Path) -> None:
+    folder = tmp_path / "walk"
+    (folder / "DCIM").mkdir(parents=True)
+    film = folder / "DCIM" / "IMG_1.MOV"
+    film.write_bytes(b"a film")
+    (folder / ".DS_Store").write_bytes(b"")
+    assert film_at(folder) == film_at(film) == film
+    check_film(folder)
+    (folder / "other.mp4").write_bytes(b"another")
+    assert film_at(folder) is None
+    (folder / "other.mp4").unlink()
+    pictures(folder)
+    assert film_at(folder) is None
+
+
+def test_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    pictures(tmp_path / "walk")
+    assert existing_folder("~/walk") == tmp_path / "walk"
