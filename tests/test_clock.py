@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -38,14 +37,13 @@ def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
     config = tiny_config(N, densify=DensifyConfig(stop=STOP), seconds=seconds, **changes)
     views = tiny_scene().train
     schedule = Schedule.of(replace(planned(config, views), follows_clock=True), len(views))
-    state = SimpleNamespace(decisions=schedule.start(), iteration=0, seconds=0.0)
-    while state.iteration < state.decisions.length:
-        state.iteration += 1
-        state.seconds += step
-        state.decisions = clock.turned(schedule, state, step)  # type: ignore[arg-type]
-    assert schedule.part(state.iteration, state.decisions) == pytest.approx(1.0)
-    assert schedule.densification_end(state.decisions) == STOP
-    return state.decisions.turned, state.iteration
+    decisions, iteration = schedule.start(), 0
+    while iteration < decisions.length:
+        iteration += 1
+        decisions = clock.turned(schedule, decisions, iteration, iteration * step, step)
+    assert schedule.part(iteration, decisions) == pytest.approx(1.0)
+    assert schedule.densification_end(decisions) == STOP
+    return decisions.turned, iteration
 
 
 def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:

@@ -278,7 +278,7 @@ def test_a_run_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_an_inspected_photo_is_held_in_few_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.diagnosis.photo.PHOTO_LARGEST", 128)
+    monkeypatch.setattr("hqgs.diagnosis.photo.LARGEST", 128)
     photo, middle = clean_photo(0), np.s_[40:168, 72:200]
     found = inspect_photo("photo", photo)
     assert (found.kept.dtype, found.kept.nbytes, found.kept.base) == (np.uint8, 3 * 128**2, None)

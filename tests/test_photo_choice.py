@@ -149,12 +149,12 @@ def test_three_sharper_photos_must_see_the_same() -> None:
         assert left_out(scene) == gone
 
 
-@pytest.mark.parametrize(("value", "name"), [(0, "black"), (255, "white"), (100, "one colour")])
-def test_empty_photos_go(value: int, name: str) -> None:
+@pytest.mark.parametrize("value", [0, 255, 100])
+def test_empty_photos_go(value: int) -> None:
     scene = changed(clean_scene(), filled(value), 1, 4, 7)
     assert left_out(scene) == ["01.png", "04.png", "07.png"]
     entry = choose_photos(scene)[1][0]
-    assert entry.why == f"it is all {name}"
+    assert entry.why == "it is all one colour"
     assert f"{value}, {value}, {value}" in (entry.evidence or "")
 
 

@@ -15,19 +15,15 @@ from hqgs.diagnosis.constants import (
     BLUR_LENGTHS,
     BLUR_SIGMAS,
     CLEARLY,
-    FAINTEST,
     FINE_LENGTHS,
     FLOOR,
     HIGHEST,
-    MIN_RINGS,
-    NEIGHBOURS,
     PLANE_POINTS,
-    POINT_ERROR,
+    POINT_VARIANCE,
     RADII,
     RING_ERROR,
     RING_SAMPLES,
     SHARP,
-    SHORTEST,
     SPECTRUM_SLOPE,
     UNKNOWN_FLOORS,
 )
@@ -72,7 +68,7 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
     spectrum = power_spectrum(grey, tile)
     frequency, log_power, number = rings(spectrum)
     known = (LUMA_NOISE * noise) ** 2 + FLOOR
-    if (log_power > np.log(known) + 1).sum() < MIN_RINGS:
+    if (log_power > np.log(known) + 1).sum() < 3:  # as many as the law and a blur have unknowns
         return None
     weights = np.minimum(number / RING_SAMPLES, 1) / (2 * RING_ERROR**2)
     blurs = [_round_blurs(kind, sizes, frequency, spectrum.step) for kind, sizes in ROUND]
@@ -100,7 +96,7 @@ def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Bl
     at, chosen = _half_plane(spectrum.tile)
     frequency = np.hypot(*at)
     log_power = np.log(spectrum.power.ravel()[chosen] + FLOOR)
-    weights = np.full(len(log_power), 1 / (NEIGHBOURS * POINT_ERROR**2))
+    weights = np.full(len(log_power), 1 / POINT_VARIANCE)
 
     def fit(log_blurs: Floats) -> Fit:
         return fit_blurs(frequency, log_power, weights, log_blurs, floor, steps=4)
@@ -117,7 +113,7 @@ def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Bl
     lengths, angles = (a.ravel() for a in np.meshgrid(FINE_LENGTHS, angle + np.deg2rad([-4.0, 0.0, 4.0])))
     moved = fit(_motions(lengths, angles, at, spectrum.step))
     length = float(lengths[moved.best])
-    if moved.cost >= CLEARLY * still or length < SHORTEST:
+    if moved.cost >= CLEARLY * still:
         return None
     direction = float(np.rad2deg(angles[moved.best]) % 180)
     return Blur("motion", length, length / 12**0.5, 1 - moved.cost / still, direction)
@@ -151,7 +147,7 @@ def _motions(lengths: Floats, angles: Floats, at: tuple[Floats, Floats], step: f
 
 def _leaked(here: Floats, below: Floats, above: Floats, frequency: Floats) -> Floats:
     """Log of what a Hann window shows of a response: power from the neighbours, by the photos' law."""
-    return np.log((here * 2 / 3 + (below + above) / 6) * frequency**SPECTRUM_SLOPE + FAINTEST)
+    return np.log((here * 2 / 3 + (below + above) / 6) * frequency**SPECTRUM_SLOPE + 1e-7)  # no zero is exact
 
 
 @lru_cache(maxsize=4)

@@ -12,14 +12,9 @@ from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.base.text import some
 from hqgs.diagnosis.constants import (
-    BLACK,
-    CHECKS,
     CHOICE_LEAST_BLUR,
-    CHOICE_MOST_POINTS,
+    CHOICE_POINTS,
     CHOICE_SHARED,
-    CHOICE_WHITE,
-    LEAST_KEPT,
-    LEAST_POINTS,
     MOST_TURNED,
     OTHERS,
     UNUSUAL,
@@ -35,8 +30,7 @@ class Sight:
 
     def __init__(self, views: Sequence[View], points: NDArray[np.float32]) -> None:
         """`points` [*, 3], world."""
-        count = min(max(CHECKS // len(views) ** 2, LEAST_POINTS), CHOICE_MOST_POINTS, len(points))
-        world = points[evenly(len(points), count)].astype(np.float64)
+        world = points[evenly(len(points), CHOICE_POINTS)].astype(np.float64)
         self._inside = np.stack([in_frame(view.camera, world) for view in views])  # [N, P]
         rays = world - np.stack([view.camera.center for view in views])[:, None]
         lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -71,7 +65,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     At least three photos and half of them stay. `Scene.notes` says which photos nearly went and why they
     stay. Held-out views are neither looked at nor changed.
     """
-    most = len(scene.train) - max(LEAST_KEPT, (len(scene.train) + 1) // 2)
+    most = len(scene.train) - max(3, (len(scene.train) + 1) // 2)
     if most <= 0:
         return scene, []
     bad = [_bad_values(view) for view in scene.train]
@@ -133,18 +127,11 @@ def _empty(
         others = int(full[peers[k]].sum())
         if look.colour is None or others < OTHERS or 2 * others <= len(peers[k]):
             continue
-        name = (
-            "black"
-            if look.colour.max() < BLACK
-            else "white"
-            if look.colour.min() > CHOICE_WHITE
-            else "one colour"
-        )
         evidence = (
             f"its colour is {', '.join(f'{c:.0f}' for c in look.colour)} with a standard deviation of "
             f"{look.spread:.1f} levels; {others} of {len(peers[k])} photos of its points show something"
         )
-        drops[k] = _Drop(view, f"it is all {name}", evidence)
+        drops[k] = _Drop(view, "it is all one colour", evidence)
     return drops
 
 

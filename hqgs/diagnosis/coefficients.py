@@ -16,18 +16,17 @@ from scipy.special import ndtr
 
 from hqgs.diagnosis.constants import (
     DCT_LEAST,
-    DCT_MAX_BLOCKS,
     DCT_SLOPE,
     DCT_SLOPE_SPREAD,
     EM_STEPS,
-    LEAST_SIGMA,
+    LEAST_BLUR,
     LIKELIHOOD_GAIN,
     MAGNITUDES,
-    MIN_BLOCKS,
     SHOWS,
     VARIANCES,
 )
 from hqgs.photos.blocks import block_coefficients
+from hqgs.photos.constants import ENOUGH_BLOCKS, MAX_BLOCKS
 from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 _GRID = (np.arange(-32, 32) + 0.5) * np.pi / 32  # rad/px
@@ -63,7 +62,7 @@ def quantised(
     levels: Floats, table: NDArray[np.int64], corner: tuple[int, int] = (0, 0)
 ) -> NDArray[np.int64]:
     """Coefficients [blocks, 63] of a decoded photo's luma in steps of its `table` [8, 8], means left out."""
-    blocks = block_coefficients(luma(levels)[corner[0] :, corner[1] :], DCT_MAX_BLOCKS)
+    blocks = block_coefficients(luma(levels)[corner[0] :, corner[1] :], MAX_BLOCKS)
     return np.rint(blocks / table).astype(np.int64).reshape(-1, 64)[:, 1:]
 
 
@@ -74,16 +73,16 @@ def estimate_hidden(steps: NDArray[np.int64], table: NDArray[np.int64]) -> Hidde
     is Gaussian, its variance the power law of photos times a Gaussian blur's response, seen through the DCT's
     basis functions (which leak: eight pixels are short), plus the noise. The likelihood is that of the cells
     in which the coefficients lie; EM finds how frequent the classes are. Noise must pay for itself: it is
-    fitted after the best noiseless model. None for fewer than 60 blocks, or where JPEG left nothing.
+    fitted after the best noiseless model. None for fewer than 40 blocks, or where JPEG left nothing.
     """
-    if len(steps) < MIN_BLOCKS or not steps.any():
+    if len(steps) < ENOUGH_BLOCKS or not steps.any():
         return None
     model = _Model(steps, table)
     clean = min((model.minimise([DCT_SLOPE, sigma]) for sigma in (0.5, 2.0)), key=lambda result: result[1])
     noisy = model.minimise([*clean[0], 3.8])
     finest = np.sort(table.ravel()[1:])[:3].mean()
     limit = max(DCT_LEAST, SHOWS * float(finest))
-    sigma_limit = LEAST_SIGMA + 0.2 * float(np.clip((finest - 30) / 30, 0, 1))
+    sigma_limit = LEAST_BLUR + 0.2 * float(np.clip((finest - 30) / 30, 0, 1))
     noise = float(np.exp(noisy[0][2] / 2)) / LUMA_NOISE
     if noise >= limit and clean[1] - noisy[1] >= LIKELIHOOD_GAIN:
         return Hidden(max(float(noisy[0][1]), 0.0), noise, limit, sigma_limit)

@@ -8,6 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+# Of several files.
+FEWEST_PHOTOS = 5  # with fewer none is compared with the others
+LARGEST = 1024  # px a side: more of the middle of a photo is not looked at, but for its enlargement
+LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6, at JPEG's quality 10 0.8
+
 # blur.py: kind and size of a photo's blur from its power spectrum
 SHARP = 0.3  # px: the sigma that the spectra of sharp photos fit; taken off in squares
 BLUR_SIGMAS = np.concatenate([np.arange(0, 4, 0.05), 4 * 1.02 ** np.arange(70)])  # px, up to 16
@@ -16,25 +21,18 @@ BLUR_LENGTHS = 3 * 1.25 ** np.arange(13)  # px, of the motion
 FINE_LENGTHS = 3 * 1.04 ** np.arange(69)  # px, around the best of them
 ANGLES = np.arange(18) * np.pi / 18  # rad, of the motion
 CLEARLY = 0.7  # a kind other than Gaussian must have less than this share of the Gaussian's misfit
-SHORTEST = 3.0  # px of motion; a shorter one is not told from the scene's own direction
-RING_ERROR, POINT_ERROR = 0.2, 0.3  # of the log power: how far sharp photos are off the power law
+RING_ERROR = 0.2  # of the log power: how far rings of sharp photos are off the power law
+POINT_VARIANCE = 0.72  # the same of frequencies alone: 0.3 squared, and 8 neighbours err together
 UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)  # levels^2: what JPEG of a quality too good to be found may have added
-MIN_RINGS = 3  # that must rise above the noise
 PLANE_POINTS = 1_000  # frequencies at which motion is looked for
 RING_SAMPLES = 40.0  # a ring with more counts no more: its error is the law's
-NEIGHBOURS = 8.0  # frequencies that err together
-FAINTEST = 1e-7  # power response; no zero is exact
 
 # choice.py: the training photos that a scene does without: broken, empty or far too blurred
-LEAST_KEPT = 3  # photos, and at least half
 OTHERS = 3  # photos that must see a point for it to be well seen
 WELL_SEEN = 0.98  # of the points of a blurred photo, without it
-# of the scene's, evenly spread, that are looked for in the photos
-LEAST_POINTS, CHOICE_MOST_POINTS = 100, 600
-CHECKS = 30_000_000  # of a point in two views; more views look at fewer points
+CHOICE_POINTS = 600  # of the scene's, evenly spread, that are looked for in the photos
 MOST_TURNED = np.cos(np.deg2rad(45))  # between two rays to a point; beyond, it may be another side of a thing
 CHOICE_SHARED = 0.5  # of a photo's points that another must see to be compared with it
-BLACK, CHOICE_WHITE = 16.0, 239.0  # levels: what is called so
 CHOICE_LEAST_BLUR = 2.0  # px, sigma of a Gaussian
 UNUSUAL = 4.0  # robust standard deviations of sigma^2 over the scene
 
@@ -42,20 +40,16 @@ UNUSUAL = 4.0  # robust standard deviations of sigma^2 over the scene
 DCT_SLOPE, DCT_SLOPE_SPREAD = 2.55, 2.0  # of the power over frequency; the spread is that of one block
 VARIANCES = 13 * 6.0 ** np.arange(-1, 8)  # levels^2: of the lowest coefficient, one per class of blocks
 MAGNITUDES = np.array([1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56, 80, 112, 160, 226, 320, 452])  # in steps
-MIN_BLOCKS, DCT_MAX_BLOCKS = 60, 4_000  # that are needed, and that are looked at
 EM_STEPS = 12  # rounds of expectation and maximisation over the classes of blocks
 LIKELIHOOD_GAIN = 8.0  # nats that noise must bring, or there is none
 SHOWS = 0.32  # times the mean of the three finest steps: the least noise that is told from fine texture
 DCT_LEAST = 6.0  # levels; below it fine texture is taken for noise at any table
-LEAST_SIGMA = 0.7  # px; coarse tables (quality 10 and below) make sharp photos look 0.8 px soft
 
 # differences.py: whether photos differ in sharpness, each in a direction of its own, or in their gains
 UNLIKE, TURNED = 0.18, 0.45  # from these values of `Unlike` on, photos were shaken
 UNLIKE_GAINS = 0.05  # of the log gains
-UNLIKE_FEWEST = 5  # photos
 SECTORS = 8  # directions of frequencies
 UNLIKE_COARSE, UNLIKE_FINE = (0.03, 0.1), (0.15, 0.4)  # frequencies, cycles per px
-UNLIKE_LARGEST = 1024  # px: of the middle of a photo that is looked at
 
 # film_traces.py: traces of a film's codec in a frame: the levels that its luma had
 LUMA_709 = np.array([0.2126, 0.7152, 0.0722])  # of films in HD (ITU-R BT.709); LUMA is that of the others
@@ -66,12 +60,11 @@ FEWEST_PIXELS, FEWEST_LEVELS = 10, 48  # of each level of the luma that counts, 
 # focus.py: whether photos were focused each in its own way: by how sharply they show the same points
 GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `FocusSigns` on, photos differ in focus
 MOST_PHOTOS, FOCUS_MOST_POINTS = 60, 4000  # that are looked at
-FEWEST_PHOTOS, FEWEST_POINTS = 5, 40  # in all, and of each photo on average
+FEWEST_POINTS = 40  # of each photo on average
 FOCUS_SHARED = 3  # photos that show a point, at least
 # px: sigmas between which details lie, and the window around a point
 FOCUS_FINE, FOCUS_COARSE, FOCUS_WINDOW = 0.8, 2.4, 9
 FOCUS_LARGEST = 2000  # px: the longest side of what is looked at of a photo
-BORDER = 4  # px: points so near to the border do not count
 FOCUS_DARK = 0.5 / 255  # contrast below which there is nothing to be sharp
 NEARNESS = (0.2, 3.0)  # that count; the photo's median depth has 1
 FOCUS_LEAST = 0.25  # added to the sum of squares of a photo's nearness: few points tell no slope
@@ -97,7 +90,6 @@ COMB_MIN_EVIDENCE = 0.5  # nats per coefficient; photos that were never JPEG hav
 SPREAD = 0.4  # levels: standard deviation of a decoded coefficient, as pixels were rounded twice
 OUTLIERS = 0.02  # share of coefficients off the comb, in blocks that were clipped
 BLOCKING_SEEN = 0.15  # above this a grid that does not begin at the corner is looked at too
-COMB_SMALLEST = 24  # px a side
 STEPS = 255  # the largest step of an 8-bit JPEG
 
 # noise.py: level of a photo's noise, and how neighbours go together in it
@@ -106,24 +98,19 @@ FEW_PATCHES = 4_000  # below this the large patch has too many directions for th
 LIMIT, SMALL_LIMIT = 2.5, 4.0  # levels: photos of fine texture without noise reach 1.9, small ones 3.2
 MIN_PATCHES, MAX_PATCHES = 200, 12_000  # that are needed, and that are looked at
 HALF_TILE = 24  # px: the photo is cut into a chessboard of tiles of this size
-# px a side, and how many must be without clipped values, to tell of neighbours
-NOISE_BLOCK, NOISE_FEW_BLOCKS = 16, 40
+NOISE_BLOCK = 16  # px a side: blocks without clipped values tell how neighbours go together
 NOISIEST = 0.05  # share of the blocks that show noise and little else
 
 # photo.py: what one photo shows, from the last step of its making back to the first
-PHOTO_LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6
 SHARPER = 0.2  # px of the small photo: shrinking halves a camera's own softness or more, to 0.45 at most
 HIDING_QUALITY = 92  # from this quality on, JPEG leaves the luma's noise and spectrum as they were
-PHOTO_LARGEST = 1024  # px a side: more of a photo is not looked at, but for its enlargement
 PHOTO_FEW_BLOCKS = 1_000  # of all photos together, to look for noise in the luma alone
 LUMA_TELLS = 100  # px a side; the coefficients of smaller photos have the fine texture of large ones
 
 # resolution.py: was a photo enlarged, and by how much?
 FACTORS = (2, 3, 4, 6, 8)  # of enlargement that are tried
 GRID_MIN_EVIDENCE = 2.1  # JPEG blocks reach 1.8 at factor 2; bicubic enlargement kept in 8 bits starts at 4.5
-LINE_STEP = 4  # every 4th row and column is looked at
 LONGEST = 768  # px of a line that are looked at
-GRID_SMALLEST = 8  # px, of the small photo
 ROUNDING = 0.05  # levels; a residual below this counts as this
 
 # scene.py: what degraded the photos of a scene, and which parts of the method that calls for
@@ -137,8 +124,6 @@ COARSE_FILM = 0.24
 # sharpness.py: what the choice of photos keeps of each photo's pixels
 CHOICE_SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the others
 CHOICE_DOUBT = 2.0  # of the log-likelihood: two standard deviations
-LEAST_SIGNAL = 1e-3  # of the power of details that may be noise alone
-CHOICE_BLOCK = 8  # px: the mean over a block hides noise
 FLAT_LEVELS = 3.0  # that a block may be off the colour of an empty photo
 FLAT_SHARE = 0.99  # of the blocks of an empty photo
 FLAT_NOISE = 8.0  # levels: standard deviation of an empty photo's luma

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.constants import SECTORS, UNLIKE_COARSE, UNLIKE_FEWEST, UNLIKE_FINE, UNLIKE_LARGEST
+from hqgs.diagnosis.constants import FEWEST_PHOTOS, LARGEST, SECTORS, UNLIKE_COARSE, UNLIKE_FINE
 from hqgs.diagnosis.sharpness import Sharpness, summarised
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.scene.scene import Scene
@@ -31,7 +31,7 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
     different amounts it does not. Faces of panoramas are compared with those of their direction: each was
     resampled in its own way.
     """
-    if len(scene.train) < UNLIKE_FEWEST:
+    if len(scene.train) < FEWEST_PHOTOS:
         return None
     looks = [look.rings for look in summarised(scene.train)]
     rings = [found for found in looks if found is not None]
@@ -52,8 +52,8 @@ def unlike_sharpness(scene: Scene) -> Unlike | None:
 
 def _directions(photo: NDArray[Any]) -> NDArray[np.float64]:
     """Log ratio of the power of fine to coarse details for each direction, [8]."""
-    top, left = (max(side - UNLIKE_LARGEST, 0) // 2 for side in photo.shape[:2])
-    grey = luma(as_floats(photo[top : top + UNLIKE_LARGEST, left : left + UNLIKE_LARGEST])).astype(np.float64)
+    top, left = (max(side - LARGEST, 0) // 2 for side in photo.shape[:2])
+    grey = luma(as_floats(photo[top : top + LARGEST, left : left + LARGEST])).astype(np.float64)
     window = np.hanning(grey.shape[0])[:, None] * np.hanning(grey.shape[1])
     power = np.abs(np.fft.fft2((grey - grey.mean()) * window)) ** 2
     rows, columns = np.fft.fftfreq(grey.shape[0])[:, None], np.fft.fftfreq(grey.shape[1])

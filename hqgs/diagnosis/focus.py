@@ -11,7 +11,6 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from hqgs.base.evenly import evenly
 from hqgs.diagnosis.constants import (
-    BORDER,
     FEWEST_PHOTOS,
     FEWEST_POINTS,
     FOCUS_COARSE,
@@ -77,7 +76,8 @@ def _look(view: View, points: Floats, rows: NDArray[np.intp], sharp: Floats, dep
         return
     where, depth = project(view.camera, points)
     height, width = view.image.shape[:2]
-    inside = (depth > 0) & (where > BORDER).all(1) & (where < [width - BORDER, height - BORDER]).all(1)
+    border = FOCUS_WINDOW // 2
+    inside = (depth > 0) & (where > border).all(1) & (where < [width - border, height - border]).all(1)
     rows, places = rows[inside], (where[inside] - 0.5).T[::-1]
     grey = luma(as_floats(view.image)).astype(np.float32)
     if (factor := max(height, width) / FOCUS_LARGEST) > 1:

@@ -12,7 +12,6 @@ from hqgs.diagnosis.constants import (
     BLOCKING_SEEN,
     COMB_MAX_BLOCKS,
     COMB_MIN_EVIDENCE,
-    COMB_SMALLEST,
     MIN_COEFFICIENTS,
     MIN_FREQUENCIES,
     OUTLIERS,
@@ -53,7 +52,7 @@ def find_jpeg(levels: Floats, path: Path | None = None) -> Jpeg:
     """
     grey = luma(levels)
     blocking, phase = measure_blocking(grey)
-    if min(grey.shape) < COMB_SMALLEST:
+    if min(grey.shape) < 3 * 8:  # too few blocks
         return Jpeg(None, 0.0, blocking, phase, None)
     filed = read_table(path) if path is not None else None
     in_range = np.all((levels > 0) & (levels < 255), axis=2)

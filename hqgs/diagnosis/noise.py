@@ -14,11 +14,12 @@ from hqgs.diagnosis.constants import (
     MAX_PATCHES,
     MIN_PATCHES,
     NOISE_BLOCK,
-    NOISE_FEW_BLOCKS,
     NOISIEST,
     SMALL_LIMIT,
     SMALL_PATCH,
 )
+from hqgs.photos.blocks import blocks_of
+from hqgs.photos.constants import ENOUGH_BLOCKS
 from hqgs.photos.pixels import Floats, luma
 
 
@@ -70,17 +71,14 @@ def neighbour_correlation(levels: Floats) -> float | None:
     pixels still go together. What a photo shows raises it, so it is taken of the blocks with the least. White
     noise strong enough to be told comes to 0.12 at most, a phone's, denoised and as JPEG, to 0.24 to 0.5.
     """
-    grey = luma(levels)
-    height, width = (side // NOISE_BLOCK * NOISE_BLOCK for side in grey.shape)
-    shape = height // NOISE_BLOCK, NOISE_BLOCK, width // NOISE_BLOCK, NOISE_BLOCK
-    blocks = grey[:height, :width].reshape(shape).swapaxes(1, 2).reshape(-1, NOISE_BLOCK, NOISE_BLOCK)
+    blocks = blocks_of(luma(levels), NOISE_BLOCK)
     blocks = blocks[((blocks > 0) & (blocks < 255)).all((1, 2))]
     one, two = (
         np.square(blocks[:, n:] - blocks[:, :-n]).mean((1, 2))
         + np.square(blocks[..., n:] - blocks[..., :-n]).mean((1, 2))
         for n in (1, 2)
     )
-    if (two > 0).sum() < NOISE_FEW_BLOCKS:
+    if (two > 0).sum() < ENOUGH_BLOCKS:
         return None
     together = 1 - one[two > 0] / two[two > 0]
     return float(max(np.quantile(together, NOISIEST), 0.0))

@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from hqgs.diagnosis.blur import Blur, estimate_blur, extra_sigma
 from hqgs.diagnosis.coefficients import Hidden, estimate_hidden, quantised
 from hqgs.diagnosis.constants import (
-    DCT_MAX_BLOCKS,
     HIDING_QUALITY,
+    LARGEST,
+    LEAST_BLUR,
     LUMA_TELLS,
     PHOTO_FEW_BLOCKS,
-    PHOTO_LARGEST,
-    PHOTO_LEAST_BLUR,
     SHARPER,
 )
 from hqgs.diagnosis.film_traces import film_detail
 from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
 from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
+from hqgs.photos.constants import MAX_BLOCKS
 from hqgs.photos.pixels import Floats, to_levels
 
 Table = tuple[tuple[int, ...], ...]
@@ -113,7 +113,7 @@ def inspect_photo(
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     levels = _middle(levels)
     jpeg = find_jpeg(levels, path)
-    limit = _least_blur(PHOTO_LEAST_BLUR, enlargement) * width / enlargement.width
+    limit = _least_blur(LEAST_BLUR, enlargement) * width / enlargement.width
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
     film = film_detail(levels) if film is None else film
     found = replace(found, film=film, correlation=neighbour_correlation(levels))
@@ -138,7 +138,7 @@ def conclude(photos: Sequence[Inspected]) -> list[PhotoDiagnosis]:
         large = min(min(photos[k].kept.shape[:2]) for k in members) >= LUMA_TELLS
         hidden = None
         if hiding or (large and shown and np.median(shown) < 0):
-            share = -(-(DCT_MAX_BLOCKS if hiding else PHOTO_FEW_BLOCKS) // len(members))
+            share = -(-(MAX_BLOCKS if hiding else PHOTO_FEW_BLOCKS) // len(members))
             steps = np.array(table)
             corners = [diagnoses[k].jpeg.phase if hiding else (0, 0) for k in members]
             blocks = [
@@ -188,9 +188,9 @@ def _enlarged(blur: Blur, scale: float) -> Blur:
 
 
 def _middle(levels: Floats) -> Floats:
-    """At most `PHOTO_LARGEST` px a side, cut so that blocks of 8 x 8 pixels stay whole."""
-    top, left = (max(0, side - PHOTO_LARGEST) // 16 * 8 for side in levels.shape[:2])
-    return levels[top : top + PHOTO_LARGEST, left : left + PHOTO_LARGEST]
+    """At most `LARGEST` px a side, cut so that blocks of 8 x 8 pixels stay whole."""
+    top, left = (max(0, side - LARGEST) // 16 * 8 for side in levels.shape[:2])
+    return levels[top : top + LARGEST, left : left + LARGEST]
 
 
 def _kept(levels: Floats) -> NDArray[np.uint8] | Floats:

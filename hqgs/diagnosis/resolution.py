@@ -9,9 +9,10 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from hqgs.diagnosis.constants import FACTORS, GRID_MIN_EVIDENCE, GRID_SMALLEST, LINE_STEP, LONGEST, ROUNDING
+from hqgs.diagnosis.constants import FACTORS, GRID_MIN_EVIDENCE, LONGEST, ROUNDING
 from hqgs.photos.pixels import Floats, luma
 from hqgs.photos.resize import resize_matrix
+from hqgs.scene.constants import SMALLEST_SIDE
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,9 @@ def find_enlargement(levels: Floats) -> Enlargement:
     height, width = levels.shape[:2]
     grey = luma(levels)
     candidates: list[tuple[float, int, int, int]] = []
-    for factor in FACTORS:
-        rows = _best_size(grey[:, ::LINE_STEP], factor)
-        columns = _best_size(grey.T[:, ::LINE_STEP], factor)
+    for factor in FACTORS:  # every fourth line tells as much as all
+        rows = _best_size(grey[:, ::4], factor)
+        columns = _best_size(grey.T[:, ::4], factor)
         candidates.append((min(rows[0], columns[0]), factor, rows[1], columns[1]))
     evidence, factor, small_height, small_width = max(candidates)
     if evidence < GRID_MIN_EVIDENCE:
@@ -60,7 +61,7 @@ def _best_size(lines: Floats, factor: int) -> tuple[float, int]:
 
 
 def _evidence(lines: Floats, small: int, factor: int) -> float:
-    if small < GRID_SMALLEST:
+    if small < SMALLEST_SIDE:
         return 0.0
     basis = _basis(small, len(lines))
     lines = lines[: len(basis)]

@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.diagnosis.constants import (
-    CHOICE_BLOCK,
     CHOICE_DOUBT,
     CHOICE_SIGMAS,
     FLAT_LEVELS,
     FLAT_NOISE,
     FLAT_SHARE,
-    LEAST_SIGNAL,
     RING_ERROR,
     RING_SAMPLES,
     SPECTRUM_SLOPE,
 )
 from hqgs.diagnosis.spectrum import fit_blurs, power_spectrum, rings, tile_size
+from hqgs.photos.blocks import blocks_of
 from hqgs.photos.pixels import Floats, luma, to_levels
 from hqgs.scene.scene import View
 
@@ -66,15 +65,10 @@ def _summary(photo: NDArray[Any], name: str, tile: int | None) -> PhotoSummary:
 
 def _flat_colour(levels: Floats) -> Floats | None:
     """The colour [3] of (nearly) all blocks of a photo [H, W, 3]; None where they differ."""
-    rows, columns = (side // CHOICE_BLOCK for side in levels.shape[:2])
-    if not rows or not columns:
+    blocks = blocks_of(levels).mean((1, 2))  # which hides noise
+    if not len(blocks):
         return None
-    blocks = (
-        levels[: rows * CHOICE_BLOCK, : columns * CHOICE_BLOCK]
-        .reshape(rows, CHOICE_BLOCK, columns, CHOICE_BLOCK, 3)
-        .mean((1, 3))
-    )
-    colour = np.median(blocks, axis=(0, 1))
+    colour = np.median(blocks, axis=0)
     off = np.abs(blocks - colour).max(-1)
     return colour if (off <= FLAT_LEVELS).mean() >= FLAT_SHARE else None
 
@@ -102,7 +96,7 @@ class Sharpness:
         mine = self._log_power[photo]
         noise = np.exp(mine.min())
         usual = np.exp(np.median(self._log_power[others], axis=0))
-        usual = np.log(np.maximum(usual - noise, LEAST_SIGNAL * usual))
+        usual = np.log(np.maximum(usual - noise, 1e-3 * usual))
         squares = (CHOICE_SIGMAS * np.abs(CHOICE_SIGMAS))[:, None]
         # `fit_blurs` expects a power law: the usual spectrum, as a blur of that law, takes its place.
         blurred = usual + SPECTRUM_SLOPE * np.log(self._frequency) - squares * self._frequency**2

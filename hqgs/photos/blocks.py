@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dctn
@@ -9,8 +11,16 @@ from scipy.fft import dctn
 from hqgs.photos.constants import ENOUGH_BLOCKS, MAX_BLOCKS
 from hqgs.photos.pixels import Floats, luma
 
+T = TypeVar("T", bound=np.generic)
 _WAVES = np.add.outer(np.arange(8), np.arange(8))
 _FINE, _COARSE = _WAVES >= 7, (_WAVES >= 3) & (_WAVES <= 5)
+
+
+def blocks_of(image: NDArray[T], side: int = 8) -> NDArray[T]:
+    """The whole blocks of `side` x `side` pixels of an image [H, W, ...], [n, side, side, ...]."""
+    rows, columns = (length // side for length in image.shape[:2])
+    cut = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *image.shape[2:])
+    return cut.swapaxes(1, 2).reshape(-1, side, side, *image.shape[2:])
 
 
 def block_coefficients(grey: Floats, most: int, usable: NDArray[np.bool_] | None = None) -> Floats:
@@ -18,11 +28,10 @@ def block_coefficients(grey: Floats, most: int, usable: NDArray[np.bool_] | None
 
     Only blocks all of whose pixels are `usable`, where there are enough of them.
     """
-    rows, columns = grey.shape[0] // 8, grey.shape[1] // 8
-    blocks = grey[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8).swapaxes(1, 2).reshape(-1, 8, 8)
+    blocks = blocks_of(grey)
     chosen = np.arange(len(blocks))
     if usable is not None:
-        whole = usable[: 8 * rows, : 8 * columns].reshape(rows, 8, columns, 8).all(axis=(1, 3)).ravel()
+        whole = blocks_of(usable).all(axis=(1, 2))
         chosen = np.flatnonzero(whole) if whole.sum() >= ENOUGH_BLOCKS else chosen
     # A stride would fall in step with the rows of blocks; a fixed shuffle spreads the choice.
     chosen = np.random.default_rng(0).permutation(chosen)[:most]

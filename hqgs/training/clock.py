@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 from hqgs.training.schedule import Decisions, Schedule
-from hqgs.training.state import TrainState
 
 SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
 
 
-def turned(schedule: Schedule, state: TrainState, step: float) -> Decisions:
+def turned(
+    schedule: Schedule, decisions: Decisions, iteration: int, seconds: float, step: float
+) -> Decisions:
     """The decisions after a step: at `Schedule.turn_at` the rest gets the length that the clock allows.
 
-    `step`: seconds of a step now. Settings with a `turn` follow that in place of the clock.
+    `seconds`: that the run has taken; `step`: those of a step now. Settings with a `turn` follow that in
+    place of the clock.
     """
-    config, decisions, iteration = schedule.config, state.decisions, state.iteration
+    config = schedule.config
     if decisions.turned:
         return decisions
     at = schedule.turn_at(decisions)
@@ -23,7 +25,7 @@ def turned(schedule: Schedule, state: TrainState, step: float) -> Decisions:
         length = config.turn[1]
     elif schedule.run.follows_clock and config.seconds is not None:
         rest = config.iterations - at
-        left = (config.seconds - state.seconds) / step if step > 0 else rest
+        left = (config.seconds - seconds) / step if step > 0 else rest
         length = at + round(min(max(left, SHORTEST * rest), LONGEST * rest))
     else:
         return decisions

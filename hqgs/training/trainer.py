@@ -290,7 +290,7 @@ class Trainer:
         """The decisions after a step, by the clock of the first rank."""
         state, before = self.state, self.state.decisions
         step = self.frugality.step_seconds
-        decisions = turned(self.schedule, state, step)
+        decisions = turned(self.schedule, before, state.iteration, state.seconds, step)
         if self.plan.follows_clock and self.ranks.count > 1:
             decisions = Decisions(**self.ranks.tell(asdict(decisions))[0])
         if decisions != before:
