@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from hqgs.base.machine import peak_rss_mb, reset_peak_rss
+from hqgs.base.machine import peak_rss_mb
 from hqgs.evaluation.held_out import HeldOutViews, held_out_means
 from hqgs.evaluation.metrics import haarpsi, psnr, ssim
 from hqgs.scene.scene import Scene
@@ -17,6 +19,17 @@ from hqgs.training.trainer import Step, Trainer
 
 Run = dict[str, Any]  # plain JSON values
 MEASURED = {"psnr": psnr, "ssim": ssim, "haarpsi": haarpsi}  # at the moments of a run
+
+
+def reset_peak_rss() -> bool:
+    """Make `peak_rss_mb` start anew from what is resident now; False where the system cannot."""
+    if sys.platform != "linux":
+        return False
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return False
+    return True
 
 
 class Training:

@@ -9,8 +9,13 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+import torch
 from numpy.typing import NDArray
 from PIL import Image
+
+from hqgs.model.gaussians import Gaussians
+from hqgs.photos.pixels import to_uint8
+from hqgs.scene.scene import Camera
 
 CX, CY = 25.0, 17.5  # not the middle, so that a swapped axis shows
 FX, FY = 40.0, 42.0
@@ -42,6 +47,21 @@ def make_truth(count: int = 9, suffix: str = ".png", seed: int = 0) -> Truth:
     points = rng.uniform(-0.7, 0.7, (12, 3))
     colors = rng.integers(0, 256, (12, 3), dtype=np.uint8)
     return Truth([f"view_{i:02d}{suffix}" for i in range(count)], viewmats, photos, points, colors)
+
+
+def photographed(truth: Truth, beside: float = 0.0) -> tuple[Truth, Gaussians]:
+    """Solid Gaussians, and photos of them by cameras that stand so far beside those of the scene."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1.5, 1.5, (150, 3)).astype(np.float32)
+    model = Gaussians.from_points(points, rng.integers(0, 255, (150, 3)).astype(np.uint8), 0)
+    model = replace(model, opacities=model.opacities + 4)
+    photos = []
+    for viewmat in truth.viewmats.copy():
+        viewmat[0, 3] += beside
+        with torch.no_grad():
+            seen = model.render(Camera(truth.width, truth.height, truth.K, viewmat))
+        photos.append(to_uint8(seen.clamp(0, 1).numpy()))
+    return replace(truth, photos=photos), model
 
 
 def _look_at_origin(azimuth: float, elevation: float, roll: float) -> NDArray[np.float64]:

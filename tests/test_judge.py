@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fixtures_scenes import make_truth, write_colmap
+from fixtures_scenes import make_truth, photographed, write_colmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from tiny_scene import tiny_config, tiny_scene
@@ -22,7 +22,6 @@ from hqgs.evaluation.causes import PARTS, Maps, causes, pixel_maps, shares, show
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import METRICS
 from hqgs.model.gaussians import Gaussians
-from hqgs.photos.pixels import to_uint8
 from hqgs.scene import source as scene_source
 from hqgs.scene.scene import Camera, Scene
 
@@ -177,17 +176,8 @@ def test_mistakes_get_a_sentence(run: Path, tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_foreign_file_and_a_folder_with_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth = make_truth(9)
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-1.5, 1.5, (150, 3)).astype(np.float32)
-    model = Gaussians.from_points(points, rng.integers(0, 255, (150, 3)).astype(np.uint8), 0)
-    model = replace(model, opacities=model.opacities + 4)
-    photos = []
-    for viewmat in truth.viewmats:
-        with torch.no_grad():
-            seen = model.render(Camera(truth.width, truth.height, truth.K, viewmat))
-        photos.append(to_uint8(seen.clamp(0, 1).numpy()))
-    root = write_colmap(replace(truth, photos=photos), tmp_path / "scene", binary=False)
+    truth, model = photographed(make_truth(9))
+    root = write_colmap(truth, tmp_path / "scene", binary=False)
     model.save(tmp_path / "foreign.ply")
     found = {}
     for which in ("test", "train", "all"):

@@ -29,7 +29,7 @@ from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.ranks import ALONE, RankError, joined
 from hqgs.cli.main import main
 from hqgs.training.adam import Adam
-from hqgs.training.batch import ROW_BYTES, Part, Rest, give_harmonics, give_others, part_of, to_rasterize
+from hqgs.training.batch import Part, Rest, give_harmonics, give_others, part_of, to_rasterize
 from hqgs.training.config import TrainConfig
 from hqgs.training.forward import TrainingViews
 from hqgs.training.guard import Fault
@@ -209,8 +209,10 @@ def test_gradients_are_those_of_the_mean_of_the_losses() -> None:
         assert gaussians.shN.grad is None  # it is made of sh0's
         part, rest = part_of(forward, None, gaussians, optimizer)
         m, bits = len(part.rows), len(gaussians) / 8
-        assert len(part.packed()) == pytest.approx(ROW_BYTES[0] * m + bits, abs=500)
-        assert len(rest().packed()) == pytest.approx(ROW_BYTES[1] * m, abs=500)
+        assert len(part.packed()) == pytest.approx(4 * 3 * m + bits, abs=500)  # a colour
+        assert len(rest().packed()) == pytest.approx(
+            4 * (3 + 3 + 4 + 1 + 1) * m, abs=500
+        )  # all others, and what growth goes by
         parts.append(Part.unpacked(part.packed()))
         rests.append(Rest.unpacked(rest().packed()))
     optimizer.zero_grad()

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures_scenes import Truth, make_truth, write_colmap, write_transforms
+from fixtures_scenes import Truth, make_truth, photographed, write_colmap, write_transforms
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -19,11 +19,10 @@ from hqgs.cli.main import main
 from hqgs.evaluation.held_out import held_out_renders
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.formula import parse_degradation
-from hqgs.photos.pixels import to_uint8
 from hqgs.scene.camera_files import load_cameras, load_path, moved, save_cameras, save_path
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.scene.load import load_scene
-from hqgs.scene.scene import Camera, Scene
+from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
 
 UTM = np.array([500000.0, 5200000.0, 300.0])
@@ -197,19 +196,9 @@ def test_a_file_in_the_frame_of_the_cameras_is_measured_in_it(tmp_path: Path) ->
 
 def test_cameras_are_fitted_in_the_frame_of_the_photos(tmp_path: Path) -> None:
     """The photos are renders of cameras that stand a little beside those of the files."""
-    truth, own = placed(make_truth(), 1e-3, np.zeros(3)), make_truth()
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-1.5, 1.5, (150, 3)).astype(np.float32)
-    model = Gaussians.from_points(points, rng.integers(0, 255, (150, 3)).astype(np.uint8), 0)
-    model = replace(model, opacities=model.opacities + 4)
-    photos = []
-    for viewmat in own.viewmats:
-        beside = viewmat.copy()
-        beside[0, 3] += 0.08
-        with torch.no_grad():
-            seen = model.render(Camera(own.width, own.height, own.K, beside))
-        photos.append(to_uint8(seen.clamp(0, 1).numpy()))
-    root = write_colmap(replace(truth, photos=photos), tmp_path / "scene", binary=False)
+    own, model = photographed(make_truth(), beside=0.08)
+    truth = placed(own, 1e-3, np.zeros(3))
+    root = write_colmap(truth, tmp_path / "scene", binary=False)
     small = {"means": model.means * 1e-3, "scales": model.scales + np.log(1e-3)}
     replace(model, **small).save(tmp_path / "foreign.ply")
     out = tmp_path / "eval.json"

@@ -69,17 +69,6 @@ def peak_rss_mb() -> float | None:
     return None
 
 
-def reset_peak_rss() -> bool:
-    """Make `peak_rss_mb` start anew from what is resident now; False where the system cannot."""
-    if sys.platform != "linux":
-        return False
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return False
-    return True
-
-
 def _cpu_model() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():

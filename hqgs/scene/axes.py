@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_LONGEST, AXES_NEAR, AXES_PAIRS, AXES_RATIO
+from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_NEAR, AXES_PAIRS, AXES_RATIO, COPY_SIDE
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import View
 
@@ -57,7 +57,7 @@ def _fitting(first: View, second: View) -> NDArray[np.int_]:
 
 def _small(view: View) -> View:
     width, height = view.camera.width, view.camera.height
-    factor = max(width, height) / AXES_LONGEST
+    factor = max(width, height) / COPY_SIDE
     return view if factor <= 1 else resized(view, round(width / factor), round(height / factor))
 
 

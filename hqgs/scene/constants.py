@@ -1,7 +1,7 @@
 """The numbers of scenes, each with its meaning and unit. Those of COLMAP and of built-in rooms are there.
 
 Limits keep damaged files and short memory out; what decides between good inputs was tried on the captures of
-the tests and on fern, fox and horns.
+the tests and on fern, fox and horns; those of GPS, of tags and of where to photograph next were set by hand.
 """
 
 # Every scene.
@@ -16,8 +16,8 @@ MOST_PIXELS = 1 << 28  # of a camera in a file
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
 LENS_SHARES = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
 MOST_FRAMES = 100_000  # of a camera path in a file
-LIST_BYTES = 1 << 24  # of a list of names
 MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
+COPY_SIDE = 640  # px: small copies of photos and frames, which tell of axes and of sharpness
 COARSE = 640  # px: cameras for photos whose longer side is scaled down to no more need not be finer than that
 
 # From photos on disk to views, and to photos that are stored for COLMAP.
@@ -40,7 +40,7 @@ SHOWN, LOOKED_AT = 0.02, 1000  # of a photo's sides, which the points must span 
 SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 FAR_ORIGIN = 100.0  # sizes from the origin: from here on the origin is moved
-AXES_PAIRS, AXES_LONGEST = 6, 640  # of neighbours, spread over the photos; px of the copies that are matched
+AXES_PAIRS = 6  # of neighbours, spread over the photos
 AXES_RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004)
 AXES_NEAR = 3.0  # px from the epipolar line: a match fits
 AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
@@ -50,3 +50,39 @@ RANDOM_POINTS = 20_000  # to start from where a scene has none
 PATH_SIZE, PATH_FOV = (504, 378), 60.0  # px, degrees, of a camera where nothing else is said
 MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
 TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
+
+# Photos that see more than a flat picture holds, and films.
+WIDE = 120.0  # degrees across or up and down that a flat picture shows at most
+FACE_LATTICE = 128  # rays each way that tell which part of a face a photo shows
+FACE_SHOWN = 0.02  # of a face; one that shows less is left out
+FACE_SPAN = 0.1  # of a face's side that what it shows must span: a strip would have no pixels when scaled
+THETAS = 1024  # angles at which a lens is asked whether its picture still grows
+DARK = 12  # of 255: corners outside of the circle that a fisheye throws
+# Frames: what a slow walk needs; matching grows with their square.
+FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST = 2.0, 30, 90
+SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
+
+# GPS: what is asked of it before it tells a scale.
+GPS_LEAST = 4  # photos with a place
+GPS_ROBUST_FROM = 12  # photos; of fewer every one counts
+GPS_SPREAD = 3.0  # times what is left over: less, and GPS says nothing of the scale
+GPS_TRIPLES = 100  # of photos that are tried, at most
+GPS_FAR = 3.5  # median errors: what lies beyond does not count
+
+# Printed tags.
+TAG_PHOTOS = 3  # that show a tag, at least
+TAG_FITS = 2.0  # px: what the corners of a tag may be off a square, median; more, and two tags look the same
+TAG_SIDE = 1000  # px: smaller photos are enlarged to show their tags better
+TAG_BORDER = 0.125  # sides of white around a tag, least that is printed
+TAG_CELL = 16  # px of a cell of the drawing
+TAG_BLUR = 0.5  # px of the photo, sigma: what a pixel's square and a good lens do
+TAG_UNLIKE = 0.1  # of the contrast; what is farther off counts less
+TAG_SURE = 1e-3  # of a side: errors of the cameras, and of printing, are not less
+TAG_LEVEL = 20.0  # degrees between a tag's normal and the cameras' up: it lies on something level
+
+# Where to photograph next.
+NEXT_FEWEST = 5  # photos: of fewer nothing is told but that they are few
+GAP, WIDER = 20.0, 2.5  # degrees around the middle between neighbours, and times the usual: a gap
+LOOSE, LOOSER = 0.5, 3.0  # px that a pose may be off, and times the usual: a loose one
+ALONE, LONELIER = 0.5, 2.0  # of a photo's points that no third photo shows, and times the usual
+NEXT_MOST = 3  # places that are told

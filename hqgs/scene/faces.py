@@ -16,18 +16,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from hqgs.scene.constants import DARK, FACE_LATTICE, FACE_SHOWN, FACE_SPAN, SMALLEST_SIDE, THETAS, WIDE
+
 AROUND = "EQUIRECTANGULAR"  # COLMAP's model of photos of 360 x 180 degrees
-WIDE = 120.0  # degrees across or up and down that a flat picture shows at most
-LATTICE = 128  # rays each way that tell which part of a face a photo shows
-LEAST_SIDE = (
-    8  # px of a face; a focal length that gives less is a mistake, which whoever reads the photo names
-)
-LEAST_SHOWN = 0.02  # of a face; one that shows less is left out
-LEAST_SPAN = (
-    0.1  # of a face's side that what it shows must span: a thinner strip would have no pixels when scaled
-)
-THETAS = 1024  # angles at which a lens is asked whether its picture still grows
-DARK = 12  # of 255: corners outside of the circle that a fisheye throws
 # rotations, face from camera: x, y and z of each face in the camera's frame (x right, y down, z forward)
 CUBE: dict[str, NDArray[np.float64]] = {
     name: np.array(rows, np.float64)
@@ -87,17 +78,17 @@ def _faces(model: str, params: tuple[float, ...], width: int, height: int, finer
         if degrees < WIDE:
             return ()
     focal = finer * radian * math.pi / 4
-    if (side := 2 * round(focal)) < LEAST_SIDE:
+    if (side := 2 * round(focal)) < SMALLEST_SIDE:
         return ()
-    nodes = (np.arange(LATTICE) + 0.5) * (2 / LATTICE) - 1
-    rays = np.stack([*np.meshgrid(nodes, nodes), np.ones((LATTICE, LATTICE))], -1)
+    nodes = (np.arange(FACE_LATTICE) + 0.5) * (2 / FACE_LATTICE) - 1
+    rays = np.stack([*np.meshgrid(nodes, nodes), np.ones((FACE_LATTICE, FACE_LATTICE))], -1)
     found = []
     for name, rotation in CUBE.items():
         shown = inside(camera, rays @ rotation, limit)
-        if shown.mean() < LEAST_SHOWN:
+        if shown.mean() < FACE_SHOWN:
             continue
         (left, right), (top, bottom) = (_span(shown, axis, side) for axis in (0, 1))
-        if min(right - left, bottom - top) < max(LEAST_SIDE, LEAST_SPAN * side):
+        if min(right - left, bottom - top) < max(SMALLEST_SIDE, FACE_SPAN * side):
             continue
         K = np.array([[focal, 0, side / 2 - left], [0, focal, side / 2 - top], [0, 0, 1]])
         found.append(Face(name, rotation, right - left, bottom - top, K, limit))
@@ -105,9 +96,9 @@ def _faces(model: str, params: tuple[float, ...], width: int, height: int, finer
 
 
 def _span(shown: NDArray[np.bool_], axis: int, side: int) -> tuple[int, int]:
-    """From and to which pixel of a side the nodes [LATTICE, LATTICE] lie that show something."""
+    """From and to which pixel of a side the nodes [FACE_LATTICE, FACE_LATTICE] lie that show something."""
     nodes = np.flatnonzero(shown.any(axis))
-    return math.floor(nodes[0] / LATTICE * side), math.ceil((nodes[-1] + 1) / LATTICE * side)
+    return math.floor(nodes[0] / FACE_LATTICE * side), math.ceil((nodes[-1] + 1) / FACE_LATTICE * side)
 
 
 def projected(camera: pycolmap.Camera, rays: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -20,12 +20,9 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 from hqgs.photos.video import pyav
-from hqgs.scene.constants import JPEG_QUALITY
+from hqgs.scene.constants import COPY_SIDE, FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST, JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
 from hqgs.scene.photo_files import film_at
-
-PER_SECOND, FEWEST, MOST = 2.0, 30, 90  # frames: what a slow walk needs; matching grows with their square
-LOOKED_AT = 640  # px a side, of the picture whose sharpness is measured
 
 
 def film_frames(
@@ -42,7 +39,8 @@ def film_frames(
         raise ValueError(f"frames is {count}, wanted at least 3")
     av = pyav(f"{path} is a film, which")
     state = path.stat()
-    name = f"4 {path.name} {state.st_size} {state.st_mtime_ns} {count} {PER_SECOND} {FEWEST} {MOST}"
+    rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
+    name = f"4 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -107,8 +105,8 @@ def _sharpest(
             stream.thread_type = "AUTO"
             curve = transfer(stream.codec_context)
             seconds = _seconds(film, stream)
-            wanted = count or int(np.clip(round(PER_SECOND * seconds), FEWEST, MOST))
-            interval = seconds / wanted if seconds > 0 else 1 / PER_SECOND
+            wanted = count or int(np.clip(round(FRAMES_A_SECOND * seconds), FRAMES_FEWEST, FRAMES_MOST))
+            interval = seconds / wanted if seconds > 0 else 1 / FRAMES_A_SECOND
             best, at, best_sharpness = None, 0, -1.0
             number, start = -1, None
             for number, frame in enumerate(film.decode(stream)):
@@ -148,7 +146,7 @@ def _seconds(film: Any, stream: Any) -> float:
 
 def _sharpness(frame: Any) -> float:
     """Mean square of the Laplacian of the luma, at a size that any film has."""
-    scale = min(1.0, LOOKED_AT / max(frame.width, frame.height))
+    scale = min(1.0, COPY_SIDE / max(frame.width, frame.height))
     small = frame.reformat(
         width=max(8, round(frame.width * scale)), height=max(8, round(frame.height * scale)), format="gray"
     )

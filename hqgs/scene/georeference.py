@@ -16,12 +16,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST = 4  # photos with a place
-ROBUST_FROM = 12  # photos; of fewer every one counts
-SPREAD = 3.0  # times what is left over: less, and GPS says nothing of the scale
-TRIPLES = 100  # of photos that are tried, at most
-FAR = 3.5  # median errors: what lies beyond does not count
-ROUNDS = 5
+from hqgs.scene.constants import GPS_FAR, GPS_LEAST, GPS_ROBUST_FROM, GPS_SPREAD, GPS_TRIPLES
+
 _A, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: semi-major axis, m, and squared eccentricity
 
 Array = NDArray[np.float64]
@@ -64,23 +60,23 @@ class Georeference:
 def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     """The place of a scene with camera centres [N, 3] in the frame of its files, and GPS of each.
 
-    None where that does not tell: fewer than LEAST photos or different places, or places that spread less
-    than SPREAD times as far as they are off. Fewer than LEAST altitudes: all count as equally high.
+    None where that does not tell: fewer than GPS_LEAST photos or different places, or places that spread less
+    than GPS_SPREAD times as far as they are off. Fewer than GPS_LEAST altitudes: all count as equally high.
     """
     gps = np.asarray(places, np.float64).reshape(-1, 3)
     high = np.isfinite(gps[:, 2])
-    level = int(high.sum()) < LEAST
+    level = int(high.sum()) < GPS_LEAST
     if level:
         gps = np.column_stack([gps[:, :2], np.zeros(len(gps))])
     else:
         gps, centers = gps[high], centers[high]
-    if len(np.unique(gps, axis=0)) < LEAST:
+    if len(np.unique(gps, axis=0)) < GPS_LEAST:
         return None
     start = np.median(gps, axis=0)
     target = _enu(gps, start)
-    used = np.ones(len(target), bool) if len(target) < ROBUST_FROM else _agreeing(centers, target)
+    used = np.ones(len(target), bool) if len(target) < GPS_ROBUST_FROM else _agreeing(centers, target)
     fit = similarity(centers[used], target[used])
-    if fit is None or used.sum() < max(LEAST, len(target) / 2):
+    if fit is None or used.sum() < max(GPS_LEAST, len(target) / 2):
         return None
     scale, R, shift = fit
     off = target[used] - (scale * centers[used] @ R.T + shift)
@@ -88,7 +84,7 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     axes = (off**2).sum(0) / max(count - 7 / 3, 1)  # variance along each; 7 values were fitted to 3 N
     spread = math.sqrt(float(((target[used] - target[used].mean(0)) ** 2).sum() / count))
     residual = math.sqrt(float(axes.sum()))
-    if not spread > SPREAD * residual:
+    if not spread > GPS_SPREAD * residual:
         return None
     from scipy.special import stdtrit  # here: to read a scene does not need it
 
@@ -131,8 +127,8 @@ def _agreeing(source: Array, target: Array) -> NDArray[np.bool_]:
     """Which of the points agree with most of the others, [N]."""
     count = len(source)
     rng = np.random.default_rng(0)
-    triples = list(combinations(range(count), 3)) if math.comb(count, 3) <= TRIPLES else []
-    while len(triples) < min(TRIPLES, math.comb(count, 3)):
+    triples = list(combinations(range(count), 3)) if math.comb(count, 3) <= GPS_TRIPLES else []
+    while len(triples) < min(GPS_TRIPLES, math.comb(count, 3)):
         triples.append(tuple(sorted(rng.choice(count, 3, replace=False).tolist())))
     best, least = np.full(count, math.inf), math.inf
     for triple in triples:
@@ -140,11 +136,11 @@ def _agreeing(source: Array, target: Array) -> NDArray[np.bool_]:
         if off is not None and (median := float(np.median(off))) < least:
             best, least = off, median
     used = best <= np.median(best)
-    for _ in range(ROUNDS):
+    for _ in range(5):  # it settles sooner
         off = _off(source, target, np.flatnonzero(used))
         if off is None:
             break
-        again = off <= FAR * np.median(off)
+        again = off <= GPS_FAR * np.median(off)
         if (again == used).all():
             break
         used = again

@@ -10,7 +10,6 @@ from typing import Any
 from urllib.parse import unquote
 
 from hqgs.base.text import some
-from hqgs.scene.constants import LIST_BYTES
 
 TRAIN, TEST, VAL = "train", "test", "val"
 LISTS = ("train_test_lists.json", "train_test_split.json", "split.json", "splits.json")
@@ -112,7 +111,7 @@ def names_by_any(names: Sequence[str]) -> dict[str, str]:
 
 def _lines(path: Path) -> list[str]:
     try:
-        text = path.read_bytes()[:LIST_BYTES].decode("utf-8-sig")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no list of names: {error}") from error
     return [line.strip().replace("\\", "/") for line in text.splitlines() if line.strip()]

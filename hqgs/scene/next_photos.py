@@ -7,14 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.scene.constants import ALONE, GAP, LONELIER, LOOSE, LOOSER, NEXT_FEWEST, NEXT_MOST, WIDER
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Scene, View
-
-FEWEST = 5  # photos: of fewer nothing is told but that they are few
-GAP, WIDER = 20.0, 2.5  # degrees around the middle between neighbours, and times the usual: a gap
-LOOSE, LOOSER = 0.5, 3.0  # px that a pose may be off, and times the usual: a loose one
-ALONE, LONELIER = 0.5, 2.0  # of a photo's points that no third photo shows, and times the usual
-MOST = 3  # places that are told
 
 Array = NDArray[np.float64]
 
@@ -30,11 +25,11 @@ class Spot:
 def next_photos(scene: Scene) -> list[Spot]:
     """The places where another photo would help most, the most helpful first; none: nothing stands out."""
     views = sorted([*scene.train, *scene.test], key=lambda view: view.name)
-    if len(views) < FEWEST:
+    if len(views) < NEXT_FEWEST:
         return []
     centers = np.stack([view.camera.center for view in views])
     return [*_gaps(scene, views, centers), *_loose(scene, views, centers), *_alone(scene, views, centers)][
-        :MOST
+        :NEXT_MOST
     ]
 
 

@@ -12,8 +12,8 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
-from hqgs.scene.constants import FAR_OFF, LOOKED_AT, ONE_PLACE, SHOWN
-from hqgs.scene.georeference import LEAST, Georeference, georeference
+from hqgs.scene.constants import FAR_OFF, GPS_LEAST, LOOKED_AT, ONE_PLACE, SHOWN
+from hqgs.scene.georeference import Georeference, georeference
 from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
@@ -130,7 +130,7 @@ def placed(capture: Capture, notes: list[str]) -> Capture:
 def located(capture: Capture) -> Georeference | None:
     """Where on Earth the frame of the capture's files is, by the GPS of its photos; None: nothing tells."""
     found = [(k, tags.gps, tags.above) for k, tags in enumerate(map(_tags, capture.photos)) if tags.gps]
-    if len(found) < LEAST:
+    if len(found) < GPS_LEAST:
         return None
     rows, gps, above = zip(*found, strict=True)
     centers = capture.world.out(_centers(capture))[[*rows]].astype(np.float64)

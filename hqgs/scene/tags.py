@@ -15,23 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
+from hqgs.photos.light import to_linear
 from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.scene.constants import (
+    TAG_BLUR,
+    TAG_BORDER,
+    TAG_CELL,
+    TAG_FITS,
+    TAG_LEVEL,
+    TAG_PHOTOS,
+    TAG_SIDE,
+    TAG_SURE,
+    TAG_UNLIKE,
+)
 from hqgs.scene.georeference import similarity
 from hqgs.scene.metres import with_metres
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Camera, Scene, View
 
 FAMILIES = ("APRILTAG_36h11", "ARUCO_ORIGINAL", "4X4_250", "5X5_250", "6X6_250")  # in this order
-LEAST = 3  # photos that show a tag
-FITS = 2.0  # px: what the corners of a tag may be off a square, median; more, and two tags look the same
-SIDE = 1000  # px: smaller photos are enlarged to show their tags better
-GAMMA = 2.2  # of photos
-BORDER = 0.125  # sides of white around a tag, least that is printed
-FINE = 16  # px of a cell of the drawing
-BLUR = 0.5  # px of the photo, sigma: what a pixel's square and a good lens do
-UNLIKE = 0.1  # of the contrast; what is farther off counts less
-SURE = 1e-3  # of a side: errors of the cameras, and of printing, are not less
-LEVEL = 20.0  # degrees between a tag's normal and the cameras' up: it lies on something level
 
 Floats = NDArray[np.float64]
 _SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])  # clockwise, as OpenCV's
@@ -57,9 +59,9 @@ def by_tags(scene: Scene, size: float) -> Scene:
     views = [*scene.train, *scene.test]
     seen = sightings(views)
     tags = [tag for name, at in seen.items() if (tag := lay(name, at, views)) is not None]
-    good = [tag for tag in tags if tag.off <= FITS]
+    good = [tag for tag in tags if tag.off <= TAG_FITS]
     if not good:
-        why = f"{LEAST} photos and more must show the same one sharply"
+        why = f"{TAG_PHOTOS} photos and more must show the same one sharply"
         if tags:
             why = f"{some([tag.name for tag in tags])} lies in several places: print each number once"
         found = f"{len(seen)} numbers in {len({k for at in seen.values() for k in at})} photos"
@@ -88,7 +90,7 @@ def check_tag_size(size: float, distance: object = None) -> None:
 
 
 def sightings(views: Sequence[View]) -> dict[str, dict[int, Floats]]:
-    """Corners [4, 2] in px of each tag by its name and the number of the view, where LEAST views show it."""
+    """Corners [4, 2] in px of each tag by its name and the view's number, where TAG_PHOTOS show it."""
     cv2 = _opencv()
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -101,7 +103,7 @@ def sightings(views: Sequence[View]) -> dict[str, dict[int, Floats]]:
     found: dict[str, dict[int, Floats]] = {}
     for k, view in enumerate(views):
         gray = np.ascontiguousarray(to_uint8(as_floats(view.image).mean(-1, keepdims=True))[..., 0])
-        larger = -(-SIDE // max(gray.shape))
+        larger = -(-TAG_SIDE // max(gray.shape))
         gray = cv2.resize(gray, None, fx=larger, fy=larger, interpolation=cv2.INTER_CUBIC)
         for family, finder in finders.items():
             corners, numbers, _ = finder.detectMarkers(gray)
@@ -109,7 +111,7 @@ def sightings(views: Sequence[View]) -> dict[str, dict[int, Floats]]:
                 found.setdefault(f"{family} {number}", {})[k] = (
                     at.reshape(4, 2).astype(np.float64) + 0.5
                 ) / larger
-    return {name: at for name, at in sorted(found.items()) if len(at) >= LEAST}
+    return {name: at for name, at in sorted(found.items()) if len(at) >= TAG_PHOTOS}
 
 
 def _opencv() -> Any:
@@ -170,14 +172,14 @@ def lay(name: str, at: dict[int, Floats], views: Sequence[View]) -> Tag | None:
         lambda v: np.concatenate([patch.off(square.moved(v)) for patch in patches]),
         np.zeros(7),
         loss="soft_l1",
-        f_scale=UNLIKE,
+        f_scale=TAG_UNLIKE,
         diff_step=1e-4,
     )
     placed = square.moved(fine.x)
     spread = np.sqrt(2 * fine.cost / max(sum(patch.pixels for patch in patches) - 7, 1))
     inverse = np.linalg.inv(fine.jac.T @ fine.jac)
     error = spread * float(np.sqrt(inverse[6, 6]))
-    return Tag(name, len(at), placed.side, max(error, SURE), -placed.R[:, 2], float(np.median(left)))
+    return Tag(name, len(at), placed.side, max(error, TAG_SURE), -placed.R[:, 2], float(np.median(left)))
 
 
 def _through_corners(at: dict[int, Floats], cameras: dict[int, Camera]) -> _Square | None:
@@ -201,7 +203,7 @@ class _Patch:
         low = np.maximum(np.floor(corners.min(0)).astype(int) - 2, 0)
         high = np.minimum(np.ceil(corners.max(0)).astype(int) + 2, [view.camera.width, view.camera.height])
         x, y = np.meshgrid(*(np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True)))
-        light = as_floats(view.image[low[1] : high[1], low[0] : high[0]]).astype(np.float64) ** GAMMA
+        light = to_linear(as_floats(view.image[low[1] : high[1], low[0] : high[0]]).astype(np.float64))
         self.camera = view.camera
         self.at = np.stack([x.ravel(), y.ravel()], 1)
         self.light = light.mean(-1).ravel()
@@ -213,11 +215,11 @@ class _Patch:
         from scipy.ndimage import map_coordinates  # here: only tags need it
 
         on = _mapped(np.linalg.inv(square.seen(self.camera)).astype(np.float64), self.at)
-        half = 0.5 + BORDER * 0.5
+        half = 0.5 + TAG_BORDER * 0.5
         inside = (np.abs(on) < half).all(1)
         if inside.sum() < 16:
             return np.ones(len(on))
-        places = (on[inside, ::-1] + 0.5 + BORDER) / (1 + 2 * BORDER) * len(self.drawing) - 0.5
+        places = (on[inside, ::-1] + 0.5 + TAG_BORDER) / (1 + 2 * TAG_BORDER) * len(self.drawing) - 0.5
         drawn = map_coordinates(self.drawing, places.T, order=1, mode="nearest")
         basis = np.column_stack([drawn, np.ones(len(drawn))])
         gain, dark = np.linalg.lstsq(basis, self.light[inside], rcond=None)[0]
@@ -227,21 +229,21 @@ class _Patch:
 
 
 def _drawing(name: str, side: float) -> Floats:
-    """A tag [S, S], white 1, with BORDER sides of white around, as smooth as photos of so many px show it."""
+    """A tag [S, S], white 1, with TAG_BORDER sides of white around, as smooth as photos show such a side."""
     from scipy.ndimage import gaussian_filter  # here: only tags need it
 
     cv2 = _opencv()
     family, number = name.split()
     codes = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))
     cells = codes.markerSize + 2
-    drawn = cv2.aruco.generateImageMarker(codes, int(number), cells * FINE).astype(np.float64) / 255
-    drawn = np.pad(drawn, round(BORDER * cells * FINE), constant_values=1.0)
-    return gaussian_filter(drawn, BLUR * cells * FINE / side, mode="nearest")
+    drawn = cv2.aruco.generateImageMarker(codes, int(number), cells * TAG_CELL).astype(np.float64) / 255
+    drawn = np.pad(drawn, round(TAG_BORDER * cells * TAG_CELL), constant_values=1.0)
+    return gaussian_filter(drawn, TAG_BLUR * cells * TAG_CELL / side, mode="nearest")
 
 
 def _up(before: Floats, tags: Sequence[Tag]) -> tuple[tuple[float, float, float] | None, list[Tag]]:
     """Up, square to the tags that lie level as far as cameras tell, and which do; None: none does."""
-    level = [tag for tag in tags if abs(tag.normal @ before) > np.cos(np.radians(LEVEL))]
+    level = [tag for tag in tags if abs(tag.normal @ before) > np.cos(np.radians(TAG_LEVEL))]
     if not level:
         return None, []
     mean = sum((tag.normal * np.sign(tag.normal @ before) / tag.error**2 for tag in level), np.zeros(3))

@@ -5,17 +5,16 @@ Those of maps of trust were fitted, and are in `hqgs.show.trust`; the layout of 
 
 # Films.
 FPS = 30.0
-DEPTH_SAMPLES, DEPTH_PERCENTILES = (
-    8,
-    (2, 98),
-)  # frames that say which depths a film shows; ends of its colours
+MOST_CAMERAS = 200  # to jump to in a page; that the viewer draws, evenly chosen
+# Frames that say which depths a film shows; ends of its colours.
+DEPTH_SAMPLES, DEPTH_PERCENTILES = 8, (2, 98)
 
 # Maps of errors, and of trust.
 WORST_SHOWN = 64.0  # levels, of the brightest or reddest pixel
 
 # Exported files.
 BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all
-CHANGE_VIEWS, CHANGE_SIDE = 4, 800  # renders that tell what a file changes, and px a side, at most
+CHANGE_VIEWS = 4  # renders that tell what a file changes, as large as photos beside cameras.json
 
 # report.html, and judge.html.
 PAGE_GAUSSIANS = 400_000  # in a page, at most
@@ -24,7 +23,7 @@ BAND_COVERED = 0.999  # of a band's coefficients that its largest stored value c
 WORST_PAIRS = 12  # photos with pictures in judge.html
 DIFFERENCE_SHOWN = 16.0  # levels between two scenes: the deepest blue and red
 PAIRS, PAIR_SIDE, SHEET_SIDE = 8, 720, 1080  # pictures of photo and render, best, worst and between; px
-PAGE_QUALITY, PAGE_VIEWS = 82, 200  # of JPEG; cameras to jump to
+PAGE_QUALITY = 82  # of JPEG
 
 # Lengths in the viewer.
 CLICKED = 3  # px a side, of the little picture around a click
@@ -40,4 +39,4 @@ MAX_MESSAGE = 1 << 20  # bytes; what a page of ours sends takes hundreds
 REST, GOAL = 0.2, 0.06  # s without a move, and the picture gets sharp; s for one while the camera moves
 SHARP, COARSEST, STREAMED_SIDE = 800, 96, 2048  # px: heights of the picture, and the largest side
 MOVED = 0.02  # radians, and of the distance: a camera nearer than that to a photo's sees the same
-FRUSTUMS, THUMB = 150, 160  # training cameras that are drawn, evenly chosen; px of the photos at them
+THUMB = 160  # px of the photos at the cameras that are drawn

@@ -12,9 +12,10 @@ from hqgs.base.evenly import evenly
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import CAMERAS, load_cameras
+from hqgs.scene.constants import KEPT_SIDE
 from hqgs.scene.paths import resized
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import CHANGE_SIDE, CHANGE_VIEWS
+from hqgs.show.constants import CHANGE_VIEWS
 
 
 @dataclass(frozen=True)
@@ -72,5 +73,5 @@ def _cameras(gaussians: Gaussians, run: Path | None) -> tuple[str, list[tuple[st
 
 
 def _small(camera: Camera) -> Camera:
-    share = min(1.0, CHANGE_SIDE / max(camera.width, camera.height))
+    share = min(1.0, KEPT_SIDE / max(camera.width, camera.height))
     return resized(camera, max(1, round(share * camera.width)), max(1, round(share * camera.height)))

@@ -32,7 +32,6 @@ Answer = Callable[[], list[bytes]]
 WIDTHS = {"means": 3, "scales": 3, "quats": 4, "opacities": 1}  # of a row of the rest, in its order
 OBSERVED = sum(WIDTHS.values())  # the column after them: what growth goes by
 UNSEEN = -1.0  # there: the Gaussian has a gradient, but the view does not show it
-ROW_BYTES = 3 * 4, 4 * (OBSERVED + 1)  # of the two messages; the first has a bit for every Gaussian too
 
 
 @dataclass(frozen=True)

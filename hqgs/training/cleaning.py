@@ -24,10 +24,11 @@ from hqgs.model.render import render_view
 from hqgs.scene.scene import Scene
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import CLEANING_DECAY, CLEANING_DROPOUT, CLEANING_STEPS
+from hqgs.training.constants import CLEANING_DECAY, CLEANING_STEPS
 from hqgs.training.few_photos import decay_opacities, with_dropout
 from hqgs.training.guard import gradient_fault
 from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.plan_few_photos import DROPOUT
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def clean(
     with one_torch_thread():
         targets = [method.prepare(view) for view in scene.train]
         for k, number in enumerate(order.tolist()):
-            some = with_dropout(fitted, CLEANING_DROPOUT, seed, k + 1)
+            some = with_dropout(fitted, DROPOUT, seed, k + 1)
             camera = scene.train[number].camera
             render, _ = render_view(some, camera, fitted.sh_degree, config.background)
             render.retain_grad()

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from hqgs.training.constants import CLOCK_LEAST, CLOCK_MOST
 from hqgs.training.schedule import Decisions, Schedule
-
-SHORTEST, LONGEST = 0.1, 4.0  # of the rest as it was planned
 
 
 def turned(
@@ -26,7 +25,7 @@ def turned(
     elif schedule.run.follows_clock and config.seconds is not None:
         rest = config.iterations - at
         left = (config.seconds - seconds) / step if step > 0 else rest
-        length = at + round(min(max(left, SHORTEST * rest), LONGEST * rest))
+        length = at + round(min(max(left, CLOCK_LEAST * rest), CLOCK_MOST * rest))
     else:
         return decisions
     if iteration != at or not at < min(length, config.iterations):

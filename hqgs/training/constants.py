@@ -20,6 +20,7 @@ GROWS_FROM = 140  # the iteration before which a run from points all over the ph
 # grows little, and its Gaussians hide more of each other as they become opaque. Measured on four captures.
 SLOWER, SLOWER_DENSE, DENSE = 2.0, 1.0, 2
 FEWEST_ITERATIONS, MOST_ITERATIONS = 50, 30_000  # of a run that has a number of seconds
+CLOCK_LEAST, CLOCK_MOST = 0.1, 4.0  # of the rest of such a run as it was planned, by the clock
 WARM, TIMED = 3, 7  # steps of each size before it: the first ones start threads and fill caches
 
 # The schedule.
@@ -32,16 +33,12 @@ EVALUATED = 0.1  # of the pixels that are trained: those of the evaluations on t
 EVALUATIONS_APART = 50  # iterations, unless asked for: each evaluation takes as long as some steps
 TAIL, TAIL_PART = 50, 1 / 3  # steps after the end of growth that tell what the rest costs; of that rest
 FASTER, LAST_OF_FIRST = 2.0, 1 / 3  # at most, of the rates of short runs
-SHOWN_PART = (
-    0.05  # of the run, its last steps, whose mean is the scene: 2.5 % +0.09, 5 and 10 % +0.11, 20 % +0.06 dB
-)
+# Of the run, its last steps, whose mean is the scene: 2.5 % +0.09, 5 and 10 % +0.11, 20 % +0.06 dB.
+SHOWN_PART = 0.05
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 # Iterations between looks at whether the run still improves; dB and iterations: when it has stopped.
 CHECKS, BETTER, PATIENCE = 500, 0.05, 2_000
-TOLERANCE, TRIED = (
-    0.02,
-    8,
-)  # dB that leaving Gaussians out may cost; training photos that it is tried on, at most
+TOLERANCE, TRIED = 0.02, 8  # dB that leaving Gaussians out may cost; photos that it is tried on, at most
 WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
 
 # Passers-by, by a small scene of small photos. CONTRADICTED was chosen on walkers in the room, fern, horns,
@@ -64,17 +61,13 @@ EVENTS_KEPT, GAUSSIANS_LISTED = 20, 10  # the first events, and the first Gaussi
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
 # Cleaning: 300 steps gain 1.0 dB on the room of 8 photos, 600 gain 1.2; half the decay takes twice the steps.
-CLEANING_STEPS, CLEANING_DECAY, CLEANING_DROPOUT = 600, 0.01, 0.2  # the last two: shares, as of few photos
+CLEANING_STEPS, CLEANING_DECAY = 600, 0.01  # the share of the opacities that each step takes away
 
 # The loss under noise. Up to KNEE standard deviations differences count by their square (Huber), half as
 # steep there as L1 on average, and growth goes by the gradient: hence STEEPER.
 KNEE, STEEPER = 2.0, 2.0
 HELD_PIXELS = 50  # one of so many is held back under noise
-PLATEAU_STEPS, PLATEAU_FACTOR = (
-    200,
-    0.5,
-)  # from one look at them to the next, at least; of the rates, without a gain
-PLATEAU_LEAST = PLATEAU_FACTOR**20  # share of the rates below which nothing moves any more
+PLATEAU_STEPS = 200  # from one look at them to the next, at least; without a gain the rates are halved
 SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 # Cameras of each photo: shares of the run before which trajectories would hide what the scene does not show
@@ -86,15 +79,9 @@ FIRST_TRAJECTORY, FIRST_RADIUS = 1e-3, 0.0015
 TRAJECTORY_RATE, LENS_RATE, GAIN_RATE = 8e-4, 4e-4, 0.005  # of the photo's width, twice; of the log gains
 NARROW = 200  # px: narrower photos count as that wide
 TRAJECTORY_POINTS = 9  # that stand for a trajectory
-WARP_SPACING, MOST_WARPS = (
-    1.5,
-    17,
-)  # px of a trajectory from one sample of the exposure to the next; and samples
+WARP_SPACING, MOST_WARPS = 1.5, 17  # px of a trajectory between samples of the exposure; and samples
 MOST_MARGIN = 48  # px around a render
-DEPTHS_REFRESH, DEPTHS_COARSER = (
-    8,
-    4,
-)  # visits of a photo until its map of depths is made anew; its pixels' sides
+DEPTHS_REFRESH, DEPTHS_COARSER = 8, 4  # visits of a photo until its depths are rendered anew; px, as coarsely
 SATURATED = 254  # levels of 1/255
 LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
 SMALLEST_RADIUS = 0.35  # px: a photo whose circles of confusion are smaller everywhere is sharp

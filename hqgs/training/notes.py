@@ -42,7 +42,7 @@ def run_notes(trainer: Trainer) -> list[str]:
         )
     if left < 1:
         why = "pixels held back from the noisy photos showed no gain any more"
-        notes.append(f"the learning rates fell to 1/{1 / left:.0f}: {why}")
+        notes.append(f"the learning rates fell to 1/{1 / left:.6g}: {why}")
     if found := trainer.method.learned():
         lengths = sorted(photo.extent for photo in found)
         if moved := sum(length > 0 for length in lengths):

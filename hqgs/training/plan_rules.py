@@ -16,6 +16,8 @@ from hqgs.photos.formula import LEARNED, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
     COARSE_FACTOR,
+    COARSE_MOST,
+    COARSE_PART,
     ENOUGH,
     FEWEST_VIEWS,
     FINEST,
@@ -23,7 +25,9 @@ from hqgs.training.constants import (
     GROWS_FROM,
     HELD_PIXELS,
     HELD_SHARE,
+    KNEE,
     MOST_HELD,
+    PIXELS,
     SMALLEST_SIDE,
 )
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
@@ -83,21 +87,18 @@ def loss(draft: Draft) -> Sequence[Choice]:
     facts, has = draft.facts, draft.kinds
     of = f"of {facts.photos} photos"
     if draft.settings.method == "srgs":
-        return [
-            Choice("0.6 at the photos' own resolution, 0.4 at full size", "SRGS: each view ties finer pixels")
-        ]
+        texture = draft.settings.srgs.texture_weight
+        value = f"{1 - texture:g} at the photos' own resolution, {texture:g} at full size"
+        return [Choice(value, "SRGS: each view ties finer pixels")]
     if draft.settings.method == "hqgs" and not draft.formed:
-        return [
-            Choice(
-                f"{draft.settings.hqgs.paper.loss} of modulated Gaussians", "the published form was asked for"
-            )
-        ]
+        value = f"{draft.settings.hqgs.paper.loss} of modulated Gaussians"
+        return [Choice(value, "the published form was asked for")]
     if "jpeg" in has:
         why = "a file says no more of a coefficient than the cell that it lies in"
         rows = [Choice(f"distance to the JPEG's cells + {draft.settings.hqgs.jpeg_pixels:g} L1", why)]
     elif "noise" in has:
         why = "the photos' mean is nearer to the truth than their median, and D-SSIM asks for the noise"
-        rows = [Choice("squares up to 2 sigma of the noise, then L1", why)]
+        rows = [Choice(f"squares up to {KNEE:g} sigma of the noise, then L1", why)]
     else:
         rows = [Choice("0.8 L1 + 0.2 D-SSIM", "as 3DGS has it")]
     if "grain" in has:
@@ -123,12 +124,8 @@ def cameras(draft: Draft) -> Sequence[Choice]:
 def rates(draft: Draft) -> Sequence[Choice]:
     asked, has = draft.asked.faster_rates, draft.kinds
     if asked is not None or not draft.formed:
-        return [
-            Choice(
-                "higher in short runs" if asked else "those of 3DGS",
-                "asked for" if asked is not None else "as published",
-            )
-        ]
+        value = "higher in short runs" if asked else "those of 3DGS"
+        return [Choice(value, "as published" if asked is None else "asked for")]
     if has in ({"jpeg"}, {"video"}):
         why = "what a codec leaves open is learned sooner at higher rates, and nothing holds it back"
         return [Choice("those of 3DGS", why, changes={"faster_rates": False})]
@@ -322,13 +319,17 @@ RULES = (
     Rule("loss", loss, "Kerbl et al. 2023, equation 7; under noise and JPEG " + CHOSEN, of_photos=True),
     Rule("cameras", cameras, "shake, focus and exposure as the diagnosis tells them"),
     Rule("budget", budget, "Candes and Donoho 2004 under noise; " + CHOSEN),
-    Rule("first points", first_points, f"one for each 100 pixels, or the budget: {CHOSEN}"),
+    Rule("first points", first_points, f"one for each {PIXELS} pixels, or the budget: {CHOSEN}"),
     Rule("first shapes", shapes, "0.1 to 0.8 dB at 30 s on fern, fox and horns"),
     Rule("smallest Gaussian", smallest, "the 3D smoothing of Mip-Splatting, Yu et al. 2024"),
     Rule("photos' size", half_size, CHOSEN),
-    Rule("length", length, "7,000, or 150 for each photo: " + CHOSEN),
-    Rule("half size", half_size_until, "60 % of the run, 1,500 iterations at most: " + CHOSEN),
-    Rule("growth", growth, "Kerbl et al. 2023, section 5.2; from 140 on: " + CHOSEN),
+    Rule("length", length, f"{ENOUGH:,}, or {FOR_EACH_PHOTO} for each photo: {CHOSEN}"),
+    Rule(
+        "half size",
+        half_size_until,
+        f"{COARSE_PART:.0%} of the run, {COARSE_MOST:,} at most: {CHOSEN}",
+    ),
+    Rule("growth", growth, f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}"),
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
     Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {WHERE}"),
     Rule("dropout of Gaussians", dropout, f"DropGaussian, Park et al. 2025; {WHERE}"),
@@ -340,7 +341,7 @@ RULES = (
     Rule("learning rates", rates, "learning_rates in schedule.py; " + CHOSEN),
     Rule("rates under noise", noise_rates, f"white noise of a pixel tells nothing of the next; {CHOSEN}"),
     Rule("left out where needless", needless, "half the time and a third of the bytes on four scenes"),
-    Rule("photos held back", held_photos, "one of 20, 4 at most"),
+    Rule("photos held back", held_photos, f"one of {1 / HELD_SHARE:.0f}, {MOST_HELD} at most"),
 )
 
 

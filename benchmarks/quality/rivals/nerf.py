@@ -20,9 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from benchmarks.measure import Run
+from benchmarks.measure import Run, reset_peak_rss
 from hqgs._rust import NEAR_PLANE
-from hqgs.base.machine import peak_rss_mb, reset_peak_rss
+from hqgs.base.machine import peak_rss_mb
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.held_out import RenderedView, held_out_means
 from hqgs.evaluation.metrics import psnr, ssim

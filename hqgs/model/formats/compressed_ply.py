@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 from hqgs.base.files import atomic_path
-from hqgs.base.ply import read_elements
+from hqgs.base.ply import MAX_HEADER_BYTES, read_elements
 from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.rows import curve_order, finite_rows, pick, to_logits, to_opacities
@@ -77,7 +77,7 @@ def write_compressed_ply(path: str | Path, arrays: Arrays) -> int:
 def is_compressed_ply(path: str | Path) -> bool:
     """Whether the header of a PLY file says so."""
     with Path(path).open("rb") as file:
-        return b"packed_position" in file.read(1 << 16).partition(b"end_header")[0]
+        return b"packed_position" in file.read(MAX_HEADER_BYTES).partition(b"end_header")[0]
 
 
 def read_compressed_ply(path: str | Path) -> Arrays:

@@ -28,7 +28,7 @@ from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.next_photos import next_photos
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
-from hqgs.show.constants import PAGE_QUALITY, PAGE_VIEWS, PAIR_SIDE, PAIRS, SHEET_SIDE
+from hqgs.show.constants import MOST_CAMERAS, PAGE_QUALITY, PAIR_SIDE, PAIRS, SHEET_SIDE
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
 from hqgs.show.page.places import places_chart
@@ -176,7 +176,7 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
 
 def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
     packed = pack_scene(gaussians)
-    views = [*scene.test, *scene.train][:PAGE_VIEWS]
+    views = [*scene.test, *scene.train][:MOST_CAMERAS]
     cameras = [view.camera for view in views]
     middle = focus([view.camera for view in scene.train])
     note = (

@@ -21,7 +21,7 @@ from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import FRUSTUMS, PORT, SHARP, THUMB
+from hqgs.show.constants import MOST_CAMERAS, PORT, SHARP, THUMB
 from hqgs.show.frames import Activated
 from hqgs.show.trust import LazyTrust
 from hqgs.show.viewer.client import Client
@@ -218,7 +218,7 @@ class Viewer:
     def _build_frustums(self) -> list[Any]:
         made = []
         views = [*self._views.values()]
-        chosen = evenly(len(views), FRUSTUMS)
+        chosen = evenly(len(views), MOST_CAMERAS)
         extent = np.linalg.norm(np.ptp([v.camera.center for v in views], axis=0)) if views else 1.0
         for k in chosen:
             view, image = views[k], None

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hqgs.photos.pixels import as_floats
-from hqgs.training.constants import HELD_PIXELS, PLATEAU_FACTOR, PLATEAU_LEAST, PLATEAU_STEPS
+from hqgs.training.constants import HELD_PIXELS, PLATEAU_STEPS
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Plateau:
         gains = self._best - now
         known = torch.isfinite(gains)
         if known.any() and gains[known].mean() <= 0:
-            self.rate_left = max(self.rate_left * PLATEAU_FACTOR, PLATEAU_LEAST)
+            self.rate_left /= 2
         else:
             self._best = torch.where(torch.isfinite(now), now, self._best)
         self._sums.zero_()
