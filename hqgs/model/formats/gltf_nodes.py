@@ -13,6 +13,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.model.formats.turned import matrices
+
 MAGIC, VERSION, JSON, BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 DEEPEST, MOST = 100, 100_000  # nodes below each other, and in all
 Array = NDArray[np.float64]
@@ -118,16 +120,8 @@ def _matrix(node: Any) -> Array:
     if "matrix" in node:
         found = np.array(node["matrix"], np.float64).reshape(4, 4).T  # columns first
     else:
-        x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
-        norm = np.sqrt(x * x + y * y + z * z + w * w)
-        x, y, z, w = x / norm, y / norm, z / norm, w / norm
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        quat = np.roll(np.array(node.get("rotation", [0, 0, 0, 1]), np.float64), 1)  # w first
+        turn = matrices(quat[None])[0]
         found = np.eye(4)
         found[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64)
         found[:3, 3] = np.array(node.get("translation", [0, 0, 0]), np.float64)

@@ -87,7 +87,7 @@ def basis(d: Array) -> Array:
 def matrices(quats: Array) -> Array:
     """Rotations [N, 3, 3] of w x y z, of any norm; the unit for one of norm 0."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    w, x, y, z = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1, 0, 0, 0]).T
+    w, x, y, z = np.where(norms == 0, [1, 0, 0, 0], quats / np.where(norms == 0, 1, norms)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

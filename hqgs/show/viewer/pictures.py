@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.model.formats.turned import matrices
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.show.constants import MOVED, STREAMED_SIDE
@@ -31,22 +32,14 @@ class Pose:
     @classmethod
     def of(cls, camera: Any) -> Pose | None:
         """Of viser's camera handle; None where its values are none that a camera has."""
-        w, x, y, z = np.asarray(camera.wxyz, np.float64)
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        quat = np.asarray(camera.wxyz, np.float64)
+        norm = float(np.linalg.norm(quat))
         position, fov = np.asarray(camera.position, np.float64), float(camera.fov)
         aspect = float(camera.image_width) / max(float(camera.image_height), 1.0)
         sound = np.isfinite([norm, fov, aspect]).all() and np.isfinite(position).all()
         if not (sound and norm > 1e-6 and 0.01 < fov < 3.1 and 0.05 < aspect < 20):
             return None
-        w, x, y, z = (value / norm for value in (w, x, y, z))
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        return cls(R, position, fov, aspect)
+        return cls(matrices(quat[None])[0], position, fov, aspect)
 
     def camera(self, height: int) -> Camera:
         """The pinhole camera of a picture of that height."""

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from hqgs.model.constants import SH_C0
+from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
 
 Floats = NDArray[np.float32]
@@ -31,19 +32,10 @@ def browser_splats(gaussians: Gaussians) -> BrowserSplats:
     """
     rows = torch.cat([tensor.detach().flatten(1) for tensor in _columns(gaussians)], dim=1)
     g = gaussians.detached().rows(rows.isfinite().all(1))
-    w, x, y, z = torch.nn.functional.normalize(g.quats, dim=1).unbind(1)
-    rotations = torch.stack(
-        [
-            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        dim=1,
-    )
-    factors = rotations * g.activated_scales()[:, None]
+    factors = matrices(g.quats.double().numpy()) * g.activated_scales()[:, None].numpy()
     colors = (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1)
-    found = g.means, factors @ factors.mT, colors, g.activated_opacities()[:, None]
-    return BrowserSplats(*(tensor.numpy().astype(np.float32) for tensor in found))
+    found = g.means, factors @ factors.swapaxes(1, 2), colors, g.activated_opacities()[:, None]
+    return BrowserSplats(*(np.asarray(values, np.float32) for values in found))
 
 
 def _columns(g: Gaussians) -> list[torch.Tensor]:
