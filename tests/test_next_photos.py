@@ -46,6 +46,17 @@ def test_an_even_ring_and_a_capture_of_one_side_ask_for_nothing(degrees: list[fl
     assert told_next(ring(degrees)) == []
 
 
+def test_neighbours_that_look_the_same_way_have_no_gap_between_them() -> None:
+    """They walk by what the others look at."""
+    scene = ring([*range(0, 150, 15), *range(240, 360, 15)])
+    train = list(scene.train)
+    for k in (9, 10):
+        eye = train[k].camera.center
+        camera = look_at(eye, eye + np.array([5.0, 0, 1]), up=UP, width=8, height=8)
+        train[k] = replace(train[k], camera=camera)
+    assert told_next(replace(scene, train=train)) == []
+
+
 def test_loose_poses_and_what_one_other_photo_shows_are_told() -> None:
     scene = ring([*range(0, 360, 15)])
     sure = {view.name: 0.2 for view in scene.train} | {"07.jpg": 2.5}
@@ -61,6 +72,7 @@ def test_loose_poses_and_what_one_other_photo_shows_are_told() -> None:
     assert len(re.findall(r"<g stroke", chart)) == 24
     assert "07.jpg: sure to 2.50 px" in chart
     assert chart.count('stroke="#c03030"') == 2
+    assert re.findall(r'font-size="11">(.*?)<', chart) == ["07.jpg", "11.jpg"]
     assert len(re.findall(r'<g stroke="#d0672a"', chart)) == 1
 
 

@@ -20,6 +20,7 @@ class Spot:
 
     at: Array  # [3], world
     told: str  # in words
+    photos: tuple[str, ...]  # that the words name
 
 
 def next_photos(scene: Scene) -> list[Spot]:
@@ -63,14 +64,23 @@ def _gaps(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
         if steps[k] < max(GAP, WIDER * usual) or (k == widest and steps[k] > 180):
             continue
         a, b = order[k], order[(k + 1) % len(order)]
+        if _turn(views[a], views[b]) < steps[k] / 2:
+            continue  # both look the same way: they walk by the middle, not around it
         half = angles[a] + np.radians(steps[k]) / 2
         far = np.linalg.norm(flat[[a, b]], axis=1).mean()
         height = (centers[[a, b]] - middle).mean(0)
         at = middle + far * (np.cos(half) * plane[0] + np.sin(half) * plane[1])
         at = at + height - plane.T @ (plane @ height)
         names = sorted((views[a].name, views[b].name))
-        found.append(Spot(at, f"between {names[0]} and {names[1]}, which are {steps[k]:.0f} degrees apart"))
+        told = f"between {names[0]} and {names[1]}, which are {steps[k]:.0f} degrees apart"
+        found.append(Spot(at, told, (names[0], names[1])))
     return found
+
+
+def _turn(a: View, b: View) -> float:
+    """Degrees between where two photos look."""
+    cosine = float(a.camera.viewmat[2, :3] @ b.camera.viewmat[2, :3])
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def loose_photos(scene: Scene) -> dict[str, float]:
@@ -84,7 +94,7 @@ def _loose(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
     """Beside them."""
     places = {view.name: center for view, center in zip(views, centers, strict=True)}
     return [
-        Spot(places[name], f"beside {name}, whose place is sure to {px:.1f} px only")
+        Spot(places[name], f"beside {name}, whose place is sure to {px:.1f} px only", (name,))
         for name, px in loose_photos(scene).items()
         if name in places
     ]
@@ -109,6 +119,7 @@ def _alone(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
         Spot(
             centers[k],
             f"beside {views[k].name}: {shares[k]:.0%} of what it shows is in one other photo at most",
+            (views[k].name,),
         )
         for k in found[np.argsort(-shares[found], kind="stable")].tolist()
     ]

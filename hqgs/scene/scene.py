@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.text import some
 from hqgs.scene.constants import MOST_DEPTHS, STRAY
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.world import World
@@ -179,7 +180,7 @@ class SfmReport:
             names = [
                 f"{name} ({self.lost[name]})" if name in self.lost else name for name in self.not_registered
             ]
-            text += f"; {len(names)} left out, as COLMAP found no place for them: {', '.join(names)}"
+            text += f"; {len(names)} left out, as COLMAP found no place for them: {some(names)}"
         if self.sure_px:
             name, least = max(self.sure_px.items(), key=lambda item: item[1])
             usual = float(np.median(list(self.sure_px.values())))

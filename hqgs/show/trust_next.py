@@ -45,7 +45,7 @@ def doubtful_spots(trust: Trust, photos: Sequence[KnownCamera]) -> list[Spot]:
             said = _said(trust, replace(photo.camera, viewmat=view_matrix(R, at)))
             if said < own - WORSE:
                 words = f"{where} {photo.name}: what is seen from there is {own - said:.0f} dB less sure"
-                found.append((said, Spot(at, words)))
+                found.append((said, Spot(at, words, (photo.name,))))
     spots = list[Spot]()
     for _, spot in sorted(found, key=lambda one: one[0]):
         if all(np.linalg.norm(spot.at - other.at) > STEP * usual for other in spots):

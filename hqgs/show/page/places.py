@@ -42,11 +42,13 @@ def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
         x, y = (place - center) * scale + np.array([WIDTH, HEIGHT]) / 2
         return round(float(x), 1), round(float(y), 1)
 
+    named = {name for spot in spots for name in spot.photos}
     sure = {} if scene.sfm is None else scene.sfm.sure_px
     loose = loose_photos(scene)
     parts = [
         Markup('<svg viewBox="0 0 {} {}" role="img"><title>cameras from above</title>').format(WIDTH, HEIGHT)
     ]
+    label = Markup('<text x="{}" y="{}" text-anchor="middle" font-size="11">{}</text>')
     dot = Markup('<circle cx="{}" cy="{}" r="1" fill="currentColor" opacity=".35"/>')
     parts += [dot.format(*at(place)) for place in points]
     for view, place in zip(views, cameras, strict=True):
@@ -63,6 +65,8 @@ def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
         )
         tip = round(x + float(ahead[0]), 1), round(y + float(ahead[1]), 1)
         parts.append(mark.format(color, x, y, color, words, x, y, *tip))
+        if view.name in named:
+            parts.append(label.format(x, y - 8, view.name))
     star = Markup(
         '<circle cx="{}" cy="{}" r="9" fill="none" stroke="{}" stroke-width="2"><title>{}</title></circle>'
         '<text x="{}" y="{}" text-anchor="middle" font-weight="600">{}</text>'
