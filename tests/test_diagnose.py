@@ -226,6 +226,8 @@ def test_report_is_json_and_names_every_part() -> None:
     assert json.loads(json.dumps(asdict(found), allow_nan=False))["formation"] == found.formation
     assert [(name, needed) for name, needed, _ in found.needs()] == [
         ("exposure", False),
+        ("vignetting", False),
+        ("response", False),
         ("shake", False),
         ("focus", False),
         ("blur", False),

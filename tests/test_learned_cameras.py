@@ -164,7 +164,7 @@ def test_gains_are_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The diagnosis and the method share what was found."""
     found: list[Any] = []
     monkeypatch.setattr(
-        scene_diagnosis, "log_gains", lambda scene: found.append(log_gains(scene)) or found[-1]
+        scene_diagnosis, "log_gains", lambda *given: found.append(log_gains(*given)) or found[-1]
     )
     scene = textured_scene()
     scene = with_gains(scene, np.random.default_rng(1).normal(0, 0.3, (len(scene.train), 3)))

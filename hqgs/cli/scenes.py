@@ -49,7 +49,7 @@ class Photos:
     scene: SceneName
     """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
     a scene that is built in: embedded, sparse, true-shake, true-defocus, true-rolling,
-    true-exposure, true-crowd or true-panorama."""
+    true-exposure, true-devices, true-crowd or true-panorama."""
     downscale: Factor = None
     """Divide the photos' sides by F."""
 

@@ -45,6 +45,16 @@ LIKELIHOOD_GAIN = 8.0  # nats that noise must bring, or there is none
 SHOWS = 0.32  # times the mean of the three finest steps: the least noise that is told from fine texture
 DCT_LEAST = 6.0  # levels; below it fine texture is taken for noise at any table
 
+# devices.py: what cameras do to all their photos: vignetting and response
+PAYS = 0.05  # of the error of held-back photos' colours: from so much less on, it is learned
+DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
+DEVICE_VALUES = 12_000  # colours of points in photos that are looked at
+DEVICE_ROUNDS, DEVICE_WEIGHTED = (
+    8,
+    4,
+)  # of means over photos and points in turn; of weights
+DEVICE_RIDGE = 1e-4  # of the weights: what no photo tells stays 0
+
 # differences.py: whether photos differ in sharpness, each in a direction of its own, or in their gains
 UNLIKE, TURNED = 0.18, 0.45  # from these values of `Unlike` on, photos were shaken
 UNLIKE_GAINS = 0.05  # of the log gains

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,28 +32,49 @@ from hqgs.scene.scene import Scene, View
 Floats = NDArray[np.float64]
 
 
-def log_gains(scene: Scene) -> Floats | None:
+@dataclass(frozen=True)
+class SharedColors:
+    """The light in which the training photos show points, where at least two of them tell it."""
+
+    logs: Floats  # [N, P, 3], of the light of red, green and blue; NaN where a photo does not tell
+    squares: Floats  # [N, P], r^2 where it shows them, see `hqgs.photos.look`; NaN too
+
+
+def shared_colors(scene: Scene) -> SharedColors | None:
+    """None where the scene does not tell which photos show which points, or a photo shares fewer than
+    GAINS_FEWEST with others (dark and saturated ones do not count)."""
+    if scene.seen is None or len(scene.train) < 3:
+        return None
+    chosen = _chosen_points(scene, scene.seen)
+    colors = np.full((len(scene.train), len(chosen), 3), np.nan)
+    squares = np.full(colors.shape[:2], np.nan)
+    for k, view in enumerate(scene.train):
+        rows = np.flatnonzero(np.isin(chosen, scene.seen.get(view.name, [])))
+        if len(rows):
+            points = scene.points[chosen[rows]].astype(np.float64)
+            _note_colors(view, points, rows, colors[k], squares[k])
+    told = np.isfinite(colors).all(2)
+    told &= told.sum(0) >= 2
+    if told.sum(1).min() < GAINS_FEWEST:
+        return None
+    with np.errstate(invalid="ignore"):
+        logs = np.log(np.where(told[..., None], colors, np.nan))
+    return SharedColors(logs, np.where(told, squares, np.nan))
+
+
+def log_gains(scene: Scene, shared: SharedColors | None = None) -> Floats | None:
     """The logarithms of the training photos' gains of red, green and blue in linear light, [N, 3], of mean 0.
 
     Only what a photo does not share with those taken beside it: where the light changes along the way, or a
     film's exposure follows the picture, neighbours go together, and colours that depend on the direction
     hold that, and held-out photos have it too. It is told apart by the likelihood of a Gaussian process over
-    places and directions with independent gains on top. None where the scene does not tell which photos show
-    which points, or a photo shares fewer than 20 points with others (dark and saturated ones do not count).
+    places and directions with independent gains on top. `shared`: the scene's, where it is known; None where
+    there are none.
     """
-    if scene.seen is None or len(scene.train) < 3:
+    shared = shared or shared_colors(scene)
+    if shared is None:
         return None
-    chosen = _chosen_points(scene, scene.seen)
-    colors = np.full((len(scene.train), len(chosen), 3), np.nan)
-    for k, view in enumerate(scene.train):
-        rows = np.flatnonzero(np.isin(chosen, scene.seen.get(view.name, [])))
-        if len(rows):
-            _note_colors(view, scene.points[chosen[rows]].astype(np.float64), rows, colors[k])
-    told = np.isfinite(colors).all(2)
-    told &= told.sum(0) >= 2
-    if told.sum(1).min() < GAINS_FEWEST:
-        return None
-    logs = np.log(np.where(told[..., None], colors, np.nan))
+    logs = shared.logs
     gains: Floats = np.zeros((len(scene.train), 3))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of points that no photo tells
@@ -68,10 +90,14 @@ def _chosen_points(scene: Scene, seen: Mapping[str, NDArray[np.intp]]) -> NDArra
     return most_shown(len(scene.points), seen, scene.train, MOST_VALUES // len(scene.train))
 
 
-def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Floats) -> None:
-    """Write the light of a photo at `points`, which have these `rows`; NaN where it does not tell."""
-    where, depths = project(view.camera, points)
+def _note_colors(view: View, points: Floats, rows: NDArray[np.intp], colors: Floats, squares: Floats) -> None:
+    """Write the light of a photo at `points`, which have these `rows`, and their r^2; NaN where it does not
+    tell."""
+    camera = view.camera
+    where, depths = project(camera, points)
     rows, where = rows[depths > 0], where[depths > 0]
+    away = np.square(where - camera.K[:2, 2]).sum(1)
+    squares[rows] = away * (4 / (camera.height**2 + camera.width**2))
     if view.image.dtype == np.uint8:  # 256 powers, not one for each value
         table = to_linear(as_floats(np.arange(256, dtype=np.uint8)).astype(np.float64))
         light = table[view.image.astype(np.uint8, copy=False)]

@@ -14,38 +14,21 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.diagnosis.constants import (
     COARSE_FILM,
-    DIFFERS,
-    GOES_WITH_DEPTH,
     MOST_PHOTOS,
     PROBES,
     SCENE_WHITE,
-    TURNED,
-    UNLIKE,
-    UNLIKE_GAINS,
     UNLIKE_NOISE,
     VISIBLE_QUALITY,
 )
-from hqgs.diagnosis.differences import unlike_sharpness
-from hqgs.diagnosis.focus import focus_signs
-from hqgs.diagnosis.gains import log_gains
+from hqgs.diagnosis.devices import DeviceSigns, device_signs
+from hqgs.diagnosis.gains import log_gains, shared_colors
+from hqgs.diagnosis.own import Finding, device_findings, exposure_finding, focus_finding, shake_finding
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
 from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One step of how the photos were made, and whether the method must undo it."""
-
-    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise", "jpeg" or "video"
-    needed: bool
-    value: float | None  # median over photos: px, factor, levels or quality; None: not told
-    spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
-    step: str | None  # in the grammar of `parse_formation`, where needed
-    reason: str  # one sentence
 
 
 @dataclass(frozen=True)
@@ -95,8 +78,8 @@ class Inspector:
         # By identity, with the views, so that no other can come to have it.
         self._inspected: dict[tuple[int, Enlargement | None], tuple[View, Inspected]] = {}
         self._concluded: dict[tuple[int, ...], tuple[PhotoDiagnosis, ...]] = {}
-        self._differences: dict[tuple[int, ...], tuple[Finding, Finding, Finding]] = {}
-        self._gains: dict[tuple[int, ...], NDArray[np.float64] | None] = {}
+        self._differences: dict[tuple[int, ...], tuple[Finding, ...]] = {}
+        self._gains: dict[tuple[int, ...], tuple[NDArray[np.float64] | None, DeviceSigns | None]] = {}
         self.last: Diagnosis | None = None  # that was made
 
     def inspect(self, view: View, enlargement: Enlargement | None = None) -> Inspected:
@@ -109,9 +92,21 @@ class Inspector:
 
     def log_gains(self, scene: Scene) -> NDArray[np.float64] | None:
         """`hqgs.diagnosis.gains.log_gains` of the training photos."""
+        return self._told_by_colors(scene)[0]
+
+    def device_signs(self, scene: Scene) -> DeviceSigns | None:
+        """`hqgs.diagnosis.devices.device_signs` of the training photos."""
+        return self._told_by_colors(scene)[1]
+
+    def _told_by_colors(self, scene: Scene) -> tuple[NDArray[np.float64] | None, DeviceSigns | None]:
         key = tuple(map(id, scene.train))
         if key not in self._gains:
-            self._gains[key] = log_gains(scene)
+            shared = shared_colors(scene)
+            self._gains[key] = (
+                (None, None)
+                if shared is None
+                else (log_gains(scene, shared), device_signs(scene.train, shared))
+            )
         return self._gains[key]
 
     def diagnose(self, scene: Scene, max_photos: int = 16) -> Diagnosis:
@@ -140,15 +135,17 @@ class Inspector:
         photos = self._concluded[key]
         everyone = tuple(map(id, scene.train))
         if everyone not in self._differences:
-            shake = _shake(scene)
-            exposure = _exposure(self.log_gains(scene), photos)
-            self._differences[everyone] = exposure, shake, _focus(scene, shake.needed)
-        exposure, shake, focus = self._differences[everyone]
+            shake = shake_finding(scene)
+            exposure = exposure_finding(self.log_gains(scene), photos)
+            devices = device_findings(self.device_signs(scene))
+            self._differences[everyone] = exposure, *devices, shake, focus_finding(scene, shake.needed)
+        own = self._differences[everyone]
+        *_, shake, focus = own
         blur = _blur(photos)
-        if own := [part.name for part in (shake, focus) if part.needed]:
-            reason = f"each photo has its own, see {' and '.join(own)}"
+        if unlike := [part.name for part in (shake, focus) if part.needed]:
+            reason = f"each photo has its own, see {' and '.join(unlike)}"
             blur = replace(blur, needed=False, step=None, reason=reason)
-        parts = (exposure, shake, focus, blur, _lowres(photos), _noise(photos), _jpeg(photos), _video(photos))
+        parts = (*own, blur, _lowres(photos), _noise(photos), _jpeg(photos), _video(photos))
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
         passed_over = _passed_over(len(scene.train), len(photos), taken)
         self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
@@ -179,46 +176,6 @@ def _passed_over(total: int, looked_at: int, taken: int) -> tuple[LeftOut, ...]:
         what = f"a look at the focus of {total - MOST_PHOTOS} of {total} training photos"
         looks.append(LeftOut(what, f"{MOST_PHOTOS} {spread}"))
     return tuple(looks)
-
-
-def _exposure(log_gains: NDArray[np.float64] | None, photos: Sequence[PhotoDiagnosis]) -> Finding:
-    """`log_gains` [N, 3], as `hqgs.diagnosis.gains` tells them."""
-    if log_gains is None:
-        return Finding("exposure", False, None, None, None, "the photos share too few points to tell")
-    spread = float(np.std(log_gains, axis=0).max())
-    reason = f"gains differ by {spread:.1%} from photo to photo"
-    # Noise that black and white cut off brightens the dark parts of a photo, and darkens the bright ones.
-    noises = [noise for photo in photos if (noise := photo.told_noise) is not None]
-    least = UNLIKE_GAINS + (0.5 * max(noises) / 255 if noises else 0.0)
-    if spread < least:
-        return Finding("exposure", False, spread, None, None, f"{reason} (needed from {least:.0%})")
-    return Finding("exposure", True, spread, None, "exposure", reason)
-
-
-def _shake(scene: Scene) -> Finding:
-    unlike = unlike_sharpness(scene)
-    if unlike is None:
-        return Finding("shake", False, None, None, None, "the photos are too few or too small to tell")
-    reason = f"photos differ by {unlike.sharpness:.2f} in sharpness, by {unlike.direction:.2f} in direction"
-    if unlike.sharpness < UNLIKE or unlike.direction < TURNED:
-        reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
-        return Finding("shake", False, unlike.sharpness, None, None, reason)
-    return Finding("shake", True, unlike.sharpness, None, "shake", reason)
-
-
-def _focus(scene: Scene, shaken: bool) -> Finding:
-    """`shaken`: photos then differ in sharpness as a whole, whatever their focus."""
-    signs = focus_signs(scene)
-    if signs is None:
-        return Finding("focus", False, None, None, None, "the photos share too few points to tell")
-    needed = signs.with_depth >= GOES_WITH_DEPTH or (signs.in_all >= DIFFERS and not shaken)
-    reason = (
-        f"points are sharper or softer from photo to photo by {signs.with_depth:.2f} with their distance and "
-        f"by {signs.in_all:.2f} in all"
-    )
-    if not needed:
-        reason += f" (needed from {GOES_WITH_DEPTH:g} or {DIFFERS:g} in the logarithm of contrast)"
-    return Finding("focus", needed, signs.with_depth, None, "focus" if needed else None, reason)
 
 
 def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:

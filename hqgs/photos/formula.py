@@ -29,6 +29,8 @@ KINDS = {
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
     "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0),
     "focus": Kind(0, math.inf, "no value", default=0, some=False),
+    "vignetting": Kind(0, math.inf, "no value", default=0, some=False),
+    "response": Kind(0, math.inf, "no value", default=0, some=False),
     "grain": Kind(0, math.inf, "no value", default=0, some=False),
     "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
@@ -40,11 +42,16 @@ KINDS = {
 NONE, MIXED, SOME = "none", "mixed", "some"
 LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
 VIDEOS = ("video", "video265")
-LEARNED = ("shake", "focus", "exposure")  # of each photo its own, which is learned with the scene
+DEVICES = ("vignetting", "response")  # of each camera its own, in all its photos
+LEARNED = ("shake", "focus", "exposure", *DEVICES)  # of each photo its own, which is learned with the scene
 OWN = (*LEARNED, "grain", "video")  # of each photo its own; the last two are noise and a film's codec
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
     "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
+    "vignetting": "it is of each camera, and photos do not tell which one took them; the built-in scene "
+    "true-devices is photographed by several",
+    "response": "it is of each camera, and photos do not tell which one took them; the built-in scene "
+    "true-devices is photographed by several",
     "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
 }  # what a method can be told of only, and what to write for photos
 

@@ -16,6 +16,7 @@ ROOMS = (
     "true-defocus",
     "true-rolling",
     "true-exposure",
+    "true-devices",
     "true-crowd",
 )
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")

@@ -45,6 +45,7 @@ class View:
     low: NDArray[np.float32] | None = None  # [h, w, 3]: a low-resolution photo before `image` enlarged it
     quarter_turns: int = 0  # clockwise, that show `image` upright, as the photo's EXIF has it: 0..3
     film: float | None = None  # `fine_detail` of the film's frame that `image` is, before it was stored
+    device: str = ""  # the camera that took it, and how it was zoomed; "": nothing tells
     face: str = ""  # of a wide photo, which `image` is; as `hqgs.scene.faces` calls it
 
 

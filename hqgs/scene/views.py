@@ -119,7 +119,8 @@ def _load_view(
     over: tuple[float, float, float] | None,
 ) -> View:
     camera, stored = photo.camera, stored_size(photo.path)
-    turns, upright = read_exif(photo.path).quarter_turns, 0
+    exif = read_exif(photo.path)
+    turns, upright = exif.quarter_turns, 0
     if turns % 2 and not fits(camera, *stored) and fits(camera, stored[1], stored[0]):
         stored, turns, upright = (
             (stored[1], stored[0]),
@@ -171,7 +172,9 @@ def _load_view(
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
     film = photo.film if downscale <= FILM_SHRUNK else None
-    return View(photo.name, camera_now, image, mask, quarter_turns=turns, film=film, face=face)
+    alike = f"{camera.model.name} {camera.params.tolist()} {stored[0]} x {stored[1]}"
+    device = " ".join(exif.camera) or alike
+    return View(photo.name, camera_now, image, mask, None, turns, film, device, face)
 
 
 @dataclass(frozen=True)

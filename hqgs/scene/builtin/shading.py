@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.photos.light import to_srgb
+from hqgs.scene.builtin.devices import Device
 from hqgs.scene.builtin.exposure import Exposure, still
 from hqgs.scene.builtin.raycast import Array, Surface, Vec, along, dot, in_view, nearest
 from hqgs.scene.builtin.studio import Studio, studio
@@ -37,22 +38,31 @@ def render_exposure(
     gains: NDArray[np.float64] | None = None,
     threads: int | None = None,
     passing: Sequence[Surface] = (),
+    device: Device | None = None,
 ) -> NDArray[np.uint8]:
     """Photo of the embedded scene, [H, W, 3] sRGB: the mean of an exposure's samples in linear light.
 
     `gains` [3] of red, green and blue are applied to the light, before the camera's curve, which is the same
     in all photos: it rolls off the highlights and encodes sRGB. `passing`: what stands in the room beside
-    its own. `threads` as in `render_view`.
+    its own. `device`: whose lens darkens the light, and whose response follows the curve. `threads` as in
+    `render_view`.
     """
     width, height = exposure.size
     image = np.empty((height, width, 3), np.uint8)
+    shade = None if device is None else device.shade(exposure.cameras[0][0]).astype(np.float32)
     factor = None if gains is None else gains.astype(np.float32)
 
     def work(tile: _Tile) -> None:
         light = _render_tile(tile)
         if factor is not None:
             light *= factor
-        image[tile.rows, tile.cols] = tile.picture((_encode(light) * 255 + 0.5).astype(np.uint8))
+        light = tile.picture(light)
+        if shade is not None:
+            light = light * shade[tile.rows, tile.cols, None]
+        values = _encode(light)
+        if device is not None:
+            values = device.respond(values)
+        image[tile.rows, tile.cols] = (values * 255 + 0.5).astype(np.uint8)
 
     _each_tile(exposure, np.float32, work, threads, passing)
     return image

@@ -15,6 +15,7 @@ from hqgs.photos.formula import Kind
 from hqgs.photos.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.crowd import Walker, draw_walkers
+from hqgs.scene.builtin.devices import Device, draw_devices
 from hqgs.scene.builtin.exposure import Exposure, rolling, shaken, still, through_lens
 from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene
 from hqgs.scene.builtin.shading import render_exposure, sample_pattern
@@ -27,11 +28,13 @@ TRUE_KINDS = {
     "true-defocus": Kind(0.5, 20, "the largest radius in px of a point at infinity", at_504=4.0),
     "true-rolling": Kind(0.5, 100, "the longest way of the picture during the readout in px", at_504=12.0),
     "true-exposure": Kind(0.01, 4, "the most stops to either side", default=1),
+    "true-devices": Kind(2, 12, "cameras that took turns", integer=True, default=4),
     "true-crowd": Kind(1, 9, "the most walkers in a photo", integer=True, default=3),
 }
 DISTANCE = FOCUS[2]  # at which translations and lenses have the stated effect, world units
 TURNS, MOVES = 0.75, 0.25  # shares of a path's extent: turns up, down and sideways; each other freedom
 NEAREST, FARTHEST = 2.5, 8.0  # between which photos are focused, world units
+DEVICE_STOPS = 0.5  # to either side, of the gains of photos by several cameras
 SHAKE_SAMPLES = (12, 96)  # at least and at most, rays a pixel
 LENS_SAMPLES = (16, 64)
 STILL = sample_pattern(3)  # as clean photos have it
@@ -49,6 +52,7 @@ class PhotoTruth(NamedTuple):
     focus: float = math.inf  # depth in focus, world units
     gains: Floats = np.ones(3)  # of red, green and blue, in linear light
     walkers: tuple[Walker, ...] = ()
+    device: Device | None = None
     samples: int = len(STILL)  # rays a pixel
 
     def record(self, kind: str) -> dict[str, Any]:
@@ -60,6 +64,8 @@ class PhotoTruth(NamedTuple):
             facts |= {"aperture": self.aperture, "focus": self.focus}
         if (self.gains != 1).any():
             facts["gains"] = self.gains.tolist()
+        if self.device is not None:
+            facts["device"] = self.device.record()
         if self.walkers:
             facts["walkers"] = [walker.record() for walker in self.walkers]
         return facts
@@ -96,6 +102,9 @@ def wild_room(
       is focused at DISTANCE, r uniform in [0.2, 1] R; the focus of each photo is uniform in 1/z between
       depths of 2.5 and 8.
     - `true-exposure[:EV]` (1): gains as in `exposure` (`draw_gains`), on the light before the camera's curve.
+    - `true-devices[:N]` (4): N cameras take turns, each with corners that its lens darkens and a response of
+      its own (`draw_devices`), each photo with gains as `true-exposure:0.5`. The means of the log gains and
+      of the responses are 0, as no photo can tell them. Views tell which camera took them (`View.device`).
     - `true-crowd[:N]` (3): 0 to N figures walk through each photo (`draw_walkers`); where they are, and
       nowhere else, it differs from the clean one.
 
@@ -113,6 +122,8 @@ def wild_room(
         view.name: _draw(name, value, view.camera, np.random.default_rng([seed, names.index(view.name)]))
         for view in clean.train
     }
+    if name == "true-devices":
+        truth = _of_devices(truth, np.random.default_rng([seed, len(names)]), int(value))
     folder = None if cache is None else cache / f"{name}_{value:g}_{seed}"
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
     kept = None if folder is None else read_kept(folder, made, list(truth))
@@ -125,7 +136,11 @@ def wild_room(
         f"photographed with {name}:{value:g}, seed {seed}: all training photos ({len(clean.train)}), "
         f"ray-cast in linear light; held-out photos ({len(clean.test)}) are clean; points and poses are exact"
     )
-    train = [replace(view, image=kept.photos[view.name]) for view in clean.train]
+    train = [
+        replace(view, image=kept.photos[view.name], device=device.name if device is not None else "")
+        for view in clean.train
+        for device in [truth[view.name].device]
+    ]
     return WildRoom(replace(clean, train=train, notes=[*clean.notes, note]), clean, truth)
 
 
@@ -160,12 +175,24 @@ def exposure(kind: str, camera: Camera, truth: PhotoTruth) -> Exposure:
 def taken(kind: str, camera: Camera, truth: PhotoTruth) -> NDArray[np.uint8]:
     """The photo that the truth stands for."""
     passing = [surface for walker in truth.walkers for surface in walker.surfaces()]
-    return render_exposure(exposure(kind, camera, truth), truth.gains, passing=passing)
+    return render_exposure(exposure(kind, camera, truth), truth.gains, passing=passing, device=truth.device)
+
+
+def _of_devices(truth: dict[str, PhotoTruth], rng: np.random.Generator, count: int) -> dict[str, PhotoTruth]:
+    """The same photos by so many cameras, with log gains of mean 0."""
+    devices = draw_devices(rng, len(truth), count)
+    mean = np.log([photo.gains for photo in truth.values()]).mean(0)
+    return {
+        name: photo._replace(gains=photo.gains / np.exp(mean), device=device)
+        for (name, photo), device in zip(truth.items(), devices, strict=True)
+    }
 
 
 def _draw(kind: str, value: float, camera: Camera, rng: np.random.Generator) -> PhotoTruth:
     if kind == "true-exposure":
         return PhotoTruth(gains=draw_gains(rng, value))
+    if kind == "true-devices":
+        return PhotoTruth(gains=draw_gains(rng, DEVICE_STOPS))
     if kind == "true-crowd":
         return PhotoTruth(walkers=draw_walkers(rng, int(value)))
     strength, focal = value * draw_strength(rng), camera.K[0, 0]

@@ -41,6 +41,7 @@ from hqgs.training.constants import (
     TRAJECTORY_RATE,
     WARP_SPACING,
 )
+from hqgs.training.methods.devices import LearnedDevices
 from hqgs.training.methods.lens import first_lens, lens_warps, samples, sharp_at, widest
 
 
@@ -60,6 +61,8 @@ class LearnedCamera:
     trajectory: NDArray[np.float64]  # [9, 2], px: of the picture's middle during the exposure; of mean 0
     gains: NDArray[np.float64]  # [3], of red, green and blue in linear light
     lens: NDArray[np.float64]  # [2], px: see `hqgs.training.methods.lens`
+    vignetting: NDArray[np.float64]  # [2] and
+    response: NDArray[np.float64]  # [2, 3], as `hqgs.photos.look` has them
 
     @property
     def defocus(self) -> float:
@@ -78,7 +81,7 @@ class LearnedCamera:
 
 
 class LearnedCameras:
-    """The cameras of a scene's training photos.
+    """The cameras of a scene's training photos; `devices`: what those do to all of their photos.
 
     A trajectory is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and
     move in all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median
@@ -86,7 +89,13 @@ class LearnedCameras:
     """
 
     def __init__(
-        self, scene: Scene, shake: bool, focus: bool, log_gains: NDArray[np.float64] | None, seed: int
+        self,
+        scene: Scene,
+        shake: bool,
+        focus: bool,
+        log_gains: NDArray[np.float64] | None,
+        seed: int,
+        devices: LearnedDevices | None = None,
     ) -> None:
         """`log_gains` [N, 3] of the training photos: to start from, and their mean stays.
 
@@ -115,6 +124,7 @@ class LearnedCameras:
         self._sharp = torch.full((count,), not focus)
         self._active = False
         self._begin, self._looks = 0, (0, 0)
+        self._devices = devices
 
     def schedule(self, iterations: int) -> None:
         """Of a run of this length."""
@@ -126,7 +136,7 @@ class LearnedCameras:
         number, camera = self._numbers[view.name], view.camera
         size = camera.height, camera.width
         blurs = self._active and self._blurs(number) and self._sizes[number] == size
-        if not blurs and not self._gains:
+        if not blurs and not self._gains and self._devices is None:
             return Shot(camera, lambda render: render)
         warps, margin = torch.zeros(0, 3, 4, dtype=torch.float64), 0
         if blurs:
@@ -144,7 +154,10 @@ class LearnedCameras:
                 gains = self._gains[number].exp()
             full = None if near is None else _enlarged(near, size).to(render)
             taken = take_photo(render, size, full, warps, gains)
-            return as_held(taken, photo) if self._gains and photo.shape == taken.shape else taken
+            if self._devices is not None:
+                taken = self._devices.develop(number, camera, taken)
+            exposed = self._gains or self._devices is not None
+            return as_held(taken, photo) if exposed and photo.shape == taken.shape else taken
 
         return Shot(wide, develop)
 
@@ -153,6 +166,8 @@ class LearnedCameras:
         number = self._numbers[view.name]
         if self._gains:
             _center(self._gains, self._mean)
+        if self._devices is not None:
+            self._devices.center()
         if not self._paths and not self._lenses:
             return
         self._active = iteration >= self._begin
@@ -174,12 +189,14 @@ class LearnedCameras:
 
     def learned(self) -> list[LearnedCamera]:
         """For each training photo."""
+        none = np.zeros(2), np.zeros((2, 3))
         return [
             LearnedCamera(
                 name,
                 np.zeros((TRAJECTORY_POINTS, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
+                *(none if self._devices is None else self._devices.learned(k)),
             )
             for name, k in self._numbers.items()
         ]
@@ -192,11 +209,11 @@ class LearnedCameras:
             groups.append({"name": "lenses", "params": self._lenses, "lr": 0.0, "betas": (0.9, 0.99)})
         if self._gains:
             groups.append({"name": "gains", "params": self._gains, "lr": 0.0, "betas": (0.9, 0.99)})
-        return groups
+        return groups + ([] if self._devices is None else self._devices.param_groups())
 
     def rates(self, part: float) -> dict[str, float]:
         """Learning rates after this part of the run."""
-        rates = {}
+        rates = {} if self._devices is None else self._devices.rates(part)
         if self._paths:
             rates["paths"] = TRAJECTORY_RATE * float(np.mean(self._widths)) * CAMERA_RATES_LEFT**part
         if self._lenses:
@@ -211,6 +228,8 @@ class LearnedCameras:
         state |= {f"path.{k}": path.detach() for k, path in enumerate(self._paths)}
         state |= {f"lens.{k}": lens.detach() for k, lens in enumerate(self._lenses)}
         state |= {f"gains.{k}": gains.detach() for k, gains in enumerate(self._gains)}
+        if self._devices is not None:
+            state |= self._devices.state_dict()
         return state | {f"near.{k}": near for k, near in enumerate(self._nearness) if near is not None}
 
     @torch.no_grad()
@@ -224,6 +243,8 @@ class LearnedCameras:
             lens.copy_(state[f"lens.{k}"])
         for k, gains in enumerate(self._gains):
             gains.copy_(state[f"gains.{k}"])
+        if self._devices is not None:
+            self._devices.load_state_dict(state)
         self._nearness = [state.get(f"near.{k}") for k in range(len(self._nearness))]
 
     def _blurs(self, number: int) -> bool:

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hqgs.diagnosis.devices import plain_devices
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import enlarge
-from hqgs.photos.formula import LEARNED, OWN
+from hqgs.photos.formula import DEVICES, LEARNED, OWN
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
@@ -22,6 +23,7 @@ from hqgs.training.config import HQGSConfig
 from hqgs.training.constants import KNEE, SIZES_REFRESH, STEEPER
 from hqgs.training.methods.base import Method
 from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, Shot, no_shot
+from hqgs.training.methods.devices import LearnedDevices
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
@@ -39,8 +41,9 @@ class HQGS(Method[FormedTarget]):
       parts.
     - Noise: differences count by their square up to two standard deviations of the noise (Huber's function).
       The mean of Gaussian noise over the views is nearer to the truth than their median, which L1 asks for.
-    - Shake, focus and exposure, each photo its own: what its camera did is learned with the scene
-      (`LearnedCameras`), and the render is taken like that. With nothing else, the rest is 3DGS's.
+    - Shake, focus and exposure, each photo its own, vignetting and response, each camera its own: what the
+      cameras did is learned with the scene (`LearnedCameras`), and the render is taken like that. With
+      nothing else, the rest is 3DGS's.
     - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
       Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
@@ -76,7 +79,12 @@ class HQGS(Method[FormedTarget]):
             if "exposure" in kinds:
                 gains = inspector.log_gains(scene)
                 gains = np.zeros((len(scene.train), 3)) if gains is None else gains
-            self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed)
+            devices = None
+            if kinds & set(DEVICES):
+                signs = inspector.device_signs(scene)
+                first = plain_devices(scene.train) if signs is None else signs.devices
+                devices = LearnedDevices(first, "vignetting" in kinds, "response" in kinds)
+            self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed, devices)
         holds = self.noise and config.held_pixels and "jpeg" not in kinds
         self._plateau = Plateau(len(scene.train)) if holds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit

@@ -1,0 +1,94 @@
+"""What the cameras that took the photos do to all of them, learned with the scene: vignetting and response.
+
+See `hqgs.photos.look` for the model. The mean of the responses over photos is that which they start with, 0:
+photos cannot tell it. A scene is shown as that mean camera would, without its vignetting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hqgs.diagnosis.devices import Devices
+from hqgs.photos.look import darken, falloff, respond, squared_radii
+from hqgs.scene.scene import Camera
+from hqgs.training.constants import CAMERA_RATES_LEFT, DEVICE_RATE, STEEPEST
+
+
+class LearnedDevices:
+    """The cameras of a scene's training photos."""
+
+    def __init__(self, first: Devices, vignetting: bool, response: bool) -> None:
+        """`vignetting` and `response`: which of them is learned; what is not does nothing."""
+        self._of_photo = first.of_photo
+        self._vignetting = _trained(first.vignetting if vignetting else [])
+        self._response = _trained(first.response if response else [])
+        counts = np.bincount(first.of_photo[first.of_photo >= 0], minlength=len(first))
+        self._shares = torch.from_numpy(counts / max(counts.sum(), 1))
+        self._squares: dict[tuple[int, int, float, float], Tensor] = {}
+        self.center()
+
+    def develop(self, number: int, camera: Camera, taken: Tensor) -> Tensor:
+        """The photo of this number of what was taken without its camera's faults, [H, W, 3]."""
+        device = int(self._of_photo[number])
+        if device < 0:
+            return taken
+        if self._vignetting:
+            height, width = taken.shape[:2]
+            key = height, width, float(camera.K[0, 2]), float(camera.K[1, 2])
+            if key not in self._squares:
+                self._squares[key] = torch.from_numpy(squared_radii(height, width, camera.K)).to(taken.dtype)
+            taken = darken(taken, falloff(self._squares[key], self._vignetting[device].to(taken.dtype)))
+        return respond(taken, self._response[device]) if self._response else taken
+
+    @torch.no_grad()
+    def center(self) -> None:
+        """What photos cannot tell stays, and responses rise: after each step."""
+        if not self._response:
+            return
+        each = torch.stack([*self._response])
+        each -= (self._shares[:, None, None] * each).sum(0)
+        each *= (STEEPEST / each.abs().sum(1, keepdim=True).clamp(min=STEEPEST)).amin(dim=0)
+        for response, value in zip(self._response, each, strict=True):
+            response.copy_(value)
+
+    def learned(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Vignetting [2] and response [2, 3] of the photo's camera."""
+        device = int(self._of_photo[number])
+        vignetting, response = np.zeros(2), np.zeros((2, 3))
+        if device >= 0 and self._vignetting:
+            vignetting = self._vignetting[device].detach().numpy().copy()
+        if device >= 0 and self._response:
+            response = self._response[device].detach().numpy().copy()
+        return vignetting, response
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        found = {"vignetting": self._vignetting, "response": self._response}
+        return [
+            {"name": name, "params": params, "lr": 0.0, "betas": (0.9, 0.99)}
+            for name, params in found.items()
+            if params
+        ]
+
+    def rates(self, part: float) -> dict[str, float]:
+        """Learning rates after this part of the run."""
+        return {group["name"]: DEVICE_RATE * CAMERA_RATES_LEFT**part for group in self.param_groups()}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        state = {f"vignetting.{k}": value.detach() for k, value in enumerate(self._vignetting)}
+        return state | {f"response.{k}": value.detach() for k, value in enumerate(self._response)}
+
+    @torch.no_grad()
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        for name, params in (("vignetting", self._vignetting), ("response", self._response)):
+            for k, value in enumerate(params):
+                value.copy_(state[f"{name}.{k}"])
+
+
+def _trained(values: Iterable[NDArray[np.float64]]) -> list[Tensor]:
+    return [torch.from_numpy(value.copy()).requires_grad_() for value in values]

@@ -1,0 +1,194 @@
+"""What cameras do to all their photos: the model, what is found before training, what is learned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from test_learned_cameras import assert_same, run
+from tiny_scene import tiny_scene
+
+import hqgs
+from hqgs.diagnosis.constants import PAYS
+from hqgs.diagnosis.devices import Devices, device_signs, grouped
+from hqgs.diagnosis.gains import SharedColors
+from hqgs.photos.light import to_linear, to_srgb
+from hqgs.photos.look import Look, darken, falloff, respond, squared_radii
+from hqgs.scene.builtin.devices import draw_devices
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.constants import STEEPEST
+from hqgs.training.methods.devices import LearnedDevices
+
+Floats = NDArray[np.float64]
+K = np.array([[40.0, 0, 17.5], [0, 40.0, 11.0], [0, 0, 1]])
+
+
+def response_of(values: Floats, response: Floats) -> Floats:
+    """Its integral from 0 of 1 + a P1(u) + b P2(u) by numpy's polynomials, straight beyond 0 and 1."""
+    out = np.empty_like(values)
+    for c in range(3):
+        slope = np.polynomial.Legendre([1, *response[:, c]])(np.polynomial.Polynomial([1, -2]))
+        whole = slope.integ(lbnd=0)
+        inside = np.clip(values[..., c], 0, 1)
+        out[..., c] = whole(inside) + (values[..., c] - inside) * slope(inside)
+    return out
+
+
+def test_a_look_is_its_definition() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.uniform(0, 1, (20, 30, 3))
+    look = Look(np.array([0.8, 1.0, 1.2]), np.array([0.3, 0.2]), rng.uniform(-0.4, 0.4, (2, 3)))
+    taken = look.of(image, K)
+    corner = (20**2 + 30**2) / 4
+    for row, column in ((0, 0), (9, 16), (19, 29)):
+        square = ((column + 0.5 - 17.5) ** 2 + (row + 0.5 - 11.0) ** 2) / corner
+        light = to_linear(image[row, column]) * look.gains * np.exp(-0.3 * square - 0.2 * square**2)
+        np.testing.assert_allclose(taken[row, column], response_of(to_srgb(light), look.response), atol=1e-12)
+
+
+def test_light_is_darkened_as_sRGB_has_it() -> None:  # noqa: N802
+    """Exactly on the curve and in its toe; between them by half a level at most."""
+    values = torch.linspace(0, 1.2, 5_001, dtype=torch.float64)[:, None, None].expand(-1, 1, 3)
+    for fall in (-0.4, 0.0, 0.2, 1.1):
+        fallen = to_linear(values.numpy()) * np.exp(-fall)
+        expected = to_srgb(fallen)
+        found = darken(values, torch.full((5_001, 1), fall, dtype=torch.float64)).numpy()
+        clear = (np.minimum(values.numpy(), expected) > 0.0405) | (
+            np.maximum(values.numpy(), expected) < 0.0404
+        )
+        np.testing.assert_allclose(found[clear], expected[clear], atol=1e-6)
+        assert np.abs(found - expected).max() < 0.55 / 255
+
+
+def test_gradients_are_those_of_differences() -> None:
+    generator = torch.Generator().manual_seed(0)
+    values = (torch.rand((4, 5, 3), generator=generator, dtype=torch.float64) * 1.2 - 0.05).requires_grad_()
+    vignetting = torch.tensor([0.4, 0.1], dtype=torch.float64, requires_grad=True)
+    response = (torch.rand((2, 3), generator=generator, dtype=torch.float64) - 0.5).requires_grad_()
+    squares = torch.from_numpy(squared_radii(4, 5, K / 7))
+
+    def taken(values: torch.Tensor, vignetting: torch.Tensor, response: torch.Tensor) -> torch.Tensor:
+        return respond(darken(values, falloff(squares, vignetting)), response)
+
+    assert torch.autograd.gradcheck(taken, (values, vignetting, response), eps=1e-7, atol=1e-5)
+
+
+def view(number: int, device: str) -> View:
+    camera = Camera(36, 24, K, np.eye(4))
+    return View(f"{number:02}.png", camera, np.zeros((24, 36, 3), np.uint8), device=device)
+
+
+def test_photos_are_those_of_their_cameras() -> None:
+    views = [view(k, "b" if k % 3 else "a") for k in range(12)] + [view(12, "rare"), view(13, "")]
+    views.append(replace(view(14, "a"), face="front"))
+    assert grouped(views).tolist() == [1, 0, 0] * 4 + [-1, -1, -1]
+
+
+def colors(rng: np.random.Generator, looks: list[Look], scatter: float) -> SharedColors:
+    """Of points that each photo shows somewhere, by the definition of a look."""
+    count, points = len(looks), 400
+    own = rng.uniform(0.05, 0.6, (points, 3))
+    squares = rng.uniform(0, 1, (count, points))
+    logs = np.empty((count, points, 3))
+    for k, look in enumerate(looks):
+        fall = look.vignetting[0] * squares[k] + look.vignetting[1] * squares[k] ** 2
+        value = response_of(to_srgb(own * look.gains * np.exp(-fall)[:, None]), look.response)
+        logs[k] = np.log(to_linear(value)) + rng.normal(0, scatter, (points, 3))
+    hidden = rng.random((count, points)) < 0.5
+    logs[hidden], squares[hidden] = np.nan, np.nan
+    return SharedColors(logs, squares)
+
+
+def test_vignetting_and_response_are_found_by_photos_that_had_no_part_in_it() -> None:
+    rng = np.random.default_rng(5)
+    views = [view(k, "ab"[k % 2]) for k in range(16)]
+    gains = np.exp(rng.normal(0, 0.2, (16, 3)))
+    vignetting, response = np.array([[0.5, 0.2], [0.0, 0.1]]), rng.uniform(-0.25, 0.25, (2, 3))
+    bends = np.stack([response, -response])
+    looks = [Look(gains[k], vignetting[k % 2], bends[k % 2]) for k in range(16)]
+    signs = device_signs(views, colors(rng, looks, 0.03))
+    assert signs is not None
+    assert signs.vignetting > 2 * PAYS
+    assert signs.response > PAYS
+    assert signs.corner == pytest.approx(1 - np.exp(-0.7), abs=0.05)
+    np.testing.assert_allclose(signs.devices.vignetting.sum(1), vignetting.sum(1), atol=0.05)
+    np.testing.assert_allclose(signs.devices.response, bends, atol=0.08)
+    np.testing.assert_allclose(signs.devices.response.mean(0), 0, atol=1e-12)
+    plain = [Look(gains[k], np.zeros(2), np.zeros((2, 3))) for k in range(16)]
+    signs = device_signs(views, colors(rng, plain, 0.1))
+    assert signs is not None
+    assert max(signs.vignetting, signs.response) < PAYS / 5
+    assert device_signs([view(k, "") for k in range(16)], colors(rng, plain, 0.1)) is None
+
+
+def test_they_are_learned() -> None:
+    """Of photos whose scene is known, from nothing."""
+    rng = np.random.default_rng(1)
+    camera = Camera(36, 24, K, np.eye(4))
+    clean = torch.from_numpy(rng.uniform(0.02, 0.98, (24, 36, 3)))
+    vignetting = np.array([[0.5, 0.2], [0.1, 0.0]])
+    response = rng.uniform(-0.3, 0.3, (2, 3))
+    truth = LearnedDevices(Devices(np.array([0, 1]), vignetting, np.stack([response, -response])), True, True)
+    devices = LearnedDevices(Devices(np.array([0, 1]), np.zeros((2, 2)), np.zeros((2, 2, 3))), True, True)
+    params = [param for group in devices.param_groups() for param in group["params"]]
+    adam = torch.optim.Adam(params, lr=0.01)
+    for step in range(400):
+        adam.zero_grad()
+        photo = truth.develop(step % 2, camera, clean).detach()
+        (devices.develop(step % 2, camera, clean) - photo).abs().mean().backward()
+        adam.step()
+        devices.center()
+    for number in (0, 1):
+        for found, wanted in zip(devices.learned(number), truth.learned(number), strict=True):
+            np.testing.assert_allclose(found, wanted, atol=0.05)
+
+
+def test_responses_rise_and_keep_their_mean() -> None:
+    wild = np.array([[[3.0, 0, 1], [-2, 0.5, 1]], [[0, 1.0, 0], [0, -4, 2]]])
+    devices = LearnedDevices(Devices(np.array([0, 1, 1, -1]), np.zeros((2, 2)), wild), True, True)
+    each = np.stack([devices.learned(k)[1] for k in range(4)])
+    np.testing.assert_allclose(each[:3].mean(0), 0, atol=1e-12)
+    assert np.abs(each).sum(1).max() <= STEEPEST + 1e-12
+    np.testing.assert_array_equal(each[3], 0)
+
+
+def by_two() -> Scene:
+    scene = tiny_scene()
+    train = [replace(v, device=f"camera {k % 2}") for k, v in enumerate(scene.train)]
+    train += [replace(v, name=f"again_{v.name}") for v in train]
+    seen = None if scene.seen is None else scene.seen | {f"again_{n}": rows for n, rows in scene.seen.items()}
+    return replace(scene, train=train, seen=seen)
+
+
+@pytest.mark.parametrize("formation", ["vignetting+response", "exposure+vignetting+response+shake"])
+def test_a_run_learns_them_bit_for_bit(formation: str, tmp_path: Path) -> None:
+    before, runs = hqgs.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            hqgs.set_num_threads(threads)
+            runs.append(run(by_two(), formation))
+    finally:
+        hqgs.set_num_threads(before)
+    assert_same(*runs)
+    learned = runs[0].method.learned()
+    assert any(np.abs(photo.vignetting).max() > 1e-3 for photo in learned)
+    np.testing.assert_allclose(np.mean([photo.response for photo in learned], 0), 0, atol=1e-9)
+
+
+def test_the_built_in_cameras() -> None:
+    devices = draw_devices(np.random.default_rng(3), 21, 4)
+    assert sorted({device.name for device in devices}) == [f"camera {k}" for k in (1, 2, 3, 4)]
+    assert np.abs(np.mean([np.log(device.gammas) for device in devices], 0)).max() < 1e-12
+    assert np.abs(np.mean([device.contrast for device in devices], 0)).max() < 1e-12
+    values = np.repeat(np.linspace(0, 1, 257, dtype=np.float32)[:, None], 3, 1)
+    for device in devices:
+        written = device.respond(values)
+        assert (np.diff(written, axis=0) > 0).all()
+        np.testing.assert_allclose(written[[0, -1]], [[0] * 3, [1] * 3], atol=1e-6)
+        shade = device.shade(Camera(36, 24, np.array([[40.0, 0, 18], [0, 40, 12], [0, 0, 1]]), np.eye(4)))
+        assert shade[0, 0] == pytest.approx((1 + device.corner * (17.5**2 + 11.5**2) / (18**2 + 12**2)) ** -2)
+        assert shade[12, 18] > 0.99
