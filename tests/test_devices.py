@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from test_learned_cameras import assert_same, run
 from tiny_scene import tiny_scene
 
 import hqgs
+from hqgs.cli.main import main
 from hqgs.diagnosis.constants import PAYS
 from hqgs.diagnosis.devices import Devices, device_signs, grouped
 from hqgs.diagnosis.gains import SharedColors
+from hqgs.evaluation.looks import look_of
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.look import Look, darken, falloff, respond, squared_radii
 from hqgs.scene.builtin.devices import draw_devices
@@ -66,10 +70,10 @@ def test_light_is_darkened_as_sRGB_has_it() -> None:  # noqa: N802
 
 def test_gradients_are_those_of_differences() -> None:
     generator = torch.Generator().manual_seed(0)
-    values = (torch.rand((4, 5, 3), generator=generator, dtype=torch.float64) * 1.2 - 0.05).requires_grad_()
+    values = (torch.rand((3, 4, 3), generator=generator, dtype=torch.float64) * 1.2 - 0.05).requires_grad_()
     vignetting = torch.tensor([0.4, 0.1], dtype=torch.float64, requires_grad=True)
     response = (torch.rand((2, 3), generator=generator, dtype=torch.float64) - 0.5).requires_grad_()
-    squares = torch.from_numpy(squared_radii(4, 5, K / 7))
+    squares = torch.from_numpy(squared_radii(3, 4, K / 9))
 
     def taken(values: torch.Tensor, vignetting: torch.Tensor, response: torch.Tensor) -> torch.Tensor:
         return respond(darken(values, falloff(squares, vignetting)), response)
@@ -135,8 +139,8 @@ def test_they_are_learned() -> None:
     truth = LearnedDevices(Devices(np.array([0, 1]), vignetting, np.stack([response, -response])), True, True)
     devices = LearnedDevices(Devices(np.array([0, 1]), np.zeros((2, 2)), np.zeros((2, 2, 3))), True, True)
     params = [param for group in devices.param_groups() for param in group["params"]]
-    adam = torch.optim.Adam(params, lr=0.01)
-    for step in range(400):
+    adam = torch.optim.Adam(params, lr=0.02)
+    for step in range(200):
         adam.zero_grad()
         photo = truth.develop(step % 2, camera, clean).detach()
         (devices.develop(step % 2, camera, clean) - photo).abs().mean().backward()
@@ -177,6 +181,33 @@ def test_a_run_learns_them_bit_for_bit(formation: str, tmp_path: Path) -> None:
     learned = runs[0].method.learned()
     assert any(np.abs(photo.vignetting).max() > 1e-3 for photo in learned)
     np.testing.assert_allclose(np.mean([photo.response for photo in learned], 0), 0, atol=1e-9)
+
+
+def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = by_two(), tmp_path / "run"
+    formation = "exposure+vignetting+response"
+    hqgs.train(scene, out=out, leave_out="none", method="hqgs", formation=formation, iterations=5)
+    report = json.loads((out / "report.json").read_text())
+    assert report["learned"][0]["name"] == "view1.png"
+    own = {"gains": [0.7, 0.8, 0.9], "vignetting": [0.5, 0.1], "response": [[0.1, 0, -0.1], [0, 0.2, 0]]}
+    report["learned"][0] |= own
+    (out / "report.json").write_text(json.dumps(report))
+    for name in ("plain", "dark"):
+        look = [] if name == "plain" else ["--look", "view1"]
+        arguments = ["render", str(out), "--views", "view0.png", "--out", str(tmp_path / name), *look]
+        assert main(arguments) == 0
+    plain, dark = (
+        np.asarray(Image.open(next((tmp_path / name).iterdir()))) / 255 for name in ("plain", "dark")
+    )
+    look, K = look_of(out, "view1.png"), scene.test[0].camera.K
+    assert look.gains.tolist() == own["gains"]
+    np.testing.assert_allclose(dark, look.of(plain, K), atol=1.6 / 255)
+    capsys.readouterr()
+    assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view9"]) == 2
+    assert "no look of a photo 'view9' was learned; there are: view1.png, " in capsys.readouterr().err
+    assert main(["render", str(out / "scene.ply"), "--out", str(tmp_path / "x.png"), "--look", "view1"]) == 0
+    (out / "report.json").unlink()
+    assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view1"]) == 2
 
 
 def test_the_built_in_cameras() -> None:

@@ -17,6 +17,7 @@ from hqgs.model.formats.files import scene_file
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
+    from hqgs.photos.look import Look
     from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Camera
     from hqgs.show.trust import Trust
@@ -47,6 +48,9 @@ class Render:
     """In pixels (as the cameras have)."""
     show: Literal["color", "depth", "alpha", "trust"] = "color"
     """What the pictures show. trust: the error that 9 of 10 pixels stay below, by the run's photos."""
+    look: Annotated[str | None, tyro.conf.arg(metavar="PHOTO", help_behavior_hint="")] = None
+    """In the look of this photo of the run: its gains, its camera's vignetting and response, where those were
+    learned (that of the mean photo)."""
     background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
     """Behind everything; 1 is white."""
     up: Annotated[
@@ -76,6 +80,7 @@ def run(options: Render) -> int:
             cameras = cameras[:1]
         trust = _trust(options, gaussians) if options.show == "trust" else None
         predicted = _predicted(options, gaussians, cameras, trust)
+        look = None if options.look is None else _look(source, options.look)
         started = time.perf_counter()
         render_frames(
             gaussians,
@@ -87,6 +92,7 @@ def run(options: Render) -> int:
             names=names,
             progress=_progress if sys.stderr.isatty() else None,
             trust=trust,
+            look=look,
         )
     except BAD_INPUT as error:
         return fail(2, error)
@@ -149,6 +155,13 @@ def _trust(options: Render, gaussians: Gaussians) -> Trust:
     elif known is not None:
         print("trust: not calibrated, as the run held out no photo: bounds are those of other captures")
     return trust
+
+
+def _look(source: Path, name: str) -> Look:
+    """What the run in a folder, or beside a scene file, has learned of a photo's look."""
+    from hqgs.evaluation.looks import look_of
+
+    return look_of(source if source.is_dir() else source.parent, name)
 
 
 def _predicted(

@@ -45,7 +45,12 @@ def learned_words(record: LearnedRecord) -> dict[str, str]:
     focus = f"{record['defocus_px']:.1f} px" if record["defocus_px"] else "sharp"
     if record["focus"] is not None:
         focus += f", sharp at {record['focus']:.2g} of the median depth"
-    return {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
+    words = {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
+    if (fall := sum(record.get("vignetting", [0.0]))) != 0:
+        words["corners"] = f"{np.expm1(-fall):+.0%} of the light"
+    if (bends := np.abs(record.get("response", [[0.0]]))).any():
+        words["slope of its curve"] = f"up to {bends.sum(0).max():.0%} off the mean"
+    return words
 
 
 def facts_of_diagnosis(photos: Iterable[PhotoDiagnosis]) -> dict[str, dict[str, str]]:

@@ -121,7 +121,12 @@ class PhotoRecord(TypedDict):
     enlarged: int  # 1: it was not
 
 
-class LearnedRecord(TypedDict):
+class _LookOfCamera(TypedDict, total=False):
+    vignetting: list[float]  # [2], as `hqgs.photos.look` has it; older runs do not tell
+    response: list[list[float]]  # [2, 3]
+
+
+class LearnedRecord(_LookOfCamera):
     """What was learned of a training photo's camera."""
 
     name: str

@@ -22,6 +22,7 @@ from hqgs.model.formats.rows import curve_order
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
 from hqgs.photos.files import PHOTO_SUFFIXES
+from hqgs.photos.look import Look
 from hqgs.photos.video import pyav
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
@@ -47,6 +48,7 @@ def render_frames(
     names: Sequence[str] | None = None,
     progress: OnFrame | None = None,
     trust: Trust | None = None,
+    look: Look | None = None,
 ) -> Path:
     """Render what cameras see into a file, which appears when it is complete, or into a folder of pictures.
 
@@ -62,6 +64,7 @@ def render_frames(
         names: of the pictures in a folder, without .png; None: 00000, 00001, ...
         progress: is called after each frame with how many are done and how many there are.
         trust: for "trust", of `hqgs.show.trust.learn_trust`.
+        look: of a photo, that colours are to have; None: the scene's own.
 
     Returns:
         `out`.
@@ -79,7 +82,7 @@ def render_frames(
         raise ValueError(f"show is {show!r}, wanted one of: {', '.join(SHOWN)}")
     if not 0 < fps <= 1000:
         raise ValueError(f"fps is {fps}, wanted a number above 0 and at most 1000")
-    pictures = _counted(frames(gaussians, cameras, show, background, trust), len(cameras), progress)
+    pictures = _counted(frames(gaussians, cameras, show, background, trust, look), len(cameras), progress)
     suffix = out.suffix.lower()
     if suffix in FILMS:
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
@@ -114,6 +117,7 @@ def frames(
     show: str = "color",
     background: Sequence[float] = BACKGROUND,
     trust: Trust | None = None,
+    look: Look | None = None,
 ) -> Iterator[Picture]:
     """What each camera sees, [H, W, 3], in turn; see `render_frames`."""
     if len(background) != 3:
@@ -121,7 +125,7 @@ def frames(
     with torch.no_grad():
         prepared = Activated(gaussians)
     if show == "color":
-        yield from (prepared.color(camera, background) for camera in cameras)
+        yield from (prepared.color(camera, background, look) for camera in cameras)
     elif show == "trust":
         if trust is None:
             raise ValueError("show is 'trust', which needs what the photos say of the Gaussians")
@@ -153,13 +157,17 @@ class Activated:
         self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
 
     @torch.no_grad()
-    def color(self, camera: Camera, background: Sequence[float] = BACKGROUND) -> Picture:
+    def color(
+        self, camera: Camera, background: Sequence[float] = BACKGROUND, look: Look | None = None
+    ) -> Picture:
         """[H, W, 3], clipped and rounded to 8 bits."""
         behind = torch.tensor([[*background]], dtype=self._tensors[0].dtype)
         with one_torch_thread():
             image, _, _ = rasterization(
                 *self._tensors, *_of(camera), sh_degree=self.degree, backgrounds=behind, **self._how
             )
+            if look is not None:
+                image = torch.from_numpy(look.of(image[0].numpy(), camera.K))[None]
             return image[0].mul_(255).round_().clamp_(0, 255).byte().numpy()
 
     @torch.no_grad()

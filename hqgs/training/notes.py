@@ -61,6 +61,14 @@ def run_notes(trainer: Trainer) -> list[str]:
         gains = np.log2([photo.gains for photo in found])
         if gains.any():
             notes.append(f"photos are up to {np.abs(gains).max():.2f} stops brighter or darker than the mean")
+        corners = sorted(1 - np.exp(-photo.vignetting.sum()) for photo in found)
+        bends = max(float(np.abs(photo.response).max()) for photo in found)
+        if any(corners) or bends:
+            notes.append(
+                f"cameras darken corners by up to {corners[-1]:.0%}, the slopes of their responses "
+                f"are up to {bends:.0%} off their mean; the scene is shown as the mean camera has "
+                "it, with bright corners, and by `hqgs render --look PHOTO` as a photo's camera would"
+            )
     return notes
 
 
@@ -84,4 +92,6 @@ def learned_record(learned: LearnedCamera) -> LearnedRecord:
         "defocus_px": learned.defocus,
         "focus": learned.focus,
         "gains": learned.gains.tolist(),
+        "vignetting": learned.vignetting.tolist(),
+        "response": learned.response.tolist(),
     }
