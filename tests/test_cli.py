@@ -135,6 +135,8 @@ def test_diagnose_prints_and_writes_what_it_found(
     assert len(written["photos"]) == 5
     assert [part["name"] for part in written["parts"]] == [
         "exposure",
+        "vignetting",
+        "response",
         "shake",
         "focus",
         "blur",
