@@ -16,7 +16,7 @@ from PIL import Image
 from tiny_scene import tiny_scene
 
 import hqgs
-from hqgs.scene.paths import resized
+from hqgs.scene.paths import with_size
 from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, write_page
 
@@ -51,7 +51,7 @@ def test_the_page(trained: tuple[hqgs.Run, Scene], tmp_path: Path) -> None:
             shown = np.asarray(
                 Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"), float
             )
-            camera = resized(view.camera, *SIZE)
+            camera = with_size(view.camera, *SIZE)
             with torch.no_grad():
                 ours = 255 * run.model.render(camera).clamp(0, 1).numpy()
             assert shown.shape == ours.shape

@@ -14,7 +14,7 @@ from tiny_scene import tiny_scene
 import hqgs
 from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
 from hqgs.scene.geometry import project
-from hqgs.scene.paths import circle, focus, resized, view_matrix, world_up
+from hqgs.scene.paths import circle, focus, view_matrix, with_size, world_up
 from hqgs.scene.scene import Camera, Scene, View
 
 
@@ -169,7 +169,7 @@ def test_circle_and_size() -> None:
         circle((0, 0, 0), 0)
     with pytest.raises(ValueError, match="frames is 0"):
         circle((0, 0, 0), 1, frames=0)
-    camera = resized(ring(1)[0], 80, 120)
+    camera = with_size(ring(1)[0], 80, 120)
     assert (camera.width, camera.height) == (80, 120)
     np.testing.assert_allclose(project(camera, np.zeros((1, 3)))[0][0], [40, 60])
     assert camera.K[1, 1] / 120 == pytest.approx(ring(1)[0].K[1, 1] / 30)

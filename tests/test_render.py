@@ -15,7 +15,7 @@ import hqgs
 from hqgs.cli import main as cli
 from hqgs.model.formats.rows import curve_order
 from hqgs.scene.camera_files import load_cameras, save_path
-from hqgs.scene.paths import resized
+from hqgs.scene.paths import with_size
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +65,14 @@ def test_a_film(folder: Path, tmp_path: Path) -> None:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 7
     path = hqgs.camera_path(load_cameras(folder).train, 7)
-    large = resized(path[3], 65, 48)
+    large = with_size(path[3], 65, 48)
     away = np.abs(frames[3].astype(float) - expected(folder, large)[:, :64])
     assert away.mean() < 6  # 4:2:0 chroma of a small picture
     assert np.abs(frames[3].astype(float) - frames[0]).mean() > 2 * away.mean() / 6
 
 
 def test_a_gif_and_a_path_file(folder: Path, tmp_path: Path) -> None:
-    path = [resized(c, 48, 32) for c in hqgs.orbit(load_cameras(folder).train, 5)]
+    path = [with_size(c, 48, 32) for c in hqgs.orbit(load_cameras(folder).train, 5)]
     save_path(tmp_path / "path.json", path, fps=10)
     assert render(folder, "--path", tmp_path / "path.json", "--out", tmp_path / "a.gif") == 0
     gif = Image.open(tmp_path / "a.gif")

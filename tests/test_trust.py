@@ -19,19 +19,9 @@ from hqgs.evaluation.metrics import psnr
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, save_cameras
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.show.trust import (
-    EMPTY,
-    FLOOR,
-    GOOD,
-    SHARE,
-    Held,
-    Trust,
-    _back,
-    bound_of,
-    calibrated,
-    learn_trust,
-)
-from hqgs.show.trust_measured import SPREAD, SPREAD_PHOTOS, _ause, measure_trust, predict_psnr
+from hqgs.show.constants import EMPTY, FLOOR, GOOD, SHARE, SPREAD, SPREAD_PHOTOS
+from hqgs.show.trust import Held, Trust, _back, bound_of, calibrated, learn_trust
+from hqgs.show.trust_measured import _ause, measure_trust, predict_psnr
 from hqgs.show.trust_next import doubtful_spots
 
 

@@ -32,7 +32,7 @@ from hqgs.evaluation.photo_facts import facts_of_photos
 from hqgs.evaluation.report import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
-from hqgs.scene.paths import resized
+from hqgs.scene.paths import with_size
 from hqgs.show.constants import MAX_MESSAGE
 from hqgs.show.frames import trust_picture
 from hqgs.show.trust import learn_trust
@@ -200,7 +200,7 @@ def test_a_photo_lies_where_its_pixels_belong() -> None:
     """A page twice as wide, with twice the focal length: the photo's middle half is scaled by two."""
     scene = tiny_scene()
     taken, photo = scene.train[0].camera, scene.train[0].image.astype(np.uint8)
-    page = resized(taken, 2 * WIDTH, 2 * HEIGHT)
+    page = with_size(taken, 2 * WIDTH, 2 * HEIGHT)
     picture = np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8)
     full = beside(picture, page, photo, taken, 1.0)
     assert np.abs(full[8:-8:2, 8:-8:2].astype(float) - photo[4:-4, 4:-4]).mean() < 8

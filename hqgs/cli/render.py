@@ -68,14 +68,14 @@ def run(options: Render) -> int:
     try:
         file = scene_file(source)
         from hqgs.model.gaussians import Gaussians
-        from hqgs.scene.paths import resized
+        from hqgs.scene.paths import with_size
         from hqgs.show.frames import render_frames  # here: they load torch
 
         gaussians = Gaussians.load(file)
         tell_read(gaussians)
         names, cameras, rate = _cameras(options, gaussians)
         if size is not None:
-            cameras = [resized(camera, *size) for camera in cameras]
+            cameras = [with_size(camera, *size) for camera in cameras]
         if out.suffix.lower() == ".png" and options.views is None:
             cameras = cameras[:1]
         trust = _trust(options, gaussians) if options.show == "trust" else None

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from hqgs import _rust
 from hqgs.model.constants import AGREE_LONGEST, AGREE_SMOOTH, AGREED, AGREEING, ASKED
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.geometry import resized
+from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
@@ -31,8 +31,7 @@ class SmallPhoto:
     @classmethod
     def of(cls, view: View) -> SmallPhoto:
         whole = view.camera
-        if (factor := max(whole.width, whole.height) / AGREE_LONGEST) > 1:
-            view = resized(view, *(max(1, round(side / factor)) for side in (whole.width, whole.height)))
+        view = shrunk(view, AGREE_LONGEST)
         camera, grey = view.camera, as_floats(view.image).mean(2, dtype=np.float32)
         smooth = np.ascontiguousarray(gaussian_filter(grey, AGREE_SMOOTH), np.float32)
         scale = np.array([camera.width / whole.width, camera.height / whole.height])

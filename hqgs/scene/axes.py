@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hqgs.base.evenly import evenly
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_NEAR, AXES_PAIRS, AXES_RATIO, COPY_SIDE
-from hqgs.scene.geometry import resized
+from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import View
 
 Floats = NDArray[np.float64]
@@ -46,19 +46,13 @@ def with_true_axes(views: Sequence[View]) -> tuple[list[View], str | None]:
 
 def _fitting(first: View, second: View) -> NDArray[np.int_]:
     """Matches of two photos that fit the cameras as they are, and turned; and how many there are."""
-    one, two = (_small(view) for view in (first, second))
+    one, two = (shrunk(view, COPY_SIDE) for view in (first, second))
     points, others = _matches(one, two)
     found = []
     for turn in (np.eye(4), TURNED):
         relative = turn @ two.camera.viewmat @ np.linalg.inv(one.camera.viewmat) @ turn
         found.append(int((_distances(one, two, relative, points, others) < AXES_NEAR).sum()))
     return np.array([*found, len(points)])
-
-
-def _small(view: View) -> View:
-    width, height = view.camera.width, view.camera.height
-    factor = max(width, height) / COPY_SIDE
-    return view if factor <= 1 else resized(view, round(width / factor), round(height / factor))
 
 
 def _matches(first: View, second: View) -> tuple[Floats, Floats]:

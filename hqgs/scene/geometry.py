@@ -98,7 +98,19 @@ def resized_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, K, camera.viewmat)
 
 
+def shrunk_camera(camera: Camera, longest: int) -> Camera:
+    """The same where no side is longer than `longest` px: the camera itself, or with larger pixels."""
+    factor = max(1.0, max(camera.width, camera.height) / longest)
+    return resized_camera(camera, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))
+
+
 def resized(view: View, width: int, height: int) -> View:
     """The view with photo, mask and camera at a smaller size, px."""
     image, mask = area_downscale(view.image, view.mask, width, height)
     return View(view.name, resized_camera(view.camera, width, height), image, mask)
+
+
+def shrunk(view: View, longest: int) -> View:
+    """The view where no side is longer than `longest` px."""
+    camera = shrunk_camera(view.camera, longest)
+    return resized(view, camera.width, camera.height)

@@ -61,7 +61,7 @@ def view_matrix(R: _Array, center: _Array) -> _Array:
     return viewmat
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
+def with_size(camera: Camera, width: int, height: int) -> Camera:
     """The camera with another size: the same vertical field of view, the principal point scaled along.
 
     ValueError where the size is below 1.

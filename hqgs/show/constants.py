@@ -1,6 +1,6 @@
 """The numbers of what people look at: pages, the viewer, films. They were chosen by eye.
 
-Those of maps of trust were fitted, and are in `hqgs.show.trust`; the layout of charts is beside them.
+The layout of charts is beside them.
 """
 
 # Films.
@@ -11,6 +11,26 @@ DEPTH_SAMPLES, DEPTH_PERCENTILES = 8, (2, 98)
 
 # Maps of errors, and of trust.
 WORST_SHOWN = 64.0  # levels, of the brightest or reddest pixel
+TRUST_PHOTOS, TRUST_SIDE = 64, 400  # training photos that are looked at, at most; px, of their longer side
+TRUST_ROUNDS = 4  # of the maximisation: more change the order of the pixels by less than its scatter
+# Of a run's steps: more views are not passed over again for the page's map, but for those of so many photos.
+TRUST_PASSES, TRUST_LEAST = 0.1, 4
+PRIOR = 0.1  # error of a Gaussian (white is 1), as of one pixel's weight
+EMPTY = 0.3  # error of what is behind everything
+FLOOR = 0.002  # keeps ratios of errors finite: half a level
+POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
+SHARE = 0.9  # of the pixels: what a bound promises
+GOOD, LEAST_GOOD = 20.0, 0.005  # levels of 255: a pixel with such a bound is good; share of them that tells
+CALIBRATORS = 40  # held-out photos that calibrate, at most
+SEEN = 0.5  # pixels' weight that a Gaussian has in a photo that sees it
+PATH_LOOKS = 32  # cameras of a path that are looked at, at most
+# Before a run says better: how far a photo's PSNR lies from what its pixels' trust says, dB, and as how many
+# photos that counts; and that a decibel of the one is a decibel of the other, as from photos whose squared
+# distances from their mean add up to so many dB^2. Of eight captures: half_width covers 88 to 100 %.
+SPREAD, SPREAD_PHOTOS, SLOPE_WEIGHT = 1.5, 3, 5.0
+# Photographs next: photos around which places are tried, how far off in the usual distance to the next photo,
+# px of a picture that tells how much is known, and dB below the photos' own places from which it is told.
+SPOT_PHOTOS, SPOT_STEP, SPOT_SIDE, SPOT_WORSE = 24, 2.0, 120, 3.0
 
 # Exported files.
 BAND_SHARE = 1e-3  # of the Gaussians: a band that no more of them use is left out for all

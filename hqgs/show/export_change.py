@@ -13,7 +13,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import CAMERAS, load_cameras
 from hqgs.scene.constants import KEPT_SIDE
-from hqgs.scene.paths import resized
+from hqgs.scene.geometry import shrunk_camera
 from hqgs.scene.scene import Camera
 from hqgs.show.constants import CHANGE_VIEWS
 
@@ -66,12 +66,8 @@ def _cameras(gaussians: Gaussians, run: Path | None) -> tuple[str, list[tuple[st
         kind = "held-out views" if any(view.held_out for view in views) else "training views"
         views = [view for view in views if view.held_out] or views
         chosen = [views[k] for k in evenly(len(views), CHANGE_VIEWS)]
-        return f"renders of {len(chosen)} {kind}", [(view.name, _small(view.camera)) for view in chosen]
+        cameras = [(view.name, shrunk_camera(view.camera, KEPT_SIDE)) for view in chosen]
+        return f"renders of {len(chosen)} {kind}", cameras
     return f"renders of {CHANGE_VIEWS} cameras around the scene", [
         (f"camera {k + 1}", camera) for k, camera in enumerate(orbit(gaussians, CHANGE_VIEWS))
     ]
-
-
-def _small(camera: Camera) -> Camera:
-    share = min(1.0, KEPT_SIDE / max(camera.width, camera.height))
-    return resized(camera, max(1, round(share * camera.width)), max(1, round(share * camera.height)))

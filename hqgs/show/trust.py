@@ -24,20 +24,24 @@ from hqgs.base.evenly import evenly
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import KnownCamera, RunCameras
-from hqgs.scene.paths import resized
+from hqgs.scene.geometry import resized_camera
 from hqgs.scene.scene import Camera
+from hqgs.show.constants import (
+    CALIBRATORS,
+    EMPTY,
+    FLOOR,
+    GOOD,
+    LEAST_GOOD,
+    POWER,
+    PRIOR,
+    SCALE,
+    SEEN,
+    SHARE,
+    TRUST_PHOTOS,
+    TRUST_ROUNDS,
+    TRUST_SIDE,
+)
 
-PHOTOS, LEAST_PHOTOS, SIDE = 64, 4, 400  # training photos that are looked at; px, of their longer side
-ROUNDS = 4  # of the maximisation: more change the order of the pixels by less than its scatter
-PRIOR, PRIOR_PIXELS = 0.1, 1.0  # error of a Gaussian (white is 1), and how many pixels' weight that has
-EMPTY = 0.3  # error of what is behind everything
-FLOOR = 0.002  # keeps ratios of errors finite: half a level
-POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
-SHARE = 0.9  # of the pixels: what a bound promises
-GOOD = 20.0  # levels of 255: a pixel is called good whose bound is no higher
-LEAST_GOOD = 0.005  # of the pixels: fewer good ones tell nothing
-HELD = 40  # held-out photos that calibrate, at most
-SEEN = 0.5  # pixels' weight that a Gaussian has in a photo that sees it
 Array = NDArray[np.float32]
 OnPass = Callable[[int, int], None]
 
@@ -147,7 +151,7 @@ def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
 
 
 def learn_trust(
-    gaussians: Gaussians, known: RunCameras, progress: OnPass | None = None, photos: int = PHOTOS
+    gaussians: Gaussians, known: RunCameras, progress: OnPass | None = None, photos: int = TRUST_PHOTOS
 ) -> Trust:
     """What the photos of a run, in its folder, say of its Gaussians.
 
@@ -166,7 +170,7 @@ def learn_trust(
         nonlocal done
         done += 1
         if progress is not None:
-            progress(done, len(chosen) * (ROUNDS + 1))
+            progress(done, len(chosen) * (TRUST_ROUNDS + 1))
 
     with one_torch_thread():
         for view in chosen:
@@ -178,17 +182,17 @@ def learn_trust(
             sums += both
             seen += both[:, 0] > SEEN
             tell()
-        weights, prior = sums[:, 0] + PRIOR_PIXELS, PRIOR * PRIOR_PIXELS
-        errors = (sums[:, 1] + prior) / weights
-        for _ in range(ROUNDS):
+        weights = sums[:, 0] + 1
+        errors = (sums[:, 1] + PRIOR) / weights
+        for _ in range(TRUST_ROUNDS):
             found = torch.zeros(n)
             for camera, error in looks:
                 found += _back(gaussians, camera, errors[:, None], error[..., None], ratio=True)[:, 0]
                 tell()
-            errors = (errors * found + prior) / weights
+            errors = (errors * found + PRIOR) / weights
     carried, held = Trust(gaussians, errors, seen), list[Held]()
     out = [view for view in known.views if view.held_out and view.photo is not None]
-    for k in evenly(len(out), HELD):
+    for k in evenly(len(out), CALIBRATORS):
         camera, error, psnr = error_of(gaussians, out[k])
         shown = *carried.shown(camera, errors), carried.shown(camera, seen)[0]
         held.append(Held(out[k].name, camera, psnr, error.numpy(), *shown))
@@ -215,9 +219,9 @@ def error_of(gaussians: Gaussians, view: KnownCamera) -> tuple[Camera, Tensor, f
     with Image.open(view.photo) as file:
         picture = file.convert("RGB")
     psnr = None
-    if view.held_out and max(picture.size) > SIDE:
+    if view.held_out and max(picture.size) > TRUST_SIDE:
         psnr = psnr_of(_off(gaussians, view.camera, picture)[1])
-    picture.thumbnail((SIDE, SIDE), Image.Resampling.LANCZOS)
+    picture.thumbnail((TRUST_SIDE, TRUST_SIDE), Image.Resampling.LANCZOS)
     camera, off = _off(gaussians, view.camera, picture)
     return camera, off.abs().mean(-1), psnr_of(off) if psnr is None else psnr
 
@@ -225,7 +229,7 @@ def error_of(gaussians: Gaussians, view: KnownCamera) -> tuple[Camera, Tensor, f
 @torch.no_grad()
 def _off(gaussians: Gaussians, camera: Camera, picture: Image.Image) -> tuple[Camera, Tensor]:
     """The camera of a photo of another size, and render less photo, [H, W, 3]."""
-    camera = resized(camera, picture.width, picture.height)
+    camera = resized_camera(camera, picture.width, picture.height)
     return camera, gaussians.render(camera).clamp(0, 1) - torch.from_numpy(np.array(picture)).float() / 255
 
 

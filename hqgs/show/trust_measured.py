@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.evaluation.constants import CONFIDENCE
-from hqgs.scene.paths import resized
+from hqgs.scene.geometry import shrunk_camera
 from hqgs.scene.scene import Camera
-from hqgs.show.trust import EMPTY, GOOD, SIDE, Array, Trust, bound_of, calibrated
-
-STEPS = 50  # of a sparsification curve
-FRAMES = 32  # of a path that are looked at, at most
-# Before a run says better: how far a photo's PSNR lies from what its pixels' trust says, dB, and as how many
-# photos that counts; and that a decibel of the one is a decibel of the other, as from photos whose squared
-# distances from their mean add up to so many dB^2. Of eight captures: half_width covers 88 to 100 %.
-SPREAD, SPREAD_PHOTOS, SLOPE_WEIGHT = 1.5, 3, 5.0
+from hqgs.show.constants import EMPTY, GOOD, PATH_LOOKS, SLOPE_WEIGHT, SPREAD, SPREAD_PHOTOS, TRUST_SIDE
+from hqgs.show.trust import Array, Trust, bound_of, calibrated
 
 
 @dataclass(frozen=True)
@@ -96,9 +90,9 @@ def predict_psnr(trust: Trust, cameras: Sequence[Camera], taken: Sequence[Camera
 
     psnr = np.array([one.psnr for one in trust.held])
     said = np.array([said_of(one.carried, one.alpha) for one in trust.held])
-    chosen = [cameras[k] for k in evenly(len(cameras), FRAMES)]
+    chosen = [cameras[k] for k in evenly(len(cameras), PATH_LOOKS)]
     raw = trust.errors / max(trust.factor, 1e-6)
-    of_path = np.array([said_of(*trust.shown(_small(camera), raw)) for camera in chosen])
+    of_path = np.array([said_of(*trust.shown(shrunk_camera(camera, TRUST_SIDE), raw)) for camera in chosen])
     count, away = len(psnr), said - said.mean()
     weight = float(np.square(away).sum()) + SLOPE_WEIGHT
     slope = (SLOPE_WEIGHT + float(away @ psnr)) / weight
@@ -120,11 +114,6 @@ def said_of(carried: Array, alpha: Array) -> float:
     return -10 * math.log10(max(float(np.square(known).mean()), 1e-10))
 
 
-def _small(camera: Camera) -> Camera:
-    share = min(1.0, SIDE / max(camera.width, camera.height))
-    return resized(camera, max(1, round(share * camera.width)), max(1, round(share * camera.height)))
-
-
 def _passed(cameras: Sequence[Camera], taken: Sequence[Camera]) -> int:
     """How many of the photos are nearest to one of the cameras."""
     if not taken:
@@ -139,7 +128,7 @@ def _ause(doubt: Array, error: Array) -> float:
 
     def curve(key: Array) -> NDArray[np.float64]:
         sums = error[np.argsort(key, kind="stable")].cumsum(dtype=np.float64)
-        ends = np.linspace(0, len(error), STEPS + 1)[1:].astype(int)
+        ends = np.linspace(0, len(error), 50 + 1)[1:].astype(int)
         return sums[ends - 1] / ends
 
     return float((curve(doubt) - curve(error)).mean() / max(float(error.mean()), 1e-9))

@@ -26,7 +26,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map, render_view
 from hqgs.model.shapes import as_discs
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.geometry import resized
+from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
@@ -65,7 +65,7 @@ def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tu
     if len(scene.train) < FEWEST_SCOUTED or scene.seen is None:
         return scene, {}
     on_stage(Stage("passers-by", 0, 0, "looking for what other photos contradict"))
-    views = [_small(view) for view in scene.train]
+    views = [shrunk(view, SCOUT_SIDE) for view in scene.train]
     agreement = Agreement(views, scene.seen)
     gaussians = _trained(scene, views, agreement, seed)
     train, found = [], dict[str, Mask]()
@@ -79,12 +79,6 @@ def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tu
             view = replace(view, mask=~passing if view.mask is None else view.mask & ~passing)
         train.append(view)
     return replace(scene, train=train), found
-
-
-def _small(view: View) -> View:
-    camera = view.camera
-    factor = max(1.0, max(camera.width, camera.height) / SCOUT_SIDE)
-    return resized(view, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))
 
 
 def _trained(scene: Scene, views: Sequence[View], agreement: Agreement, seed: int) -> Gaussians:

@@ -15,12 +15,11 @@ from hqgs.scene.camera_files import load_cameras
 from hqgs.scene.next_photos import Spot
 from hqgs.scene.paths import camera_path
 from hqgs.scene.scene import Scene
+from hqgs.show.constants import PATH_LOOKS, TRUST_LEAST, TRUST_PASSES, TRUST_PHOTOS, TRUST_ROUNDS
 from hqgs.show.frames import trust_picture
-from hqgs.show.trust import LEAST_PHOTOS, PHOTOS, ROUNDS, Held, learn_trust
-from hqgs.show.trust_measured import FRAMES, measure_trust, predict_psnr
+from hqgs.show.trust import Held, learn_trust
+from hqgs.show.trust_measured import measure_trust, predict_psnr
 from hqgs.show.trust_next import doubtful_spots
-
-PASSES = 0.1  # of a run's steps: more views are not passed over again for trust
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class TrustPart:
 def trust_part(folder: Path, scene: Scene, gaussians: Gaussians, iterations: int) -> TrustPart:
     """Of a run that has written its cameras and photos into a folder."""
     known = load_cameras(folder)
-    some = min(max(round(PASSES * iterations / (ROUNDS + 1)), LEAST_PHOTOS), PHOTOS)
+    some = min(max(round(TRUST_PASSES * iterations / (TRUST_ROUNDS + 1)), TRUST_LEAST), TRUST_PHOTOS)
     trust = learn_trust(gaussians, known, photos=some)
     measured = measure_trust(trust)
     spots = doubtful_spots(trust, [view for view in known.views if not view.held_out])
@@ -44,7 +43,7 @@ def trust_part(folder: Path, scene: Scene, gaussians: Gaussians, iterations: int
         why = "No photo was held out, so no number says how far renders of other places can be believed."
         return TrustPart([why], spots=spots)
     lines = [f"Trust: {measured}. Each photo is judged by a calibration on the others."]
-    path = predict_psnr(trust, camera_path(known.train, FRAMES), known.train)
+    path = predict_psnr(trust, camera_path(known.train, PATH_LOOKS), known.train)
     if path is not None:
         lines.append(f"Photos from the way through the training cameras would have a PSNR of {path}.")
     worst = min(range(len(trust.held)), key=lambda k: trust.held[k].psnr)
