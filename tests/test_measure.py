@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from hqgs.model.gaussians import Gaussians
+from hqgs.scene.metres import point_of
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World
 from hqgs.show.frames import Activated
@@ -80,6 +81,12 @@ def test_two_clicks_on_the_page_tell_a_distance(wall: Gaussians) -> None:
         assert found is not None
         assert float(found[1]) == pytest.approx(1.0, abs=0.01)  # two units of half a metre
         assert 0.02 <= float(found[2]) < 0.05
+        points = re.search(r"`--distance (\S+) (\S+) METRES`", ruler.told.content)
+        assert points is not None
+        a, b = (point_of(text) for text in points.groups())
+        assert a is not None
+        assert b is not None
+        assert np.linalg.norm(a - b) == pytest.approx(2.0, abs=0.02)  # of the files' units
         ruler.clicked(SimpleNamespace(ray_origin=(0.0, 0.0, 0.0), ray_direction=(0.0, 0.0, 1.0)))
         assert ruler.told.content == "Click the second point."
         ruler.clicked(SimpleNamespace(ray_origin=(0.0, 0.0, 0.0), ray_direction=(0.0, 0.0, -1.0)))

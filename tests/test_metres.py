@@ -11,11 +11,15 @@ import pytest
 from fixtures_scenes import make_truth, write_colmap
 from PIL import Image
 from plyfile import PlyData
+from test_world import placed
 
 import hqgs
 from hqgs.cli.main import main
+from hqgs.cli.parse import parse
+from hqgs.cli.train import Train
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import load_cameras, save_cameras
+from hqgs.scene.metres import distance_of, point_of
 from hqgs.scene.world import World
 
 A, B = "view_01.png", "view_06.png"
@@ -67,6 +71,35 @@ def test_what_is_written_is_in_metres_and_nothing_else_changes(tmp_path: Path, a
         np.testing.assert_allclose(again[view.name], view.camera.viewmat, atol=1e-8)
 
 
+@pytest.mark.parametrize("away", [0.0, 5e6])
+def test_a_distance_of_points_in_the_frame_of_the_files(tmp_path: Path, away: float) -> None:
+    truth = placed(make_truth(), 1e-3, np.full(3, away), seed=2)
+    root = write_colmap(truth, tmp_path, binary=False)
+    a, b = (",".join(repr(float(x)) for x in point) for point in truth.points[:2])
+    apart = np.linalg.norm(truth.points[0] - truth.points[1])
+    scene = hqgs.load(root, distance=(a, b, 3.0))
+    assert scene.world.metres == pytest.approx(3 / apart, rel=1e-6)
+    camera = -truth.viewmats[1, :3, :3].T @ truth.viewmats[1, :3, 3]
+    mixed = hqgs.load(root, distance=(a, A, 3.0)).world.metres
+    assert mixed == pytest.approx(3 / np.linalg.norm(truth.points[0] - camera), rel=1e-5)
+    assert any(
+        f"the point {a} and the camera of {A} are 3 m apart" in note
+        for note in hqgs.load(root, distance=(a, A, 3.0)).notes
+    )
+    with pytest.raises(ValueError, match=r"the point .* and the point .* are in one place"):
+        hqgs.load(root, distance=(a, f" {a}", 3.0))
+
+
+def test_points_with_negative_coordinates_on_the_command_line() -> None:
+    options = parse(Train, "train", "x", ["a", "--out", "b", "--distance", "-1,2e-3,-3", "-.5,0,1", "2.5"])
+    assert options.distance is not None
+    assert distance_of(options.distance)[2] == 2.5
+    for written, wanted in zip(options.distance[:2], ([-1, 2e-3, -3], [-0.5, 0, 1]), strict=True):
+        np.testing.assert_array_equal(point_of(written), wanted)
+    assert point_of("1,2.jpg") is None
+    assert point_of("1,2") is None
+
+
 def test_a_photo_may_be_named_without_folder_suffix_or_case(tmp_path: Path) -> None:
     root = write_colmap(make_truth(), tmp_path / "scene", binary=False)
     wanted = hqgs.load(root, distance=(A, B, 2.0)).world
@@ -82,7 +115,7 @@ def test_a_photo_may_be_named_without_folder_suffix_or_case(tmp_path: Path) -> N
         ((A, B, 0.0), "0 m between view_01.png and view_06.png; it must be more than 0"),
         ((A, B, -3.0), "-3 m between"),
         ((A, B, float("nan")), "nan m between"),
-        ((A, B), "two photos' names and metres"),
+        ((A, B), "takes two photos' names, or points x,y,z, and metres"),
     ],
 )
 def test_a_distance_that_cannot_be_is_told(
@@ -98,7 +131,9 @@ def test_photos_from_one_place_have_no_distance(tmp_path: Path) -> None:
     viewmats = truth.viewmats.copy()
     viewmats[6] = viewmats[1]
     root = write_colmap(replace(truth, viewmats=viewmats), tmp_path / "scene", binary=False)
-    with pytest.raises(ValueError, match=r"view_01.png and view_06.png were taken from one place"):
+    with pytest.raises(
+        ValueError, match=r"view_01.png and the camera of view_06.png are in one place"
+    ):
         hqgs.load(root, distance=(A, B, 1.0))
 
 

@@ -44,6 +44,7 @@ WORDS = {  # tyro's, and ours
 }
 GPU = ("--device", "--cuda", "--gpu", "--gpus")
 OF_3DGS = ("-s", "--source_path", "-m", "--model_path")
+POINT = re.compile(r"-[\d.]+(?:e-?\d+)?,")  # one whose first coordinate is negative
 HOME = re.compile(r"^(--[\w-]+=)?(~(?:/.*)?)$", re.DOTALL)  # which the shell leaves as it is after =
 
 
@@ -53,6 +54,7 @@ def parse(options: type[T], command: str, about: str, arguments: Sequence[str], 
         raise SystemExit(fail(2, f"there is no {asked[0]}: hqgs trains on the CPU, leave it out"))
     if asked := [a for a in arguments if a in OF_3DGS]:
         raise SystemExit(fail(2, f"there is no {asked[0]}: write hqgs train PHOTOS --out RUN"))
+    arguments = [f" {a}" if POINT.match(a) else a for a in arguments]  # else -1,2,3 would be an option
     arguments = [HOME.sub(lambda m: (m[1] or "") + os.path.expanduser(m[2]), a) for a in arguments]
     more = {} if default is None else {"default": default}
     told = io.StringIO()

@@ -96,7 +96,7 @@ class Train(Photos):
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
     distance: Apart = None
-    """Metres between the cameras of the photos A and B: the scene is written in metres."""
+    """Metres between the cameras of the photos A and B, or points x,y,z: the scene is written in metres."""
     tag_size: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
     """Width of printed tags (AprilTag 36h11, ArUco) in the scene: it is written in metres, upright."""
     degrade: Kind = "none"

@@ -1,4 +1,4 @@
-"""Scenes in metres: from the distance between the cameras of two photos, as somebody has measured it."""
+"""Scenes in metres: from the distance between two photos' cameras, or two points, as somebody measured it."""
 
 from __future__ import annotations
 
@@ -9,20 +9,24 @@ from difflib import get_close_matches
 from pathlib import PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hqgs.base.text import some
 from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
 
-Distance = tuple[str, str, float]  # two photos' names, and how many metres lie between their cameras
+Distance = tuple[str, str, float]  # two photos' names or points, and how many metres lie between them
+_COORDINATES = 3  # of a point, joined by commas: in the frame of the scene's files
 
 
 def distance_of(value: Sequence[str | float]) -> Distance:
-    """Two names and metres as they were given. ValueError where they can be no distance."""
+    """Two names or points, and metres, as they were given. ValueError where they can be no distance."""
     try:
         a, b, length = str(value[0]), str(value[1]), float(value[2])
     except (IndexError, TypeError, ValueError) as error:
-        raise ValueError(f"distance takes two photos' names and metres, got {list(value)}") from error
+        raise ValueError(
+            f"distance takes two photos' names, or points x,y,z, and metres, got {list(value)}"
+        ) from error
     if a == b:
         raise ValueError(f"distance: both photos are {a!r}; name two whose cameras stood apart")
     if not 0 < length < math.inf:
@@ -30,13 +34,25 @@ def distance_of(value: Sequence[str | float]) -> Distance:
     return a, b, length
 
 
-def named_photos(names: Sequence[str], distance: Distance) -> tuple[int, int]:
+def point_of(written: str) -> NDArray[np.float64] | None:
+    """The point [3] that is meant; None: it is a photo's name."""
+    parts = written.split(",")
+    try:
+        point = np.array([float(part) for part in parts])
+    except ValueError:
+        return None
+    return point if len(point) == _COORDINATES and np.isfinite(point).all() else None
+
+
+def named_photos(names: Sequence[str], distance: Distance) -> tuple[int | None, int | None]:
     """Where in `names` the two photos are, by whole name, else by its last part, with suffix or without.
+
+    None: a point is meant.
 
     ValueError where one is not among them or could be several, or where both are one.
     """
-    a, b = (_named(names, wanted) for wanted in distance[:2])
-    if a == b:
+    a, b = (None if point_of(wanted) is not None else _named(names, wanted) for wanted in distance[:2])
+    if a is not None and a == b:
         raise ValueError(f"distance: {distance[0]!r} and {distance[1]!r} are both the photo {names[a]}")
     return a, b
 
@@ -66,21 +82,23 @@ def _named(names: Sequence[str], wanted: str) -> int:
 
 
 def in_metres(scene: Scene, distance: Distance) -> Scene:
-    """The same scene, which is written in metres: the cameras of the two photos are that far apart then.
+    """The same scene, which is written in metres: the two cameras or points are that far apart then.
 
     Nothing that is trained or rendered changes. ValueError as `named_photos` raises it, or where both cameras
     are in one place.
     """
     views = [*scene.train, *scene.test]
-    a, b = named_photos([view.name for view in views], distance)
-    world = scene.world
-    apart = float(np.linalg.norm(views[a].camera.center - views[b].camera.center)) * world.unit
+    world, ends, called = scene.world, list[NDArray[np.floating]](), list[str]()
+    for written, k in zip(distance[:2], named_photos([v.name for v in views], distance), strict=True):
+        point = point_of(written) if k is None else world.out(views[k].camera.center)
+        assert point is not None
+        ends.append(point)
+        called.append(f"the point {written.strip()}" if k is None else f"the camera of {views[k].name}")
+    apart = float(np.linalg.norm(ends[0] - ends[1]))
     if not apart > 1e-6 * world.unit * scene.extent:
-        raise ValueError(f"distance: {views[a].name} and {views[b].name} were taken from one place")
+        raise ValueError(f"distance: {called[0]} and {called[1]} are in one place")
     metres = distance[2] / apart
-    said = (
-        f"the cameras of {views[a].name} and {views[b].name} are {distance[2]:g} m apart, as --distance says"
-    )
+    said = f"{called[0]} and {called[1]} are {distance[2]:g} m apart, as --distance says"
     return with_metres(scene, metres, said)
 
 

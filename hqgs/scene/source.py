@@ -72,7 +72,8 @@ def load(
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
         frames: how many of a film; None: two a second, 30 to 90.
-        distance: (A, B, metres) between the cameras of two photos: what is written is in metres then.
+        distance: (A, B, metres) between the cameras of two photos, or points "x,y,z" in the frame of the
+            files: what is written is in metres then.
         tag_size: metres; the width of the black square of printed tags (AprilTag 36h11, ArUco) that photos
             show: what is written is in metres then, and upright where a tag lies (the extra `tags`).
         on_stage: hears what is being done, and how far it is.

@@ -62,6 +62,12 @@ def told_distance(a: Point, b: Point, world: World) -> str:
     return f"{length:.{digits}f} ± {error:.{digits}f} {unit} (95 %{scale})"
 
 
+def told_points(a: Point, b: Point, world: World) -> str:
+    """How the two points are given to --distance: in the frame of the scene's files, whatever a metre is."""
+    ends = (world.out(point.at) / (world.metres or 1.0) for point in (a, b))
+    return "--distance " + " ".join(",".join(f"{x:.9g}" for x in end) for end in ends) + " METRES"
+
+
 def with_bar(picture: Picture, camera: Camera, depth: float, world: World) -> Picture:
     """The picture with a bar that is as long as it says at that depth (world units)."""
     longest = BAR * picture.shape[1] * depth / camera.K[0, 0] * world.unit
@@ -125,7 +131,9 @@ class Ruler:
         self._marks.append(ball)
         self.told.content = "Click the second point."
         if len(self._points) == 2:
-            self.told.content = told_distance(self._points[0], self._points[1], self.world)
+            a, b = self._points
+            told, given = told_distance(a, b, self.world), told_points(a, b, self.world)
+            self.told.content = f"{told}\n\nhqgs train: `{given}`"
 
     def _switch(self, _: object) -> None:
         self._clear()
