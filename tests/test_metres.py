@@ -131,9 +131,7 @@ def test_photos_from_one_place_have_no_distance(tmp_path: Path) -> None:
     viewmats = truth.viewmats.copy()
     viewmats[6] = viewmats[1]
     root = write_colmap(replace(truth, viewmats=viewmats), tmp_path / "scene", binary=False)
-    with pytest.raises(
-        ValueError, match=r"view_01.png and the camera of view_06.png are in one place"
-    ):
+    with pytest.raises(ValueError, match=r"view_01.png and the camera of view_06.png are in one place"):
         hqgs.load(root, distance=(A, B, 1.0))
 
 
