@@ -20,6 +20,8 @@ _FULL = 2  # AVColorRange
 _PQ, _HLG = 16, 18  # AVColorTransferCharacteristic
 HDR = {_PQ: "PQ", _HLG: "HLG"}
 _SWS_709, _SWS_RGB = 1, 5
+# SWS_BICUBIC, SWS_FULL_CHR_H_INT and SWS_ACCURATE_RND: FFmpeg's quick way makes frames a level darker.
+_SWS_EXACT = 0x4 | 0x2000 | 0x40000
 _KR, _KB = 0.2627, 0.0593  # of BT.2020
 # BT.2020's primaries in BT.709's, both with the white D65 (ITU-R BT.2087).
 _TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
@@ -45,16 +47,15 @@ def as_photo(frame: Any, film_transfer: int = 0) -> NDArray[np.uint8]:
     if matrix in _BT2020 or curve in HDR:
         signal = _signal(frame, wide)
         return np.rint(255 * (toned(signal, curve) if curve in HDR else signal).clip(0, 1)).astype(np.uint8)
+    named = {"format": "rgb24"}
     if matrix == _BT709:
-        range_now = _FULL if wide else 1
-        frame = frame.reformat(
-            format="rgb24",
-            src_colorspace=_SWS_709,
-            dst_colorspace=_SWS_RGB,
-            src_color_range=range_now,
-            dst_color_range=_FULL,
-        )
-    return frame.to_ndarray(format="rgb24")
+        named |= {"src_colorspace": _SWS_709, "dst_colorspace": _SWS_RGB}
+        named |= {"src_color_range": _FULL if wide else 1, "dst_color_range": _FULL}
+    try:
+        frame = frame.reformat(**named, interpolation=_SWS_EXACT)
+    except KeyError:  # PyAV 13 cannot be asked for it
+        frame = frame.reformat(**named)
+    return frame.to_ndarray()
 
 
 def toned(signal: Floats, curve: int) -> Floats:

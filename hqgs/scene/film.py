@@ -40,7 +40,7 @@ def film_frames(
     av = pyav(f"{path} is a film, which")
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
-    name = f"4 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
+    name = f"5 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -112,15 +112,14 @@ def _sharpest(
             for number, frame in enumerate(film.decode(stream)):
                 time = frame.time if frame.time is not None else number / 30
                 start = time if start is None else start
-                now = int((time - start) / interval)
+                now = min(int((time - start) / interval), wanted - 1)
                 if now > at and best is not None:
-                    yield best
+                    yield best[0], _upright(best[1], curve)
                     best, best_sharpness = None, -1.0
                 at = max(at, now)
                 if (sharpness := _sharpness(frame)) > best_sharpness:
                     best_sharpness = sharpness
-                    turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
-                    best = number, np.ascontiguousarray(np.rot90(as_photo(frame, curve), turns))
+                    best = number, frame
                 on_stage(Stage("frames of the film looked at", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
         known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
@@ -128,7 +127,13 @@ def _sharpest(
         raise ValueError(f"the film {path} cannot be read: {why}") from error
     if best is None:
         raise ValueError(f"the film {path} holds no frame that can be read")
-    yield best
+    yield best[0], _upright(best[1], curve)
+
+
+def _upright(frame: Any, curve: int) -> NDArray[np.uint8]:
+    """A frame of a film with this transfer function as it is to be shown, [H, W, 3]."""
+    turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
+    return np.ascontiguousarray(np.rot90(as_photo(frame, curve), turns))
 
 
 def _transfer(av: Any, path: Path) -> int:
