@@ -9,6 +9,7 @@ from pathlib import Path
 from hqgs.base.files import PLY
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
+from hqgs.model.formats.content import format_held
 from hqgs.model.formats.gltf import read_gltf, write_gltf
 from hqgs.model.formats.ksplat import read_ksplat
 from hqgs.model.formats.nerfstudio import in_data_frame
@@ -57,6 +58,7 @@ READERS: dict[str, Callable[[Path], Arrays]] = {
     "meta.json": read_sog,
     "ksplat": read_ksplat,
 }
+_CONTENT = {"compressed.ply": "ply", "full.ply": "ply", "meta.json": "sog"}  # of which those are kinds
 WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
     "ply": write_ply,
     "spz": lambda path, arrays: write_spz(path, arrays).left_out,
@@ -69,8 +71,8 @@ WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
 
 
 def has_format(path: Path) -> bool:
-    """Whether the name of a file says a format that is read."""
-    return bool(_fitting(path, [*READERS]))
+    """Whether the name of a file, or what it holds, says a format that is read."""
+    return bool(_fitting(path, [*READERS])) or format_held(path) is not None
 
 
 def _fitting(path: Path, known: Sequence[str]) -> list[str]:
@@ -79,8 +81,10 @@ def _fitting(path: Path, known: Sequence[str]) -> list[str]:
 
 
 def format_of(path: Path, name: str | None = None, *, written: bool = False) -> str:
-    """The format of that name, or the one that the file's suffix says. ValueError where there is none, or,
-    of a file that is to be `written`, where it is only read."""
+    """The format of that name, or the one that the file holds, or its suffix says.
+
+    ValueError where there is none, or, of a file that is to be `written`, where it is only read.
+    """
     known = [*WRITERS] if written else [*READERS]
     if name is not None:
         if name not in known:
@@ -89,6 +93,9 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
     if path.is_dir() and (path / "meta.json").is_file():
         return "meta.json"
     fitting = _fitting(path, known)
+    held = None if written or not path.is_file() else format_held(path)
+    if held is not None and not any(_CONTENT.get(format, format) == held for format in fitting):
+        return held
     if not fitting:
         raise ValueError(f"{path}: the suffix says no format; wanted .{', .'.join(known)}")
     return max(fitting, key=len)

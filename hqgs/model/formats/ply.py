@@ -19,7 +19,7 @@ from plyfile import PlyData, PlyElement
 
 from hqgs.base.files import atomic_path
 from hqgs.base.ply import header_of, read_vertices
-from hqgs.model.constants import MAX_SH_DEGREE
+from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.rows import pick, sound_errors, whole_rows
 from hqgs.scene.world import World, world_for
@@ -28,11 +28,13 @@ _REST_COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 
 _REST_4 = 72  # of degree 4, which some exporters write
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
+_COLORS = ["red", "green", "blue"]  # in place of _DC
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _ERROR = "hqgs_error"
 _WORLD, _ANTIALIASED = "hqgs world ", "hqgs antialiased"  # comments of the header
 MOST_LOGIT = 18.0  # of an opacity that is stored as infinite: float32 rounds its sigmoid to 1 or next to 0
+FLAT = math.log(1e-3)  # of the smaller radius of a disc: its thickness
 LEAST_LOG = math.log(1e-20)  # of a scale of 0
 
 
@@ -108,9 +110,14 @@ def read_ply(path: str | Path) -> Arrays:
     vertices = read_vertices(path)
     present = {name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
     rest = [f"f_rest_{i}" for i in range(sum(name.startswith("f_rest_") for name in present))]
-    missing = [n for n in [*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_QUATS] if n not in present]
+    discs = _SCALES[2] not in present and {*_SCALES[:2]} <= present
+    colored = {*_COLORS} <= present and not {*_DC} & present
+    wanted = [*_MEANS, *([] if colored else _DC), *rest, "opacity", *_SCALES[: 2 if discs else 3], *_QUATS]
+    missing = [name for name in wanted if name not in present]
     if missing:
-        raise ValueError(f"{path}: not a 3DGS scene, these properties are missing: {', '.join(missing)}")
+        points = {*_MEANS} <= present and not {"opacity", *_SCALES} & present
+        why = "; it holds points alone, of which `hqgs train` makes a scene by their photos" if points else ""
+        raise ValueError(f"{path}: not a 3DGS scene, these properties are missing: {', '.join(missing)}{why}")
     if len(rest) not in [*_REST_COUNTS, _REST_4]:
         raise ValueError(f"{path}: {len(rest)} f_rest_* properties, wanted one of {_REST_COUNTS}")
 
@@ -128,7 +135,11 @@ def read_ply(path: str | Path) -> Arrays:
             world = _world_of(path, line)
     wide = any(vertices.dtype[name].itemsize > 4 for name in _MEANS)
     means = columns(_MEANS, np.float64) if wide or not world.ordinary else columns(_MEANS)
-    scales, opacities = columns(_SCALES), columns(["opacity"])[:, 0]
+    opacities = columns(["opacity"])[:, 0]
+    scales = columns(_SCALES[:2] if discs else _SCALES)
+    if discs:
+        scales = np.append(scales, scales.min(1, keepdims=True) + np.float32(FLAT), axis=1)
+        notes.append("its Gaussians are discs (2DGS): they get a thousandth of their radius as thickness")
     if wide and world.ordinary and np.isfinite(means).any():
         finite = means[np.isfinite(means).all(1)]
         world = World(1.0, world_for(finite, finite).shift)
@@ -148,7 +159,7 @@ def read_ply(path: str | Path) -> Arrays:
         "scales": scales,
         "quats": columns(_QUATS),
         "opacities": opacities,
-        "sh0": columns(_DC)[:, None, :],
+        "sh0": (_of_colors(vertices) if colored else columns(_DC))[:, None, :],
         "shN": np.ascontiguousarray(higher),
     }
     if _ERROR in present:
@@ -180,3 +191,10 @@ def _world_of(path: Path, line: str) -> World:
         return World.of_json(json.loads(line.removeprefix(_WORLD)))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: its comment {line!r:.80} is damaged: {error}") from error
+
+
+def _of_colors(vertices: NDArray[Any]) -> NDArray[np.float32]:
+    """The harmonics of degree 0 [N, 3] of plain colours: bytes, or numbers where 1 is white."""
+    colors = np.stack([vertices[name] for name in _COLORS], -1)
+    white = 255.0 if colors.dtype.kind in "ui" else 1.0
+    return ((colors / white - 0.5) / SH_C0).astype(np.float32)
