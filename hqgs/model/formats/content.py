@@ -53,9 +53,7 @@ def _of_zip(path: Path) -> str:
     with zipfile.ZipFile(path) as packed:
         names = [Path(name).name for name in packed.namelist()]
     if "data.pkl" in names:
-        raise ValueError(
-            f"{path}: not a scene file, but a checkpoint of PyTorch: export its scene as .ply, by the program it is of"
-        )
+        raise ValueError(f"{path}: not a scene file, but a checkpoint of PyTorch: export the scene as .ply")
     if "meta.json" not in names:
         raise ValueError(f"{path}: not a scene file, but an archive: unpack it")
     return "sog"
