@@ -88,6 +88,17 @@ def write_json(path: str | Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
+def read_json(path: str | Path) -> Any:
+    """The value of a JSON file: UTF-8, with or without a byte order mark, or UTF-16, which PowerShell writes.
+
+    ValueError, which names the file, where it is damaged.
+    """
+    try:
+        return json.loads(Path(path).read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+
+
 class FolderBusyError(RuntimeError):
     """Another run writes into the same folder."""
 

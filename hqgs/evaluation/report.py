@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import numpy as np
 from PIL import Image
 
-from hqgs.base.files import atomic_path, write_json
+from hqgs.base.files import atomic_path, read_json, write_json
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED, PNG_LEVEL
@@ -139,10 +139,7 @@ def _written(out_dir: Path, result: RunResult) -> Report:
 def read_report(path: str | Path) -> Report:
     """Read a report.json. Raises FileNotFoundError, or ValueError where the file is no report."""
     path = Path(path)
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    report = read_json(path)
     if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
         raise ValueError(f"{path} is no hqgs report: it has no metrics")
     missing = {"mean", "views", "reasons"} - report["metrics"].keys()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path, write_json
+from hqgs.base.files import atomic_path, read_json, write_json
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES, MOST_PIXELS
 from hqgs.scene.paths import scene_up, view_matrix
@@ -96,7 +95,7 @@ def load_cameras(folder: str | Path) -> RunCameras:
     """
     folder = Path(folder)
     path = folder / CAMERAS
-    value = _read_json(path)
+    value = read_json(path)
     try:
         up = np.array(value["up"], np.float64)
         world = World.of_json(value["world"]) if "world" in value else World()
@@ -176,7 +175,7 @@ def load_path(path: str | Path) -> tuple[list[Camera], float]:
     Raises FileNotFoundError, or ValueError that names the file.
     """
     path = Path(path)
-    value = _read_json(path)
+    value = read_json(path)
     try:
         width, height, fps = value["render_width"], value["render_height"], float(value.get("fps", 30))
         frames = value["camera_path"]
@@ -213,10 +212,3 @@ def checked_camera(width: Any, height: Any, K: Any, viewmat: Any) -> Camera:
     if not np.isfinite(viewmat).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise ValueError("a pose is no rotation and translation")
     return Camera(width, height, K, viewmat)
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+from hqgs.base.files import read_json
 from hqgs.base.text import some
 
 TRAIN, TEST, VAL = "train", "test", "val"
@@ -118,8 +118,5 @@ def _lines(path: Path) -> list[str]:
 
 
 def _from_json(path: Path, source: str) -> Split | None:
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+    meta = read_json(path)
     return lists_in(meta, source) if isinstance(meta, dict) else None

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from hqgs.base.files import PLAN
+from hqgs.base.files import PLAN, read_json
 from hqgs.base.typed import build
 from hqgs.training.config import TrainConfig, run_config
 
@@ -52,10 +52,7 @@ def read_config(path: str | Path) -> TrainConfig:
         path = path / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"there is no configuration {path}")
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    values = read_json(path)
     if isinstance(values, dict) and isinstance(values.get("train"), dict):
         values = values["train"]
     return config_of_values(values, str(path))

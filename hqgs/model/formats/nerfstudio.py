@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.files import read_json
 from hqgs.base.ply import header_of
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.turned import mapped
@@ -55,10 +55,7 @@ def in_data_frame(path: Path, arrays: Arrays) -> Arrays:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        said = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+    said = read_json(path)
     if not isinstance(said, dict):
         raise ValueError(f"{path}: expected an object, got {said!r:.80}")
     return said

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from contextlib import suppress
@@ -13,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.base.files import read_json
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.capture import (
     Capture,
@@ -58,12 +58,12 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     files = Named(root)
     present = [name for name in (TRAIN, TEST, VAL) if (root / name).is_file()]
     main = SINGLE if (root / SINGLE).is_file() and (TRAIN not in present or len(present) < 2) else TRAIN
-    meta = _read_json(root / main)
+    meta = _read(root / main)
     photos, called = _read_frames(root, main, meta, files)
     test_names = None
     split_file = TEST if TEST in present else VAL if VAL in present else None
     if split_file is not None:
-        test, _ = _read_frames(root, split_file, _read_json(root / split_file), files)
+        test, _ = _read_frames(root, split_file, _read(root / split_file), files)
         test_names = frozenset(p.name for p in test)
         if main == SINGLE:
             photos = [p for p in photos if p.name not in test_names]
@@ -94,11 +94,8 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     return Capture("transforms", photos, downscale, points, colors, test_names=test_names, notes=notes)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        meta = json.loads(path.read_bytes())  # in UTF-8, or the UTF-16 of PowerShell
-    except (ValueError, RecursionError) as e:
-        raise ValueError(f"cannot read {path}: {e}") from e
+def _read(path: Path) -> dict[str, Any]:
+    meta = read_json(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
         raise ValueError(f"{path}: expected an object with a list 'frames' that is not empty")
     return meta

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from hqgs.base.files import write_text
 from hqgs.evaluation.constants import PATCH
@@ -27,7 +25,7 @@ from hqgs.evaluation.judge_words import (
     wrong_frame,
 )
 from hqgs.evaluation.verdict import verdict
-from hqgs.photos.pixels import upright
+from hqgs.photos.pixels import png, upright
 from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_PAIRS, WORST_SHOWN
 from hqgs.show.page.page import pair, rendered
 
@@ -122,6 +120,5 @@ def _levels(causes: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def _png(pixels: NDArray[np.float64], turn: int) -> str:
-    file = io.BytesIO()
-    Image.fromarray(upright(np.rint(pixels).astype(np.uint8), turn)).save(file, "PNG")
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+    shown = png(upright(np.rint(pixels).astype(np.uint8), turn))
+    return "data:image/png;base64," + base64.b64encode(shown).decode()
