@@ -19,10 +19,9 @@ from hqgs.diagnosis.constants import (
     FLOOR,
     HIGHEST,
     PLANE_POINTS,
-    POINT_VARIANCE,
+    POINT_ERROR,
     RADII,
     RING_ERROR,
-    RING_SAMPLES,
     SHARP,
     SPECTRUM_SLOPE,
     UNKNOWN_FLOORS,
@@ -66,14 +65,13 @@ def estimate_blur(levels: Floats, noise: float) -> Blur | None:
     if tile is None:
         return None
     spectrum = power_spectrum(grey, tile)
-    frequency, log_power, number = rings(spectrum)
+    frequency, log_power = rings(spectrum)
     known = (LUMA_NOISE * noise) ** 2 + FLOOR
     if (log_power > np.log(known) + 1).sum() < 3:  # as many as the law and a blur have unknowns
         return None
-    weights = np.minimum(number / RING_SAMPLES, 1) / (2 * RING_ERROR**2)
     blurs = [_round_blurs(kind, sizes, frequency, spectrum.step) for kind, sizes in ROUND]
     fits = [
-        (*(fit_blurs(frequency, log_power, weights, blur, floor) for blur in blurs), floor)
+        (*(fit_blurs(frequency, log_power, RING_ERROR, blur, floor) for blur in blurs), floor)
         for floor in known + np.array(UNKNOWN_FLOORS)
     ]
     gaussian, defocus, floor = min(fits, key=lambda fit: min(fit[0].cost, fit[1].cost))
@@ -96,10 +94,9 @@ def _motion(spectrum: Spectrum, floor: float, sigma: float, radius: float) -> Bl
     at, chosen = _half_plane(spectrum.tile)
     frequency = np.hypot(*at)
     log_power = np.log(spectrum.power.ravel()[chosen] + FLOOR)
-    weights = np.full(len(log_power), 1 / POINT_VARIANCE)
 
     def fit(log_blurs: Floats) -> Fit:
-        return fit_blurs(frequency, log_power, weights, log_blurs, floor, steps=4)
+        return fit_blurs(frequency, log_power, POINT_ERROR, log_blurs, floor, steps=4)
 
     near = np.linspace(0.8, 1.2, 5)
     still = min(

@@ -21,13 +21,12 @@ BLUR_LENGTHS = 3 * 1.25 ** np.arange(13)  # px, of the motion
 FINE_LENGTHS = 3 * 1.04 ** np.arange(69)  # px, around the best of them
 ANGLES = np.arange(18) * np.pi / 18  # rad, of the motion
 CLEARLY = 0.7  # a kind other than Gaussian must have less than this share of the Gaussian's misfit
-RING_ERROR = 0.2  # of the log power: how far rings of sharp photos are off the power law
-POINT_VARIANCE = 0.72  # the same of frequencies alone: 0.3 squared, and 8 neighbours err together
+# Of the log power: how far sharp photos are off the law; as points err together, each tells little.
+RING_ERROR, POINT_ERROR = 0.2, 0.6
 # levels^2: what JPEG of a quality too good to be found may have added; without them a blur of 2 px under
 # quality 95 passes for a disc, one of 1 px under 92 for 0.7 px.
 UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)
 PLANE_POINTS = 1_000  # frequencies at which motion is looked for
-RING_SAMPLES = 40.0  # a ring with more counts no more: its error is the law's
 
 # choice.py: the training photos that a scene does without: broken, empty or far too blurred
 OTHERS = 3  # photos that must see a point for it to be well seen

@@ -16,7 +16,6 @@ from hqgs.diagnosis.constants import (
     FLAT_NOISE,
     FLAT_SHARE,
     RING_ERROR,
-    RING_SAMPLES,
     SPECTRUM_SLOPE,
 )
 from hqgs.diagnosis.spectrum import fit_blurs, power_spectrum, rings, tile_size
@@ -24,7 +23,7 @@ from hqgs.photos.blocks import blocks_of
 from hqgs.photos.pixels import Floats, luma, to_levels
 from hqgs.scene.scene import View
 
-Rings = tuple[Floats, Floats, Floats]  # as `rings` returns them
+Rings = tuple[Floats, Floats]  # as `rings` returns them
 
 
 @dataclass(frozen=True)
@@ -78,9 +77,8 @@ class Sharpness:
 
     def __init__(self, spectra: Sequence[Rings]) -> None:
         """Of N photos, all from tiles of one size."""
-        self._frequency, _, number = spectra[0]
-        self._log_power = np.stack([log_power for _, log_power, _ in spectra])  # [N, rings]
-        self._weights = np.minimum(number / RING_SAMPLES, 1) / (2 * RING_ERROR**2)
+        self._frequency = spectra[0][0]
+        self._log_power = np.stack([log_power for _, log_power in spectra])  # [N, rings]
 
     def quarters(self) -> NDArray[np.float64]:
         """[4, N]: the log power of a quarter of the details each, from the coarsest to the finest."""
@@ -100,6 +98,6 @@ class Sharpness:
         squares = (CHOICE_SIGMAS * np.abs(CHOICE_SIGMAS))[:, None]
         # `fit_blurs` expects a power law: the usual spectrum, as a blur of that law, takes its place.
         blurred = usual + SPECTRUM_SLOPE * np.log(self._frequency) - squares * self._frequency**2
-        fit = fit_blurs(self._frequency, mine, self._weights, blurred, float(noise))
+        fit = fit_blurs(self._frequency, mine, RING_ERROR, blurred, float(noise))
         likely = CHOICE_SIGMAS[fit.costs <= fit.cost + CHOICE_DOUBT]
         return float(likely[np.abs(likely).argmin()])

@@ -78,8 +78,8 @@ def power_spectrum(grey: Floats, tile: int) -> Spectrum:
     return Spectrum(np.fft.fftshift(power), tile)
 
 
-def rings(spectrum: Spectrum) -> tuple[Floats, Floats, Floats]:
-    """Mean frequency (rad/px), mean log power and number of samples of rings one step wide; each [rings]."""
+def rings(spectrum: Spectrum) -> tuple[Floats, Floats]:
+    """Mean frequency (rad/px) and mean log power of rings one step wide; each [rings]."""
     vertical, horizontal = spectrum.frequencies()
     radius = np.hypot(vertical, horizontal).ravel()
     ring = np.rint(radius / spectrum.step).astype(np.int64)
@@ -90,26 +90,27 @@ def rings(spectrum: Spectrum) -> tuple[Floats, Floats, Floats]:
     means = (np.bincount(ring[inside], x, count) / number for x in (radius[inside], log_power))
     first = 2 if spectrum.tile < 100 else 3  # the lowest rings hold few samples and the window's leakage
     frequency, power = (mean[first:] for mean in means)
-    return frequency, power, number[first:]
+    return frequency, power
 
 
 def fit_blurs(
     frequency: Floats,
     log_power: Floats,
-    weights: Floats,
+    error: float,
     log_blurs: Floats,
     noise: float,
     steps: int = NEWTON_STEPS,
 ) -> Fit:
     """Fit `log(exp(c) frequency^-a blur + noise)` to `log_power` for each blur; [points], blurs [B, points].
 
-    `log_blurs` are log power responses, `noise` the power of what was not blurred. Amplitude c is free, slope
-    a is held near its usual value (SPECTRUM_SLOPE): so a blur is told from a soft scene. Gauss-Newton.
+    `error`: standard deviation of the log power. `log_blurs` are log power responses, `noise` the power of
+    what was not blurred. Amplitude c is free, slope a is held near its usual value (SPECTRUM_SLOPE): so a
+    blur is told from a soft scene. Gauss-Newton.
     """
     log_frequency, log_noise = np.log(frequency), np.log(noise)
     slope = np.full(len(log_blurs), SPECTRUM_SLOPE)
     height = np.full(len(log_blurs), np.median(log_power[:3] + SPECTRUM_SLOPE * log_frequency[:3]))
-    stiffness = 1 / SPECTRUM_SLOPE_SPREAD**2
+    weight, stiffness = 1 / (2 * error**2), 1 / SPECTRUM_SLOPE_SPREAD**2
 
     def predict() -> tuple[Floats, Floats]:
         signal = height[:, None] - slope[:, None] * log_frequency + log_blurs
@@ -119,16 +120,16 @@ def fit_blurs(
         signal, model = predict()
         misfit = log_power - model
         share = np.exp(signal - model)  # of the signal in the power: the derivative by c
-        w = weights * share * share
+        w = weight * share * share
         h11, h12 = w.sum(1), -(w * log_frequency).sum(1)
         h22 = (w * log_frequency**2).sum(1) + stiffness
-        g1 = (weights * share * misfit).sum(1)
-        g2 = -(weights * share * misfit * log_frequency).sum(1) + stiffness * (SPECTRUM_SLOPE - slope)
+        g1 = (weight * share * misfit).sum(1)
+        g2 = -(weight * share * misfit * log_frequency).sum(1) + stiffness * (SPECTRUM_SLOPE - slope)
         determinant = h11 * h22 - h12**2
         height += ((h22 * g1 - h12 * g2) / determinant).clip(-3, 3)
         slope += ((h11 * g2 - h12 * g1) / determinant).clip(-0.7, 0.7)
     misfit = log_power - predict()[1]
-    return Fit((weights * misfit**2).sum(1) + stiffness * (slope - SPECTRUM_SLOPE) ** 2)
+    return Fit((weight * misfit**2).sum(1) + stiffness * (slope - SPECTRUM_SLOPE) ** 2)
 
 
 def _starts(size: int, tile: int) -> NDArray[np.int64]:
