@@ -56,7 +56,7 @@ def test_a_look_is_its_definition() -> None:
 
 def test_light_is_darkened_as_sRGB_has_it() -> None:  # noqa: N802
     """Exactly on the curve and in its toe; between them by half a level at most."""
-    values = torch.linspace(0, 1.2, 5_001, dtype=torch.float64)[:, None, None].expand(-1, 1, 3)
+    values = torch.linspace(0, 1.2, 5_001, dtype=torch.float64).view(1, -1, 1).expand(3, -1, 1)
     for fall in (-0.4, 0.0, 0.2, 1.1):
         fallen = to_linear(values.numpy()) * np.exp(-fall)
         expected = to_srgb(fallen)
@@ -70,7 +70,7 @@ def test_light_is_darkened_as_sRGB_has_it() -> None:  # noqa: N802
 
 def test_gradients_are_those_of_differences() -> None:
     generator = torch.Generator().manual_seed(0)
-    values = (torch.rand((3, 4, 3), generator=generator, dtype=torch.float64) * 1.2 - 0.05).requires_grad_()
+    values = (torch.rand((3, 3, 4), generator=generator, dtype=torch.float64) * 1.2 - 0.05).requires_grad_()
     vignetting = torch.tensor([0.4, 0.1], dtype=torch.float64, requires_grad=True)
     response = (torch.rand((2, 3), generator=generator, dtype=torch.float64) - 0.5).requires_grad_()
     squares = torch.from_numpy(squared_radii(3, 4, K / 9))
@@ -116,8 +116,8 @@ def test_vignetting_and_response_are_found_by_photos_that_had_no_part_in_it() ->
     looks = [Look(gains[k], vignetting[k % 2], bends[k % 2]) for k in range(16)]
     signs = device_signs(views, colors(rng, looks, 0.03))
     assert signs is not None
-    assert signs.vignetting > 2 * PAYS
-    assert signs.response > PAYS
+    assert signs.vignetting > 2 * PAYS["vignetting"]
+    assert signs.response > 0.08
     assert signs.corner == pytest.approx(1 - np.exp(-0.7), abs=0.05)
     np.testing.assert_allclose(signs.devices.vignetting.sum(1), vignetting.sum(1), atol=0.05)
     np.testing.assert_allclose(signs.devices.response, bends, atol=0.08)
@@ -125,7 +125,7 @@ def test_vignetting_and_response_are_found_by_photos_that_had_no_part_in_it() ->
     plain = [Look(gains[k], np.zeros(2), np.zeros((2, 3))) for k in range(16)]
     signs = device_signs(views, colors(rng, plain, 0.1))
     assert signs is not None
-    assert max(signs.vignetting, signs.response) < PAYS / 5
+    assert max(signs.vignetting, signs.response) < min(PAYS.values()) / 5
     assert device_signs([view(k, "") for k in range(16)], colors(rng, plain, 0.1)) is None
 
 

@@ -51,9 +51,9 @@ def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
         return vignetting, response
     found: list[Finding] = []
     for name, less in zip(DEVICES, (signs.vignetting, signs.response), strict=True):
-        needed = less >= PAYS
+        needed = less >= PAYS[name]
         reason = f"with each camera's {name} photos that were held back agree better by {less:.1%}"
-        reason += "" if needed else f" (needed from {PAYS:.0%})"
+        reason += "" if needed else f" (needed from {PAYS[name]:.0%})"
         found.append(Finding(name, needed, less, None, name if needed else None, reason))
     return found[0], found[1]
 

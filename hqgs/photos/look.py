@@ -36,7 +36,8 @@ class Look:
         square = torch.from_numpy(squared_radii(image.shape[0], image.shape[1], K))
         light = to_linear(image.astype(np.float64)) * self.gains
         light *= np.exp(-falloff(square, torch.from_numpy(self.vignetting)).numpy())[..., None]
-        return respond(torch.from_numpy(to_srgb(light)), torch.from_numpy(self.response)).numpy()
+        values = torch.from_numpy(to_srgb(light).transpose(2, 0, 1))
+        return respond(values, torch.from_numpy(self.response)).numpy().transpose(1, 2, 0)
 
 
 def squared_radii(height: int, width: int, K: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,19 +53,21 @@ def falloff(square: Tensor, vignetting: Tensor) -> Tensor:
 
 
 def darken(values: Tensor, fall: Tensor) -> Tensor:
-    """Values [H, W, 3] of sRGB with their light times exp(-fall), [H, W].
+    """Values [3, H, W] of sRGB with their light times exp(-fall), [H, W].
 
     Exact but where light goes from the curve into its toe: there by half a level at a third of the light.
     """
-    fall = fall.to(values.dtype)[..., None]
+    fall = fall.to(values.dtype)
     root, straight = torch.exp(fall / -_EXPONENT), torch.exp(-fall)
     curved, straight = (values + _OFFSET) * root - _OFFSET, values * straight
+    if bool((fall >= 0).all()):
+        return torch.maximum(curved, straight)
     return torch.where(fall > 0, torch.maximum(curved, straight), torch.minimum(curved, straight))
 
 
 def respond(values: Tensor, response: Tensor) -> Tensor:
-    """Values [..., 3] as a camera of this response [2, 3] writes them."""
-    a, b = response.to(values.dtype)
+    """Values [3, H, W] as a camera of this response [2, 3] writes them."""
+    a, b = response.to(values.dtype)[..., None, None]
     inside = values.clamp(0, 1)
     u = 1 - 2 * inside
     bend = inside * (1 - inside) * (a + b * u)

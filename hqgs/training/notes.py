@@ -66,8 +66,9 @@ def run_notes(trainer: Trainer) -> list[str]:
         if any(corners) or bends:
             notes.append(
                 f"cameras darken corners by up to {corners[-1]:.0%}, the slopes of their responses "
-                f"are up to {bends:.0%} off their mean; the scene is shown as the mean camera has "
-                "it, with bright corners, and by `hqgs render --look PHOTO` as a photo's camera would"
+                f"are up to {bends:.0%} off their mean; the scene looks as the mean camera has "
+                "it, with bright corners, so held-out photos by these cameras measure it as worse than it is; `hqgs render --look PHOTO` "
+                "shows it as a photo's camera would"
             )
     return notes
 

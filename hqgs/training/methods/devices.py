@@ -38,13 +38,16 @@ class LearnedDevices:
         device = int(self._of_photo[number])
         if device < 0:
             return taken
+        planes = taken.permute(2, 0, 1).contiguous()  # a factor of a channel, or of a pixel, is quicker so
         if self._vignetting:
             height, width = taken.shape[:2]
             key = height, width, float(camera.K[0, 2]), float(camera.K[1, 2])
             if key not in self._squares:
                 self._squares[key] = torch.from_numpy(squared_radii(height, width, camera.K)).to(taken.dtype)
-            taken = darken(taken, falloff(self._squares[key], self._vignetting[device].to(taken.dtype)))
-        return respond(taken, self._response[device]) if self._response else taken
+            planes = darken(planes, falloff(self._squares[key], self._vignetting[device].to(taken.dtype)))
+        if self._response:
+            planes = respond(planes, self._response[device])
+        return planes.permute(1, 2, 0).contiguous()
 
     @torch.no_grad()
     def center(self) -> None:
