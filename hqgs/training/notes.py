@@ -65,10 +65,10 @@ def run_notes(trainer: Trainer) -> list[str]:
         bends = max(float(np.abs(photo.response).max()) for photo in found)
         if any(corners) or bends:
             notes.append(
-                f"cameras darken corners by up to {corners[-1]:.0%}, the slopes of their responses "
-                f"are up to {bends:.0%} off their mean; the scene looks as the mean camera has "
-                "it, with bright corners, so held-out photos by these cameras measure it as worse than it is; `hqgs render --look PHOTO` "
-                "shows it as a photo's camera would"
+                f"cameras darken corners by up to {corners[-1]:.0%}, the slopes of their responses are "
+                f"up to {bends:.0%} off their mean; the scene looks as the mean camera has it, with bright "
+                "corners: held-out photos by these cameras measure it as worse than it is; "
+                "`hqgs render --look PHOTO` shows it as a photo's camera would"
             )
     return notes
 
