@@ -19,6 +19,7 @@ from hqgs.base.files import missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
+from hqgs.photos.spherical import projection
 from hqgs.photos.video import pyav
 from hqgs.scene.constants import COPY_SIDE, FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST, JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
@@ -38,9 +39,10 @@ def film_frames(
     if count is not None and count < 3:
         raise ValueError(f"frames is {count}, wanted at least 3")
     av = pyav(f"{path} is a film, which")
+    around = _is_around(path)
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
-    name = f"5 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
+    name = f"6 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -53,7 +55,7 @@ def film_frames(
                 file = new / f"{number:06d}.jpg"
                 Image.fromarray(frame).save(file, quality=JPEG_QUALITY, subsampling=0)
                 details[file.name] = fine_detail(frame.astype(np.float64))
-            write_details(new, details)
+            write_details(new, details, around)
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
@@ -73,9 +75,28 @@ def check_film(path: str | Path) -> None:
         raise ValueError(f"frames is for films, and {path} is none: each of its photos is used")
 
 
-def write_details(folder: Path, details: dict[str, float]) -> None:
-    """Say that photos of a folder are frames of a film: the `fine_detail` of each as it was decoded."""
-    write_json(folder / FRAMES, {"details": details})
+def _is_around(path: Path) -> bool:
+    """Whether the film says that its frames are panoramas of 360 x 180 degrees. ValueError where it says that
+    they are something else of a sphere."""
+    try:
+        told = projection(path)
+    except OSError:
+        return False  # reading its frames tells why
+    if told is None:
+        return False
+    kind, stereo = told
+    if kind == "equirectangular" and stereo == "mono":
+        return True
+    what = (
+        f"frames are {kind}" if stereo == "mono" else f"frames hold two pictures, one for each eye ({stereo})"
+    )
+    raise ValueError(f"the film {path} is of 360 degrees, but its {what}: export it as equirectangular, mono")
+
+
+def write_details(folder: Path, details: dict[str, float], around: bool = False) -> None:
+    """Say that photos of a folder are frames of a film: the `fine_detail` of each as it was decoded, and
+    whether they are panoramas."""
+    write_json(folder / FRAMES, {"details": details, "around": around})
 
 
 def frame_details(folder: Path) -> dict[str, float]:
@@ -83,12 +104,22 @@ def frame_details(folder: Path) -> dict[str, float]:
 
     ValueError where its file is damaged.
     """
+    return _told(folder)[0]
+
+
+def frames_around(folder: Path) -> bool:
+    """Whether the film whose frames a folder holds said that they are panoramas. ValueError as above."""
+    return _told(folder)[1]
+
+
+def _told(folder: Path) -> tuple[dict[str, float], bool]:
     path = folder / FRAMES
     if not path.is_file():
-        return {}
+        return {}, False
     try:
-        details = json.loads(path.read_text(encoding="utf-8"))["details"]
-        return {name: float(detail) for name, detail in details.items()}
+        told = json.loads(path.read_text(encoding="utf-8"))
+        details = {name: float(detail) for name, detail in told["details"].items()}
+        return details, bool(told.get("around"))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error!r}") from error
 

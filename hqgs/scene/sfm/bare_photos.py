@@ -26,6 +26,7 @@ from hqgs.photos.files import (
 from hqgs.scene.capture import photo_folder
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.faces import CUBE, face_name
+from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
 from hqgs.scene.photo_files import MASKS, is_run
 from hqgs.scene.sfm.front_door import (
@@ -196,6 +197,8 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         notes.append(f"{len(twice)} of {len(looked)} photos are copies of others and were left out: {pairs}")
     names = [name for name in looked if name not in twice]
     looked, tags = {name: looked[name] for name in names}, {name: exif[name] for name in names}
+    if film and frames_around(photos.folder):
+        tags = {name: replace(tag, panorama=True) for name, tag in tags.items()}
     sphere = all_around(photos.folder, looked, tags)
     if not film or sphere:
         notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
