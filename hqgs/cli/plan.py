@@ -53,6 +53,7 @@ def run(options: PlanOptions) -> int:
         ready(options.scene)
         from hqgs.scene.source import load, pictures  # here: they load torch
         from hqgs.training.prepare import Prepared, plan_of_photos
+        from hqgs.training.trainer import Trainer
 
         downscale = 1.0 if options.downscale is None else options.downscale
         longest = longest_side("standard", options.downscale)
@@ -70,7 +71,7 @@ def run(options: PlanOptions) -> int:
                 scene = pictures(options.scene, downscale=downscale, longest=longest)
             later: list[str] = []
             if len(scene.points):
-                plan = Prepared(scene, config).plan()
+                plan = Prepared(scene, config, begin=Trainer).plan()
             else:
                 plan, later = plan_of_photos(scene, config)
     except BAD_INPUT as error:

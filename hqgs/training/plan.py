@@ -28,6 +28,16 @@ class StepSeconds:
 
 
 @dataclass(frozen=True)
+class Tried:
+    """A bound of growth in short runs on small copies of the photos (`tried_growth`)."""
+
+    level: float  # Gaussians at most, in times of the first points; 0: nothing grows
+    gain: float  # dB over growth as it likes, mean over photos held back
+    error: float  # standard error of that mean
+    photos: int  # that were held back
+
+
+@dataclass(frozen=True)
 class Facts:
     """What a run's decisions go by, beside the diagnosis of its photos."""
 
@@ -42,6 +52,7 @@ class Facts:
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
     passed: int | None = None  # photos in which somebody passes by; None: not looked at
     passing: float = 0.0  # share of all pixels that these cover
+    tried: tuple[Tried, ...] = ()  # what bounds of growth gain; none: not tried
     # What the method tells of the photos (`Method.facts`):
     as_photographed: bool = False  # renders are compared with photos as they are, of any size
     sizes: tuple[tuple[int, int], ...] = ()  # height and width of each photo as it was taken

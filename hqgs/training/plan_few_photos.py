@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hqgs.training.plan import Choice, Draft
+from hqgs.training.plan import Choice, Draft, Facts
 
 DECAY = 0.005  # share of the opacities that each view takes away (Han et al. 2024: 0.995 of them stay)
 DROPOUT = 0.2  # share of Gaussians left out of a step, at the end of the run (Park et al. 2025)
@@ -18,6 +18,11 @@ FEWEST = 10  # photos, up to which dropout gained beside decay: 0.3 to 1.0 dB (a
 WHERE = "where it pays: 25 sets of 3 to 43 photos"
 
 
+def in_agreement(facts: Facts) -> bool:
+    """Whether the photos bear each other out: more than FEW, which agree on where things are."""
+    return facts.photos > FEW and facts.agreed is not None and facts.agreed >= AGREED
+
+
 def opacity_decay(draft: Draft) -> Sequence[Choice]:
     asked, facts = draft.asked.opacity_decay, draft.facts
     if asked is not None or not draft.undegraded:
@@ -26,7 +31,7 @@ def opacity_decay(draft: Draft) -> Sequence[Choice]:
     evidence = f"{facts.photos} photos{agreed}"
     if facts.photos > MANY:
         return [Choice("none", "so many photos bear out what is there, and it would cost detail", evidence)]
-    if facts.photos > FEW and facts.agreed is not None and facts.agreed >= AGREED:
+    if in_agreement(facts):
         return [Choice("none", "the photos agree on where things are, and it would cost detail", evidence)]
     why = "what few photos bear out would hang in the air between them"
     return [

@@ -19,8 +19,6 @@ from hqgs.training.constants import (
     COARSE_MOST,
     COARSE_PART,
     ENOUGH,
-    FEWEST_VIEWS,
-    FINEST,
     FOR_EACH_PHOTO,
     GROWS_FROM,
     HELD_PIXELS,
@@ -31,8 +29,18 @@ from hqgs.training.constants import (
     SMALLEST_SIDE,
 )
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
-from hqgs.training.plan_budget import first_points_wanted, gaussians_determined, kept_gradient, sharp_pixels
+from hqgs.training.plan_budget import (
+    best_tried,
+    bound_of_growth,
+    first_points_wanted,
+    gaussians_determined,
+    kept_gradient,
+    no_growth,
+    sharp_pixels,
+    told_by_trial,
+)
 from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
+from hqgs.training.plan_left_out import held_photos, needless
 from hqgs.training.plan_length import fitting, shown
 from hqgs.training.plan_photos import passersby, photos
 from hqgs.training.schedule import half_size_end
@@ -236,7 +244,7 @@ def budget(draft: Draft) -> Sequence[Choice]:
     facts, settings = draft.facts, draft.settings
     growth = settings.densify
     if not draft.formed or draft.undegraded or not facts.sizes:
-        return [Choice(f"{growth.max_gaussians:,} Gaussians at most", "it bounds the memory")]
+        return [bound_of_growth(draft)]
     degradation = draft.degradation
     wanted = max(gaussians_determined(facts, degradation, settings.hqgs.gaussians_per_pixel), facts.points)
     most = min(growth.max_gaussians, wanted)
@@ -271,44 +279,23 @@ def resets(draft: Draft) -> Sequence[Choice]:
 
 
 def growth(draft: Draft) -> Sequence[Choice]:
-    densify = draft.settings.densify
+    densify, told = draft.settings.densify, told_by_trial(draft.facts)
+    best = best_tried(draft.facts) if draft.undegraded and draft.dense else None
+    if best is not None and not best.level:
+        why = "what grows explains each photo alone, and views between photos are worse"
+        changes = {f"densify.{name}": value for name, value in no_growth(densify).items()}
+        return [Choice("none", why, told, "growth", changes=changes)]
     if draft.undegraded and draft.dense and densify.start < GROWS_FROM:
         why = "until sizes and colours are about right, gradients do not tell where something is missing"
         left = f"growth in the first {GROWS_FROM} iterations"
         value = _growth(GROWS_FROM, densify.stop, densify.every)
-        return [Choice(value, why, "", left, changes={"densify.start": GROWS_FROM})]
+        return [Choice(value, why, told, left, changes={"densify.start": GROWS_FROM})]
     value = _growth(densify.start, densify.stop, densify.every)
-    return [Choice(value, "3DGS's schedule, fitted to the length of the run")]
+    return [Choice(value, "3DGS's schedule, fitted to the length of the run", told)]
 
 
 def _growth(start: int, stop: int, every: int) -> str:
     return f"every {every} iterations from {start:,} to {stop:,}"
-
-
-def needless(draft: Draft) -> Sequence[Choice]:
-    items, facts, has = set(draft.settings.leave_out), draft.facts, draft.kinds
-    rows: list[Choice] = []
-    if has & set(LEARNED):
-        items &= set(OF_PHOTOS)
-    elif not facts.as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
-        items &= {*OF_PHOTOS, "iterations"}
-    left = tuple(item for item in ITEMS if item in items)
-    if "growth" in items:
-        why = "no photo shows more than that"
-        rows.append(Choice(f"not of Gaussians below {FINEST:g} px", why, what="growth of fine ones"))
-    names = ", ".join(left) or "nothing"
-    why = "asked for, as far as these photos and this length bear it"
-    return [*rows, Choice(names, why, changes={"leave_out": left})]
-
-
-def held_photos(draft: Draft) -> Sequence[Choice]:
-    count = 0
-    if "iterations" in draft.settings.leave_out and draft.facts.photos >= FEWEST_VIEWS:
-        count = min(MOST_HELD, max(1, round(HELD_SHARE * draft.facts.photos)))
-    if not count:
-        return []
-    why = "they tell when more iterations no longer pay, and then come back"
-    return [Choice(f"{count} of {draft.facts.photos} at first", why, changes={"held_photos": count})]
 
 
 RULES = (
@@ -329,7 +316,7 @@ RULES = (
         half_size_until,
         f"{COARSE_PART:.0%} of the run, {COARSE_MOST:,} at most: {CHOSEN}",
     ),
-    Rule("growth", growth, f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}"),
+    Rule("growth", growth, f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}; none: tried"),
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
     Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {WHERE}"),
     Rule("dropout of Gaussians", dropout, f"DropGaussian, Park et al. 2025; {WHERE}"),

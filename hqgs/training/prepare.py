@@ -22,15 +22,24 @@ from hqgs.training.forward import TrainingViews
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.passersby import without_passersby
-from hqgs.training.plan import Facts, RunPlan, StepSeconds, plan_by
+from hqgs.training.plan import Draft, Facts, RunPlan, StepSeconds, Tried, plan_by
+from hqgs.training.plan_few_photos import in_agreement
 from hqgs.training.plan_rules import RULES, plan_run
+from hqgs.training.trial import Begin, calls_for_trial, tried_growth
 
 
 class Prepared:
     """A scene on which a run was asked for, looked at; plans are made from its facts."""
 
-    def __init__(self, scene: Scene, asked: TrainConfig, inspector: Inspector | None = None) -> None:
-        """`inspector`: what looks at the photos. ValueError if the scene cannot be trained."""
+    def __init__(
+        self,
+        scene: Scene,
+        asked: TrainConfig,
+        inspector: Inspector | None = None,
+        begin: Begin | None = None,
+    ) -> None:
+        """`inspector`: what looks at the photos; `begin` makes trainers of short runs that try what pays,
+        None: nothing is tried. ValueError if the scene cannot be trained."""
         scene.check_trainable()
         inspector = inspector or Inspector()
         unused = list[LeftOut]()
@@ -55,6 +64,8 @@ class Prepared:
         )  # of more photos, where the method asks for it
         self._on_stage = inspector.on_stage
         self._points: dict[int, tuple[Points, Colors]] = {}
+        self._begin: Begin | None = begin
+        self._tried: tuple[Tried, ...] | None = None
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
         """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""
@@ -64,6 +75,14 @@ class Prepared:
             found = len(self._first_points(plan.first_points)[0]) - facts.points
             facts = replace(facts, agreed=found / (plan.first_points - facts.points))
             plan = plan_run(facts, self.diagnosis, self.asked)
+        draft = Draft(facts, self.diagnosis, self.asked, plan)
+        timed = self.asked.seconds is None or seconds is not None  # else the run's length is not known yet
+        begin = self._begin if timed and "growth" in self.asked.leave_out else None
+        unsure = draft.undegraded and draft.dense and not in_agreement(facts)
+        if begin is not None and unsure and calls_for_trial(self.scene, plan):
+            if self._tried is None:
+                self._tried = tried_growth(self.scene, plan, begin, self._on_stage)
+            plan = plan_run(replace(facts, tried=self._tried), self.diagnosis, self.asked)
         return plan
 
     def first_gaussians(self, plan: RunPlan) -> Gaussians:

@@ -61,7 +61,7 @@ class Trainer:
         """`inspector`: what looks at the photos before the first step; `ranks`: the processes that train
         together. ValueError if scene or configuration cannot be trained."""
         self.ranks = ranks
-        self.prepared: Prepared = Prepared(scene, config, inspector)
+        self.prepared: Prepared = Prepared(scene, config, inspector, Trainer)
         self.asked: TrainConfig = config
         self.scene: Scene = self.prepared.scene
         self.method: Method[Any] = self.prepared.method

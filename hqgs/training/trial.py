@@ -1,0 +1,133 @@
+"""Whether growth pays, tried before a run: short runs on small copies, judged by photos held back from them.
+
+Where a photo is not yet shown as it is, growth adds Gaussians, whether or not other photos bear them out.
+Poses that are a little off, light that changes, mirrors and what a codec left ask for them without end: then
+they explain each photo alone, and views between photos are worse with every step. Short runs that differ in
+nothing but how many Gaussians there may be tell it, on training photos that they have not seen. Test views
+are never looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.evaluation.held_out import HeldOutViews
+from hqgs.evaluation.metrics import psnr_aligned
+from hqgs.photos.formula import NONE, parse_formation
+from hqgs.scene.geometry import resized
+from hqgs.scene.scene import Scene, View
+from hqgs.training.config import TrainConfig
+from hqgs.training.constants import (
+    TRIAL_EACH,
+    TRIAL_LEVELS,
+    TRIAL_OFFSETS,
+    TRIAL_SHARE,
+    TRIAL_SIDE,
+    TRIAL_STEPS,
+    TRIAL_VIEWS,
+)
+from hqgs.training.plan import RunPlan, Tried
+from hqgs.training.plan_budget import no_growth
+from hqgs.training.settings import with_iterations
+
+
+class ShortRun(Protocol):
+    """What is asked of a trainer here."""
+
+    plan: RunPlan
+
+    @property
+    def iteration(self) -> int: ...
+    @property
+    def length(self) -> int: ...
+    @property
+    def method(self) -> Any: ...
+    def begin(self, plan: RunPlan) -> None: ...
+    def step(self) -> Any: ...
+    def held_out(self) -> HeldOutViews: ...
+
+
+Begin = Callable[[Scene, TrainConfig], ShortRun]  # a trainer before its first step
+
+
+def calls_for_trial(scene: Scene, plan: RunPlan) -> bool:
+    """Whether growth is to be tried before a run of this plan.
+
+    Not where nothing grows, where no photo can be spared, or where the trial would show more than TRIAL_SHARE
+    of the pixels that the run trains on.
+    """
+    settings, views = plan.settings, scene.train
+    if settings.densify.stop <= settings.densify.start or len(views) < TRIAL_VIEWS or not len(scene.points):
+        return False
+    sizes = np.array([(view.camera.width, view.camera.height) for view in views])
+    small = np.minimum(1, TRIAL_SIDE / sizes.max(1)) ** 2 * sizes.prod(1)
+    shown = TRIAL_STEPS * len(TRIAL_LEVELS) * len(TRIAL_OFFSETS) * small.mean()
+    return bool(shown <= TRIAL_SHARE * settings.iterations * sizes.prod(1).mean())
+
+
+def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = silent) -> tuple[Tried, ...]:
+    """What less growth than in TRIAL_LEVELS[0] gains on photos held back, for each of the other levels.
+
+    Every TRIAL_EACH-th photo is held back, twice, each time others. `plan`: of the run; `begin` makes
+    trainers.
+    """
+    on_stage(Stage("growth", 0, 0, "trying on photos held back whether growth pays"))
+    config, views = _settings(plan.settings), [_small(view) for view in scene.train]
+    found: list[list[float]] = [[] for _ in TRIAL_LEVELS]
+    for offset in TRIAL_OFFSETS:
+        held = range(offset, len(views), TRIAL_EACH)
+        train = [view for k, view in enumerate(views) if k not in held]
+        part = replace(scene, train=train, test=[views[k] for k in held])
+        for values, psnr in zip(found, _short_runs(begin(part, config)), strict=True):
+            values += psnr
+    gains = np.array(found[1:]) - found[0]
+    gains = gains[:, np.isfinite(gains).all(0)]
+    if gains.shape[1] < 2:
+        return ()  # no scatter is known
+    errors = gains.std(1, ddof=1) / np.sqrt(gains.shape[1])
+    return tuple(
+        Tried(level, float(gain), float(error), gains.shape[1])
+        for level, gain, error in zip(TRIAL_LEVELS[1:], gains.mean(1), errors, strict=True)
+    )
+
+
+def _short_runs(trainer: ShortRun) -> Iterator[list[float]]:
+    """PSNR of each held-out photo, brightness and tint set aside, after a run of each level."""
+    kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
+    settings, first = trainer.plan.settings, trainer.plan.first_points
+    for level in TRIAL_LEVELS:
+        growth = settings.densify
+        growth = (
+            replace(growth, max_gaussians=round(level * first))
+            if level
+            else replace(growth, **no_growth(growth))
+        )
+        trainer.begin(replace(trainer.plan, settings=replace(settings, densify=growth)))
+        trainer.method.load_state_dict(kept)
+        while trainer.iteration < trainer.length:
+            trainer.step()
+        values = [psnr_aligned(view.render, view.photo, view.mask) for view in trainer.held_out()]
+        yield [np.nan if value is None else value for value in values]  # None: a mask leaves nothing
+
+
+def _settings(settings: TrainConfig) -> TrainConfig:
+    """Of a short run: the run's, but that nothing more is decided; small photos show no shake."""
+    exposed = any(step.kind == "exposure" for step in parse_formation(settings.hqgs.formation).steps)
+    return replace(
+        with_iterations(replace(settings, leave_out=(), seconds=None, turn=None), TRIAL_STEPS),
+        hqgs=replace(settings.hqgs, formation="exposure" if exposed else NONE),
+        batch=1,
+        opacity_decay=settings.opacity_decay or 0.0,
+        dropout=settings.dropout or 0.0,
+    )
+
+
+def _small(view: View) -> View:
+    camera = view.camera
+    factor = max(1.0, max(camera.width, camera.height) / TRIAL_SIDE)
+    return resized(view, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))

@@ -1,0 +1,145 @@
+"""The trial of growth before a run: what is held back, what is compared, and what the plan makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_scene import tiny_scene
+
+from hqgs.evaluation.held_out import RenderedView
+from hqgs.scene.scene import Scene
+from hqgs.training import prepare, trial
+from hqgs.training.config import TrainConfig, run_config
+from hqgs.training.constants import TRIAL_EACH, TRIAL_LEVELS, TRIAL_OFFSETS, TRIAL_STEPS
+from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
+from hqgs.training.plan_rules import plan_run
+from hqgs.training.trainer import Trainer
+
+ASKED = run_config(iterations=1000, method="hqgs", formation="none")
+FIRST = 40  # points that the fake runs start from
+
+
+def facts(*tried: Tried) -> Facts:
+    """Of photos that call for 100 first points."""
+    sizes = ((100, 100),) * 10
+    return Facts(10, 10_000, 100, 50, True, 0.7, as_photographed=True, sizes=sizes, tried=tried)
+
+
+def told(plan: RunPlan) -> str:
+    return next(row.evidence for row in plan.rows if row.what == "growth")
+
+
+@pytest.mark.parametrize(
+    ("gains", "wanted"),
+    [
+        ((), 1_000_000),
+        (((2.5, -0.76, 0.2), (0.0, -1.98, 0.4)), 1_000_000),  # growth pays
+        (((2.5, 0.44, 0.2), (0.0, 0.99, 0.4)), 0),  # none pays most
+        (((2.5, 0.67, 0.2), (0.0, 0.22, 0.1)), 250),  # some pays most
+        (((2.5, 0.30, 0.4), (0.0, 0.02, 0.01)), 1_000_000),  # within the scatter, or too little
+    ],
+)
+def test_growth_is_bounded_where_photos_held_back_are_better_for_it(
+    gains: tuple[tuple[float, float, float], ...], wanted: int
+) -> None:
+    tried = tuple(Tried(*gain, photos=6) for gain in gains)
+    plan = plan_run(facts(*tried), None, ASKED)
+    densify, rows = plan.settings.densify, {row.what: row for row in plan.rows}
+    assert densify.max_gaussians == (wanted or 1_000_000)
+    assert (rows["growth"].value == "none") == (densify.start >= densify.stop) == (wanted == 0)
+    assert densify.reset_every >= densify.stop  # a short run has no resets in any case
+    for _, gain, error in gains:
+        assert f"{gain:+.2f} ± {error:.2f} dB" in rows["growth"].evidence
+    fewer = replace(ASKED, densify=replace(ASKED.densify, max_gaussians=90))
+    assert plan_run(facts(*tried), None, fewer).settings.densify.max_gaussians == 90  # as asked for
+    noisy = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="noise:25"))  # which have a budget of their own
+    assert plan_run(facts(*tried), None, noisy).settings == plan_run(facts(), None, noisy).settings
+
+
+class FakeRun:
+    """A trainer whose renders are the worse, the more Gaussians there may be."""
+
+    def __init__(self, scene: Scene, config: TrainConfig) -> None:
+        self.scene, self.iteration, self.length = scene, 0, config.iterations
+        self.method: Any = SimpleNamespace(state_dict=dict, load_state_dict=lambda state: None)
+        self.plan = RunPlan(config, FIRST, True, 0, 0, False)
+
+    def begin(self, plan: RunPlan) -> None:
+        self.plan, self.iteration = plan, 0
+
+    def step(self) -> None:
+        self.iteration += 1
+
+    def held_out(self) -> list[RenderedView]:
+        assert self.iteration == self.length == TRIAL_STEPS
+        growth = self.plan.settings.densify
+        level = growth.max_gaussians / FIRST if growth.start < growth.stop else 1
+        rng = np.random.default_rng(0)
+        found = []
+        for view in self.scene.test:
+            error = 0.01 * level * rng.choice([-1, 1], view.image.shape)
+            render = (view.image / 255 + error).astype(np.float32)
+            found.append(RenderedView(view.name, view.image, render))
+        return found
+
+
+def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
+    scene, seen = tiny_scene(12), list[Scene]()
+
+    def begin(part: Scene, config: TrainConfig) -> FakeRun:
+        seen.append(part)
+        assert config.leave_out == ()  # nothing is tried within a trial
+        assert (config.opacity_decay, config.hqgs.formation) == (0.0, "none")
+        return FakeRun(part, config)
+
+    plan = RunPlan(replace(ASKED, leave_out=("growth",)), FIRST, True, 0, 0, False)
+    found = trial.tried_growth(scene, plan, begin)  # type: ignore[arg-type]
+    names = [view.name for view in scene.train]
+    for part, offset in zip(seen, TRIAL_OFFSETS, strict=True):
+        assert [view.name for view in part.test] == names[offset::TRIAL_EACH]
+        assert sorted(view.name for view in (*part.train, *part.test)) == sorted(names)
+    assert [tried.level for tried in found] == [*TRIAL_LEVELS[1:]]
+    assert {tried.photos for tried in found} == {sum(len(part.test) for part in seen)}
+    for tried in found:  # errors are in proportion to the level
+        assert tried.gain == pytest.approx(20 * np.log10(TRIAL_LEVELS[0] / (tried.level or 1)), abs=0.3)
+        assert tried.error < 0.1
+
+
+def test_a_trial_takes_a_small_share_of_a_run_and_needs_photos_to_spare() -> None:
+    scene = tiny_scene(12)
+    plan = RunPlan(replace(ASKED, iterations=10**6), FIRST, True, 0, 0, False)
+    assert trial.calls_for_trial(scene, plan)
+    assert not trial.calls_for_trial(scene, replace(plan, settings=ASKED))
+    assert not trial.calls_for_trial(replace(scene, train=scene.train[:4]), plan)
+    still = replace(plan.settings, densify=replace(ASKED.densify, stop=0))
+    assert not trial.calls_for_trial(scene, replace(plan, settings=still))
+
+
+def test_a_run_is_planned_by_its_trial_and_the_same_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "TRIAL_STEPS", 20)
+    monkeypatch.setattr(trial, "TRIAL_SHARE", np.inf)
+    scene = tiny_scene(12, num_points=10)
+    seen = {view.name: np.arange(10) for view in scene.train}
+    config = run_config(iterations=1000, method="hqgs", leave_out="growth", formation="none")
+    first, again = (Trainer(replace(scene, seen=seen), config).plan for _ in range(2))
+    assert first == again
+    assert "photos held back" in told(first)
+    assert told(Trainer(replace(scene, seen=seen), replace(config, leave_out=())).plan) == ""
+
+
+def test_a_run_of_seconds_is_tried_when_its_length_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked_for = list[int]()
+    monkeypatch.setattr(
+        prepare, "calls_for_trial", lambda scene, plan: bool(asked_for.append(plan.settings.iterations))
+    )
+    scene = tiny_scene(12, num_points=10)
+    config = run_config(iterations=1000, method="hqgs", leave_out="growth", formation="none")
+    seen = {view.name: np.arange(10) for view in scene.train}
+    trainer = Trainer(replace(scene, seen=seen), replace(config, seconds=2.0))
+    assert asked_for == []
+    trainer.prepared.plan(StepSeconds(0.01, 0.0))
+    assert asked_for == [200]
