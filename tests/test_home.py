@@ -13,13 +13,14 @@ from test_sfm import cards  # noqa: F401
 from test_sharpen import made  # noqa: F401
 
 from hqgs.scene.scene import Scene
-from hqgs.scene.sfm.agree import agreement, confirmed
+from hqgs.scene.sfm.agree import agreement, confirmed, loose_parts
 from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.facts import placed_names
 from hqgs.scene.sfm.failure import Pass, doubtful, why_doubtful
 from hqgs.scene.sfm.home import without
 from hqgs.scene.sfm.reconstruct import _write_photos
 from hqgs.scene.sfm.run import Model
+from hqgs.scene.sfm.tracks import Tracks, rebuilt
 
 Made = tuple[pycolmap.Reconstruction, list[np.ndarray], Path]
 
@@ -90,6 +91,30 @@ def test_lost_photos_come_home_and_strange_ones_do_not(attempt: Attempt) -> None
     assert placed_names(attempt.model) == set(before) - {"00002.png"}
     assert set(attempt.agree) == set(before) - {"00002.png"}
     assert all(confirmed(*counts) for counts in attempt.agree.values())
+
+
+def test_parts_that_hang_on_few_points_are_told(made: Made) -> None:  # noqa: F811
+    """Photos 0 to 3 share 60 points, 4 to 6 share 25, and both parts 12; photo 7 shares 9 with the first."""
+    model, _, _ = made
+    seen = [(range(4), range(60)), (range(4, 7), range(60, 85)), (range(3, 5), range(85, 97))]
+    seen += [(range(7, 8), range(9)), (range(7, 8), range(97, 150))]  # and 53 that nobody else has
+    pairs = np.array(sorted({(v, p) for views, points in seen for v in views for p in points}))
+    rng = np.random.default_rng(0)
+    tracks = Tracks(
+        rng.random((150, 3)),
+        np.zeros((150, 3), np.uint8),
+        pairs[:, 0],
+        pairs[:, 1],
+        rng.random((len(pairs), 2)),
+    )
+    hung = rebuilt(model, [f"{k}.png" for k in range(8)], tracks)
+    parts = loose_parts(hung)
+    assert parts == [(["4.png", "5.png", "6.png"], 12), (["7.png"], 9)]
+    said = why_doubtful(Pass(False, 8, {}, [], [], loose=parts))
+    assert "4.png, 5.png, 6.png by 12 points; 7.png by 9 points. Take photos between these" in said
+    more = replace(tracks, view=np.append(tracks.view, [2] * 8), point=np.append(tracks.point, range(60, 68)))
+    more = replace(more, xy=rng.random((len(more.view), 2)))
+    assert loose_parts(rebuilt(model, [f"{k}.png" for k in range(8)], more)) == [(["7.png"], 9)]
 
 
 def test_a_run_says_that_no_pose_can_be_trusted() -> None:

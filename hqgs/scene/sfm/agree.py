@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from hqgs.scene.sfm.patches import REACH, PatchView, fitted, read_photo, widened
 from hqgs.scene.sfm.tracks import read_tracks
@@ -20,6 +22,7 @@ POINTS = 60  # of each photo that the others are searched for, those that most p
 BESIDE = 4 * REACH  # px of the photos that are looked at: there no patch reaches the place
 DEVIATIONS = 3.0  # by which more must agree at the place than beside it
 TIMES = 1.5  # the same, as a ratio
+JOINT = 20  # points that a part shares with the rest: wrong ones 12 and 15, right ones 36 and more
 
 Agreement = dict[str, tuple[int, int, int]]  # of a photo: points looked for, that agree, that agree beside
 
@@ -55,3 +58,29 @@ def confirmed(looked: int, agreed: int, beside: int) -> bool:
     """Whether a photo shows more of what it should than chance lets it; where little was looked for, no."""
     more = agreed - beside
     return more > DEVIATIONS * (agreed + beside) ** 0.5 and agreed > TIMES * beside
+
+
+def loose_parts(model: pycolmap.Reconstruction) -> list[tuple[list[str], int]]:
+    """Photos, all but those of the largest part, that share fewer than JOINT points with any others, and how
+    many: inside such a part all may agree, and yet it lies where it does by a few false matches."""
+    names, tracks = read_tracks(model)
+    part = np.arange(len(names))
+    while True:
+        seen = coo_matrix((np.ones(len(tracks.view), np.int64), (part[tracks.view], tracks.point))).tocsr()
+        seen.data[:] = 1
+        shared = (seen @ seen.T).toarray()
+        np.fill_diagonal(shared, 0)
+        count, joined = connected_components(shared >= JOINT, directed=False)
+        if count < len(shared):
+            part = joined[part]
+            continue
+        sizes = np.bincount(part)
+        largest = int(np.argmax(sizes))
+        among = shared.copy()  # parts beside the largest, which may join each other by fewer
+        among[largest] = among[:, largest] = 0
+        k, other = np.unravel_index(int(np.argmax(among)), among.shape)
+        if among[k, other] <= shared[[k, other], largest].max():
+            break
+        part = np.unique(np.where(part == k, other, part), return_inverse=True)[1]
+    loose = [k for k in range(len(sizes)) if k != largest]
+    return [([names[v] for v in np.flatnonzero(part == k)], int(shared[k].max())) for k in loose]

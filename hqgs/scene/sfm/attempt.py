@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.agree import Agreement, agreement, confirmed
+from hqgs.scene.sfm.agree import Agreement, agreement, confirmed, loose_parts
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
 from hqgs.scene.sfm.facts import apart, borne_out, counts, placed_names
 from hqgs.scene.sfm.home import brought_home, without
@@ -259,6 +259,8 @@ class Attempt:
         own = {"tolerant": self.tolerant, "registered": self.registered, "learned": self.learned}
         if self.model is not None and self.faces > 1:
             own["borne_out"] = borne_out(self.database, self.model)
+        elif self.model is not None:
+            own["loose"] = loose_parts(self.model)
         return {**own, "agree": self.agree, "apart": self.apart, **counts(self.database, placed)}
 
     def _geometry(self) -> pycolmap.TwoViewGeometryOptions:

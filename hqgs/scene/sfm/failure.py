@@ -35,6 +35,8 @@ class Pass:
     learned: bool = False  # by features of networks
     agree: dict[str, list[int]] = field(default_factory=dict)  # of photos with a place, where that was looked
     # at: points that they should show, those that show, and those that show where only chance puts them
+    loose: list[tuple[list[str], int]] = field(default_factory=list)  # photos that share few points with the
+    # rest, and how many
     borne_out: float | None = None  # share of the inliers that the places of panoramas bear out
 
 
@@ -124,6 +126,12 @@ def doubtful(one: Pass) -> list[str]:
 
 def why_doubtful(one: Pass, called: Callable[[str], str] = str) -> str:
     """That places may be wrong, and what to do; empty where nothing says so."""
+    if one.loose and not doubtful(one):
+        parts = [f"{some([called(name) for name in part])} by {points} points" for part, points in one.loose]
+        return (
+            "Places are in doubt where photos hang on few points that they share with the rest: "
+            f"{'; '.join(parts)}. Take photos between these and the others"
+        )
     if wrong := doubtful(one):
         looked, agreed, beside = np.median([one.agree[name] for name in wrong], axis=0)
         return (
