@@ -40,6 +40,7 @@ from hqgs.show.constants import (
     TRUST_PHOTOS,
     TRUST_ROUNDS,
     TRUST_SIDE,
+    TRUST_TRAINED,
 )
 
 Array = NDArray[np.float32]
@@ -80,6 +81,7 @@ class Trust:
     photos: Tensor  # [N], how many see it; 0 where a file says the errors
     factor: float = 1.0  # by which the errors were calibrated
     held: tuple[Held, ...] = ()  # what calibrated them
+    trained: tuple[Held, ...] = ()  # the same of a few training photos
 
     def bound(self, camera: Camera) -> Array:
         """Levels of 255 that a pixel's error, the mean of its channels, stays below 9 times of 10, [H, W].
@@ -190,14 +192,18 @@ def learn_trust(
                 found += _back(gaussians, camera, errors[:, None], error[..., None], ratio=True)[:, 0]
                 tell()
             errors = (errors * found + PRIOR) / weights
-    carried, held = Trust(gaussians, errors, seen), list[Held]()
-    out = [view for view in known.views if view.held_out and view.photo is not None]
-    for k in evenly(len(out), CALIBRATORS):
-        camera, error, psnr = error_of(gaussians, out[k])
+    carried = Trust(gaussians, errors, seen)
+
+    def look(view: KnownCamera) -> Held:
+        camera, error, psnr = error_of(gaussians, view, psnr=True)
         shown = *carried.shown(camera, errors), carried.shown(camera, seen)[0]
-        held.append(Held(out[k].name, camera, psnr, error.numpy(), *shown))
+        return Held(view.name, camera, psnr, error.numpy(), *shown)
+
+    out = [view for view in known.views if view.held_out and view.photo is not None]
+    held = tuple(look(out[k]) for k in evenly(len(out), CALIBRATORS))
+    trained = tuple(look(chosen[k]) for k in evenly(len(chosen), TRUST_TRAINED)) if held else ()
     factor = calibrated(held)
-    return Trust(gaussians, factor * errors, seen, factor, tuple(held))
+    return Trust(gaussians, factor * errors, seen, factor, held, trained)
 
 
 def _back(
@@ -212,18 +218,18 @@ def _back(
     return values.grad
 
 
-def error_of(gaussians: Gaussians, view: KnownCamera) -> tuple[Camera, Tensor, float]:
+def error_of(gaussians: Gaussians, view: KnownCamera, psnr: bool = False) -> tuple[Camera, Tensor, float]:
     """A smaller camera of a view, the error of its render there, mean of the channels, [H, W], and the PSNR,
-    dB, of a held-out one at the size that the photo was kept in."""
+    dB; with `psnr` at the size that the photo was kept in."""
     assert view.photo is not None
     with Image.open(view.photo) as file:
         picture = file.convert("RGB")
-    psnr = None
-    if view.held_out and max(picture.size) > TRUST_SIDE:
-        psnr = psnr_of(_off(gaussians, view.camera, picture)[1])
+    large = (
+        psnr_of(_off(gaussians, view.camera, picture)[1]) if psnr and max(picture.size) > TRUST_SIDE else None
+    )
     picture.thumbnail((TRUST_SIDE, TRUST_SIDE), Image.Resampling.LANCZOS)
     camera, off = _off(gaussians, view.camera, picture)
-    return camera, off.abs().mean(-1), psnr_of(off) if psnr is None else psnr
+    return camera, off.abs().mean(-1), psnr_of(off) if large is None else large
 
 
 @torch.no_grad()

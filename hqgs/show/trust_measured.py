@@ -13,7 +13,16 @@ from hqgs.base.evenly import evenly
 from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.scene.geometry import shrunk_camera
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import EMPTY, GOOD, PATH_LOOKS, SLOPE_WEIGHT, SPREAD, SPREAD_PHOTOS, TRUST_SIDE
+from hqgs.show.constants import (
+    EMPTY,
+    GOOD,
+    HELD_AWAY,
+    PATH_LOOKS,
+    SLOPE_WEIGHT,
+    SPREAD,
+    SPREAD_PHOTOS,
+    TRUST_SIDE,
+)
 from hqgs.show.trust import Array, Trust, bound_of, calibrated
 
 
@@ -80,16 +89,20 @@ def predict_psnr(trust: Trust, cameras: Sequence[Camera], taken: Sequence[Camera
     """PSNR against photos that these cameras would take: of a few of them, evenly chosen.
 
     A regression of the held-out photos' PSNR on what the pixels' trust says of it, with priors for its slope
-    and scatter (normal, inverse gamma), and Student's predictive interval of a mean. Cameras that go past
-    many photos of `taken`, those that were trained on, average over as many held-out photos' scatter as lie
-    among those; others are taken for one photo. None without a held-out photo.
+    and scatter (normal, inverse gamma), and Student's predictive interval of a mean. From where photos were
+    trained on (`taken`) a scene shows more: what it shows of some of those more than the regression says is
+    added there, and less the farther a camera stands off, none where held-out ones do. Cameras that go past
+    many photos average over as many held-out photos' scatter as the held-out ones' share of all photos makes
+    of those; others are taken for one photo. None without a held-out photo.
     """
     if not trust.held or not cameras:
         return None
     from scipy.special import stdtrit  # here: the command line waits for no scipy
 
-    psnr = np.array([one.psnr for one in trust.held])
-    said = np.array([said_of(one.carried, one.alpha) for one in trust.held])
+    (psnr, said), (own, own_said) = (
+        np.array([[one.psnr, said_of(one.carried, one.alpha)] for one in of]).reshape(-1, 2).T
+        for of in (trust.held, trust.trained)
+    )
     chosen = [cameras[k] for k in evenly(len(cameras), PATH_LOOKS)]
     raw = trust.errors / max(trust.factor, 1e-6)
     of_path = np.array([said_of(*trust.shown(shrunk_camera(camera, TRUST_SIDE), raw)) for camera in chosen])
@@ -101,11 +114,24 @@ def predict_psnr(trust: Trust, cameras: Sequence[Camera], taken: Sequence[Camera
     freedom = SPREAD_PHOTOS + count - 1
     variance = (SPREAD_PHOTOS * SPREAD**2 + squares) / freedom
     each = psnr.mean() + slope * (of_path - said.mean())
+    if len(own) and taken:
+        more = max(float((own - psnr.mean() - slope * (own_said - said.mean())).mean()), 0.0)
+        usual = np.quantile(_away([one.camera for one in trust.held], taken), HELD_AWAY)
+        each = each + more * (1 - (_away(chosen, taken) / max(float(usual), 1e-12)).clip(0, 1))
     off = float(of_path.mean() - said.mean())
-    averaged = max(1.0, _passed(cameras, taken) * count / max(len(taken), 1))
+    averaged = max(1.0, _passed(cameras, taken) * count / (count + len(taken)))
     spread = math.sqrt(variance * (1 / averaged + 1 / count + off**2 / weight))
     half = float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * spread
     return Predicted(each.tolist(), float(each.mean()), half, count)
+
+
+def _away(cameras: Sequence[Camera], taken: Sequence[Camera]) -> NDArray[np.float64]:
+    """How far each camera is from the nearest of the others, world units."""
+    return np.linalg.norm(_centers(cameras)[:, None] - _centers(taken)[None], axis=2).min(1)
+
+
+def _centers(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    return np.stack([camera.center for camera in cameras])
 
 
 def said_of(carried: Array, alpha: Array) -> float:
@@ -118,8 +144,8 @@ def _passed(cameras: Sequence[Camera], taken: Sequence[Camera]) -> int:
     """How many of the photos are nearest to one of the cameras."""
     if not taken:
         return 0
-    places, stops = (np.stack([camera.center for camera in of]) for of in (taken, cameras))
-    return len(set(np.linalg.norm(stops[:, None] - places[None], axis=2).argmin(1).tolist()))
+    apart = np.linalg.norm(_centers(cameras)[:, None] - _centers(taken)[None], axis=2)
+    return len(set(apart.argmin(1).tolist()))
 
 
 def _ause(doubt: Array, error: Array) -> float:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from hqgs.model.constants import SH_C0
 from hqgs.model.formats.codebooks import palette
 from hqgs.model.gaussians import Gaussians
-from hqgs.show.constants import BAND_COVERED, GAUSSIANS_A_SET, MOST_SETS, PAGE_GAUSSIANS
+from hqgs.show.constants import BAND_COVERED, GAUSSIANS_A_SET, LEAST_SETS, MOST_SETS, PAGE_GAUSSIANS
 from hqgs.show.export import along_a_curve
 
 COLORS = (-0.25, 1.25)
@@ -80,7 +80,9 @@ def pack_scene(gaussians: Gaussians, most: int = PAGE_GAUSSIANS) -> PackedScene:
     opacities = g.activated_opacities().double().numpy()
     rest, labels = np.zeros((0, 3 * g.shN.shape[1])), np.zeros(n, np.int64)
     if n and degree:
-        rest, labels = palette(g.shN.flatten(1).numpy(), opacities, min(MOST_SETS, -(-n // GAUSSIANS_A_SET)))
+        rest, labels = palette(
+            g.shN.flatten(1).numpy(), opacities, min(n, MOST_SETS, max(-(-n // GAUSSIANS_A_SET), LEAST_SETS))
+        )
     tops = [_top(rest[:, 3 * (d * d - 1) : 3 * ((d + 1) ** 2 - 1)]) for d in range(1, degree + 1)]
     units = np.repeat(tops, [3 * (2 * d + 1) for d in range(1, degree + 1)]) if degree else np.ones(0)
     parts = [
