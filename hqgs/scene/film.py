@@ -104,24 +104,23 @@ def frame_details(folder: Path) -> dict[str, float]:
 
     ValueError where its file is damaged.
     """
-    return _told(folder)[0]
+    path = folder / FRAMES
+    if not path.is_file():
+        return {}
+    try:
+        details = json.loads(path.read_text(encoding="utf-8"))["details"]
+        return {name: float(detail) for name, detail in details.items()}
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
 
 
 def frames_around(folder: Path) -> bool:
-    """Whether the film whose frames a folder holds said that they are panoramas. ValueError as above."""
-    return _told(folder)[1]
-
-
-def _told(folder: Path) -> tuple[dict[str, float], bool]:
-    path = folder / FRAMES
-    if not path.is_file():
-        return {}, False
+    """Whether the film whose frames a folder holds said that they are panoramas."""
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        details = {name: float(detail) for name, detail in told["details"].items()}
-        return details, bool(told.get("around"))
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error!r}") from error
+        told = json.loads((folder / FRAMES).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(told, dict) and told.get("around") is True
 
 
 def _sharpest(
