@@ -56,6 +56,7 @@ def project_forward(
     height: int,
     options: tuple[float, float, float, float, bool, bool],
     sh_degree: int | None,
+    activate: bool = False,
     knobs: tuple[float, float, str, bool] | None = None,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
 def project_backward(
@@ -102,6 +103,10 @@ def adam_step(
     options: tuple[float, float, float, float],
     used: int | None,
 ) -> None: ...
+def add_pulls(
+    sums: Array, views: Array, gradient: Array, radii: Array, half: tuple[float, float]
+) -> None: ...
+def all_below(arrays: list[Array], limit: float) -> bool: ...
 def add_rows(views: list[tuple[Array, Array]], sums: Array, scale: float) -> None: ...
 def add_harmonics(
     views: list[tuple[Array, Array, list[float], int]], means: Array, high: Array, scale: float

@@ -8,6 +8,7 @@ use crate::{
     project::Splat,
     simd::{Real, groups::Column},
 };
+use rayon::prelude::*;
 use std::{
     marker::PhantomData,
     mem::MaybeUninit,
@@ -139,6 +140,20 @@ impl<T: Copy> UninitVec<T> {
     }
 }
 
+/// As many zeros, set by all threads of rayon's current pool.
+///
+/// # Errors
+/// As for [`UninitVec::new`].
+pub fn zeros<T: Real>(len: usize, name: &str) -> Result<Vec<T>, Error> {
+    const PIECE: usize = 1 << 15;
+    let mut vector = UninitVec::new(len, name)?;
+    let lengths = (0..len.div_ceil(PIECE)).map(|k| PIECE.min(len - k * PIECE));
+    vector.cut(lengths).into_par_iter().for_each(|piece| {
+        piece.fill(T::ZERO);
+    });
+    Ok(vector.finish())
+}
+
 impl<'a, T: Copy> UninitPiece<'a, T> {
     /// Set every element.
     #[inline(always)]
@@ -250,7 +265,6 @@ pub(crate) fn prefetch_all<T: Copy>(data: &[T]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rayon::prelude::*;
 
     #[test]
     fn pieces_become_one_vector() {
@@ -270,6 +284,13 @@ mod tests {
                 .flat_map(|(k, n)| vec![k as f64; *n])
                 .collect();
             assert_eq!(vector.finish(), expected);
+        }
+    }
+
+    #[test]
+    fn zeros_are_zeros() {
+        for len in [0, 1, (1 << 15) + 7] {
+            assert_eq!(zeros::<f32>(len, "test").unwrap(), vec![0.0; len]);
         }
     }
 

@@ -88,7 +88,9 @@ def test_work_and_limit_follow_from_the_counts(quick: DataFrame) -> None:
 
 def test_speed_up_growth_and_memory(quick: DataFrame) -> None:
     threads = part(quick, "threads")
-    assert [r["threads"] for r in threads] == [1, 2, 1, 2]
+    assert [r["threads"] for r in threads] == [1, 2] * 3
+    assert all(r["expected"] == pytest.approx(r["ratio"], rel=1e-6) for r in threads)
+    assert all(sum(seconds for _, seconds in pairs_of(r["stages"])) > 0 for r in threads)
     assert [r["ratio"] for r in threads if r["threads"] == 1] == [1, 1]
     assert all(0 < r["ratio"] < 20 for r in threads)
     assert all(math.isfinite(float(power(quick, against))) for against in ("gaussians", "pixels"))

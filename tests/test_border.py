@@ -388,6 +388,9 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
     def add_rows(rows: Any, values: Any, sums: Any) -> None:
         _rust.add_rows([(rows, values)], sums, 0.5)
 
+    def all_below(single: Any, double: Any) -> bool:
+        return _rust.all_below([single, double], 10.0)
+
     def add_harmonics(rows: Any, colors: Any, means: Any, high: Any) -> None:
         _rust.add_harmonics([(rows, colors, [0.0, 0.0, 0.0], 1)], means, high, 0.5)
 
@@ -439,6 +442,14 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         "add_rows": (
             add_rows, {**rows, "values": np.ones((2, 5), np.float32), "sums": np.zeros((4, 5), np.float32)}
         ),
+        "add_pulls": (
+            _rust.add_pulls,
+            {
+                "gradient": np.ones((12, 2), np.float32), "radii": np.ones((12, 2), np.int32),
+                "sums": np.zeros(12, np.float32), "views": np.zeros(12, np.float32), "half": (15.0, 10.0),
+            },
+        ),
+        "all_below": (all_below, {"single": np.ones((12, 4), np.float32), "double": np.ones(12)}),
         "add_harmonics": (
             add_harmonics,
             {
@@ -465,7 +476,7 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
 
 
 # What a message calls an argument; by function where it depends on it.
-PUBLIC = {"ks": "Ks", "rest": r"colors\[1\]", "project_forward of harmonics colors": r"colors\[0\]"}
+PUBLIC = {"ks": "Ks", "single": "arrays", "double": "arrays", "rest": r"colors\[1\]", "project_forward of harmonics colors": r"colors\[0\]"}
 ARRAYS = [
     (call, name)
     for call, (_, arguments) in calls().items()
@@ -498,10 +509,13 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         ("photometric", "render"),
         ("ssim", "a"),
         ("add_rows", "sums"),
+        ("add_pulls", "gradient"),
+        ("all_below", "single"),
+        ("all_below", "double"),
         ("agreed_depths", "first"),
         ("agreed_depths", "others"),
     }
-    free = call == "data_pointer" or (
+    free = call in ("data_pointer", "all_below") or (
         leading and (call in ("adam_step", "cell_distance") or change == "one more")
     )
     free |= change == "one more" and (call == "Separable" or (call, name) == ("project_forward", "colors"))

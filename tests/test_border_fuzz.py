@@ -15,7 +15,12 @@ from hypothesis import strategies as st
 from test_border import calls
 
 CALLS = calls()
-WRITTEN = {"adam_step": ("param", "exp_avg", "exp_avg_sq"), "add_rows": ("sums",), "add_harmonics": ("high",)}
+WRITTEN = {
+    "adam_step": ("param", "exp_avg", "exp_avg_sq"),
+    "add_rows": ("sums",),
+    "add_pulls": ("sums", "views"),
+    "add_harmonics": ("high",),
+}
 REFUSALS = (ValueError, TypeError, OverflowError, MemoryError)  # a panic is none of them
 
 

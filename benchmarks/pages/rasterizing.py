@@ -23,14 +23,28 @@ def stages_table(passes: DataFrame) -> str:
     return table(["Gaussians", *stages, "whole", "whole / limit", "lanes in use"], body)
 
 
+def threads_tables(runs: DataFrame) -> list[str]:
+    """Each case by stage and number of threads, and how many times as fast as one thread."""
+    tables = []
+    for case, part in runs.groupby("case", sort=False):
+        stages = [name for name, _ in pairs_of(part.iloc[0]["stages"])]
+        body = [
+            [f"{line['threads']:.0f}", *(number(value, "ms") for _, value in pairs_of(line["stages"])),
+             number(line["seconds"], "ms"), f"{line['ratio']:.2f}", f"{line['expected']:.2f}"]
+            for line in records(part)
+        ]  # fmt: skip
+        tables.append(table([str(case), *stages, "whole", "times one", "expected of two"], body))
+    return tables
+
+
 def cases_in_ms(runs: DataFrame) -> str:
     """`42 (3dgs, 100,000) and 64 (3dgs, 200,000)`."""
     return and_list([f"{number(line['seconds'], 'ms')} ({line['case']})" for line in records(runs)])
 
 
 def threads_words(runs: DataFrame) -> str:
-    """How many times as fast several threads are."""
-    many = runs.loc[runs["threads"] > 1]
+    """How many times as fast two threads are."""
+    many = runs.loc[runs["threads"] == 2]
     words = [f"{line['case'].rsplit(', ', 1)[0]} {line['ratio']:.2f}" for line in records(many)]
     return f"two are times as fast as one: {and_list(words)}" if words else "there was one"
 

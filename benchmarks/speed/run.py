@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,21 @@ from typing import Any
 import hqgs
 from benchmarks.command import TIMED, Benchmark, UnavailableError, sizes_of
 from benchmarks.pages.figures import listed, pick
-from benchmarks.pages.rasterizing import power, stages_table
+from benchmarks.pages.rasterizing import power, stages_table, threads_tables
 from benchmarks.protocol import read_toml
 from benchmarks.rows import Table, facts
 from benchmarks.speed.inputs import RasterInputs, fitted, make_inputs
-from benchmarks.speed.rasterizer import RasterPass, measure
-from benchmarks.speed.timing import interleaved, median_ratio, using_threads, warmed, whole
-from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, whole_step
+from benchmarks.speed.rasterizer import BIN, RasterPass, measure
+from benchmarks.speed.timing import (
+    Seconds,
+    expected_ratio,
+    interleaved,
+    median_ratio,
+    using_threads,
+    warmed,
+    whole,
+)
+from benchmarks.speed.training import make_trainer, measure_memory, measure_steps, step_by_parts
 from hqgs.training.config import METHODS, PAPER, HQGSConfig, check_method
 from hqgs.training.methods.paper import VARIANTS
 from hqgs.training.trainer import Trainer
@@ -74,14 +83,17 @@ class Speed:
         return self.step({f"3dgs, {n:,}": self._trainer(n, "3dgs")} | trainers)
 
     def threads(self) -> Rows:
-        """Both with 1, 2, 4, ... threads and with all; `ratio`: how many times as fast as with one."""
+        """All sizes and a step with 1, 2, 4, ... threads and with all.
+
+        `ratio`: how many times as fast as with one; `expected`: what follows of one and two.
+        """
         if hqgs.get_num_threads() == 1:
             raise UnavailableError("there is one thread")
-        middle, trainer = self.inputs[len(self.inputs) // 2], next(iter(self.trainers.values()))
-        cases = {
-            f"rasterizer, {len(middle):,} Gaussians": RasterPass(middle),
-            f"training step, {len(trainer.gaussians):,} Gaussians": whole_step(trainer),
+        trainer = next(iter(self.trainers.values()))
+        cases: dict[str, Callable[[], Seconds]] = {
+            f"rasterizer, {len(x):,} Gaussians": RasterPass(x) for x in self.inputs
         }
+        cases[f"training step, {len(trainer.gaussians):,} Gaussians"] = step_by_parts(trainer)
         most = hqgs.get_num_threads()
         counts = sorted({most, *(1 << k for k in range(most.bit_length()))})
         jobs = {
@@ -95,7 +107,9 @@ class Speed:
                 "case": name,
                 **whole(rounds),
                 "ratio": median_ratio(measured[name, 1], rounds),
+                "expected": expected_ratio(median_ratio(measured[name, 1], measured[name, 2]), count),
                 "threads": count,
+                "stages": rounds.drop(columns=["total", BIN], errors="ignore").median().to_dict(),
             }
             for (name, count), rounds in measured.items()
         ]
@@ -154,6 +168,8 @@ def run(args: argparse.Namespace) -> list[str]:
     tables = [listed(runs, {name: how for name, how in SHOWN.items() if name in runs})]
     if "rasterizer" in args.parts:
         tables.append(stages_table(pick(runs, part="rasterizer")))
+    if "threads" in runs["part"].values:
+        tables += threads_tables(pick(runs, part="threads"))
     if "scaling" in args.parts:
         powers = f"{power(runs, 'gaussians')} with the Gaussians, {power(runs, 'pixels')} with the pixels"
         tables.append(f"Power with which the time grows: {powers}.")

@@ -72,6 +72,13 @@ def median_ratio(rounds: DataFrame, others: DataFrame) -> float:
     return float((rounds["total"] / others["total"]).median())
 
 
+def expected_ratio(two: float, threads: int) -> float:
+    """How many times as fast as one thread so many are, where two are `two` times as fast and a share of the
+    work is for one thread alone (Amdahl 1967)."""
+    serial = 2 / two - 1
+    return 1 / (serial + (1 - serial) / threads)
+
+
 def whole(rounds: DataFrame) -> dict[str, float]:
     """Median and quartiles of the whole, as columns."""
     low, high = quartiles(rounds["total"])

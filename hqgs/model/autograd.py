@@ -72,13 +72,13 @@ class _Project(torch.autograd.Function):
     def forward(
         ctx: Any, means, quats, scales, opacities, covars, colors, rest, viewmats, Ks, config, enabled
     ):
-        width, height, options, sh_degree = config
+        width, height, options, activate, sh_degree = config
         needs_means, *geometry, needs_harmonics, needs_rest, needs_viewmats = ctx.needs_input_grad[:8]
         colors_vary = needs_means or needs_viewmats or needs_harmonics or needs_rest
-        options = (*options, enabled and colors_vary)
+        others = (*options, enabled and colors_vary), sh_degree, activate
         inputs = _numpy(means), _numpy(quats), _numpy(scales), _numpy(opacities), _numpy(colors)
         frame, *arrays = _rust.project_forward(
-            *inputs, _optional(rest), _numpy(viewmats), _numpy(Ks), width, height, options, sh_degree
+            *inputs, _optional(rest), _numpy(viewmats), _numpy(Ks), width, height, *others
         )
         n, c = means.shape[0], viewmats.shape[0]
         means2d, depths, conics, radii, alphas, sh_colors = map(torch.from_numpy, arrays)

@@ -219,8 +219,8 @@ class Gaussians:
         return rasterization(
             self.means,
             self.quats,
-            self.activated_scales(),
-            self.activated_opacities(),
+            self.scales,
+            self.opacities,
             own if colors is None else colors,
             torch.tensor(camera.viewmat[None]),
             torch.tensor(camera.K[None]),
@@ -233,6 +233,7 @@ class Gaussians:
             near_plane=near_plane,
             packed=False,
             rasterize_mode="antialiased" if self.antialiased else "classic",
+            activate=True,
         )
 
     def save(self, path: str | Path, format: str | None = None) -> int:

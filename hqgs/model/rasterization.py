@@ -90,6 +90,7 @@ def rasterization(
     camera_model: str = "pinhole",
     *,
     covars: Tensor | None = None,
+    activate: bool = False,
     **unsupported: object,
 ) -> tuple[Tensor, Tensor, RasterizationMeta]:
     """Render N Gaussians into C pinhole cameras; code written for `gsplat.rasterization` runs unchanged.
@@ -119,6 +120,7 @@ def rasterization(
         rasterize_mode: "classic", or "antialiased" (opacities compensated for the low-pass, Mip-Splatting).
         covars: covariances [N, 3, 3] in place of `quats` and `scales`, which are not looked at then. As for
             gsplat, the entries on and above the diagonal count, those above it for two, and get the gradient.
+        activate: `scales` and `opacities` are what training holds, logarithms and logits; so are gradients.
         packed: whether the meta data hold only what is not culled. Images and gradients are the same.
         tile_size, sparse_grad, channel_chunk: hints of other implementations; they change no image. There are
             no tile lists (`tiles_per_gauss`, `isect_ids`, `flatten_ids`, `isect_offsets`: a KeyError that
@@ -140,6 +142,8 @@ def rasterization(
     refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
     colors, rest = colors if isinstance(colors, tuple) else (colors, None)
     upper = None if covars is None else upper_entries(covars, means)
+    if upper is not None and activate:
+        raise ValueError("activate: not with covars, which are no logarithms")
     if upper is not None:
         quats, scales = quats_and_scales(upper)
     tensors: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
@@ -174,7 +178,7 @@ def rasterization(
     check_colors(one["colors"], one.get("colors[1]"), n, c, sh_degree)
 
     numbers = (float(near_plane), float(far_plane), float(radius_clip), float(eps2d))
-    config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), sh_degree)
+    config = (int(width), int(height), (*numbers, rasterize_mode == "antialiased"), activate, sh_degree)
     projected = [_project(scene, config) for scene in scenes]
     ids = [(s["radii"] > 0).all(-1).nonzero(as_tuple=True) for s in projected] if packed else None
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
@@ -57,10 +58,8 @@ class Densifier:
 
     def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
-        norm = gradient_norms(means2d_grad, width, height)
-        visible = (radii > 0).all(dim=1)
-        self.grad_sum += torch.where(visible, norm, 0.0)
-        self.count += visible
+        given = (t.contiguous().numpy() for t in (self.grad_sum, self.count, means2d_grad, radii))
+        _rust.add_pulls(*given, (width / 2, height / 2))
 
     def note(self, rows: Tensor, norms: Tensor) -> None:
         """Add one view that shows the Gaussians of these rows, [M], with `gradient_norms` [M]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from hqgs import _rust
 from hqgs.evaluation.records import GuardEvent, GuardRecord
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
@@ -78,7 +79,7 @@ def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -
         for param in group["params"]
         if param.grad is not None
     ]
-    if all(map(is_sound, (*named.values(), *(grad for _, grad in others)))):
+    if are_sound([*named.values(), *(grad for _, grad in others)]):
         return None
     if render.grad is not None and not torch.isfinite(render.grad).all():
         return Fault("gradient", ["render"], torch.zeros(len(gaussians), dtype=torch.bool))
@@ -94,19 +95,15 @@ def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
     """Where a Gaussian is not finite. shN is looked at after a change of rows: its gradients are finite, so
     nothing else can spoil it."""
     named = {n: t for n, t in gaussians.named().items() if n != "shN" or rows_changed}
-    if all(map(is_sound, named.values())):
+    if are_sound(named.values()):
         return None
     names, rows = bad_rows(gaussians.named())
     return Fault("parameter", names, rows) if names else None
 
 
-def is_sound(tensor: Tensor) -> bool:
-    """Whether no value can be NaN, Inf or beyond GUARD_LIMIT. One pass; False may be a false alarm.
-
-    The sum of squares has no term that another one could cancel.
-    """
-    values = tensor.detach().reshape(-1)
-    return float(torch.dot(values, values)) < GUARD_LIMIT**2
+def are_sound(tensors: Iterable[Tensor]) -> bool:
+    """Whether no value of float32 or float64 tensors is NaN, Inf or beyond GUARD_LIMIT."""
+    return _rust.all_below([tensor.detach().contiguous().numpy() for tensor in tensors], GUARD_LIMIT)
 
 
 def bad_rows(tensors: Mapping[str, Tensor]) -> tuple[list[str], Tensor]:

@@ -369,7 +369,7 @@ fn backward_chunk<S: Simd, T: Real>(
             chunk.put(&zeros, rows);
             continue;
         }
-        inputs.read(simd, gaussians, first);
+        inputs.read(simd, gaussians, first, options.activate);
         if let Some(shading) = shading {
             counts.backward_harmonics += (rows * sh::count(shading.degree)) as u64;
             let (means, v_colors) = (&inputs.means, &cotangents.colors);
@@ -405,6 +405,11 @@ fn backward_chunk<S: Simd, T: Real>(
                 let v_mean = colors.mean_vjp(simd, at, valid);
                 grad.mean = grad.mean + v_mean;
                 camera_grad.center = camera_grad.center - v_mean;
+            }
+            if options.activate {
+                grad.scale = grad.scale.times(wide3(simd, &inputs.scales, at));
+                let opacity = inputs.opacities.wide(simd, at);
+                v_opacity *= opacity * (splat_lanes(simd, 1.0) - opacity);
             }
             out.set(simd, at, &grad, v_opacity, valid, zero);
         }

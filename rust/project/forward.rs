@@ -318,7 +318,7 @@ fn forward_chunk<S: Simd, T: Real>(
             // A processor fetches ahead within a page, of which a group takes the most part.
             Coefficients::prefetch(h, first + GROUP);
         }
-        inputs.read(simd, gaussians, first);
+        inputs.read(simd, gaussians, first, options.activate);
         let mut keep = group.project(simd, &inputs, camera, &camera_lanes, options, directed);
         if rows < GROUP {
             keep &= (1 << rows) - 1;

@@ -20,7 +20,9 @@ use crate::{
     simd::{
         Level, Real, Wide,
         groups::{self, Column, GROUP, wide3},
-        lanes, splat,
+        lanes,
+        math::exp,
+        splat,
     },
     uninit::{UninitPiece, UninitVec},
 };
@@ -43,6 +45,9 @@ pub struct RenderOptions {
     pub antialiased: bool,
     /// Keep what the gradients need of the harmonics.
     pub differentiable: bool,
+    /// Scales and opacities come as training holds them, as logarithms and logits: exp and the sigmoid are taken first,
+    /// and the gradients are of what is given.
+    pub activate: bool,
     /// What trades accuracy for time, in this and the later stages.
     #[doc(hidden)]
     pub knobs: AccuracyKnobs,
@@ -60,6 +65,7 @@ impl Default for RenderOptions {
             eps2d: EPS2D,
             antialiased: false,
             differentiable: true,
+            activate: false,
             knobs: AccuracyKnobs::default(),
             level: None,
         }
@@ -164,11 +170,23 @@ impl<T: Real> Columns<T> {
     };
 
     #[inline(always)]
-    fn read<S: Simd>(&mut self, simd: S, g: &Gaussians<T>, first: usize) {
+    fn read<S: Simd>(&mut self, simd: S, g: &Gaussians<T>, first: usize, activate: bool) {
         groups::read(simd, g.means, first, &mut self.means);
         groups::read(simd, g.quats, first, &mut self.quats);
         groups::read(simd, g.scales, first, &mut self.scales);
         self.opacities.load(g.opacities, first);
+        if activate {
+            for at in (0..GROUP).step_by(lanes::<S>()) {
+                for scale in &mut self.scales {
+                    let logarithm = scale.wide(simd, at);
+                    scale.round(simd, at, exp(simd, logarithm));
+                }
+                let logit = self.opacities.wide(simd, at);
+                let one = splat(simd, 1.0);
+                self.opacities
+                    .round(simd, at, one / (one + exp(simd, -logit)));
+            }
+        }
     }
 
     /// The geometry of the Gaussians `at..` of the group.

@@ -1,11 +1,12 @@
 //! Arrays in and out. They come in as [`Array`] or [`ArrayMut`] alone, which check all that can be wrong with them,
 //! overlaps among them.
 
-use crate::error::BindingResult;
+use crate::{error::BindingResult, threads};
 use hqgs::internals::{
     Error,
-    memory::{self, with_capacity},
+    memory::with_capacity,
     simd::Real,
+    uninit::zeros,
 };
 use numpy::{
     Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
@@ -263,8 +264,8 @@ pub(crate) fn filled<T>(
 }
 
 /// A gradient to be filled, with no elements if it is not `wanted`.
-pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> Result<Vec<T>, Error> {
-    memory::filled(T::ZERO, if wanted { len } else { 0 }, "gradient")
+pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> BindingResult<Vec<T>> {
+    Ok(threads::install(|| zeros(if wanted { len } else { 0 }, "gradient"))??)
 }
 
 /// One array of every camera's outputs, one after the other, [C, ...].

@@ -6,6 +6,7 @@ use crate::threads;
 use hqgs::{Error, Real};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
+    growth::{self, Pulls},
     loss::{self, LossOptions, LossScratch, Sample},
     views::{self, ViewColors, ViewRows},
 };
@@ -19,6 +20,8 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(ssim, m)?)?;
     m.add_function(wrap_pyfunction!(adam_step, m)?)?;
     m.add_function(wrap_pyfunction!(add_rows, m)?)?;
+    m.add_function(wrap_pyfunction!(add_pulls, m)?)?;
+    m.add_function(wrap_pyfunction!(all_below, m)?)?;
     m.add_function(wrap_pyfunction!(add_harmonics, m)?)
 }
 
@@ -247,6 +250,50 @@ fn add_rows(
     Ok(sums
         .py()
         .detach(|| threads::install(|| views::add(&views, target, width, scale)))??)
+}
+
+/// See [`Pulls::add`]: the `gradient [N, 2]` of one view is added to `sums [N]` and `views [N]`, all f32, where `radii
+/// [N, 2] i32` are not 0.
+#[pyfunction]
+fn add_pulls(
+    sums: &Bound<'_, PyAny>,
+    views: &Bound<'_, PyAny>,
+    gradient: &Bound<'_, PyAny>,
+    radii: &Bound<'_, PyAny>,
+    half: [f32; 2],
+) -> BindingResult<()> {
+    let py = sums.py();
+    let (gradient, n) = Array::<f32>::new("gradient", gradient)?.of_width(2)?;
+    let radii = Array::<i32>::new("radii", radii)?.of_shape(&[n, 2])?;
+    let mut sums = ArrayMut::<f32>::new("sums", sums)?.of_shape(&[n])?;
+    let mut views = ArrayMut::<f32>::new("views", views)?.of_shape(&[n])?;
+    let mut pulls = Pulls {
+        sums: sums.slice()?,
+        views: views.slice()?,
+    };
+    let (gradient, radii) = (gradient.slice()?, radii.slice()?);
+    Ok(py.detach(|| threads::install(|| pulls.add(gradient, radii, half)))??)
+}
+
+/// See [`growth::all_below`]: of several arrays, f32 or f64.
+#[pyfunction]
+fn all_below(py: Python<'_>, arrays: Vec<Bound<'_, PyAny>>, limit: f64) -> BindingResult<bool> {
+    let (mut single, mut double) = (Vec::new(), Vec::new());
+    for array in &arrays {
+        if is_f32("arrays", array)? {
+            single.push(Array::<f32>::new("arrays", array)?);
+        } else {
+            double.push(Array::<f64>::new("arrays", array)?);
+        }
+    }
+    let single: Vec<_> = single.iter().map(Array::slice).collect::<BindingResult<_>>()?;
+    let double: Vec<_> = double.iter().map(Array::slice).collect::<BindingResult<_>>()?;
+    py.detach(|| {
+        threads::install(|| {
+            single.iter().all(|values| growth::all_below(values, limit))
+                && double.iter().all(|values| growth::all_below(values, limit))
+        })
+    })
 }
 
 /// `(rows [M] i32, colors [M, 3] f32, centre, degree)`

@@ -52,6 +52,15 @@ impl<T: Real> Column<T> {
         values.store_slice(&mut self.0[at..at + Lanes::<T, S>::LEN]);
     }
 
+    /// Set the Gaussians `at..` to the nearest values of this type.
+    #[inline(always)]
+    pub fn round<S: Simd>(&mut self, _: S, at: usize, values: Wide<S>) {
+        let out = &mut self.0[at..at + lanes::<S>()];
+        for lane in 0..lanes::<S>() {
+            out[lane] = T::from_f64(values[lane]);
+        }
+    }
+
     /// Set the Gaussians `at..` to the nearest finite values of this type.
     #[inline(always)]
     pub fn saturate<S: Simd>(&mut self, _: S, at: usize, values: Wide<S>) {

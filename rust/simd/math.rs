@@ -1,7 +1,7 @@
 //! Functions that the standard library has for numbers, lane by lane.
 
 use super::{Lanes, Wide, splat};
-use fearless_simd::{Simd, SimdBase, SimdFloat};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 
 /// Coefficients of `2^f` on [-0.5, 0.5], constant term first: minimax in the relative error (1.9e-9).
 const EXP2_F32: [f32; 7] = [
@@ -61,6 +61,15 @@ pub(super) fn exp2_f64<S: Simd>(simd: S, x: Lanes<f64, S>) -> Lanes<f64, S> {
         52u32,
         EXP2_F64
     )
+}
+
+/// `e^x` with a relative error below (1 + |x|) 2e-16, and never less than the smallest normal number; NaN stays.
+#[inline(always)]
+pub(crate) fn exp<S: Simd>(simd: S, x: Wide<S>) -> Wide<S> {
+    const LN_MAX: f64 = 709.782_712_893_384; // of the largest number
+    let power = exp2_f64(simd, x.min(splat(simd, LN_MAX)) * std::f64::consts::LOG2_E);
+    let finite = x.simd_le(splat(simd, LN_MAX)).select(power, splat(simd, f64::INFINITY));
+    x.simd_eq(x).select(finite, x)
 }
 
 /// Coefficients of `2 atanh(r) / r` in powers of `r^2`.

@@ -2,17 +2,17 @@
 //!
 //! For any training: [`loss`], the usual loss on pictures with its gradient, and [`adam`]. How photos come about, each
 //! with its gradient: [`exposure`] is a camera that moves while its shutter is open, [`separable`] blurs and shrinks,
-//! [`jpeg_cells`] knows what a compressed file leaves open. [`views`] adds the gradients of several views, and
-//! [`stereo`] finds where photos agree on a surface, for points to start from.
+//! [`jpeg_cells`] knows what a compressed file leaves open. [`views`] adds the gradients of several views,
+//! [`growth`] gathers what densification goes by, and [`stereo`] finds where photos agree on a surface, for points to start from.
 //!
 //! Arrays are row-major slices, results the same bits for any number of threads, which are those of rayon's current
 //! pool. `examples/fit_image.rs` fits Gaussians to a picture.
 
 pub mod adam;
 pub mod exposure;
+pub mod growth;
 pub mod jpeg_cells;
 pub mod loss;
-
 pub mod separable;
 pub mod stereo;
 pub mod views;

@@ -79,4 +79,5 @@ class _Photometric(torch.autograd.Function):
         ctx: Any, v_loss: Tensor
     ) -> tuple[Tensor, None, None, None, None]:
         (grad,) = ctx.saved_tensors
-        return v_loss * grad, None, None, None, None
+        # A product with 1 would be one more pass through the image.
+        return grad if v_loss == 1 else v_loss * grad, None, None, None, None

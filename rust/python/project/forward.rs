@@ -67,7 +67,7 @@ fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
 /// Project Gaussians; see `hqgs/model/rasterization.py` for the shapes. `colors` are harmonics if there is a degree.
 /// `knobs`, which also hold for the later stages, are for the benchmark of error against run time alone.
 #[pyfunction]
-#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, knobs=None))]
+#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, activate=false, knobs=None))]
 pub(super) fn project_forward<'py>(
     means: &Bound<'py, PyAny>,
     quats: &Bound<'py, PyAny>,
@@ -81,6 +81,7 @@ pub(super) fn project_forward<'py>(
     height: usize,
     options: (f64, f64, f64, f64, bool, bool),
     sh_degree: Option<usize>,
+    activate: bool,
     knobs: Option<Knobs>,
 ) -> BindingResult<Bound<'py, PyAny>> {
     let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
@@ -91,6 +92,7 @@ pub(super) fn project_forward<'py>(
         eps2d,
         antialiased,
         differentiable,
+        activate,
         knobs: accuracy_knobs(knobs)?,
         level: None,
     };
