@@ -476,7 +476,13 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
 
 
 # What a message calls an argument; by function where it depends on it.
-PUBLIC = {"ks": "Ks", "single": "arrays", "double": "arrays", "rest": r"colors\[1\]", "project_forward of harmonics colors": r"colors\[0\]"}
+PUBLIC = {
+    "ks": "Ks",
+    "single": "arrays",
+    "double": "arrays",
+    "rest": r"colors\[1\]",
+    "project_forward of harmonics colors": r"colors\[0\]",
+}
 ARRAYS = [
     (call, name)
     for call, (_, arguments) in calls().items()

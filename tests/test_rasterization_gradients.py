@@ -279,3 +279,33 @@ def test_harmonics_in_two_tensors_are_those_in_one(sh_degree: int, dtype: torch.
     assert one.means.grad.abs().sum() > 0
     assert two.means.grad is not None
     assert torch.equal(one.means.grad, two.means.grad)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@both_dtypes
+def test_logarithms_and_logits_are_activated(dtype: torch.dtype, antialiased: bool) -> None:
+    scene = random_scene(200, 60, 45, seed=6, dtype=dtype, sh_degree=1).with_grad("means", "colors")
+    others: dict[str, Any] = {"rasterize_mode": "antialiased" if antialiased else "classic"}
+    raw = {"scales": scene.scales.log(), "opacities": scene.opacities.logit()}
+    weights = torch.rand(1, 45, 60, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
+
+    def gradients(activate: bool) -> tuple[Tensor, ...]:
+        given = {name: tensor.detach().clone().requires_grad_() for name, tensor in raw.items()}
+        seen = (
+            given
+            if activate
+            else {"scales": given["scales"].exp(), "opacities": given["opacities"].sigmoid()}
+        )
+        image, _, _ = hqgs.rasterization(**scene.arguments(**seen, **others), activate=activate)
+        leaves = (*given.values(), scene.means, scene.colors)
+        return image, *torch.autograd.grad((image * weights).sum(), leaves)
+
+    for found, expected in zip(gradients(True), gradients(False), strict=True):
+        assert (found - expected).norm() < TOLERANCE[dtype] * expected.norm()
+
+
+def test_covariances_have_no_logarithm() -> None:
+    scene = random_scene(3, 8, 6)
+    covars = torch.eye(3, dtype=F64).expand(3, 3, 3)
+    with pytest.raises(ValueError, match="activate: not with covars"):
+        hqgs.rasterization(**scene.arguments(covars=covars), activate=True)

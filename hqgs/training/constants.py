@@ -71,6 +71,7 @@ TRIAL_GAIN = 0.1  # dB on the photos held back, and its standard error: less gro
 
 # The guard. Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.
 GUARD_LIMIT = 1e18
+LOG_LIMIT = 88.7228  # of the scales' logarithms: exp of more overflows 32 bits
 EVENTS_KEPT, GAUSSIANS_LISTED = 20, 10  # the first events, and the first Gaussians that an event names
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 

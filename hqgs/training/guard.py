@@ -14,7 +14,7 @@ from hqgs import _rust
 from hqgs.evaluation.records import GuardEvent, GuardRecord
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
-from hqgs.training.constants import EVENTS_KEPT, GAUSSIANS_LISTED, GUARD_LIMIT
+from hqgs.training.constants import EVENTS_KEPT, GAUSSIANS_LISTED, GUARD_LIMIT, LOG_LIMIT
 
 
 @dataclass
@@ -95,23 +95,23 @@ def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
     """Where a Gaussian is not finite. shN is looked at after a change of rows: its gradients are finite, so
     nothing else can spoil it."""
     named = {n: t for n, t in gaussians.named().items() if n != "shN" or rows_changed}
-    if are_sound(named.values()):
+    if are_sound(named.values()) and are_sound([gaussians.scales], LOG_LIMIT):
         return None
-    names, rows = bad_rows(gaussians.named())
+    names, rows = bad_rows(gaussians.named(), scales=LOG_LIMIT)
     return Fault("parameter", names, rows) if names else None
 
 
-def are_sound(tensors: Iterable[Tensor]) -> bool:
-    """Whether no value of float32 or float64 tensors is NaN, Inf or beyond GUARD_LIMIT."""
-    return _rust.all_below([tensor.detach().contiguous().numpy() for tensor in tensors], GUARD_LIMIT)
+def are_sound(tensors: Iterable[Tensor], limit: float = GUARD_LIMIT) -> bool:
+    """Whether no value of float32 or float64 tensors is NaN, Inf or beyond the limit."""
+    return _rust.all_below([tensor.detach().contiguous().numpy() for tensor in tensors], limit)
 
 
-def bad_rows(tensors: Mapping[str, Tensor]) -> tuple[list[str], Tensor]:
-    """The names of the tensors [N, ...] with a value that is not finite or beyond GUARD_LIMIT, and which rows
-    have one in any tensor, bool [N]."""
+def bad_rows(tensors: Mapping[str, Tensor], **limits: float) -> tuple[list[str], Tensor]:
+    """The names of the tensors [N, ...] with a value that is not finite or beyond GUARD_LIMIT (or one of
+    `limits`), and which rows have one in any tensor, bool [N]."""
     names, rows = [], torch.zeros(len(next(iter(tensors.values()))), dtype=torch.bool)
     for name, tensor in tensors.items():
-        bad = ~(tensor.detach().abs() < GUARD_LIMIT).reshape(len(rows), -1).all(dim=1)
+        bad = ~(tensor.detach().abs() < limits.get(name, GUARD_LIMIT)).reshape(len(rows), -1).all(dim=1)
         if bad.any():
             names.append(name)
             rows |= bad

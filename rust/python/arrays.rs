@@ -2,12 +2,7 @@
 //! overlaps among them.
 
 use crate::{error::BindingResult, threads};
-use hqgs::internals::{
-    Error,
-    memory::with_capacity,
-    simd::Real,
-    uninit::zeros,
-};
+use hqgs::internals::{Error, memory::with_capacity, simd::Real, uninit::zeros};
 use numpy::{
     Element, PyArrayDyn, PyArrayMethods, PyReadonlyArrayDyn, PyReadwriteArrayDyn,
     PyUntypedArrayMethods,
@@ -265,7 +260,9 @@ pub(crate) fn filled<T>(
 
 /// A gradient to be filled, with no elements if it is not `wanted`.
 pub(crate) fn gradient<T: Real>(len: usize, wanted: bool) -> BindingResult<Vec<T>> {
-    Ok(threads::install(|| zeros(if wanted { len } else { 0 }, "gradient"))??)
+    Ok(threads::install(|| {
+        zeros(if wanted { len } else { 0 }, "gradient")
+    })??)
 }
 
 /// One array of every camera's outputs, one after the other, [C, ...].

@@ -286,8 +286,14 @@ fn all_below(py: Python<'_>, arrays: Vec<Bound<'_, PyAny>>, limit: f64) -> Bindi
             double.push(Array::<f64>::new("arrays", array)?);
         }
     }
-    let single: Vec<_> = single.iter().map(Array::slice).collect::<BindingResult<_>>()?;
-    let double: Vec<_> = double.iter().map(Array::slice).collect::<BindingResult<_>>()?;
+    let single: Vec<_> = single
+        .iter()
+        .map(Array::slice)
+        .collect::<BindingResult<_>>()?;
+    let double: Vec<_> = double
+        .iter()
+        .map(Array::slice)
+        .collect::<BindingResult<_>>()?;
     py.detach(|| {
         threads::install(|| {
             single.iter().all(|values| growth::all_below(values, limit))

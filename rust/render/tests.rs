@@ -280,6 +280,57 @@ fn check_single(level: Level) {
     }
 }
 
+/// What training holds gives the same picture, and gradients by the chain rule.
+#[test]
+fn logarithms_and_logits_are_activated() {
+    let s = Synthetic::<f64>::new(300, 60, 45, 2).unwrap();
+    let mut raw = Synthetic::<f64>::new(300, 60, 45, 2).unwrap();
+    raw.scales.iter_mut().for_each(|x| *x = x.ln());
+    raw.opacities
+        .iter_mut()
+        .for_each(|x| *x = (*x / (1.0 - *x)).ln());
+    at_each_level(|level| {
+        let options = options(level);
+        let activated = RenderOptions {
+            activate: true,
+            ..options
+        };
+        for antialiased in [false, true] {
+            let of = |s, options| {
+                let options = RenderOptions {
+                    antialiased,
+                    ..options
+                };
+                let r = render_with(s, &options);
+                let g = gradients(s, &r);
+                (r.image, g)
+            };
+            let ((image, mut g), (found, v)) = (of(&s, options), of(&raw, activated));
+            g.scales
+                .iter_mut()
+                .zip(&s.scales)
+                .for_each(|(v, x)| *v *= x);
+            let opacities = g.opacities.iter_mut().zip(&s.opacities);
+            opacities.for_each(|(v, x)| *v *= x * (1.0 - x));
+            let pairs = [
+                (&image, &found),
+                (&g.means, &v.means),
+                (&g.quats, &v.quats),
+                (&g.scales, &v.scales),
+                (&g.opacities, &v.opacities),
+                (&g.colors, &v.colors),
+            ];
+            for (k, (expected, found)) in pairs.into_iter().enumerate() {
+                let size = expected.iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+                assert!(size > 0.0);
+                for (x, y) in expected.iter().zip(found) {
+                    assert!((x - y).abs() < 1e-11 * size, "{k}: {x} {y}");
+                }
+            }
+        }
+    });
+}
+
 #[test]
 fn no_gaussians_and_none_visible_give_an_empty_image() {
     at_each_level(check_empty);

@@ -68,7 +68,9 @@ pub(super) fn exp2_f64<S: Simd>(simd: S, x: Lanes<f64, S>) -> Lanes<f64, S> {
 pub(crate) fn exp<S: Simd>(simd: S, x: Wide<S>) -> Wide<S> {
     const LN_MAX: f64 = 709.782_712_893_384; // of the largest number
     let power = exp2_f64(simd, x.min(splat(simd, LN_MAX)) * std::f64::consts::LOG2_E);
-    let finite = x.simd_le(splat(simd, LN_MAX)).select(power, splat(simd, f64::INFINITY));
+    let finite = x
+        .simd_le(splat(simd, LN_MAX))
+        .select(power, splat(simd, f64::INFINITY));
     x.simd_eq(x).select(finite, x)
 }
 
@@ -126,6 +128,25 @@ mod tests {
         at_each_level(|level| {
             let errors = [worst_error::<f32>(level), worst_error::<f64>(level)];
             assert!(errors[0] < 1.2e-7 && errors[1] < 3e-16, "{errors:?}");
+        });
+    }
+
+    #[inline(always)]
+    fn exponential<S: Simd>(simd: S, x: f64) -> f64 {
+        exp(simd, splat(simd, x))[0]
+    }
+
+    #[test]
+    fn exponential_is_as_accurate_as_stated() {
+        at_each_level(|level| {
+            let exp = |x| dispatch!(level.token, simd => exponential(simd, x));
+            for i in -70_000..70_900 {
+                let x = f64::from(i) * 0.01;
+                let error = (exp(x) / x.exp() - 1.0).abs();
+                assert!(error < (1.0 + x.abs()) * 2e-16, "exp {x}: {error}");
+            }
+            assert!(exp(709.78).is_finite() && exp(-1e300) < 1e-307 && exp(f64::NAN).is_nan());
+            assert_eq!([exp(709.79), exp(f64::INFINITY)], [f64::INFINITY; 2]);
         });
     }
 

@@ -38,7 +38,11 @@ impl Pulls<'_> {
                     // In f64, where the squares are exact and nothing overflows.
                     let [x, y] = [0, 1].map(|k| f64::from(g[k] * half[k]));
                     let visible = radii[0] > 0 && radii[1] > 0;
-                    *sum += if visible { (x * x + y * y).sqrt() as f32 } else { 0.0 };
+                    *sum += if visible {
+                        (x * x + y * y).sqrt() as f32
+                    } else {
+                        0.0
+                    };
                     *views += f32::from(u8::from(visible));
                 }
             });
@@ -74,7 +78,10 @@ mod tests {
         pulls.add(&gradient, &radii, [252.0, 189.0]).unwrap();
         for i in 0..n {
             let [x, y] = [252.0, 189.0].map(f64::from);
-            let (x, y) = (x * f64::from(gradient[2 * i]), y * f64::from(gradient[2 * i + 1]));
+            let (x, y) = (
+                x * f64::from(gradient[2 * i]),
+                y * f64::from(gradient[2 * i + 1]),
+            );
             let visible = 2 * i % 3 > 0 && (2 * i + 1) % 3 > 0;
             let expected = if visible { 1.0 + x.hypot(y) } else { 1.0 };
             assert!((f64::from(sums[i]) - expected).abs() < 1e-6 * expected);
