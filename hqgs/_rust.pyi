@@ -94,19 +94,15 @@ def agreed_depths(
 def cell_distance(
     x: Array, centres: Array, widths: Array, scale: float, want_grad: bool
 ) -> tuple[float, Array | None]: ...
-def adam_step(
-    param: Array,
-    grad: Array,
-    exp_avg: Array,
-    exp_avg_sq: Array,
-    step: int,
-    options: tuple[float, float, float, float],
-    used: int | None,
-) -> None: ...
+def adam_steps(
+    steps: list[tuple[Array, Array, Array, Array, int, tuple[float, float, float, float], int | None]],
+) -> None:
+    """Of each: the parameter, its gradient, both moments, the step, (lr, beta1, beta2, eps), what is used."""
+
 def add_pulls(
     sums: Array, views: Array, gradient: Array, radii: Array, half: tuple[float, float]
 ) -> None: ...
-def all_below(arrays: list[Array], limit: float) -> bool: ...
+def all_below(arrays: list[tuple[Array, float]]) -> bool: ...
 def add_rows(views: list[tuple[Array, Array]], sums: Array, scale: float) -> None: ...
 def add_harmonics(
     views: list[tuple[Array, Array, list[float], int]], means: Array, high: Array, scale: float

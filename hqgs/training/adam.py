@@ -56,7 +56,11 @@ class Adam(torch.optim.Optimizer):
         inspect.unwrap(Optimizer.add_param_group)(self, param_group)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        inspect.unwrap(Optimizer.zero_grad)(self, set_to_none)
+        if not set_to_none:
+            return inspect.unwrap(Optimizer.zero_grad)(self, set_to_none)
+        for group in self.param_groups:
+            for param in group["params"]:
+                param.grad = None
 
     def state_dict(self) -> dict[str, Any]:
         return inspect.unwrap(Optimizer.state_dict)(self)
@@ -81,26 +85,37 @@ class Adam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        moved = list[tuple[Tensor, dict[str, Any], int]]()
         for group in self.param_groups:
             if asked := [name for name in UNSUPPORTED if group.get(name)]:
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
             for param in group["params"]:
                 if param.grad is not None or group.get("used") == 0:
-                    self._update(param, group, 1 if views is None else views.get(param, 1))
+                    moved.append((param, group, 1 if views is None else views.get(param, 1)))
+        steps = [self._next_step(param) for param, *_ in moved]
+        written = [
+            (param, self._write(param, int(step), group, count))
+            for (param, group, count), step in zip(moved, steps, strict=True)
+            if group.get("used") != 0
+        ]
+        _rust.adam_steps([write for _, write in written])
+        for param, _ in written:
+            for tensor in (param, self.state[param]["exp_avg"], self.state[param]["exp_avg_sq"]):
+                increment_version(tensor)  # written behind torch's back
+        for (param, *_), step in zip(moved, steps, strict=True):
+            self.state[param]["step"] = step  # a new tensor: a loaded state dict may share the old one
         return loss
 
-    def _update(self, param: Tensor, group: dict[str, Any], views: int) -> None:
+    def _next_step(self, param: Tensor) -> Tensor:
         state = self.state[param]
         if not state:
             state["step"] = torch.tensor(0.0)
             state["exp_avg"] = torch.zeros_like(param)
             state["exp_avg_sq"] = torch.zeros_like(param)
-        step = state["step"] + 1
-        if group.get("used") != 0:
-            self._write(param, int(step), group, views)
-        state["step"] = step  # a new tensor: a loaded state dict may share the old one
+        return state["step"] + 1
 
-    def _write(self, param: Tensor, step: int, group: dict[str, Any], views: int) -> None:
+    def _write(self, param: Tensor, step: int, group: dict[str, Any], views: int) -> tuple[Any, ...]:
+        """What `_rust.adam_steps` is to do."""
         grad = param.grad
         assert grad is not None
         if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
@@ -113,9 +128,7 @@ class Adam(torch.optim.Optimizer):
         beta1, beta2 = group["betas"]
         options = (float(group["lr"]) * math.sqrt(views), beta1**views, beta2**views, group["eps"])
         used = group.get("used")
-        _rust.adam_step(values, grad.contiguous().numpy(), first, second, step, options, used)
-        for tensor in (param, *moments):
-            increment_version(tensor)  # written behind torch's back
+        return values, grad.contiguous().numpy(), first, second, step, options, used
 
 
 def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: int) -> None:

@@ -79,7 +79,7 @@ def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -
         for param in group["params"]
         if param.grad is not None
     ]
-    if are_sound([*named.values(), *(grad for _, grad in others)]):
+    if are_sound([*named.items(), *others]):
         return None
     if render.grad is not None and not torch.isfinite(render.grad).all():
         return Fault("gradient", ["render"], torch.zeros(len(gaussians), dtype=torch.bool))
@@ -95,15 +95,16 @@ def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
     """Where a Gaussian is not finite. shN is looked at after a change of rows: its gradients are finite, so
     nothing else can spoil it."""
     named = {n: t for n, t in gaussians.named().items() if n != "shN" or rows_changed}
-    if are_sound(named.values()) and are_sound([gaussians.scales], LOG_LIMIT):
+    if are_sound(named.items(), scales=LOG_LIMIT):
         return None
     names, rows = bad_rows(gaussians.named(), scales=LOG_LIMIT)
     return Fault("parameter", names, rows) if names else None
 
 
-def are_sound(tensors: Iterable[Tensor], limit: float = GUARD_LIMIT) -> bool:
-    """Whether no value of float32 or float64 tensors is NaN, Inf or beyond the limit."""
-    return _rust.all_below([tensor.detach().contiguous().numpy() for tensor in tensors], limit)
+def are_sound(tensors: Iterable[tuple[str, Tensor]], **limits: float) -> bool:
+    """Whether no value of float32 or float64 tensors is NaN, Inf or beyond GUARD_LIMIT (or one of `limits`)."""
+    arrays = ((name, tensor.detach().contiguous().numpy()) for name, tensor in tensors)
+    return _rust.all_below([(array, limits.get(name, GUARD_LIMIT)) for name, array in arrays])
 
 
 def bad_rows(tensors: Mapping[str, Tensor], **limits: float) -> tuple[list[str], Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -28,6 +29,12 @@ from hqgs.training.constants import (
     TAIL_PART,
 )
 from hqgs.training.plan import RunPlan
+
+
+@lru_cache(maxsize=2)
+def _order(seed: int, epoch: int, count: int) -> list[int]:
+    """The order of so many views in an epoch."""
+    return np.random.default_rng([seed, epoch]).permutation(count).tolist()
 
 
 @dataclass(frozen=True)
@@ -142,8 +149,7 @@ class Schedule:
         if self.holds(decisions):
             views = [k for k in views if k not in self.held]
         epoch, index = divmod(iteration - 1, len(views))
-        order = np.random.default_rng([self.config.seed, epoch]).permutation(len(views))
-        return views[order[index]]
+        return views[_order(self.config.seed, epoch, len(views))[index]]
 
     def part(self, iteration: int, decisions: Decisions) -> float:
         """Of the run that is done with this step, 0..1."""

@@ -110,10 +110,12 @@ pub fn backward<T: Real>(
                 Ok(())
             },
         )?;
+    let gradients = gather(input, &pair_grads, layout, wanted)?;
+    pair_grads.into_par_iter().for_each(drop); // to free them takes a while, too
     Ok(CompositeGrads {
         background,
         counts: counts.into_iter().fold(Counts::default(), Counts::plus),
-        ..gather(input, &pair_grads, layout, wanted)?
+        ..gradients
     })
 }
 

@@ -37,6 +37,14 @@ struct Composite {
     bin_seconds: f64,
 }
 
+impl Drop for Composite {
+    /// To free thousands of lists takes a while, in which the caller need not wait.
+    fn drop(&mut self) {
+        let views = std::mem::replace(&mut self.views, Box::new(()));
+        threads::spawn(move || drop(views));
+    }
+}
+
 /// One camera's tile lists and replay state.
 struct View<T> {
     tiles: Tiles<T>,

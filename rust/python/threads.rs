@@ -131,6 +131,18 @@ pub(crate) fn install<R: Send>(f: impl FnOnce() -> R + Send) -> BindingResult<R>
     Ok(pool.install(f))
 }
 
+/// Run `f` on the pool some time; here, where there is none.
+pub(crate) fn spawn(f: impl FnOnce() + Send + 'static) {
+    match Pool::of_this_process(None) {
+        Ok(pool) => pool
+            .pool
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .spawn(f),
+        Err(_) => f(),
+    }
+}
+
 /// Run `f` once on each thread of the pool.
 ///
 /// # Errors

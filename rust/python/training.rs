@@ -5,7 +5,7 @@ use crate::error::BindingResult;
 use crate::threads;
 use hqgs::{Error, Real};
 use hqgs_training::{
-    adam::{self, AdamArrays, AdamOptions, Selection},
+    adam::{self, AdamArrays, AdamOptions, AdamStep, Selection},
     growth::{self, Pulls},
     loss::{self, LossOptions, LossScratch, Sample},
     views::{self, ViewColors, ViewRows},
@@ -18,7 +18,7 @@ use std::cell::RefCell;
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(photometric, m)?)?;
     m.add_function(wrap_pyfunction!(ssim, m)?)?;
-    m.add_function(wrap_pyfunction!(adam_step, m)?)?;
+    m.add_function(wrap_pyfunction!(adam_steps, m)?)?;
     m.add_function(wrap_pyfunction!(add_rows, m)?)?;
     m.add_function(wrap_pyfunction!(add_pulls, m)?)?;
     m.add_function(wrap_pyfunction!(all_below, m)?)?;
@@ -162,63 +162,101 @@ fn ssim_as<'py, T: Buffered, Y: Sample<T> + Element>(
     Ok(value.map_err(|e| e.renamed("render", "a").renamed("target", "b"))?)
 }
 
-/// `adam::step`, in place on `param`, `exp_avg` and `exp_avg_sq`. `used`: of parameters [N, K, ...] the first so
-/// many of the K alone are updated.
+/// `(param, grad, exp_avg, exp_avg_sq, step, (lr, beta1, beta2, eps), used)`
+type StepOf<'py> = (
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    Bound<'py, PyAny>,
+    u64,
+    (f64, f64, f64, f64),
+    Option<usize>,
+);
+
+/// `adam::steps`, in place on `param`, `exp_avg` and `exp_avg_sq` of each. `used`: of parameters [N, K, ...] the first
+/// so many of the K alone are updated.
 #[pyfunction]
-fn adam_step(
-    param: &Bound<'_, PyAny>,
-    grad: &Bound<'_, PyAny>,
-    exp_avg: &Bound<'_, PyAny>,
-    exp_avg_sq: &Bound<'_, PyAny>,
-    step: u64,
-    options: (f64, f64, f64, f64),
-    used: Option<usize>,
-) -> BindingResult<()> {
-    let (lr, beta1, beta2, eps) = options;
-    let options = AdamOptions {
-        lr,
-        beta1,
-        beta2,
-        eps,
-    };
-    let update = if is_f32("param", param)? {
-        adam_step_as::<f32>
-    } else {
-        adam_step_as::<f64>
-    };
-    let in_place = [param, exp_avg, exp_avg_sq];
-    update(in_place, grad, step, &options, used)
+fn adam_steps(py: Python<'_>, steps: Vec<StepOf<'_>>) -> BindingResult<()> {
+    let (mut single, mut double) = (Vec::new(), Vec::new());
+    for step in &steps {
+        if is_f32("param", &step.0)? {
+            single.push(HeldStep::<f32>::new(step)?);
+        } else {
+            double.push(HeldStep::<f64>::new(step)?);
+        }
+    }
+    let single = single
+        .iter_mut()
+        .map(HeldStep::borrow)
+        .collect::<BindingResult<Vec<_>>>()?;
+    let double = double
+        .iter_mut()
+        .map(HeldStep::borrow)
+        .collect::<BindingResult<Vec<_>>>()?;
+    Ok(py.detach(|| {
+        threads::install(|| {
+            adam::check(&single)?;
+            adam::check(&double)?;
+            adam::steps(single).and_then(|()| adam::steps(double))
+        })
+    })??)
 }
 
-fn adam_step_as<T: Real + Element>(
-    in_place: [&Bound<'_, PyAny>; 3],
-    grad: &Bound<'_, PyAny>,
+/// The borrowed arrays of a step.
+struct HeldStep<'py, T: Element> {
+    param: ArrayMut<'py, T>,
+    grad: Array<'py, T>,
+    exp_avg: ArrayMut<'py, T>,
+    exp_avg_sq: ArrayMut<'py, T>,
     step: u64,
-    options: &AdamOptions,
-    used: Option<usize>,
-) -> BindingResult<()> {
-    let py = grad.py();
-    let mut param = ArrayMut::<T>::new("param", in_place[0])?;
-    let shape = param.shape().to_vec();
-    let mut exp_avg = ArrayMut::<T>::new("exp_avg", in_place[1])?.of_shape(&shape)?;
-    let mut exp_avg_sq = ArrayMut::<T>::new("exp_avg_sq", in_place[2])?.of_shape(&shape)?;
-    let grad = Array::<T>::new("grad", grad)?.of_shape(&shape)?;
-    if let Some(used) = used.filter(|used| shape.len() < 2 || *used > shape[1]) {
-        let message = format!("cannot update {used} columns of {shape:?}");
-        return Err(Error::new("used", message).into());
+    options: AdamOptions,
+    selection: Selection,
+}
+
+impl<'py, T: Real + Element> HeldStep<'py, T> {
+    fn new(
+        (param, grad, exp_avg, exp_avg_sq, step, options, used): &StepOf<'py>,
+    ) -> BindingResult<Self> {
+        let param = ArrayMut::<T>::new("param", param)?;
+        let shape = param.shape().to_vec();
+        if let Some(used) = used.filter(|used| shape.len() < 2 || *used > shape[1]) {
+            let message = format!("cannot update {used} columns of {shape:?}");
+            return Err(Error::new("used", message).into());
+        }
+        let width: usize = shape.iter().skip(1).product();
+        let (lr, beta1, beta2, eps) = *options;
+        Ok(Self {
+            param,
+            grad: Array::new("grad", grad)?.of_shape(&shape)?,
+            exp_avg: ArrayMut::new("exp_avg", exp_avg)?.of_shape(&shape)?,
+            exp_avg_sq: ArrayMut::new("exp_avg_sq", exp_avg_sq)?.of_shape(&shape)?,
+            step: *step,
+            options: AdamOptions {
+                lr,
+                beta1,
+                beta2,
+                eps,
+            },
+            selection: Selection {
+                width,
+                used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
+            },
+        })
     }
-    let width: usize = shape.iter().skip(1).product();
-    let selection = Selection {
-        width,
-        used: used.map_or(width, |used| used * shape[2..].iter().product::<usize>()),
-    };
-    let arrays = AdamArrays {
-        param: param.slice()?,
-        grad: grad.slice()?,
-        exp_avg: exp_avg.slice()?,
-        exp_avg_sq: exp_avg_sq.slice()?,
-    };
-    Ok(py.detach(|| threads::install(|| adam::step(arrays, step, options, &selection)))??)
+
+    fn borrow(&mut self) -> BindingResult<AdamStep<'_, T>> {
+        Ok(AdamStep {
+            arrays: AdamArrays {
+                param: self.param.slice()?,
+                grad: self.grad.slice()?,
+                exp_avg: self.exp_avg.slice()?,
+                exp_avg_sq: self.exp_avg_sq.slice()?,
+            },
+            step: self.step,
+            options: self.options,
+            selection: self.selection,
+        })
+    }
 }
 
 /// See [`views::add`]: `(rows [M] i32, values [M, W] f32)` of each view are added to `sums [N, W]`, f32.
@@ -275,31 +313,26 @@ fn add_pulls(
     Ok(py.detach(|| threads::install(|| pulls.add(gradient, radii, half)))??)
 }
 
-/// See [`growth::all_below`]: of several arrays, f32 or f64.
+/// See [`growth::all_below`]: of several arrays, f32 or f64, each with its limit.
 #[pyfunction]
-fn all_below(py: Python<'_>, arrays: Vec<Bound<'_, PyAny>>, limit: f64) -> BindingResult<bool> {
+fn all_below(py: Python<'_>, arrays: Vec<(Bound<'_, PyAny>, f64)>) -> BindingResult<bool> {
     let (mut single, mut double) = (Vec::new(), Vec::new());
-    for array in &arrays {
+    for (array, limit) in &arrays {
         if is_f32("arrays", array)? {
-            single.push(Array::<f32>::new("arrays", array)?);
+            single.push((Array::<f32>::new("arrays", array)?, *limit));
         } else {
-            double.push(Array::<f64>::new("arrays", array)?);
+            double.push((Array::<f64>::new("arrays", array)?, *limit));
         }
     }
-    let single: Vec<_> = single
+    let (single, double) = (slices(&single)?, slices(&double)?);
+    py.detach(|| threads::install(|| growth::all_below(&single) && growth::all_below(&double)))
+}
+
+fn slices<'a, T: Element>(arrays: &'a [(Array<'_, T>, f64)]) -> BindingResult<Vec<(&'a [T], f64)>> {
+    arrays
         .iter()
-        .map(Array::slice)
-        .collect::<BindingResult<_>>()?;
-    let double: Vec<_> = double
-        .iter()
-        .map(Array::slice)
-        .collect::<BindingResult<_>>()?;
-    py.detach(|| {
-        threads::install(|| {
-            single.iter().all(|values| growth::all_below(values, limit))
-                && double.iter().all(|values| growth::all_below(values, limit))
-        })
-    })
+        .map(|(array, limit)| Ok((array.slice()?, *limit)))
+        .collect()
 }
 
 /// `(rows [M] i32, colors [M, 3] f32, centre, degree)`

@@ -50,10 +50,14 @@ impl Pulls<'_> {
     }
 }
 
-/// Whether all values are nearer to 0 than `limit`; NaN is not.
-pub fn all_below<T: Real>(values: &[T], limit: f64) -> bool {
-    let limit = T::from_f64(limit);
-    values.par_chunks(CHUNK).all(|chunk| {
+/// Whether all values of several arrays are nearer to 0 than the limit of theirs; NaN is not.
+pub fn all_below<T: Real>(arrays: &[(&[T], f64)]) -> bool {
+    let mut tasks = Vec::new();
+    for &(values, limit) in arrays {
+        let limit = T::from_f64(limit);
+        tasks.extend(values.chunks(CHUNK).map(|chunk| (chunk, limit)));
+    }
+    tasks.into_par_iter().all(|(chunk, limit)| {
         // No early end: so it goes through as vectors.
         let inside = |x: &T| -limit < *x && *x < limit;
         chunk.iter().fold(true, |all, x| all & inside(x))
@@ -106,11 +110,13 @@ mod tests {
     #[test]
     fn one_value_out_of_bounds_is_found_wherever_it_lies() {
         let mut values = vec![-9.0f32; 2 * CHUNK + 5];
-        assert!(all_below(&values, 10.0) && all_below::<f64>(&[], 1.0));
+        let near = [1.0f32; 3];
+        assert!(all_below(&[(&near, 2.0), (&values, 10.0)]) && all_below::<f64>(&[]));
+        assert!(!all_below(&[(&near, 1.0), (&values, 10.0)]));
         for k in [0, CHUNK - 1, CHUNK, 2 * CHUNK + 4] {
             for bad in [10.0, -10.0, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
                 let good = std::mem::replace(&mut values[k], bad);
-                assert!(!all_below(&values, 10.0), "{bad} at {k}");
+                assert!(!all_below(&[(&near, 2.0), (&values, 10.0)]), "{bad} at {k}");
                 values[k] = good;
             }
         }

@@ -90,6 +90,19 @@ struct Factors<T> {
     eps: T,
 }
 
+/// A step of one array.
+#[derive(Debug)]
+pub struct AdamStep<'a, T> {
+    /// What it moves.
+    pub arrays: AdamArrays<'a, T>,
+    /// Its number, from 1.
+    pub step: u64,
+    /// Its settings.
+    pub options: AdamOptions,
+    /// What of the array it moves.
+    pub selection: Selection,
+}
+
 /// Make step number `step` (from 1) of what is selected.
 ///
 /// # Errors
@@ -103,6 +116,39 @@ pub fn step<T: Real>(
     step_at(simd::level()?, arrays, step, options, selection)
 }
 
+/// The steps of several arrays, shared out among the threads together.
+///
+/// # Errors
+/// As for [`step`]; then none has been made.
+pub fn steps<T: Real>(steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
+    steps_at(simd::level()?, steps)
+}
+
+/// Check several steps.
+///
+/// # Errors
+/// As for [`step`].
+pub fn check<T: Real>(steps: &[AdamStep<'_, T>]) -> Result<(), Error> {
+    steps.iter().try_for_each(|step| step.factors().map(|_| ()))
+}
+
+/// One task: what it moves, the factors, the numbers of a row and how many of them are moved.
+type Task<'a, T> = (AdamArrays<'a, T>, Factors<T>, usize, usize);
+
+fn steps_at<T: Real>(level: Level, steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
+    let mut tasks: Vec<Task<'_, T>> = Vec::new();
+    for step in steps {
+        step.cut(&mut tasks)?;
+    }
+    let level = level.token();
+    tasks
+        .into_par_iter()
+        .for_each(|(arrays, factors, width, used)| {
+            dispatch!(level, simd => update_rows(simd, &factors, arrays, width, used));
+        });
+    Ok(())
+}
+
 /// [`step`] with the vector instructions of `level`.
 fn step_at<T: Real>(
     level: Level,
@@ -111,33 +157,59 @@ fn step_at<T: Real>(
     options: &AdamOptions,
     selection: &Selection,
 ) -> Result<(), Error> {
-    let AdamArrays {
-        param,
-        grad,
-        exp_avg,
-        exp_avg_sq,
-    } = arrays;
-    let factors = options.factors(step)?;
-    let n = param.len();
-    check_len("grad", grad, n)?;
-    check_len("exp_avg", exp_avg, n)?;
-    check_len("exp_avg_sq", exp_avg_sq, n)?;
-    if n == 0 {
-        return Ok(());
+    let step = AdamStep {
+        arrays,
+        step,
+        options: *options,
+        selection: *selection,
+    };
+    steps_at(level, vec![step])
+}
+
+impl<'a, T: Real> AdamStep<'a, T> {
+    /// Its factors, if its arrays and settings fit.
+    fn factors(&self) -> Result<Factors<T>, Error> {
+        let factors = self.options.factors(self.step)?;
+        let n = self.arrays.param.len();
+        check_len("grad", self.arrays.grad, n)?;
+        check_len("exp_avg", self.arrays.exp_avg, n)?;
+        check_len("exp_avg_sq", self.arrays.exp_avg_sq, n)?;
+        if n > 0 {
+            self.selection.check(n)?;
+        }
+        Ok(factors)
     }
-    selection.check(n)?;
-    let Selection { width, used } = *selection;
-    let chunk = (CHUNK / width).max(1) * width;
-    let level = level.token();
-    param
-        .par_chunks_mut(chunk)
-        .zip(exp_avg.par_chunks_mut(chunk))
-        .zip(exp_avg_sq.par_chunks_mut(chunk))
-        .zip(grad.par_chunks(chunk))
-        .for_each(|(((param, m), v), grad)| {
-            dispatch!(level, simd => update_rows(simd, &factors, param, m, v, grad, width, used));
-        });
-    Ok(())
+
+    /// Add the tasks that make it up.
+    fn cut(self, tasks: &mut Vec<Task<'a, T>>) -> Result<(), Error> {
+        let factors = self.factors()?;
+        let AdamArrays {
+            param,
+            grad,
+            exp_avg,
+            exp_avg_sq,
+        } = self.arrays;
+        let Selection { width, used } = self.selection;
+        if param.is_empty() {
+            return Ok(());
+        }
+        let chunk = (CHUNK / width).max(1) * width;
+        let chunks = param
+            .chunks_mut(chunk)
+            .zip(exp_avg.chunks_mut(chunk))
+            .zip(exp_avg_sq.chunks_mut(chunk))
+            .zip(grad.chunks(chunk));
+        tasks.extend(chunks.map(|(((param, exp_avg), exp_avg_sq), grad)| {
+            let arrays = AdamArrays {
+                param,
+                grad,
+                exp_avg,
+                exp_avg_sq,
+            };
+            (arrays, factors, width, used)
+        }));
+        Ok(())
+    }
 }
 
 impl AdamOptions {
@@ -185,13 +257,16 @@ impl AdamOptions {
 fn update_rows<T: Real, S: Simd>(
     simd: S,
     factors: &Factors<T>,
-    param: &mut [T],
-    exp_avg: &mut [T],
-    exp_avg_sq: &mut [T],
-    grad: &[T],
+    arrays: AdamArrays<'_, T>,
     width: usize,
     used: usize,
 ) {
+    let AdamArrays {
+        param,
+        grad,
+        exp_avg,
+        exp_avg_sq,
+    } = arrays;
     if used == width {
         return update(simd, factors, param, exp_avg, exp_avg_sq, grad);
     }
