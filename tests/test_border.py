@@ -107,7 +107,7 @@ def test_adam_refuses_arrays_that_overlap() -> None:
     def step(**arrays: torch.Tensor) -> None:
         param, grad, exp_avg, exp_avg_sq = (tensor.numpy() for tensor in arrays.values())
         options = (0.1, 0.9, 0.999, 1e-8)
-        _rust.adam_step(param, grad, exp_avg, exp_avg_sq, 1, options, None)
+        _rust.adam_steps([(param, grad, exp_avg, exp_avg_sq, 1, options, None)])
 
     step(**apart)
     before = memory.clone()
@@ -389,7 +389,10 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         _rust.add_rows([(rows, values)], sums, 0.5)
 
     def all_below(single: Any, double: Any) -> bool:
-        return _rust.all_below([single, double], 10.0)
+        return _rust.all_below([(single, 10.0), (double, 5.0)])
+
+    def adam_steps(**arguments: Any) -> None:
+        _rust.adam_steps([tuple(arguments.values())])
 
     def add_harmonics(rows: Any, colors: Any, means: Any, high: Any) -> None:
         _rust.add_harmonics([(rows, colors, [0.0, 0.0, 0.0], 1)], means, high, 0.5)
@@ -435,7 +438,7 @@ def calls() -> dict[str, tuple[Any, dict[str, Any]]]:
         ),
         "ssim": (_rust.ssim, {"a": pictures[0], "b": pictures[1], "mask": mask}),
         "cell_distance": (_rust.cell_distance, {**cells, "scale": 1.0, "want_grad": True}),
-        "adam_step": (_rust.adam_step, {**adam, **options, "used": 2}),
+        "adam_steps": (adam_steps, {**adam, **options, "used": 2}),
         "Separable": (
             _rust.Separable, {"rows": np.eye(20), "columns": np.eye(30), "channels": np.eye(3)}
         ),
@@ -510,7 +513,7 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         "one axis less": array.shape[1:],
     }[change]
     leading = (call, name) in {
-        ("adam_step", "param"),
+        ("adam_steps", "param"),
         ("cell_distance", "x"),
         ("photometric", "render"),
         ("ssim", "a"),
@@ -522,7 +525,7 @@ def test_a_wrong_shape_is_named_with_the_right_one(call: str, name: str, change:
         ("agreed_depths", "others"),
     }
     free = call in ("data_pointer", "all_below") or (
-        leading and (call in ("adam_step", "cell_distance") or change == "one more")
+        leading and (call in ("adam_steps", "cell_distance") or change == "one more")
     )
     free |= change == "one more" and (call == "Separable" or (call, name) == ("project_forward", "colors"))
     if free:

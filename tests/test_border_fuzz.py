@@ -16,7 +16,7 @@ from test_border import calls
 
 CALLS = calls()
 WRITTEN = {
-    "adam_step": ("param", "exp_avg", "exp_avg_sq"),
+    "adam_steps": ("param", "exp_avg", "exp_avg_sq"),
     "add_rows": ("sums",),
     "add_pulls": ("sums", "views"),
     "add_harmonics": ("high",),

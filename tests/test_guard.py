@@ -251,13 +251,14 @@ def test_the_report_of_a_healthy_run(tmp_path: Path) -> None:
 
 def test_one_look_finds_what_the_rows_would() -> None:
     sound = torch.tensor([1e17, -9e17, 0.0])
-    assert are_sound([sound, sound.double().expand(4, 3).T])
+    assert are_sound([("a", sound), ("b", sound.double().expand(4, 3).T)])
+    assert not are_sound([("a", sound), ("b", torch.tensor([-88.0]))], b=88)
     for bad in (torch.inf, -torch.inf, torch.nan, 1.1e18, -1.1e18):
         for dtype in (torch.float32, torch.float64):
             values = torch.full((4000, 3), 9e17, dtype=dtype)
-            assert are_sound([sound, values])
+            assert are_sound([("a", sound), ("b", values)])
             values[2345, 1] = bad
-            assert not are_sound([sound, values])
+            assert not are_sound([("a", sound), ("b", values)])
             names, rows = bad_rows({"a": values, "b": torch.zeros(4000)})
             assert names == ["a"]
             assert rows.nonzero().tolist() == [[2345]]

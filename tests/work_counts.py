@@ -60,8 +60,11 @@ def _of_backward(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
 
 
 def _of_adam(found: Any, arguments: tuple[Any, ...]) -> dict[str, int]:
-    param, used = arguments[0], arguments[6]
-    return {"adam_numbers": param.size if used is None else param.size // param.shape[1] * used}
+    moved = [
+        param.size if used is None else param.size // param.shape[1] * used
+        for param, *_, used in arguments[0]
+    ]
+    return {"adam_numbers": sum(moved)}
 
 
 COUNTED: dict[str, Callable[[Any, tuple[Any, ...]], dict[str, int]]] = {
@@ -69,7 +72,7 @@ COUNTED: dict[str, Callable[[Any, tuple[Any, ...]], dict[str, int]]] = {
     "composite_forward": _of_forward,
     "project_backward": _of_backward,
     "composite_backward": _of_backward,
-    "adam_step": _of_adam,
+    "adam_steps": _of_adam,
 }
 
 

@@ -140,9 +140,8 @@ def part_of(
     part = replace(part, shown=shown, colors=gradients["sh0"].reshape(n, 3)[shown])
 
     def rest() -> Rest:
-        means2d, higher = forward.meta["means2d"].grad, trained.shN.grad
-        assert means2d is not None  # the backward pass was sound
-        norms = torch.where(visible, gradient_norms(means2d[0], camera.width, camera.height), UNSEEN)
+        (means2d,), higher = forward.pulls[0], trained.shN.grad
+        norms = torch.where(visible, gradient_norms(means2d, camera.width, camera.height), UNSEEN)
         columns = [gradients[name].reshape(n, width) for name, width in WIDTHS.items()]
         values = torch.cat([*columns, norms[:, None]], dim=1)[part.rows]
         own = {name: param.grad for name, param in _own(optimizer).items() if param.grad is not None}

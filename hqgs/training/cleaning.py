@@ -26,7 +26,7 @@ from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
 from hqgs.training.constants import CLEANING_DECAY, CLEANING_STEPS
 from hqgs.training.few_photos import decay_opacities, with_dropout
-from hqgs.training.guard import gradient_fault
+from hqgs.training.guard import coming_gradient, gradient_fault
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.plan_few_photos import DROPOUT
 
@@ -91,10 +91,10 @@ def clean(
             some = with_dropout(fitted, DROPOUT, seed, k + 1)
             camera = scene.train[number].camera
             render, _ = render_view(some, camera, fitted.sh_degree, config.background)
-            render.retain_grad()
+            of_render = coming_gradient(render)
             optimizer.zero_grad()
             method.loss(render, targets[number]).backward()
-            if gradient_fault(fitted, optimizer, render) is None:
+            if gradient_fault(fitted, optimizer, of_render) is None:
                 optimizer.step()
             decay_opacities(fitted.opacities, CLEANING_DECAY)
             on_stage(Stage("steps of cleaning", k + 1, steps))

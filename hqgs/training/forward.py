@@ -19,7 +19,7 @@ from hqgs.model.render import render_view
 from hqgs.photos.pixels import floats
 from hqgs.scene.scene import Camera, View
 from hqgs.training.adam import Adam
-from hqgs.training.guard import Fault, bad_values, gradient_fault
+from hqgs.training.guard import Fault, bad_values, coming_gradient, gradient_fault
 from hqgs.training.methods.base import Method, Target
 from hqgs.training.schedule import StepPlan, low_pass, smaller
 
@@ -36,14 +36,15 @@ class ForwardPass:
     photo: Tensor  # the developed render, [H, W, 3]
     loss: Tensor
     measured: Tensor  # what the method goes by after the step, [K]
+    pulls: list[Tensor]  # the gradient of the projected means, [1, N, 2], once it is there
 
     def backward(self, trained: Gaussians, optimizer: Adam) -> Fault | None:
         """Compute the gradients of all that is trained; what is not finite of them or of the loss, if
         anything is."""
         if math.isfinite(self.loss.detach()):
-            self.render.retain_grad()
+            of_render = coming_gradient(self.render)
             self.loss.backward()
-            return gradient_fault(trained, optimizer, self.render)
+            return gradient_fault(trained, optimizer, of_render)
         count = bad_values(self.view)
         none = torch.zeros(len(trained), dtype=torch.bool)
         return Fault("photo" if count else "loss", [], none, count)
@@ -78,13 +79,12 @@ class TrainingViews:
         shot = method.shot(view, target)
         eps2d = low_pass(plan.coarse)
         render, meta = render_view(gaussians, shot.camera, plan.degree, self.background, eps2d)
-        meta["means2d"].retain_grad()  # [1, N, 2]
+        pulls = coming_gradient(meta["means2d"])
         photo = shot.develop(render)
         image = method.compare(photo, target)
         loss = method.loss(image, target)
-        return ForwardPass(
-            plan, view, shot.camera, render, meta, photo, loss, method.measured(image.detach(), target)
-        )
+        measured = method.measured(image.detach(), target)
+        return ForwardPass(plan, view, shot.camera, render, meta, photo, loss, measured, pulls)
 
     @torch.no_grad()
     def psnr(

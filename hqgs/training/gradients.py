@@ -57,11 +57,10 @@ class _OfOne(Gradients):
 
     def apply(self, state: TrainState) -> None:
         forward = self._forward
-        radii, gradient = forward.meta["radii"][0], forward.meta["means2d"].grad
         if forward.plan.observes:
-            assert gradient is not None  # the backward pass was sound
+            (gradient,), radii = forward.pulls[0], forward.meta["radii"][0]
             camera = forward.view.camera
-            state.densifier.observe(gradient[0], radii, camera.width, camera.height)
+            state.densifier.observe(gradient, radii, camera.width, camera.height)
         state.optimizer.step()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,7 +63,14 @@ class Fault:
     values: int = 0  # of a photo
 
 
-def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -> Fault | None:
+def coming_gradient(tensor: Tensor) -> list[Tensor]:
+    """Where the gradient of a tensor will be once it is there; `retain_grad` would copy it."""
+    found = list[Tensor]()
+    tensor.register_hook(found.append)
+    return found
+
+
+def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, of_render: Sequence[Tensor]) -> Fault | None:
     """Where a gradient is not finite.
 
     The Gaussians are not at fault where the gradient of the loss with respect to the render is not finite
@@ -81,7 +88,7 @@ def gradient_fault(gaussians: Gaussians, optimizer: Optimizer, render: Tensor) -
     ]
     if are_sound([*named.items(), *others]):
         return None
-    if render.grad is not None and not torch.isfinite(render.grad).all():
+    if not all(torch.isfinite(gradient).all() for gradient in of_render):
         return Fault("gradient", ["render"], torch.zeros(len(gaussians), dtype=torch.bool))
     names, rows = bad_rows(gaussians.named())
     if names:  # which is why: the activations pass NaN on
@@ -102,7 +109,7 @@ def parameter_fault(gaussians: Gaussians, rows_changed: bool) -> Fault | None:
 
 
 def are_sound(tensors: Iterable[tuple[str, Tensor]], **limits: float) -> bool:
-    """Whether no value of float32 or float64 tensors is NaN, Inf or beyond GUARD_LIMIT (or one of `limits`)."""
+    """Whether no value is NaN, Inf or beyond GUARD_LIMIT (or one of `limits`); float32 or float64."""
     arrays = ((name, tensor.detach().contiguous().numpy()) for name, tensor in tensors)
     return _rust.all_below([(array, limits.get(name, GUARD_LIMIT)) for name, array in arrays])
 

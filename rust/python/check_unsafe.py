@@ -66,7 +66,7 @@ def train(dtype: type) -> None:
     distance, slope = _rust.cell_distance(flat, flat[::-1].copy(), np.full_like(flat, 0.1), 1.0, True)
     look(np.array(distance), slope)
     param, first, second = picture[0].copy(), np.zeros((WIDTH, 3), dtype), np.zeros((WIDTH, 3), dtype)
-    _rust.adam_step(param, picture[1].copy(), first, second, 1, (0.01, 0.9, 0.999, 1e-15), 2)
+    _rust.adam_steps([(param, picture[1].copy(), first, second, 1, (0.01, 0.9, 0.999, 1e-15), 2)])
     look(param, first, second)
 
 
@@ -93,6 +93,11 @@ def add_views() -> None:
     _rust.add_rows(values, sums, 0.5)
     _rust.add_harmonics(colors, means, high, 0.5)
     look(sums, high)
+    norms, seen = np.zeros(COUNT, np.float32), np.zeros(COUNT, np.float32)
+    gradient = rng.normal(size=(COUNT, 2)).astype(np.float32)
+    _rust.add_pulls(norms, seen, gradient, np.ones((COUNT, 2), np.int32), (WIDTH / 2, HEIGHT / 2))
+    look(norms, seen)
+    assert _rust.all_below([(norms, 1e9), (gradient.astype(np.float64), 1e9)])
 
 
 for kind in (np.float32, np.float64):

@@ -227,9 +227,9 @@ impl<'py, T: Real + Element> HeldStep<'py, T> {
         let (lr, beta1, beta2, eps) = *options;
         Ok(Self {
             param,
-            grad: Array::new("grad", grad)?.of_shape(&shape)?,
             exp_avg: ArrayMut::new("exp_avg", exp_avg)?.of_shape(&shape)?,
             exp_avg_sq: ArrayMut::new("exp_avg_sq", exp_avg_sq)?.of_shape(&shape)?,
+            grad: Array::new("grad", grad)?.of_shape(&shape)?,
             step: *step,
             options: AdamOptions {
                 lr,
