@@ -59,6 +59,21 @@ def project_forward(
     activate: bool = False,
     knobs: tuple[float, float, str, bool] | None = None,
 ) -> tuple[Frame, Array, Array, Array, Array, Array, Array]: ...
+def pictures(
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    colors: Array,
+    rest: Array | None,
+    viewmats: Array,
+    ks: Array,
+    width: int,
+    height: int,
+    options: tuple[float, float, float, float, bool, bool],
+    sh_degree: int | None,
+    backgrounds: Array | None,
+) -> Array: ...
 def project_backward(
     frame: Frame,
     inputs: tuple[Array, Array, Array, Array],

@@ -14,6 +14,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs import _rust
+from hqgs._rust import EPS2D, FAR_PLANE
 from hqgs.base.evenly import evenly
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
@@ -147,34 +149,44 @@ class Activated:
         with one_torch_thread():
             g = g.rows(torch.from_numpy(curve_order(g.means.numpy())))
         self.degree: int = g.sh_degree
-        colors = (g.sh0, g.shN) if g.sh_degree else g.sh0
+        near = g.near_plane()
         self._how: dict[str, Any] = {
-            "near_plane": g.near_plane(),
+            "near_plane": near,
             "rasterize_mode": "antialiased" if g.antialiased else "classic",
             "packed": False,
         }
         self.gaussians = g
-        self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities(), colors
+        self._tensors = g.means, g.quats, g.activated_scales(), g.activated_opacities()
+        means, quats, scales, opacities, sh0 = (t.contiguous().numpy() for t in (*self._tensors, g.sh0))
+        rest = g.shN.contiguous().numpy() if g.sh_degree else None
+        self._arrays = means, quats, scales, opacities, sh0, rest
+        self._options = (near, FAR_PLANE, 0.0, EPS2D, g.antialiased, False)
 
     @torch.no_grad()
     def color(
         self, camera: Camera, background: Sequence[float] = BACKGROUND, look: Look | None = None
     ) -> Picture:
         """[H, W, 3], clipped and rounded to 8 bits."""
-        behind = torch.tensor([[*background]], dtype=self._tensors[0].dtype)
-        with one_torch_thread():
-            image, _, _ = rasterization(
-                *self._tensors, *_of(camera), sh_degree=self.degree, backgrounds=behind, **self._how
+        if look is not None:
+            image, _, _ = self.gaussians.rasterize(
+                camera, sh_degree=self.degree, background=background, near_plane=self._how["near_plane"]
             )
-            if look is not None:
-                image = torch.from_numpy(look.of(image[0].numpy(), camera.K))[None]
-            return image[0].mul_(255).round_().clamp_(0, 255).byte().numpy()
+            seen = torch.from_numpy(look.of(image[0].numpy(), camera.K))
+            return seen.mul_(255).round_().clamp_(0, 255).byte().numpy()
+        means, quats, scales, opacities, sh0, rest = self._arrays
+        viewmat, K = (np.ascontiguousarray(m[None], np.float64) for m in (camera.viewmat, camera.K))
+        width, height = camera.width, camera.height
+        picture = _rust.pictures(
+            means, quats, scales, opacities, sh0, rest, viewmat, K, width, height, self._options,
+            self.degree, np.array([[*background]], means.dtype),
+        )  # fmt: skip
+        return picture.reshape(height, width, 3)
 
     @torch.no_grad()
     def depth(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Expected depth along the viewing axis, world units, and alpha, both [H, W]."""
         with one_torch_thread():
-            means, quats, scales, opacities, _ = self._tensors
+            means, quats, scales, opacities = self._tensors
             none = means.new_zeros(len(means), 1)
             image, alpha, _ = rasterization(
                 means, quats, scales, opacities, none, *_of(camera), render_mode="ED", **self._how
@@ -186,7 +198,7 @@ class Activated:
         """Standard deviation along a direction, unit [3], of the Gaussians around a point [3]: the median."""
         from scipy.spatial.transform import Rotation  # here: only clicks need it
 
-        means, quats, scales, *_ = self._tensors
+        means, quats, scales, _ = self._tensors
         apart = (means - torch.from_numpy(at).to(means)).square().sum(1)
         rows = apart.topk(min(THICKNESS_OF, len(means)), largest=False).indices
         turns = Rotation.from_quat(np.roll(quats[rows].double().numpy(), -1, axis=1))

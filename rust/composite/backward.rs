@@ -225,11 +225,12 @@ fn replay_blocks<S: Simd, T: Real>(
         memory::reserve(layers, total * LAYER - layers.len(), NAME)?;
         layers.resize(total * LAYER, T::ZERO);
     }
+    let list = &input.tiles.lists[tile];
     let mut begins = [0; TILE_BLOCKS + 1];
     for block in 0..TILE_BLOCKS {
         let (begin, depth) = (begins[block], depths[block] as usize);
         let end = begin + depth;
-        let mut seen = input.layers(tile, block);
+        let mut seen = input.layers(list, block);
         seen.list = &seen.list[..depth];
         let out = &mut layers[begin * LAYER..end * LAYER];
         for_vectors!(S, T, V => kernel::replay::<S, T, V>(simd, grid, block, seen, adjoint, out));

@@ -10,6 +10,7 @@ use crate::{
     error::Error,
     memory,
     simd::Real,
+    tiles::List,
     uninit::UninitVec,
 };
 use fearless_simd::{Simd, dispatch};
@@ -50,8 +51,12 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
         .map(|(tile, ((depths, transmittance), colors))| {
             let transmittance = transmittance.fill(T::ZERO);
             let colors = colors.fill([T::ZERO; TILE_PIXELS]);
+            if let Some(next) = tiles.lists.get(tile + 1) {
+                next.prefetch();
+            }
+            let list = &tiles.lists[tile];
             dispatch!(level, simd => for_channels!(
-                channels, forward_tile, simd, T, (input, &grid, tile, depths, transmittance, colors)
+                channels, forward_tile, simd, T, (input, &grid, tile, list, depths, transmittance, colors)
             ))
         })
         .reduce(Counts::default, Counts::plus);
@@ -112,19 +117,16 @@ fn image_from_tiles<T: Real>(
 
 /// Composite one tile.
 #[inline(always)]
-fn forward_tile<S: Simd, T: Real, const D: usize>(
+pub(super) fn forward_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
     input: &CompositeInput<T>,
     grid: &Grid<T>,
     tile: usize,
+    list: &List<T>,
     depths: &mut [u32; TILE_BLOCKS],
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
 ) -> Counts {
-    let list = &input.tiles.lists[tile];
-    if let Some(next) = input.tiles.lists.get(tile + 1) {
-        next.prefetch();
-    }
     let mut counts = Counts {
         tiles: u64::from(!list.records.is_empty()),
         pairs: list.records.len() as u64,
@@ -135,7 +137,7 @@ fn forward_tile<S: Simd, T: Real, const D: usize>(
     }
     for (block, depth) in depths.iter_mut().enumerate() {
         let pixels = &mut transmittance[block * BLOCK_PIXELS..(block + 1) * BLOCK_PIXELS];
-        let layers = input.layers(tile, block);
+        let layers = input.layers(list, block);
         let blended = for_vectors!(S, T, V => kernel::blend::<S, T, D, V>(simd, grid, block, layers, pixels, colors));
         *depth = blended.layers as u32;
         counts.blocks += blended.layers as u64;

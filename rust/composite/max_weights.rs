@@ -84,7 +84,7 @@ fn weigh_tile<S: Simd, T: Real>(
         if open.iter().all(|x| *x == T::ZERO) {
             continue;
         }
-        let layers = input.layers(tile, block);
+        let layers = input.layers(list, block);
         for_vectors!(S, T, V => weigh::<S, T, V>(simd, grid, block, layers, open, lanes));
     }
     for (record, lanes) in list.records.iter().zip(lanes.chunks_exact(width::<S, T>())) {

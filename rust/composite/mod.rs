@@ -5,10 +5,12 @@ mod forward;
 mod gather;
 mod kernel;
 mod max_weights;
+mod picture;
 
 pub use backward::{CompositeCotangents, CompositeGrads, Wanted, backward};
 pub use forward::{Image, forward};
 pub use max_weights::max_weights;
+pub use picture::picture;
 
 use crate::{
     constants::{BLOCK, TILE, TILE_BLOCKS, TILE_PIXELS},
@@ -16,7 +18,7 @@ use crate::{
     project::Projection,
     scene::Camera,
     simd::Real,
-    tiles::Tiles,
+    tiles::{List, Tiles},
 };
 use kernel::Layers;
 
@@ -60,9 +62,8 @@ impl<T: Real> CompositeInput<'_, T> {
         self.camera.width * self.camera.height
     }
 
-    /// What reaches one block.
-    fn layers(&self, tile: usize, block: usize) -> Layers<'_, T> {
-        let list = &self.tiles.lists[tile];
+    /// What reaches one block of the tile of this list.
+    fn layers<'a>(&'a self, list: &'a List<T>, block: usize) -> Layers<'a, T> {
         Layers {
             list: &list.blocks[list.begins[block] as usize..list.begins[block + 1] as usize],
             records: &list.records,

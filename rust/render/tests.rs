@@ -332,6 +332,42 @@ fn logarithms_and_logits_are_activated() {
 }
 
 #[test]
+fn a_picture_is_the_image_in_8_bits() {
+    at_each_level(|level| {
+        let mut s = Synthetic::<f32>::new(400, 75, 50, 3).unwrap();
+        s.harmonics.iter_mut().for_each(|x| *x *= 3.0); // some colours beyond white
+        let background = [0.3, 0.6, 0.9];
+        let options = options(level);
+        for (n, channels) in [(400, 3), (400, 5), (0, 3)] {
+            let gaussians = Gaussians {
+                means: &s.means[..3 * n],
+                quats: &s.quats[..4 * n],
+                scales: &s.scales[..3 * n],
+                opacities: &s.opacities[..n],
+            };
+            let given: Vec<f32> = s.harmonics[..n * channels].to_vec();
+            let of_harmonics = Harmonics {
+                coefficients: &s.harmonics[..48 * n],
+                ..harmonics(&s)
+            };
+            let (colors, behind) = if channels == 3 {
+                (Colors::Harmonics(of_harmonics), Some(&background[..]))
+            } else {
+                (Colors::Channels(&given, channels), None)
+            };
+            let image = forward(gaussians, colors, behind, &s.camera, &options).unwrap();
+            let bytes = picture(gaussians, colors, behind, &s.camera, &options).unwrap();
+            let level = |x: &f32| (x * 255.0).round_ties_even().clamp(0.0, 255.0) as u8;
+            assert_eq!(bytes, image.image.iter().map(level).collect::<Vec<_>>());
+        }
+        let s = &s;
+        let colors = Colors::Harmonics(harmonics(s));
+        let error = picture(s.gaussians(), colors, Some(&[0.0]), &s.camera, &options);
+        assert_eq!(error.unwrap_err().name(), "background");
+    });
+}
+
+#[test]
 fn no_gaussians_and_none_visible_give_an_empty_image() {
     at_each_level(check_empty);
 }

@@ -29,6 +29,15 @@ pub(crate) struct List<T> {
 }
 
 impl<T: Copy> List<T> {
+    /// Hold nothing, and keep the memory.
+    fn clear(&mut self) {
+        self.records.clear();
+        self.colors.clear();
+        self.places.clear();
+        self.blocks.clear();
+        self.begins = [0; TILE_BLOCKS + 1];
+    }
+
     /// Send for the records and colours, for which the blocks will ask one by one.
     #[inline(always)]
     pub fn prefetch(&self) {
@@ -38,7 +47,7 @@ impl<T: Copy> List<T> {
 }
 
 /// Buffers of one thread, reused from tile to tile.
-pub(super) struct Scratch<T> {
+pub(crate) struct Scratch<T> {
     /// (bits of the depth as f32, place by index).
     keys: Vec<u64>,
     /// For their sort.
@@ -63,16 +72,17 @@ impl<T> Default for Scratch<T> {
     }
 }
 
-/// Collect a tile's pairs and order them.
+/// Collect a tile's pairs and order them, in the place of what `list` held.
 #[inline(always)]
-pub(super) fn list<S: Simd, T: Real>(
+pub(super) fn collect<S: Simd, T: Real>(
     simd: S,
     projection: &Projection,
     chunks: &[Pairs<T>],
     channels: usize,
     tile: usize,
     scratch: &mut Scratch<T>,
-) -> Result<List<T>, Error> {
+    list: &mut List<T>,
+) -> Result<(), Error> {
     let Scratch {
         keys,
         sorted,
@@ -103,15 +113,13 @@ pub(super) fn list<S: Simd, T: Real>(
         colors.extend_from_slice(&pairs.colors[range.start * channels..range.end * channels]);
         records.extend_from_slice(&pairs.records[range]);
     }
-    let mut list = List {
-        records: memory::with_capacity(n, NAME)?,
-        colors: memory::with_capacity(n * channels, NAME)?,
-        places: memory::with_capacity(n, NAME)?,
-        ..List::default()
-    };
+    list.clear();
     if n == 0 {
-        return Ok(list);
+        return Ok(());
     }
+    memory::reserve(&mut list.records, n, NAME)?;
+    memory::reserve(&mut list.colors, n * channels, NAME)?;
+    memory::reserve(&mut list.places, n, NAME)?;
     sort(keys, sorted)?;
     for key in keys.iter() {
         list.places.push(*key as u32);
@@ -133,12 +141,12 @@ pub(super) fn list<S: Simd, T: Real>(
     } else {
         all_blocks(n, &mut list.masks, reached)
     };
-    list.blocks = memory::with_capacity(lengths.iter().sum(), NAME)?;
+    memory::reserve(&mut list.blocks, lengths.iter().sum(), NAME)?;
     for (block, length) in lengths.into_iter().enumerate() {
         list.blocks.extend_from_slice(&reached[block][..length]);
         list.begins[block + 1] = list.blocks.len() as u32;
     }
-    Ok(list)
+    Ok(())
 }
 
 /// Keys below which a comparing sort is faster.

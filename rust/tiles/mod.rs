@@ -10,6 +10,7 @@ mod lists;
 mod pairs;
 mod spans;
 
+pub(crate) use lists::{List, Scratch};
 pub(crate) use pairs::{Chunk, Record, UNIT};
 pub(crate) use spans::Span;
 
@@ -22,8 +23,7 @@ use crate::{
     simd::Real,
 };
 use fearless_simd::dispatch;
-use lists::{List, Scratch, list};
-use pairs::{Source, pair_bytes};
+use pairs::{Pairs, Source, pair_bytes};
 use rayon::prelude::*;
 use std::sync::atomic::AtomicU64;
 
@@ -76,8 +76,12 @@ pub fn bin<T: Real>(
     channels: usize,
     camera: &Camera,
 ) -> Result<Tiles<T>, Error> {
-    let limit = (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS);
-    bin_at_most(projection, colors, channels, camera, limit)
+    bin_at_most(projection, colors, channels, camera, limit::<T>(channels))
+}
+
+/// The most pairs that there may be.
+fn limit<T>(channels: usize) -> u64 {
+    (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS)
 }
 
 /// `bin` with at most `limit` pairs.
@@ -88,6 +92,66 @@ fn bin_at_most<T: Real>(
     camera: &Camera,
     limit: u64,
 ) -> Result<Tiles<T>, Error> {
+    let (mut tiles, pairs) = scatter(projection, colors, channels, camera, limit)?;
+    let count = tiles.tiles_x * tiles.tiles_y;
+    // Counts to places: in a tile chunk by chunk.
+    let mut sums = memory::filled(0u32, count, NAME)?;
+    for chunk in &mut tiles.chunks {
+        for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
+            *sum += std::mem::replace(start, *sum);
+        }
+    }
+    let mut lists = memory::with_capacity(count, NAME)?;
+    lists.resize_with(count, List::default);
+    lists
+        .par_iter_mut()
+        .enumerate()
+        .try_for_each_init(Scratch::default, |scratch, (tile, list)| {
+            pairs.list(projection, channels, tile, scratch, list)
+        })?;
+    tiles.lists = lists;
+    Ok(tiles)
+}
+
+/// The pairs of all chunks, not yet collected tile by tile.
+pub(crate) struct Scattered<T>(Vec<Pairs<T>>);
+
+impl<T: Real> Scattered<T> {
+    /// Make `list` that of a tile.
+    pub(crate) fn list(
+        &self,
+        projection: &Projection,
+        channels: usize,
+        tile: usize,
+        scratch: &mut Scratch<T>,
+        list: &mut List<T>,
+    ) -> Result<(), Error> {
+        dispatch!(projection.level.token, simd => lists::collect(
+            simd, projection, &self.0, channels, tile, scratch, list
+        ))
+    }
+}
+
+/// [`bin`] up to the lists, which are still to be made of the pairs.
+///
+/// # Errors
+/// As for [`bin`].
+pub(crate) fn scattered<T: Real>(
+    projection: &Projection,
+    colors: &[T],
+    channels: usize,
+    camera: &Camera,
+) -> Result<(Tiles<T>, Scattered<T>), Error> {
+    scatter(projection, colors, channels, camera, limit::<T>(channels))
+}
+
+fn scatter<T: Real>(
+    projection: &Projection,
+    colors: &[T],
+    channels: usize,
+    camera: &Camera,
+    limit: u64,
+) -> Result<(Tiles<T>, Scattered<T>), Error> {
     let n = projection.splats.len();
     let (tiles_x, tiles_y) = (camera.width.div_ceil(TILE), camera.height.div_ceil(TILE));
     // Small chunks stay in cache and balance the load; their number changes no result.
@@ -111,7 +175,7 @@ fn bin_at_most<T: Real>(
             dispatch!(level, simd => source.chunk(simd, range))
         })
         .collect::<Result<_, Error>>()?;
-    let (mut chunks, pairs): (Vec<_>, Vec<_>) = made.into_iter().unzip();
+    let (chunks, pairs): (Vec<_>, Vec<_>) = made.into_iter().unzip();
     if source.total.into_inner() > limit {
         return Err(Error::TooManyPairs {
             gaussians: n as u64,
@@ -120,30 +184,14 @@ fn bin_at_most<T: Real>(
             bytes: limit * pair_bytes::<T>(channels),
         });
     }
-    // Counts to places: in a tile chunk by chunk.
-    let mut sums = memory::filled(0u32, tiles_x * tiles_y, NAME)?;
-    for chunk in &mut chunks {
-        for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
-            *sum += std::mem::replace(start, *sum);
-        }
-    }
-    let mut lists = memory::with_capacity(tiles_x * tiles_y, NAME)?;
-    lists.resize_with(tiles_x * tiles_y, List::default);
-    lists.par_iter_mut().enumerate().try_for_each_init(
-        Scratch::default,
-        |scratch, (tile, out)| -> Result<(), Error> {
-            *out =
-                dispatch!(level, simd => list(simd, projection, &pairs, channels, tile, scratch))?;
-            Ok(())
-        },
-    )?;
-    Ok(Tiles {
+    let tiles = Tiles {
         tiles_x,
         tiles_y,
-        lists,
+        lists: Vec::new(),
         channels,
         chunks,
-    })
+    };
+    Ok((tiles, Scattered(pairs)))
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use super::{Arrays, Frame, Projections, channels_of, of_camera};
 use crate::threads;
 use crate::{
-    arrays::{Array, Optional, Scalar, by_dtype, join, optional},
+    arrays::{Array, Optional, Scalar, by_dtype, join, optional, optional_of_shape},
     error::BindingResult,
 };
 use hqgs::internals::{
@@ -13,7 +13,8 @@ use hqgs::internals::{
     project::{self, RenderOptions},
     scene::{Camera, Colors, Harmonics},
 };
-use numpy::IntoPyArray;
+use hqgs::render;
+use numpy::{Element, IntoPyArray, PyArray1};
 use pyo3::{IntoPyObjectExt, prelude::*};
 use std::sync::Arc;
 
@@ -64,6 +65,144 @@ fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
     Ok(knobs)
 }
 
+/// Pictures of Gaussians in 8 bits, [C, H, W, channels], without a way back; arguments as for `project_forward`.
+#[pyfunction]
+#[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, backgrounds))]
+pub(super) fn pictures<'py>(
+    means: &Bound<'py, PyAny>,
+    quats: &Bound<'py, PyAny>,
+    scales: &Bound<'py, PyAny>,
+    opacities: &Bound<'py, PyAny>,
+    colors: &Bound<'py, PyAny>,
+    rest: Optional<'_, 'py>,
+    viewmats: &Bound<'py, PyAny>,
+    ks: &Bound<'py, PyAny>,
+    width: usize,
+    height: usize,
+    options: (f64, f64, f64, f64, bool, bool),
+    sh_degree: Option<usize>,
+    backgrounds: Optional<'_, 'py>,
+) -> BindingResult<Bound<'py, PyArray1<u8>>> {
+    let options = options_of(options);
+    by_dtype!(
+        "means",
+        means,
+        pictures_as(
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            rest,
+            viewmats,
+            ks,
+            width,
+            height,
+            options,
+            sh_degree,
+            backgrounds
+        )
+    )
+}
+
+fn pictures_as<'py, T: Scalar>(
+    means: &Bound<'py, PyAny>,
+    quats: &Bound<'py, PyAny>,
+    scales: &Bound<'py, PyAny>,
+    opacities: &Bound<'py, PyAny>,
+    colors: &Bound<'py, PyAny>,
+    rest: Optional<'_, 'py>,
+    viewmats: &Bound<'py, PyAny>,
+    ks: &Bound<'py, PyAny>,
+    width: usize,
+    height: usize,
+    options: RenderOptions,
+    sh_degree: Option<usize>,
+    backgrounds: Optional<'_, 'py>,
+) -> BindingResult<Bound<'py, PyArray1<u8>>> {
+    let py = means.py();
+    let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
+    let shades = Shades::<T>::new(colors, rest)?;
+    let cameras = cameras(viewmats, ks, width, height)?;
+    let gaussians = arrays.gaussians()?;
+    let colors = shades.of(gaussians.len(), cameras.len(), sh_degree)?;
+    let channels = colors(0).channels();
+    let backgrounds =
+        optional_of_shape::<T>("backgrounds", backgrounds, &[cameras.len(), channels])?;
+    let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
+    let pictures = py.detach(|| {
+        threads::install(|| -> Result<_, Error> {
+            let mut all = Vec::new();
+            for (i, camera) in cameras.iter().enumerate() {
+                let behind = backgrounds.map(|b| &b[i * channels..(i + 1) * channels]);
+                let picture = render::picture(gaussians, colors(i), behind, camera, &options)?;
+                if cameras.len() == 1 {
+                    return Ok(picture);
+                }
+                all.extend_from_slice(&picture);
+            }
+            Ok(all)
+        })
+    })??;
+    Ok(pictures.into_pyarray(py))
+}
+
+/// The options of an image: near, far, radius_clip, eps2d, antialiased, and whether it is differentiated.
+fn options_of(options: (f64, f64, f64, f64, bool, bool)) -> RenderOptions {
+    let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
+    RenderOptions {
+        near_plane,
+        far_plane,
+        radius_clip,
+        eps2d,
+        antialiased,
+        differentiable,
+        ..RenderOptions::default()
+    }
+}
+
+/// The borrowed arrays of colours: channels, or harmonics.
+struct Shades<'py, T: Element> {
+    colors: Array<'py, T>,
+    rest: Option<Array<'py, T>>,
+}
+
+impl<'py, T: Scalar> Shades<'py, T> {
+    fn new(colors: &Bound<'py, PyAny>, rest: Optional<'_, 'py>) -> BindingResult<Self> {
+        let name = if rest.is_some() {
+            "colors[0]"
+        } else {
+            "colors"
+        };
+        Ok(Self {
+            colors: Array::new(name, colors)?,
+            rest: optional("colors[1]", rest)?,
+        })
+    }
+
+    /// Those of `n` Gaussians in each of so many cameras, by its number.
+    fn of<'a>(
+        &'a self,
+        n: usize,
+        cameras: usize,
+        sh_degree: Option<usize>,
+    ) -> BindingResult<impl Fn(usize) -> Colors<'a, T> + Sync + use<'a, T>> {
+        let harmonics = sh_degree
+            .map(|degree| harmonics(&self.colors, self.rest.as_ref(), n, degree))
+            .transpose()?;
+        let (data, channels) = match harmonics {
+            Some(_) => (&[][..], 0),
+            None => channels_of(&self.colors, n, cameras)?,
+        };
+        Ok(move |i| {
+            harmonics.map_or_else(
+                || Colors::Channels(of_camera(data, i, n * channels), channels),
+                Colors::Harmonics,
+            )
+        })
+    }
+}
+
 /// Project Gaussians; see `hqgs/model/rasterization.py` for the shapes. `colors` are harmonics if there is a degree.
 /// `knobs`, which also hold for the later stages, are for the benchmark of error against run time alone.
 #[pyfunction]
@@ -84,17 +223,10 @@ pub(super) fn project_forward<'py>(
     activate: bool,
     knobs: Option<Knobs>,
 ) -> BindingResult<Bound<'py, PyAny>> {
-    let (near_plane, far_plane, radius_clip, eps2d, antialiased, differentiable) = options;
     let options = RenderOptions {
-        near_plane,
-        far_plane,
-        radius_clip,
-        eps2d,
-        antialiased,
-        differentiable,
         activate,
         knobs: accuracy_knobs(knobs)?,
-        level: None,
+        ..options_of(options)
     };
     by_dtype!(
         "means",
@@ -122,32 +254,14 @@ fn project_as<'py, T: Scalar>(
 ) -> BindingResult<Bound<'py, PyAny>> {
     let py = means.py();
     let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
-    let name = if rest.is_some() {
-        "colors[0]"
-    } else {
-        "colors"
-    };
-    let colors = Array::<T>::new(name, colors)?;
-    let rest = optional::<T>("colors[1]", rest)?;
+    let shades = Shades::<T>::new(colors, rest)?;
     let cameras = cameras(viewmats, ks, width, height)?;
     let gaussians = arrays.gaussians()?;
     let n = gaussians.len();
-    let harmonics = sh_degree
-        .map(|degree| harmonics(&colors, rest.as_ref(), n, degree))
-        .transpose()?;
-    let (channel_data, channels) = match harmonics {
-        Some(_) => (&[][..], 0),
-        None => channels_of(&colors, n, cameras.len())?,
-    };
+    let colors = shades.of(n, cameras.len(), sh_degree)?;
     let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
-            let project = |(i, camera)| {
-                let colors = harmonics.map_or_else(
-                    || Colors::Channels(of_camera(channel_data, i, n * channels), channels),
-                    Colors::Harmonics,
-                );
-                project::forward(&gaussians, colors, camera, &options)
-            };
+            let project = |(i, camera)| project::forward(&gaussians, colors(i), camera, &options);
             cameras
                 .iter()
                 .enumerate()

@@ -21,6 +21,7 @@ use std::sync::Arc;
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<Frame>()?;
     m.add_function(wrap_pyfunction!(forward::project_forward, m)?)?;
+    m.add_function(wrap_pyfunction!(forward::pictures, m)?)?;
     m.add_function(wrap_pyfunction!(backward::project_backward, m)?)
 }
 

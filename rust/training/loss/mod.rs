@@ -27,8 +27,11 @@ use rayon::prelude::*;
 /// What an error calls the buffers of this folder.
 const NAME: &str = "loss";
 
-/// A band is at least this high: below it the rows shared with its neighbours cost more than they gain.
-const MIN_BAND: usize = 32;
+/// Threads have two bands each, so that a late one can be helped, where these are as high as this: below it the rows
+/// that a band shares with its neighbours cost more than they gain.
+const HIGH_BAND: usize = 32;
+/// A band is at least this high.
+const MIN_BAND: usize = 16;
 
 /// A pixel value that can be compared with a render of `T`.
 pub trait Sample<T>: Copy + Send + Sync {
@@ -267,7 +270,8 @@ fn run<T: Real, Y: Sample<T>>(
     let [height, width, channels] = images.size;
     let n = width * channels;
     let threads = rayon::current_num_threads();
-    let wanted = if threads == 1 { 1 } else { 2 * threads }; // two each, so that a late thread can be helped
+    let two_each = threads > 1 && height >= 2 * threads * HIGH_BAND;
+    let wanted = if two_each { 2 * threads } else { threads };
     let rows = height.div_ceil(wanted).max(MIN_BAND);
     let count = height.div_ceil(rows);
     scratch.sums.clear();
