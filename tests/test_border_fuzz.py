@@ -14,6 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_border import calls
 
+from hqgs import _rust
+
 CALLS = calls()
 WRITTEN = {
     "adam_steps": ("param", "exp_avg", "exp_avg_sq"),
@@ -22,6 +24,23 @@ WRITTEN = {
     "add_harmonics": ("high",),
 }
 REFUSALS = (ValueError, TypeError, OverflowError, MemoryError)  # a panic is none of them
+
+
+NO_ARRAYS = {
+    "Composite",
+    "Exposure",
+    "Frame",
+    "get_num_threads",
+    "give_back_memory",
+    "set_num_threads",
+    "simd_level",
+}
+
+
+def test_every_function_is_called() -> None:
+    named = {call.split()[0] for call in CALLS}
+    there = {name for name in dir(_rust) if callable(getattr(_rust, name)) and not name.startswith("_")}
+    assert there == NO_ARRAYS | (named - {"apply", "apply_absolute"})
 
 
 def of_call(call: str) -> dict[str, np.ndarray]:

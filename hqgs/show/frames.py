@@ -168,11 +168,13 @@ class Activated:
     ) -> Picture:
         """[H, W, 3], clipped and rounded to 8 bits."""
         if look is not None:
-            image, _, _ = self.gaussians.rasterize(
-                camera, sh_degree=self.degree, background=background, near_plane=self._how["near_plane"]
-            )
-            seen = torch.from_numpy(look.of(image[0].numpy(), camera.K))
-            return seen.mul_(255).round_().clamp_(0, 255).byte().numpy()
+            near = self._how["near_plane"]
+            with one_torch_thread():
+                image, _, _ = self.gaussians.rasterize(
+                    camera, sh_degree=self.degree, background=background, near_plane=near
+                )
+                seen = torch.from_numpy(look.of(image[0].numpy(), camera.K))
+                return seen.mul_(255).round_().clamp_(0, 255).byte().numpy()
         means, quats, scales, opacities, sh0, rest = self._arrays
         viewmat, K = (np.ascontiguousarray(m[None], np.float64) for m in (camera.viewmat, camera.K))
         width, height = camera.width, camera.height

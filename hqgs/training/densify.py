@@ -58,8 +58,9 @@ class Densifier:
 
     def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
-        given = (t.contiguous().numpy() for t in (self.grad_sum, self.count, means2d_grad, radii))
-        _rust.add_pulls(*given, (width / 2, height / 2))
+        sums, views = self.grad_sum.numpy(), self.count.numpy()
+        gradient, seen = means2d_grad.contiguous().numpy(), radii.contiguous().numpy()
+        _rust.add_pulls(sums, views, gradient, seen, (width / 2, height / 2))
 
     def note(self, rows: Tensor, norms: Tensor) -> None:
         """Add one view that shows the Gaussians of these rows, [M], with `gradient_norms` [M]."""
