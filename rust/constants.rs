@@ -54,7 +54,7 @@ pub const SUPPORT_SLACK: f64 = 8e-6;
 
 /// Gaussians per unit of parallel work in the projection. Fixed, so that sums over Gaussians (the gradient
 /// of the camera) are added in the same order for any number of threads.
-pub const PROJECT_CHUNK: usize = 512;
+pub const PROJECT_CHUNK: usize = 1024;
 
 /// Most bytes of the (Gaussian, tile) pairs of one view. How many pairs these are follows from the size of a pair.
 pub const MAX_PAIR_BYTES: u64 = 24 << 30;
