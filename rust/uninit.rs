@@ -140,12 +140,14 @@ impl<T: Copy> UninitVec<T> {
     }
 }
 
+/// Zeros that one thread sets at a time.
+const PIECE: usize = if cfg!(miri) { 1 << 6 } else { 1 << 15 };
+
 /// As many zeros, set by all threads of rayon's current pool.
 ///
 /// # Errors
 /// As for [`UninitVec::new`].
 pub fn zeros<T: Real>(len: usize, name: &str) -> Result<Vec<T>, Error> {
-    const PIECE: usize = 1 << 15;
     let mut vector = UninitVec::new(len, name)?;
     let lengths = (0..len.div_ceil(PIECE)).map(|k| PIECE.min(len - k * PIECE));
     vector.cut(lengths).into_par_iter().for_each(|piece| {
@@ -289,7 +291,7 @@ mod tests {
 
     #[test]
     fn zeros_are_zeros() {
-        for len in [0, 1, (1 << 15) + 7] {
+        for len in [0, 1, PIECE + 7] {
             assert_eq!(zeros::<f32>(len, "test").unwrap(), vec![0.0; len]);
         }
     }
