@@ -56,11 +56,14 @@ def places(count: int, beyond: bool, width: int, height: int) -> list[View]:
     return views
 
 
-def pool(scene: Scene, views: list[View], iterations: int, method: str) -> list[ViewMetrics]:
-    """What each of the photos measures of a scene that was trained."""
-    done = Training(scene, Row(method).train_config(0, iterations, {}))
-    done.steps(iterations)
-    return measured(held_out_renders(replace(scene, test=views), done.trainer.shown()))
+def pools(scene: Scene, sets: list[list[View]], iterations: int) -> list[list[list[ViewMetrics]]]:
+    """What the photos of each set measure of a scene, after three quarters of its training and at the end."""
+    done, found = Training(scene, Row("3dgs").train_config(0, iterations, {})), []
+    for steps in (iterations * 3 // 4, iterations - iterations * 3 // 4):
+        done.steps(steps)
+        shown = done.trainer.shown()
+        found.append([measured(held_out_renders(replace(scene, test=views), shown)) for views in sets])
+    return found
 
 
 def held(
@@ -74,23 +77,26 @@ def held(
 
 def run(args: argparse.Namespace) -> list[str]:
     """Train, measure all photos once, and draw some of them many times."""
-    count, draws, iterations, width = (40, 20, 20, 48) if args.quick else (160, 200, 400, 160)
+    count, draws, iterations, width = (40, 20, 20, 48) if args.quick else (120, 200, 300, 96)
     height, lines, rng = width * 3 // 4, list[dict[str, Any]](), np.random.default_rng(0)
-    for photos, beyond in ((12, False), (12, True), (24, False)):
-        name = f"the room by {photos} photos{', also from beyond them' if beyond else ''}"
-        print(f"intervals: {name}", file=sys.stderr)
-        scene, views = beyond_room(photos, None, width, height), places(count, beyond, width, height)
-        one, other = (pool(scene, views, n, "3dgs") for n in (iterations, iterations * 3 // 4))
-        values = {m: np.array([getattr(view, m) for view in one], float) for m in NAMES}
-        apart = values["psnr"] - [view.psnr or 0.0 for view in other]
-        for drawn in DRAWN:
-            sets = [rng.choice(count, drawn, replace=False) for _ in range(draws)]
-            line: dict[str, Any] = {"scene": name, "photos": drawn, "draws": draws}
-            for metric, of in values.items():
-                line[metric], half = held(sets, of, lambda some, metric=metric: half_width(some, metric))
-                line |= {"half": half} if metric == "psnr" else {}
-            line["psnr_difference"], line["half_difference"] = held(sets, apart, half_width)
-            lines.append(line | {"deviation": float(values["psnr"].std())} | facts())
+    for photos, kinds in ((12, (False, True)), (24, (False,))):
+        print(f"intervals: the room by {photos} photos", file=sys.stderr)
+        scene = beyond_room(photos, None, width, height)
+        sets = [places(count, beyond, width, height) for beyond in kinds]
+        for beyond, *moments in zip(kinds, *pools(scene, sets, iterations), strict=True):
+            other, one = (
+                {m: np.array([getattr(view, m) for view in of], float) for m in NAMES} for of in moments
+            )
+            name = f"the room by {photos} photos{', also from beyond them' if beyond else ''}"
+            for drawn in DRAWN:
+                some = [rng.choice(count, drawn, replace=False) for _ in range(draws)]
+                line: dict[str, Any] = {"scene": name, "photos": drawn, "draws": draws}
+                for metric, of in one.items():
+                    line[metric], half = held(some, of, lambda values, m=metric: half_width(values, m))
+                    line |= {"half": half} if metric == "psnr" else {}
+                apart = one["psnr"] - other["psnr"]
+                line["psnr_difference"], line["half_difference"] = held(some, apart, half_width)
+                lines.append(line | {"deviation": float(one["psnr"].std())} | facts())
     table = Table(args.out / "intervals.csv")
     return [listed(table.frame(table.put(lines)), SHOWN)]
 

@@ -14,7 +14,7 @@ WORST_SHOWN = 64.0  # levels, of the brightest or reddest pixel
 TRUST_PHOTOS, TRUST_SIDE = 64, 400  # training photos that are looked at, at most; px, of their longer side
 TRUST_ROUNDS = 4  # of the maximisation: more change the order of the pixels by less than its scatter
 # Of a run's steps: more views are not passed over again for the page's map, but for those of so many photos.
-TRUST_PASSES, TRUST_LEAST = 0.1, 4
+TRUST_PASSES, TRUST_LEAST = 0.06, 4
 PRIOR = 0.1  # error of a Gaussian (white is 1), as of one pixel's weight
 EMPTY = 0.3  # error of what is behind everything
 FLOOR = 0.002  # keeps ratios of errors finite: half a level
