@@ -230,6 +230,8 @@ def test_files_hold_it_or_say_that_they_do_not(
         back = Gaussians.load(tmp_path / name)
         assert back.errors is not None
         assert torch.equal(back.errors, torch.cat([errors[:3], errors[4:]]))
+        assert cli.main(["info", str(tmp_path / name)]) == 0
+        assert "the error of what each shows" in capsys.readouterr().out
         maps = ["render", str(tmp_path / name), "--show", "trust", "--out", str(tmp_path / "map.png")]
         assert cli.main([*maps, "--size", "40", "30"]) == 0
         back.save(tmp_path / "again.ply")

@@ -58,6 +58,7 @@ def _file(path: Path) -> list[str]:
         f"{path}: {len(gaussians):,} Gaussians, harmonics of degree {gaussians.sh_degree}, "
         f"{path.stat().st_size / 1e6:.3g} MB",
         f"nine tenths of them lie in x, y, z: {box}",
+        *(["the error of what each shows: hqgs render --show trust"] if gaussians.errors is not None else []),
         *(f"read: {note}" for note in gaussians.notes),
     ]
 

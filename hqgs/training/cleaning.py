@@ -79,6 +79,7 @@ def clean(
     } | {"means": 0.0}
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in gaussians.named().items()}
     fitted = gaussians.like(leaves)
+    fitted.errors = None  # they were of what it showed before
     optimizer = Adam(
         [{"name": name, "params": [tensor], "lr": rates[name]} for name, tensor in leaves.items()],
         eps=config.adam_eps,
