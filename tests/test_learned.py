@@ -14,8 +14,8 @@ import hqgs
 from hqgs.base.stages import Stage
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm import learned, run
+from hqgs.scene.sfm.constants import NETWORK_ALL
 from hqgs.scene.sfm.folder import write_colmap_folder
-from hqgs.scene.sfm.learned import FEW
 from hqgs.scene.sfm.likely import partners
 from hqgs.scene.sfm.reconstruct import sfm_scene
 
@@ -76,7 +76,7 @@ def test_cameras_come_from_learned_features(package: None, cards: Scene, tmp_pat
 
 
 def test_of_many_photos_the_likely_partners_are_matched() -> None:
-    assert FEW < 30
+    assert NETWORK_ALL < 30
     scores = np.zeros((30, 30), np.int64)
     scores[3, 20] = scores[20, 3] = 9
     pairs = partners(scores, 2)

@@ -124,7 +124,7 @@ def test_large_photos_are_looked_at_smaller(
     model, true, folder = made
     adjust(model, 1.0, True)
     by_features, off = turned(model, true), usual(model)
-    monkeypatch.setattr(patches, "SIDE", 100)
+    monkeypatch.setattr(patches, "PATCH_SIDE", 100)
     better = sharpened(model, folder, adjust)
     assert usual(better) < 0.6 * off
     assert turned(better, true) < 0.6 * by_features

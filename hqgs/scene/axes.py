@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_NEAR, AXES_PAIRS, AXES_RATIO, COPY_SIDE
+from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_NEAR, AXES_PAIRS, COPY_SIDE
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import View
+from hqgs.scene.sfm.constants import LOWE_RATIO
 
 Floats = NDArray[np.float64]
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])  # y down and z forward for y up and z back, and the other way round
@@ -65,7 +66,7 @@ def _matches(first: View, second: View) -> tuple[Floats, Floats]:
     far = np.sqrt(np.maximum(2 - 2 * alike, 0))
     nearest = far.argmin(1)
     best, second_best = np.partition(far, 1, axis=1)[:, :2].T
-    kept = (best < AXES_RATIO * second_best) & (far.argmin(0)[nearest] == np.arange(len(a)))
+    kept = (best < LOWE_RATIO * second_best) & (far.argmin(0)[nearest] == np.arange(len(a)))
     return points[kept], others[nearest[kept]]
 
 

@@ -41,7 +41,6 @@ SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary one
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 FAR_ORIGIN = 100.0  # sizes from the origin: from here on the origin is moved
 AXES_PAIRS = 6  # of neighbours, spread over the photos
-AXES_RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004)
 AXES_NEAR = 3.0  # px from the epipolar line: a match fits
 AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
 RANDOM_POINTS = 20_000  # to start from where a scene has none

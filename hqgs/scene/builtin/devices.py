@@ -33,7 +33,7 @@ class Device(NamedTuple):
         """Values [..., 3] of 0..1 as this camera writes them; each channel rises, black and white stay."""
         v = np.power(values, self.gammas.astype(np.float32)).astype(np.float32)
         bent = v + self.contrast.astype(np.float32) * (v * v * (3 - 2 * v) - v)
-        return np.clip(bent, 0, 1)
+        return np.clip(bent, 0, 1).astype(np.float32, copy=False)
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""

@@ -15,14 +15,11 @@ import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hqgs.scene.sfm.patches import REACH, PatchView, fitted, read_photo, widened
+from hqgs.scene.sfm.constants import DEVIATIONS, JOINT, REACH, SEARCHED, TIMES
+from hqgs.scene.sfm.patches import PatchView, fitted, read_photo, widened
 from hqgs.scene.sfm.tracks import read_tracks
 
-POINTS = 60  # of each photo that the others are searched for, those that most photos see
 BESIDE = 4 * REACH  # px of the photos that are looked at: there no patch reaches the place
-DEVIATIONS = 3.0  # by which more must agree at the place than beside it
-TIMES = 1.5  # the same, as a ratio
-JOINT = 20  # points that a part shares with the rest: wrong ones 12 and 15, right ones 36 and more
 
 Agreement = dict[str, tuple[int, int, int]]  # of a photo: points looked for, that agree, that agree beside
 
@@ -34,7 +31,7 @@ def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
     longest = np.zeros(len(length), bool)
     for k in range(len(names)):
         mine = tracks.point[tracks.view == k]
-        longest[mine[np.argsort(-length[mine], kind="stable")[:POINTS]]] = True
+        longest[mine[np.argsort(-length[mine], kind="stable")[:SEARCHED]]] = True
     views = [PatchView(model, name, read_photo(folder / name)) for name in names]
     chosen = tracks.chosen(longest[tracks.point])
     should = chosen.xy.copy()

@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Floats = NDArray[np.float64]
-
-ORIENTATIONS = (
-    0.1  # weight of the cameras' orientations beside their centres; decides where those are in line
+from hqgs.scene.sfm.constants import (
+    ALIGN_ROUNDS,
+    FARTHEST,
+    HUBER,
+    HYPOTHESES,
+    ORIENTATIONS,
+    OUTLIER,
+    ROUNDING,
 )
-HYPOTHESES = 300  # pairs of cameras that are tried
-OUTLIER = 3.0  # robust standard deviations
-ROUNDING = 1e-9  # residuals below it are none
-MAX_ROUNDS = 20
-HUBER, FAR = 1.0, 1e3  # px from where on a distance counts linearly, and no more
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def align(source: Floats, target: Floats) -> tuple[Similarity, NDArray[np.bool_]
         raise ValueError(f"the {count} cameras of a frame have one centre, which leaves its scale open")
     best = min(found, key=lambda similarity: float(np.median(residuals(similarity))))
     inliers = np.zeros(count, bool)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(ALIGN_ROUNDS):
         rest = residuals(best)
         now = rest <= max(OUTLIER * 1.4826 * float(np.median(rest)), ROUNDING)
         better = fit(now)
@@ -155,7 +156,7 @@ def refine(
     best = start
     apart, cost = _distances(start, points, seen, Ks, viewmats)
     damping = 1e-6
-    for _ in range(MAX_ROUNDS):
+    for _ in range(ALIGN_ROUNDS):
         step = _gauss_newton(best, points, seen, Ks, viewmats, damping)
         now, now_cost = _distances(step, points, seen, Ks, viewmats)
         if now_cost < cost:
@@ -187,7 +188,7 @@ def _distances(
     p = np.where(front[:, None], p, 1.0)
     pixels = np.einsum("nij,nj->ni", Ks[seen.camera, :2], p / p[:, 2:])
     apart = np.where(front, np.linalg.norm(pixels - seen.pixels, axis=1), np.inf)
-    huber = np.where(apart <= HUBER, apart**2 / 2, HUBER * (np.minimum(apart, FAR) - HUBER / 2))
+    huber = np.where(apart <= HUBER, apart**2 / 2, HUBER * (np.minimum(apart, FARTHEST) - HUBER / 2))
     return apart, float(huber.mean())
 
 
@@ -206,7 +207,7 @@ def _gauss_newton(
     K, R = Ks[seen.camera], viewmats[seen.camera, :3, :3]
     off = np.einsum("nij,nj->ni", K[:, :2], p / p[:, 2:]) - seen.pixels
     apart = np.linalg.norm(off, axis=1)
-    weights = np.where(front & (apart < FAR), np.minimum(1, HUBER / np.maximum(apart, ROUNDING)), 0)
+    weights = np.where(front & (apart < FARTHEST), np.minimum(1, HUBER / np.maximum(apart, ROUNDING)), 0)
     project = np.zeros((len(p), 2, 3))  # d pixel / d camera frame
     project[:, 0, 0], project[:, 1, 1] = K[:, 0, 0] / p[:, 2], K[:, 1, 1] / p[:, 2]
     project[:, 0, 2] = -project[:, 0, 0] * p[:, 0] / p[:, 2]

@@ -18,27 +18,31 @@ import numpy as np
 import pycolmap
 
 from hqgs.scene.sfm.agree import Agreement, agreement, confirmed, loose_parts
+from hqgs.scene.sfm.constants import (
+    ALWAYS_CHECKED,
+    COARSE,
+    FALSE,
+    LARGEST,
+    LEAST_PHOTOS,
+    LOG_LOOKS,
+    MATCHED_ALL,
+    PROBED,
+    RICH,
+    ROUNDS,
+    SELDOM,
+    SIGMAS,
+    UNSURE,
+)
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
 from hqgs.scene.sfm.facts import apart, borne_out, counts, placed_names
 from hqgs.scene.sfm.home import brought_home, without
 from hqgs.scene.sfm.learned import look_learned
-from hqgs.scene.sfm.likely import MANY, likely_pairs, pairs_of_faces
+from hqgs.scene.sfm.likely import likely_pairs, pairs_of_faces
 from hqgs.scene.sfm.matching import extract, match, pipeline_options
 from hqgs.scene.sfm.sharpen import sharpened
 from hqgs.scene.sfm.tracks import read_tracks, rebuilt, usual
-from hqgs.scene.sfm.versions import SIGMAS, join, smoothed_copies
+from hqgs.scene.sfm.versions import join, smoothed_copies
 
-LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
-PROBED, RICH = 8, 1000  # photos that tell whether coarse features are enough, and how many they need (median)
-ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
-UNSURE = 0.36  # px of what SIFT sees that observations are usually off, from where on patches tell more
-SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
-COARSE = 2048  # features of a photo that is looked at coarsely, before those with two directions count twice
-FAR = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
-ROUNDS = 3  # of leaving those out, which makes the median smaller
-SMALLEST = 3  # photos of a model
-FEW = 16  # photos, whose places are always checked
-EVERY = 0.5  # s between looks into the log
 BLOCK = re.compile(r"Processing block \[(\d+)/(\d+)(?:, (\d+)/(\d+))?\]")
 
 
@@ -136,7 +140,7 @@ class Attempt:
         if models:
             order = sorted(models, key=lambda k: (-models[k].num_reg_images(), -models[k].num_points3D(), k))
             self.model = models[order[0]]
-            self.apart = apart([placed_names(models[k]) for k in order], SMALLEST)
+            self.apart = apart([placed_names(models[k]) for k in order], LEAST_PHOTOS)
             self._settle(self.model)
 
     def bring_home(self) -> None:
@@ -162,7 +166,7 @@ class Attempt:
             self.model = sharpened(plain, self.photos, self._adjust)
         if self.model is plain and not self._sure >= placed_names(plain):
             self._settle(plain)
-        if not (unsure or self.registered < len(self.names) or len(self.names) < FEW):
+        if not (unsure or self.registered < len(self.names) or len(self.names) < ALWAYS_CHECKED):
             return
         self._tell("agree", 0)
         names, tracks = read_tracks(plain)
@@ -247,7 +251,7 @@ class Attempt:
         if "pairs" in self.given and not self.tolerant:
             return self.given["pairs"]
         pairs = None
-        if len(self.names) > MANY and not self.tolerant:
+        if len(self.names) > MATCHED_ALL and not self.tolerant:
             self._tell("matches", 0)
             with pycolmap.Database.open(database) as db:
                 pairs = likely_pairs(db, len(self.names))
@@ -272,7 +276,7 @@ class Attempt:
 
     def _mapping(self) -> pycolmap.IncrementalPipelineOptions:
         options = pipeline_options()
-        options.min_model_size = SMALLEST
+        options.min_model_size = LEAST_PHOTOS
         mapper = options.mapper
         if self.coarse:
             options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM
@@ -295,7 +299,7 @@ class Attempt:
         """
         mapping = self._mapping()
         for _ in range(ROUNDS):
-            far = FAR * float(np.median([point.error for point in model.points3D.values()]))
+            far = FALSE * float(np.median([point.error for point in model.points3D.values()]))
             seen = pycolmap.ObservationManager(model)
             seen.filter_all_points3D(far, mapping.mapper.filter_min_tri_angle)
             pycolmap.bundle_adjustment(model, mapping.get_global_bundle_adjustment())
@@ -317,7 +321,7 @@ class Attempt:
         done = threading.Event()
 
         def watch() -> None:
-            while not done.wait(EVERY):
+            while not done.wait(LOG_LOOKS):
                 text = log.read_bytes()[start:].decode(errors="replace") if log.exists() else ""
                 count = text.count("Processed file [")
                 if blocks := BLOCK.findall(text):
@@ -336,14 +340,8 @@ class Attempt:
 
     def _tell(self, stage: str, done: int, total: int = 0) -> None:
         """What is being done, for whoever waits."""
-        now = {
-            "tolerant": self.tolerant,
-            "smoothed": self.smoothed,
-            "learned": self.learned,
-            "stage": stage,
-            "done": done,
-            "total": total,
-        }
+        now: dict[str, Any] = {"stage": stage, "done": done, "total": total}
+        now |= {name: getattr(self, name) for name in ("tolerant", "smoothed", "learned")}
         new = self.directory / "stage.new"
         new.write_text(json.dumps(now), encoding="utf-8")
         new.replace(self.directory / "stage.json")

@@ -29,6 +29,7 @@ from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
 from hqgs.scene.photo_files import MASKS, is_run
+from hqgs.scene.sfm.constants import DECODERS, FOLDERS_DEEP
 from hqgs.scene.sfm.front_door import (
     cameras_beside,
     copies,
@@ -43,8 +44,6 @@ from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
-WORKERS = 2
-DEEP = 5  # folders below the one named in which photos are looked for: Takeout/Google Photos/Walk
 
 
 @dataclass(frozen=True)
@@ -176,7 +175,7 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         except UnreadableError as error:
             return str(error)
 
-    with ThreadPoolExecutor(min(WORKERS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(DECODERS, os.cpu_count() or 1)) as pool:
         for k, (name, found) in enumerate(zip(photos.names, pool.map(look, photos.names), strict=True)):
             if isinstance(found, str):
                 unreadable[name.encode(errors="replace").decode()] = found
@@ -230,7 +229,7 @@ def ups(exif: Sequence[Exif]) -> np.ndarray:
 def _photos_below(folder: Path) -> dict[str, list[str]]:
     """The photos in the folders below, by their paths: those of the first level that has any."""
     level = [folder]
-    for _ in range(DEEP):
+    for _ in range(FOLDERS_DEEP):
         inner = (p for place in level for p in place.iterdir() if p.is_dir())
         level = sorted(p for p in inner if p.name not in (MASKS, KEPT) and p.name[0] != "." and not is_run(p))
         if found := {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}:

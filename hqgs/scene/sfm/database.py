@@ -1,6 +1,6 @@
 """COLMAP's database before anything is found: photos, and their cameras.
 
-It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
+It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-FOCAL = 1.2  # of the longer side, where nothing tells
+from hqgs.scene.sfm.constants import FOCAL
 
 
 def known_cameras(given: dict[str, Any], database: Path) -> pycolmap.Reconstruction:

@@ -1,6 +1,6 @@
 """What a pass of COLMAP came to, in counts.
 
-It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
+It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-NEAR = 4.0  # px from its epipolar line that COLMAP lets a match be
+from hqgs.scene.sfm.constants import EPIPOLAR
 
 
 def counts(database: Path, placed: set[str]) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def counts(database: Path, placed: set[str]) -> dict[str, Any]:
 
 def borne_out(database: Path, model: pycolmap.Reconstruction) -> float:
     """The share of the matches between photos with a place, of those that a geometry of their pair bears out,
-    that the places bear out as well: within NEAR of their epipolar lines (Sampson's distance)."""
+    that the places bear out as well: within EPIPOLAR of their epipolar lines (Sampson's distance)."""
     images = {k: model.images[k] for k in model.reg_image_ids()}
     cameras = {k: model.cameras[image.camera_id] for k, image in images.items()}
     rays, agree, total = dict[int, Any](), 0, 0
@@ -63,7 +63,7 @@ def borne_out(database: Path, model: pycolmap.Reconstruction) -> float:
         slopes = np.column_stack([(x @ E.T)[:, :2], (y @ E)[:, :2]])
         focal = min(cameras[k].mean_focal_length() for k in (a, b))
         off = np.abs((y @ E * x).sum(1)) * focal
-        agree += int((off <= NEAR * np.linalg.norm(slopes, axis=1)).sum())
+        agree += int((off <= EPIPOLAR * np.linalg.norm(slopes, axis=1)).sum())
         total += len(matches)
     return agree / max(total, 1)
 

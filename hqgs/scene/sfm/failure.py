@@ -9,15 +9,7 @@ import numpy as np
 
 from hqgs.base.text import some
 from hqgs.scene.sfm.agree import confirmed
-
-FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
-POOR = 0.25  # of the features of the others: the same
-AGREE = 15  # matches that agree, which COLMAP asks of a pair
-BORNE_OUT = (
-    0.85  # of the matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
-)
-LOOKED = 20  # points that a photo should show; fewer tell nothing
-ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
+from hqgs.scene.sfm.constants import BORNE_OUT, DOUBT_POINTS, ENOUGH_INLIERS, FEW_FEATURES, MATCHES, POOR
 
 
 @dataclass(frozen=True)
@@ -82,13 +74,13 @@ def why_lost(name: str, one: Pass) -> str:
     matches, inliers, with_placed = one.best[name]
     if features < max(FEW_FEATURES, POOR * usual):
         return f"blurred, dark or bare: {features:,} features, half of the photos have {usual:,.0f}"
-    if matches < AGREE:
+    if matches < MATCHES:
         return "alone: it matches no other photo"
-    if inliers < AGREE:
+    if inliers < MATCHES:
         return f"no two photos agree: {matches} matches at best, {inliers} of them bear each other out"
     if group := next((group for group in one.apart if name in group), None):
         return f"fits {len(group) - 1} photos that have no place either"
-    if with_placed < AGREE:
+    if with_placed < MATCHES:
         return "fits only photos that have no place either"
     return f"few matches agree: {with_placed} with a photo that has a place"
 
@@ -120,7 +112,7 @@ def doubtful(one: Pass) -> list[str]:
     return sorted(
         name
         for name, (looked, *found) in one.agree.items()
-        if looked >= LOOKED and not confirmed(looked, *found)
+        if looked >= DOUBT_POINTS and not confirmed(looked, *found)
     )
 
 

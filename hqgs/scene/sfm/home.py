@@ -14,9 +14,8 @@ from pathlib import Path
 
 import pycolmap
 
+from hqgs.scene.sfm.constants import GATES
 from hqgs.scene.sfm.facts import placed_names
-
-GATES = ((15, 0.15), (12, 0.1))  # matches with points that agree on a place, and their share of all; least
 
 
 def brought_home(

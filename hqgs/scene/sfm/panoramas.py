@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,8 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode
 from hqgs.scene.faces import Face, around, faces_of
+from hqgs.scene.sfm.constants import FINER, LEAST_PHOTOS, PANORAMA_PLAIN, PANORAMA_POLE, PANORAMA_SEAM, PROBED
 from hqgs.scene.views import to_pinhole
-
-LEAST = 3  # photos of a scene: one alone shows no depth
-LOOKED_AT = 8  # photos of which the files do not tell
-SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of a panorama are neighbours
-POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
-FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo, so that SIFT sees all of it
-PLAIN = 0.25  # the same: a border with less shows nothing
 
 
 def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> bool:
@@ -36,7 +29,7 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
     whole = [name for name, seen in looked.items() if seen.size[0] == 2 * seen.size[1]]
     found = [name for name in whole if name in set(tagged)]
     untold = [name for name in whole if name not in set(tagged)]
-    picks = [untold[k] for k in evenly(len(untold), LOOKED_AT)] if 2 * len(untold) > len(looked) else []
+    picks = [untold[k] for k in evenly(len(untold), PROBED)] if 2 * len(untold) > len(looked) else []
     if 2 * sum(_closes(folder / name) for name in picks) > len(picks):
         found = whole
     if not found:
@@ -53,10 +46,10 @@ def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -
             f"{folder}: {len(found)} of {len(looked)} photos are panoramas of 360 x 180 degrees, others are "
             f"not ({some(others)}): put each kind into a folder of its own"
         )
-    if len(found) < LEAST:
+    if len(found) < LEAST_PHOTOS:
         raise ValueError(
             f"{folder}: {len(found)} panorama{'s' * (len(found) > 1)} of 360 x 180 degrees ({some(found)}) "
-            f"show no depth, wanted at least {LEAST}: take 10 to 50, a step apart"
+            f"show no depth, wanted at least {LEAST_PHOTOS}: take 10 to 50, a step apart"
         )
     return True
 
@@ -71,9 +64,8 @@ def _closes(path: Path) -> bool:
     apart = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
     seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
     poles, border = pixels[[0, -1]].std(1).mean(1), pixels[:, 0].std(0).mean()
-    return bool(
-        seam <= SEAM * np.median(apart) and (poles <= POLE * contrast).all() and border > PLAIN * contrast
-    )
+    joined, poles_plain = seam <= PANORAMA_SEAM * np.median(apart), (poles <= PANORAMA_POLE * contrast).all()
+    return bool(joined and poles_plain and border > PANORAMA_PLAIN * contrast)
 
 
 def colmap_faces(width: int, height: int) -> tuple[Face, ...]:

@@ -15,28 +15,29 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from hqgs.scene.sfm.constants import (
+    CANDIDATES,
+    COARSER,
+    FRONTAL,
+    HALF,
+    NEW,
+    PATCH_PHOTOS,
+    PATCH_SIDE,
+    PATCH_STEPS,
+    REACH,
+    SMOOTH,
+    SURE,
+    UNLIKE,
+    WINDOW,
+)
 from hqgs.scene.sfm.tracks import Floats, Tracks
-
-HALF = 6  # nodes of a patch to each side of its middle
-WINDOW = 3.5  # nodes, sigma of the weights over a patch
-SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
-SIDE = 1000  # px, of these photos
-STEPS = 5  # of Gauss-Newton
-REACH = 3.0  # px that an observation may move
-SURE = 0.6  # correlation with the other photos' mean, of an observation that stays
-UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it
-NEW = 0.7  # the same, of one that no feature told of
-CANDIDATES = 1 << 21  # of a point in a photo, looked at together: 100 MB
-PHOTOS = 12  # that a point is looked for in, beside those whose features show it
-FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
-COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
 
 
 def read_photo(file: Path) -> NDArray[np.float32]:
-    """A photo, gray and smoothed, its longest side at most SIDE px."""
+    """A photo, gray and smoothed, its longest side at most PATCH_SIDE px."""
     with Image.open(file) as image:
         gray = image.convert("L")
-        share = SIDE / max(gray.size)
+        share = PATCH_SIDE / max(gray.size)
         if share < 1:
             size = max(1, round(gray.width * share)), max(1, round(gray.height * share))
             gray = gray.resize(size, Image.Resampling.BOX)
@@ -145,7 +146,7 @@ def fitted(
     usable = _inside(views, tracks, turns, tracks.xy) & (middles > -1e5).all(axis=1)
     at, counted = tracks.xy, usable & ~new
     reach = REACH / np.array([view.ratio[0] for view in views])[tracks.view, None]
-    for _ in range(STEPS):
+    for _ in range(PATCH_STEPS):
         patches = _patches(views, tracks, turns, at)
         mean = _means(patches, tracks, counted)
         grid = mean.reshape(-1, 2 * HALF + 1, 2 * HALF + 1)
@@ -197,14 +198,14 @@ def _candidates(
     may[tracks.view[own], tracks.point[own] - first] = False
     # Of each point's candidates some that are spread over the photos.
     rank, count = np.cumsum(may, axis=0) - 1, may.sum(axis=0)
-    share = np.minimum(1, PHOTOS / np.maximum(count, 1))
+    share = np.minimum(1, PATCH_PHOTOS / np.maximum(count, 1))
     may &= np.floor((rank + 1) * share) > np.floor(rank * share)
     view, point = np.nonzero(may)
     return view, point + first, np.array(places)[view, point]
 
 
 def widened(views: list[PatchView], tracks: Tracks) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Also the observations that photos should have of points, PHOTOS of each; and which are new [O]."""
+    """Also observations that photos should have of points, PATCH_PHOTOS of each; and which are new [O]."""
     axes = axes_of(views, tracks)
     normals = np.cross(axes[:, :, 0], axes[:, :, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

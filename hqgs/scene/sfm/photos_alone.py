@@ -17,14 +17,13 @@ from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
 from hqgs.scene.faces import around
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
+from hqgs.scene.paths import UP
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
+from hqgs.scene.sfm.constants import LEAST_AGREED
 from hqgs.scene.sfm.front_door import tell_strays
 from hqgs.scene.sfm.run import SIFT, run_colmap
 from hqgs.scene.sfm.tracks import sureness
-
-UP = np.array([0.0, -1.0, 0.0])  # in the world of photos alone, as in an upright camera's frame
-LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
 
 
 @dataclass(frozen=True)
@@ -164,4 +163,4 @@ def _upright(viewmats: NDArray[np.float64], exif: list[Exif]) -> NDArray[np.floa
     length = float(np.linalg.norm(mean))
     if length < LEAST_AGREED:
         return np.eye(3)
-    return Rotation.align_vectors(UP[None], (mean / length)[None])[0].as_matrix()
+    return Rotation.align_vectors(np.array([UP]), (mean / length)[None])[0].as_matrix()

@@ -37,13 +37,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.sfm.attempt import ALMOST, Attempt
+from hqgs.scene.sfm.attempt import Attempt
+from hqgs.scene.sfm.constants import ALMOST, COARSE, ENOUGH_PLACED, MAX_ERROR, MIN_TRACK
 from hqgs.scene.sfm.database import known_cameras
 from hqgs.scene.sfm.matching import match, pipeline_options
-
-MAX_FEATURES = 2048  # per photo, of known cameras
-MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many pixels on average
-ENOUGH = 0.7  # of the photos: with fewer, the second pass follows
 
 
 def triangulate(directory: Path) -> None:
@@ -56,7 +53,7 @@ def triangulate(directory: Path) -> None:
     photos, names = Path(str(given["photos"])), given["names"].tolist()
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = 1
-    extraction.sift.max_num_features = MAX_FEATURES
+    extraction.sift.max_num_features = COARSE
     match(directory, photos, names, extraction, 1, database)
     pycolmap.guided_geometric_verification(known, database, num_threads=1)
     (directory / "model").mkdir()
@@ -114,7 +111,7 @@ def _by_sift(directory: Path, given: dict[str, Any], threads: int) -> list[Attem
         again.run()
         passes = [max(passes[0], again, key=lambda one: one.registered)]
     passes[0].bring_home()
-    if passes[0].registered < ENOUGH * len(given["names"]):
+    if passes[0].registered < ENOUGH_PLACED * len(given["names"]):
         passes.append(Attempt(directory, given, threads, tolerant=True))
         passes[1].run()
         passes[1].bring_home()

@@ -25,7 +25,17 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import learned, likely
-from hqgs.scene.sfm.attempt import LARGEST
+from hqgs.scene.sfm.constants import (
+    AGAIN,
+    LARGEST,
+    LEAST_PHOTOS,
+    LEAST_SHARE,
+    LISTEN,
+    LONG,
+    MANY,
+    MATCHED_ALL,
+    PARTNERS,
+)
 from hqgs.scene.sfm.failure import (
     Pass,
     counts,
@@ -38,27 +48,11 @@ from hqgs.scene.sfm.failure import (
 )
 
 PROGRAM = Path(__file__).with_name("program.py")
-IMPORTED = (
-    "agree",
-    "attempt",
-    "database",
-    "facts",
-    "home",
-    "learned",
-    "likely",
-    "matching",
-    "patches",
-    "sharpen",
-    "tracks",
-    "versions",
-)  # by PROGRAM, of this folder
-PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED)]
+IMPORTED = (  # by PROGRAM, of this folder
+    "agree attempt constants database facts home learned likely matching patches sharpen tracks versions"
+)
+PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED.split())]
 FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
-LEAST_PHOTOS = 3  # of a reconstruction
-LEAST_SHARE = 0.5  # of the photos must find their place in it
-LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
-AGAIN = 4  # times the first pass, that all passes take at most
-LISTEN = 0.25  # s between looks at what COLMAP is doing
 STAGES = {
     "features": "COLMAP: features",
     "matches": "COLMAP: pairs of photos matched",
@@ -152,7 +146,7 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
     """
     count = len(sizes)
     if pairs is None:
-        pairs = count * (count - 1) // 2 if count <= likely.MANY else count * likely.BEST
+        pairs = count * (count - 1) // 2 if count <= MATCHED_ALL else count * PARTNERS
     stored = sizes.prod(axis=1) / 1e6  # megapixels
     seen = stored * np.minimum(1, LARGEST / sizes.max(axis=1)) ** 2
     share = 2 / threads

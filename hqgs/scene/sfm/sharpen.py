@@ -15,17 +15,11 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.scene.sfm.patches import SIDE, PatchView, aligned, read_photo, widened
+from hqgs.scene.sfm.constants import ANGLE, CELL, GROWN, LAID, PATCH_SIDE, ROUNDS, STRAY
+from hqgs.scene.sfm.patches import PatchView, aligned, read_photo, widened
 from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, usual
 
 Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
-
-ENOUGH = 150  # observations of a photo, of the points whose patches are laid
-CELL = 2.0  # px, where points are the same
-ROUNDS = 3  # of patches and adjustment
-FAR = 3.0  # times the usual error; observations farther off are left out
-ANGLE = 1.5  # degrees between two rays, least, of a point
-GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
 
 
 def sharpened(
@@ -38,13 +32,13 @@ def sharpened(
     `folder` holds the photos. `adjust` gets a model, the error in px from where on it counts an error less,
     and whether the photos move or the points alone.
 
-    The points that most photos see, ENOUGH in each photo, make the poses precise; the others follow them.
+    The points that most photos see, LAID in each photo, make the poses precise; the others follow them.
     """
     names, tracks = read_tracks(model)
     photos = {name: read_photo(folder / name) for name in names}
     before = usual(model)
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
-    used, fresh = _used(tracks, len(names), CELL * max(1, float(np.median(sides)) / SIDE))
+    used, fresh = _used(tracks, len(names), CELL * max(1, float(np.median(sides)) / PATCH_SIDE))
     now = rebuilt(model, names, tracks.chosen(used[tracks.point]))
     for number in range(ROUNDS):
         _, some = read_tracks(now)
@@ -60,16 +54,16 @@ def sharpened(
         _, some = read_tracks(now)
         off = errors(now)
         own = np.array([np.median([0, *off[some.view == k]]) for k in range(len(names))])
-        now = rebuilt(now, names, some.chosen(off <= FAR * np.maximum(own, usual(now))[some.view]))
+        now = rebuilt(now, names, some.chosen(off <= STRAY * np.maximum(own, usual(now))[some.view]))
         pycolmap.ObservationManager(now).filter_all_points3D(1e9, ANGLE)
         adjust(now, usual(now), True)
     if usual(now) > GROWN * before:
         return model
-    return _joined(now, names, tracks.chosen((fresh & ~used)[tracks.point]), adjust, FAR * before)
+    return _joined(now, names, tracks.chosen((fresh & ~used)[tracks.point]), adjust, STRAY * before)
 
 
 def _used(tracks: Tracks, photos: int, cell: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The points [P] whose patches are laid: those with the longest tracks, until each photo has ENOUGH.
+    """The points [P] whose patches are laid: those with the longest tracks, until each photo has LAID.
 
     Also returns which points are new [P]; versions of a photo, and features with two directions, show the
     same thing again, within a cell of so many px in most of its photos.
@@ -87,7 +81,7 @@ def _used(tracks: Tracks, photos: int, cell: float) -> tuple[NDArray[np.bool_], 
         taken.update(here)
         fresh[point] = True
         views = tracks.view[rows[point]]
-        if (has[views] < ENOUGH).any():
+        if (has[views] < LAID).any():
             used[point] = True
             has[views] += 1
     return used, fresh

@@ -1,6 +1,6 @@
 """A COLMAP model's points and observations as arrays, and the model that they make.
 
-It imports nothing of hqgs: `program.py` uses it in COLMAP's process.
+It imports of hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.scene.sfm.constants import POSE_LEAST, RAYLEIGH
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
-
-LEAST = 4  # observations of a photo that tell a pose and more
-RAYLEIGH = 1.1774  # median distance of points in a plane that scatter by 1 in each direction
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,7 @@ def sureness(model: pycolmap.Reconstruction) -> dict[str, float]:
     off, common, sure = errors(model), usual(model), dict[str, float]()
     for k, name in enumerate(names):
         own = off[tracks.view == k]
-        if len(own) >= LEAST:
+        if len(own) >= POSE_LEAST:
             spread = max(common, float(np.median(own))) / RAYLEIGH
             sure[name] = float(spread * np.sqrt(6 / len(own)))
     return sure

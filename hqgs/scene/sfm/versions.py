@@ -1,8 +1,8 @@
 """Several versions of each photo side by side: noise and blocks hide features that a smoothed copy shows.
 
 No single strength is best for all photos; the features of all versions can lie in one database. Each
-version is matched by itself: a feature that two versions show would pass for ambiguous. It imports nothing of
-hqgs: `program.py` uses it in COLMAP's process.
+version is matched by itself: a feature that two versions show would pass for ambiguous. It imports of
+hqgs what needs nothing else: `program.py` uses it in COLMAP's process.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import pycolmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-SIGMAS = (1.0, 1.5)  # px of what SIFT sees; of the smoothed versions
-QUALITY = 95  # of JPEG, of photos whose names end so
+from hqgs.scene.sfm.constants import COPIES_QUALITY
 
 
 def smoothed_copies(photos: Path, out: Path, names: Sequence[str], sigma: float, largest: int) -> None:
@@ -31,7 +30,9 @@ def smoothed_copies(photos: Path, out: Path, names: Sequence[str], sigma: float,
         with Image.open(photos / name) as image:
             gray = np.asarray(image.convert("L"), np.float32)
         smooth = gaussian_filter(gray, sigma * max(1, max(gray.shape) / largest), mode="nearest")
-        Image.fromarray(np.rint(smooth).astype(np.uint8)).save(target, quality=QUALITY, compress_level=1)
+        Image.fromarray(np.rint(smooth).astype(np.uint8)).save(
+            target, quality=COPIES_QUALITY, compress_level=1
+        )
     new.rename(out)
 
 

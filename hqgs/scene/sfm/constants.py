@@ -1,0 +1,98 @@
+"""The numbers of finding cameras, by what they are for: what each means and its unit.
+
+Where no source is named, the number was set by hand. It imports nothing of hqgs: `program.py` uses it in
+COLMAP's process.
+"""
+
+import math
+
+# What is asked of photos and models.
+LEAST_PHOTOS = 3  # of a scene or model: one alone shows no depth
+LEAST_SHARE = 0.5  # of the photos must find their place in a model
+ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
+ENOUGH_PLACED = 0.7  # of the photos: with fewer, the second pass follows
+MATCHES = 15  # that agree, which COLMAP asks of a pair
+FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
+POOR = 0.25  # of the features of the others: the same
+ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
+BORNE_OUT = 0.85  # of matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
+DOUBT_POINTS = 20  # that a photo should show; fewer tell nothing
+MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many px on average
+PROBED = 8  # photos that tell of all what files do not: how rich they are, whether they are panoramas
+LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
+FOLDERS_DEEP = 5  # below the one named in which photos are looked for: Takeout/Google Photos/Walk
+DECODERS = 2  # photos that are read at once
+
+# Time.
+LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
+AGAIN = 4  # times the first pass, that all passes take at most
+LISTEN, LOG_LOOKS = 0.25, 0.5  # s between looks at what COLMAP is doing, and into its log
+
+# Features, and which photos are matched.
+LARGEST = 1600  # px a side: features of larger photos cost minutes and place no camera better than that
+COARSE = 2048  # features of a photo looked at coarsely (before those with two directions count twice)
+RICH = 1000  # features (median of the probed photos) from where on coarse ones are enough
+SIGMAS = (1.0, 1.5)  # px of what SIFT sees; of the smoothed versions
+COPIES_QUALITY = 95  # of JPEG, of smoothed copies of photos whose names end so
+FOCAL = 1.2  # of the longer side, where nothing tells
+MATCHED_ALL = 60  # photos; of fewer each is matched with each
+LOWE_RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004; COLMAP's too)
+COMPARED = 256  # features of a photo, the largest, that tell its partners
+PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those that follow it
+FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
+DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
+COMPARED_AT_ONCE = 64  # photos that are compared with one
+BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
+LISTED = 64  # blocks of pairs that are listed
+NETWORK_FEATURES = 1024  # of a photo
+NETWORK_SMALL, NETWORK_LARGE = 640, 1024  # px: photos are brought to a longest side between the two
+NETWORK_ALL, NETWORK_PARTNERS = 24, 12  # photos, of fewer each is matched with each; partners of one of more
+
+# Panoramas.
+PANORAMA_SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of it are neighbours
+PANORAMA_POLE = 0.35  # of the picture's contrast: its first and last rows show a point each
+PANORAMA_PLAIN = 0.25  # the same: a border with less shows nothing
+FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo, so that SIFT sees all of it
+
+# Places by weaker evidence, and what photos say of places.
+GATES = ((15, 0.15), (12, 0.1))  # matches with points that agree on a place, and their share of all; least
+EPIPOLAR = 4.0  # px from its epipolar line that COLMAP lets a match be
+ALWAYS_CHECKED = 16  # photos, whose places are always checked
+SEARCHED = 60  # points of each photo that the others are searched for, those that most photos see
+DEVIATIONS, TIMES = 3.0, 1.5  # by which more must agree at the place than beside it; the same, as a ratio
+JOINT = 20  # points that a part shares with the rest: wrong ones 12 and 15, right ones 36 and more
+
+# What is left out, and adjusted.
+ROUNDS = 3  # of patches, or of leaving out what lies far off, and adjustment
+FALSE = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
+UNSURE = 0.36  # px of what SIFT sees that observations are usually off, from where on patches tell more
+SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
+POSE_LEAST = 4  # observations of a photo that tell a pose and more
+RAYLEIGH = math.sqrt(2 * math.log(2))  # median distance of points in a plane that scatter by 1 each way
+
+# Patches of points.
+HALF = 6  # nodes of a patch to each side of its middle
+WINDOW = 3.5  # nodes, sigma of the weights over a patch
+SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
+PATCH_SIDE = 1000  # px, of these photos
+PATCH_STEPS = 5  # of Gauss-Newton
+REACH = 3.0  # px that an observation may move
+SURE, NEW = 0.6, 0.7  # correlation with the others' mean, of what stays; of what no feature told of
+UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it
+CANDIDATES = 1 << 21  # of a point in a photo, looked at together: 100 MB
+PATCH_PHOTOS = 12  # that a point is looked for in, beside those whose features show it
+FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
+COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
+LAID = 150  # observations of a photo, of the points whose patches are laid
+CELL = 2.0  # px, where points are the same
+STRAY = 3.0  # times the usual error; observations farther off are left out
+ANGLE = 1.5  # degrees between two rays, least, of a point
+GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
+
+# Frames laid onto each other.
+ORIENTATIONS = 0.1  # weight of cameras' orientations beside their centres; decides where those are in line
+HYPOTHESES = 300  # pairs of cameras that are tried
+OUTLIER = 3.0  # robust standard deviations
+ROUNDING = 1e-9  # residuals below it are none
+ALIGN_ROUNDS = 20
+HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more
