@@ -13,6 +13,7 @@ import pytest
 from fixtures_scenes import FX, FY, HEIGHT, WIDTH, frames, make_truth, subset, write_photos, write_transforms
 from PIL import Image
 
+from hqgs.scene.geometry import resized
 from hqgs.scene.load import load_scene
 
 
@@ -132,6 +133,12 @@ def test_blender_set(tmp_path: Path) -> None:
     ):
         assert view.mask is None
         np.testing.assert_array_equal(view.image, np.rint(photo * (alpha[..., None] / 255)).astype(np.uint8))
+        np.testing.assert_array_equal(view.empty, 255 - alpha)
+    small = load_scene(tmp_path, downscale=2).train[0]
+    assert small.empty is not None
+    shown = (255.0 - alpha).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean((1, 3))
+    np.testing.assert_allclose(small.empty, shown, atol=0.5)
+    np.testing.assert_array_equal(resized(scene.train[0], WIDTH // 2, HEIGHT // 2).empty, small.empty)
     assert any("the 6 photos are cut out" in note for note in scene.notes)
     assert "the test views are the 2 of transforms_test.json" in scene.notes[0]
     # The random points were drawn where the masks count, around the point all cameras look at.

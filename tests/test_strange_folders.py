@@ -123,6 +123,17 @@ def test_two_hundred_megapixels_are_read_and_more_than_memory_are_not(
         glance(tmp_path / "b.png")
 
 
+def test_photos_that_are_in_a_cloud_alone_are_told(tmp_path: Path) -> None:
+    pictures(tmp_path, 4)
+    (tmp_path / "0.png").write_bytes(b"")
+    (tmp_path / ".IMG_5.JPG.icloud").write_bytes(b"a name")
+    (tmp_path / "b.jpg.crdownload").write_bytes(b"half")
+    photos = looked_at(tmp_path)
+    assert photos.unreadable == {"0.png": "0 bytes: not downloaded from a cloud, or not copied to its end"}
+    told = "2 files not here, or not to the end: download .IMG_5.JPG.icloud, b.jpg.crdownload first"
+    assert photos.notes == ["3 photos, no camera in EXIF", told]
+
+
 def test_a_film_alone_in_a_folder_is_that_film(tmp_path: Path) -> None:
     folder = tmp_path / "walk"
     (folder / "DCIM").mkdir(parents=True)

@@ -93,7 +93,7 @@ def _photos(path: Path) -> list[str]:
     photos = readable(found)
     sizes = sorted(set(photos.sizes))
     guess = photos.guess()
-    focal = sum(value > 0 for value in guess.focals)
+    focal = sum(exif.focal > 0 for exif in photos.exif)
     poses = ", ".join(formats) if formats else "none yet: hqgs train and hqgs sfm find them"
     lines = [
         f"{root}: {len(photos.names)} photos of {', '.join(f'{w} x {h}' for w, h in sizes[:4])} px"

@@ -95,6 +95,8 @@ class Glance:
 def glance(path: Path) -> Glance:
     """Look at a photo that can be decoded to its end. UnreadableError: it cannot."""
     try:
+        if not path.stat().st_size:
+            raise UnreadableError("0 bytes: not downloaded from a cloud, or not copied to its end")
         with open_photo(path) as photo:
             size = photo.size
             photo.draft("L", (size[0] // 8, size[1] // 8))  # a JPEG is quickly read like this
@@ -102,6 +104,8 @@ def glance(path: Path) -> Glance:
             return Glance(size, photo.format or "", np.array(small))
     except UnidentifiedImageError as error:
         raise UnreadableError("no picture") from error
+    except UnreadableError:
+        raise
     except DECODE_ERRORS as error:
         raise UnreadableError(str(error) or type(error).__name__) from error
 
@@ -135,7 +139,8 @@ def decode(
     `least`: the width and height that are enough. A JPEG file is then decoded at 1/2, 1/4 or 1/8 of its
     sides, rounded up, where that is at least as much; `shrunk` tells by how much. None: at its full size.
 
-    `over`: a colour (R, G, B, 1 is white) that shows where the photo is transparent, in place of a mask.
+    `over`: a colour (R, G, B, 1 is white) that shows where the photo is transparent, in place of a mask; a
+    fourth channel then has how empty each pixel is, 255 less its alpha.
 
     Greyscale becomes three equal channels, 16 bits become 8. Colours are as stored: nothing is composited,
     no colour profile is applied. EXIF orientation is not applied either: the cameras were computed for the
@@ -157,10 +162,11 @@ def decode(
                 if over is not None:
                     alpha = rgba[..., 3:] / 255
                     mixed = alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(over)
-                    return np.rint(mixed).astype(np.uint8), None
+                    return np.rint(np.dstack([mixed, 255 - rgba[..., 3]])).astype(np.uint8), None
                 opaque = bool((rgba[..., 3] == 255).all())
                 return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
-            return np.array(photo.convert("RGB")), None
+            rgb = np.array(photo.convert("RGB"))
+            return (rgb if over is None else np.dstack([rgb, np.zeros_like(rgb[..., 0])])), None
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the photo {path}: {e}") from e
 

@@ -43,6 +43,7 @@ FAR_ORIGIN = 100.0  # sizes from the origin: from here on the origin is moved
 AXES_PAIRS = 6  # of neighbours, spread over the photos
 AXES_NEAR = 3.0  # px from the epipolar line: a match fits
 AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
+EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 RANDOM_POINTS = 20_000  # to start from where a scene has none
 
 # Camera paths.

@@ -41,7 +41,7 @@ def degrade_scene(scene: Scene, degradation: Degradation, seed: int) -> Scene:
     that is too small for a blur, or photos of several sizes before a video; the last two name the photo.
     """
     train = [
-        replace(view, image=result.image, low=result.low, film=None)
+        replace(view, image=result.image, low=result.low, film=None, empty=None)
         for view, result in degraded_views(scene, degradation, seed)
     ]
     note = _note(scene, degradation, seed, "kept as 32-bit floats")

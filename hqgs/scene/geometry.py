@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs._rust import NEAR_PLANE
-from hqgs.photos.resize import area_downscale
+from hqgs.photos.resize import Pixels, area_downscale
 from hqgs.scene.constants import PICTURE_MARGIN
 from hqgs.scene.scene import Camera, Scene, View
 
@@ -106,8 +106,21 @@ def shrunk_camera(camera: Camera, longest: int) -> Camera:
 
 def resized(view: View, width: int, height: int) -> View:
     """The view with photo, mask and camera at a smaller size, px."""
+    camera = resized_camera(view.camera, width, height)
+    if view.empty is not None:
+        pixels = np.dstack([view.image, view.empty]).astype(np.uint8)
+        both, mask = area_downscale(pixels, view.mask, width, height)
+        image, empty = parts_of(both)
+        return View(view.name, camera, image, mask, empty=empty)
     image, mask = area_downscale(view.image, view.mask, width, height)
-    return View(view.name, resized_camera(view.camera, width, height), image, mask)
+    return View(view.name, camera, image, mask)
+
+
+def parts_of(pixels: Pixels) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Colours [H, W, 3] and how empty each pixel is [H, W], of both [H, W, 4]; None: nothing is empty."""
+    found = pixels.astype(np.uint8)
+    empty = np.ascontiguousarray(found[..., 3])
+    return np.ascontiguousarray(found[..., :3]), empty if empty.any() else None
 
 
 def shrunk(view: View, longest: int) -> View:

@@ -112,7 +112,7 @@ def cut_outs(capture: Capture, notes: list[str]) -> bool:
         return False
     if not all(is_cut_out(photo.path) for photo in photos):
         return False
-    notes.append(f"the {len(photos)} photos are cut out: what is transparent is empty, and black behind")
+    notes.append(f"the {len(photos)} photos are cut out: what is transparent is empty")
     return True
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import RANDOM_POINTS
+from hqgs.scene.constants import EMPTY, RANDOM_POINTS
 from hqgs.scene.geometry import unproject
 from hqgs.scene.paths import sight_lines
 from hqgs.scene.scene import View
@@ -27,8 +27,9 @@ def random_points(
     for i, view in enumerate(views):
         count = RANDOM_POINTS * (i + 1) // len(views) - RANDOM_POINTS * i // len(views)
         cells = np.arange(view.image.shape[0] * view.image.shape[1])
-        if view.mask is not None:
-            cells = cells[view.mask.ravel()]
+        shown = view.mask if view.empty is None else view.empty < EMPTY
+        if shown is not None:
+            cells = cells[shown.ravel()]
         if len(cells) == 0:
             continue
         rows, columns = np.divmod(rng.choice(cells, count), view.camera.width)

@@ -96,7 +96,7 @@ def restore_scene(scene: Scene, weights: str | Path, config: RestoreConfig = DEF
         if not hasattr(local, "network"):
             local.network = copy.deepcopy(network)  # some networks keep values of a call in their modules
         try:
-            return replace(view, image=_restored_image(local.network, view, config), film=None)
+            return replace(view, image=_restored_image(local.network, view, config), film=None, empty=None)
         except NETWORK_ERRORS as error:
             height, width = _as_taken(view).shape[:2]
             raise ValueError(

@@ -47,6 +47,7 @@ class View:
     film: float | None = None  # `fine_detail` of the film's frame that `image` is, before it was stored
     device: str = ""  # the camera that took it, and how it was zoomed; "": nothing tells
     face: str = ""  # of a wide photo, which `image` is; as `hqgs.scene.faces` calls it
+    empty: NDArray[np.uint8] | None = None  # [H, W], of a cut-out photo: 255 where nothing is, and black
 
 
 @dataclass(frozen=True)

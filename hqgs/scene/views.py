@@ -40,6 +40,7 @@ from hqgs.scene.constants import (
     STRAIGHT,
 )
 from hqgs.scene.faces import AROUND, Face, faces_of, lit, projected
+from hqgs.scene.geometry import parts_of
 from hqgs.scene.lenses import check_camera, check_size, fits
 from hqgs.scene.scene import Camera, View
 
@@ -122,11 +123,8 @@ def _load_view(
     exif = read_exif(photo.path)
     turns, upright = exif.quarter_turns, 0
     if turns % 2 and not fits(camera, *stored) and fits(camera, stored[1], stored[0]):
-        stored, turns, upright = (
-            (stored[1], stored[0]),
-            0,
-            turns,
-        )  # the cameras are those of photos as EXIF shows them
+        # the cameras are those of photos as EXIF shows them
+        stored, turns, upright = (stored[1], stored[0]), 0, turns
     check_size(camera, *stored, photo.name)
     # A mask hides colours that must not be mixed into what it shows: such photos are decoded whole.
     enough = downscale > 1 and photo.mask_path is None
@@ -143,7 +141,7 @@ def _load_view(
         counts = decode_mask(photo.mask_path, width, height)
         mask = counts if mask is None else mask & counts
     size = stored[0] / shrunk(stored[0], width), stored[1] / shrunk(stored[1], height)
-    if photo.face is not None and camera.model.name != AROUND and not (light := lit(image)).all():
+    if photo.face is not None and camera.model.name != AROUND and not (light := lit(image[..., :3])).all():
         mask = light if mask is None else mask & light
 
     face = "" if photo.face is None else photo.face.name
@@ -174,7 +172,8 @@ def _load_view(
     film = photo.film if downscale <= FILM_SHRUNK else None
     alike = f"{camera.model.name} {camera.params.tolist()} {stored[0]} x {stored[1]}"
     device = " ".join(exif.camera) or alike
-    return View(photo.name, camera_now, image, mask, None, turns, film, device, face)
+    image, empty = (image, None) if over is None else parts_of(image)
+    return View(photo.name, camera_now, image, mask, None, turns, film, device, face, empty)
 
 
 @dataclass(frozen=True)

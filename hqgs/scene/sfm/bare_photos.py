@@ -34,6 +34,7 @@ from hqgs.scene.sfm.front_door import (
     cameras_beside,
     copies,
     films_beside,
+    not_here,
     photos_and_maps,
     photos_below,
     strays,
@@ -147,7 +148,7 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
             notes.append(f"not taken for photos, by the names of their folders: {some([*others])}")
     if not names:
         return None
-    notes += [*films_beside(folder, names), *cameras_beside(root, folder)]
+    notes += [*films_beside(folder, names), *cameras_beside(root, folder), *not_here(folder)]
     return BarePhotos(folder, left, names, notes=notes)
 
 

@@ -33,6 +33,7 @@ _NO_PHOTOS = re.compile(
     r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
     re.IGNORECASE,
 )
+_NOT_HERE = (".icloud", ".crdownload", ".part", ".partial", ".download")
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
 _OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
 _LEAST = 3  # photos of that camera
@@ -147,6 +148,14 @@ def cameras_beside(*folders: Path) -> list[str]:
         f"cameras are found from the photos: those in {some([*named])} ({what}) are not read; an export for "
         "COLMAP or nerfstudio is"
     ]
+
+
+def not_here(folder: Path) -> list[str]:
+    """That photos are in a cloud alone, or not downloaded to their end; or nothing."""
+    found = sorted(p.name for p in folder.iterdir() if p.name.lower().endswith(_NOT_HERE))
+    if not found:
+        return []
+    return [f"{_count(len(found), 'file')} not here, or not to the end: download {some(found)} first"]
 
 
 def photos_and_maps(below: dict[str, list[str]]) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
