@@ -77,7 +77,7 @@ def held(
 
 def run(args: argparse.Namespace) -> list[str]:
     """Train, measure all photos once, and draw some of them many times."""
-    count, draws, iterations, width = (40, 20, 20, 48) if args.quick else (120, 200, 300, 96)
+    count, draws, iterations, width = (40, 20, 20, 48) if args.quick else (80, 200, 300, 96)
     height, lines, rng = width * 3 // 4, list[dict[str, Any]](), np.random.default_rng(0)
     for photos, kinds in ((12, (False, True)), (24, (False,))):
         print(f"intervals: the room by {photos} photos", file=sys.stderr)
