@@ -12,9 +12,9 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.config import TrainConfig, run_config
-from hqgs.training.few_photos import DROPPED, OPAQUE, decay_opacities, with_dropout
+from hqgs.training.constants import DECAY, DROPOUT, DROPPED, OPAQUE
+from hqgs.training.few_photos import decay_opacities, with_dropout
 from hqgs.training.plan import Facts
-from hqgs.training.plan_few_photos import DECAY, DROPOUT
 from hqgs.training.plan_rules import plan_run
 from hqgs.training.trainer import Trainer
 

@@ -24,11 +24,10 @@ from hqgs.model.render import render_view
 from hqgs.scene.scene import Scene
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import CLEANING_DECAY, CLEANING_STEPS
+from hqgs.training.constants import CLEANING_DECAY, CLEANING_STEPS, DROPOUT
 from hqgs.training.few_photos import decay_opacities, with_dropout
 from hqgs.training.guard import coming_gradient, gradient_fault
 from hqgs.training.methods.base import ThreeDGS
-from hqgs.training.plan_few_photos import DROPOUT
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,7 @@ from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
-
-SPLIT_CHILDREN = 2
-SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN  # a child's scales are its parent's over this
+from hqgs.training.constants import SPLIT_CHILDREN, SPLIT_SHRINK
 
 
 @dataclass(frozen=True)

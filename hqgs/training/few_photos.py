@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
-
-OPAQUE = 0.999  # opacity that dropout raises a Gaussian to, at most: its logit stays finite
-DROPPED = -20.0  # logit of a dropped one's opacity, 2e-9: no pixel blends it
+from hqgs.training.constants import DROPPED, OPAQUE
 
 
 @torch.no_grad()

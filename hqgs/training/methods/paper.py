@@ -15,10 +15,10 @@ from hqgs.photos.edges import edge_magnitude
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import ESFGConfig, PaperConfig
-from hqgs.training.constants import DIMMEST, SCS_CACHE_BYTES, SCS_WEIGHT
+from hqgs.training.constants import DIMMEST, LAMBDA_DSSIM, SCS_CACHE_BYTES, SCS_WEIGHT
 from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.photometric import LAMBDA_DSSIM, photometric_loss
+from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.state import TrainState
 
 VARIANTS = {

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs import _rust
-
-LAMBDA_DSSIM = 0.2  # weight of D-SSIM beside L1 (Kerbl et al. 2023, equation 7)
+from hqgs.training.constants import LAMBDA_DSSIM
 
 
 def photometric_loss(
