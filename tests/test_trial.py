@@ -20,7 +20,7 @@ from hqgs.training.plan_rules import plan_run
 from hqgs.training.trainer import Trainer
 
 ASKED = run_config(iterations=1000, method="hqgs", formation="none")
-FIRST = 40  # points that the fake runs start from
+FIRST, GAUSSIAN = 40, 80  # points that the fake runs start from; pixels a Gaussian of one that does not grow
 
 
 def facts(*tried: Tried) -> Facts:
@@ -37,14 +37,14 @@ def told(plan: RunPlan) -> str:
     ("gains", "wanted"),
     [
         ((), 1_000_000),
-        (((2.5, -0.76, 0.2), (0.0, -1.98, 0.4)), 1_000_000),  # growth pays
-        (((2.5, 0.44, 0.2), (0.0, 0.99, 0.4)), 0),  # none pays most
-        (((2.5, 0.67, 0.2), (0.0, 0.22, 0.1)), 250),  # some pays most
-        (((2.5, 0.30, 0.4), (0.0, 0.02, 0.01)), 1_000_000),  # within the scatter, or too little
+        (((40, -0.76, 0.2), (0, -1.98, 0.4)), 1_000_000),  # growth pays
+        (((40, 0.44, 0.2), (0, 0.99, 0.4)), 0),  # none pays most
+        (((40, 0.67, 0.2), (0, 0.22, 0.1)), 250),  # some pays most
+        (((40, 0.30, 0.4), (0, 0.02, 0.01)), 1_000_000),  # within the scatter, or too little
     ],
 )
 def test_growth_is_bounded_where_photos_held_back_are_better_for_it(
-    gains: tuple[tuple[float, float, float], ...], wanted: int
+    gains: tuple[tuple[int, float, float], ...], wanted: int
 ) -> None:
     tried = tuple(Tried(*gain, photos=6) for gain in gains)
     plan = plan_run(facts(*tried), None, ASKED)
@@ -77,11 +77,12 @@ class FakeRun:
     def held_out(self) -> list[RenderedView]:
         assert self.iteration == self.length == TRIAL_STEPS
         growth = self.plan.settings.densify
-        level = growth.max_gaussians / FIRST if growth.start < growth.stop else 1
+        pixels = sum(view.camera.width * view.camera.height for view in self.scene.train)
+        level = growth.max_gaussians / pixels if growth.start < growth.stop else 1 / GAUSSIAN
         rng = np.random.default_rng(0)
         found = []
         for view in self.scene.test:
-            error = 0.01 * level * rng.choice([-1, 1], view.image.shape)
+            error = 0.5 * level * rng.choice([-1, 1], view.image.shape)
             render = (view.image / 255 + error).astype(np.float32)
             found.append(RenderedView(view.name, view.image, render))
         return found
@@ -104,8 +105,10 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
         assert sorted(view.name for view in (*part.train, *part.test)) == sorted(names)
     assert [tried.level for tried in found] == [*TRIAL_LEVELS[1:]]
     assert {tried.photos for tried in found} == {sum(len(part.test) for part in seen)}
-    for tried in found:  # errors are in proportion to the level
-        assert tried.gain == pytest.approx(20 * np.log10(TRIAL_LEVELS[0] / (tried.level or 1)), abs=0.3)
+    for tried in found:  # errors are in proportion to the Gaussians
+        assert tried.gain == pytest.approx(
+            20 * np.log10((tried.level or GAUSSIAN) / TRIAL_LEVELS[0]), abs=0.3
+        )
         assert tried.error < 0.1
 
 

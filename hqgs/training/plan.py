@@ -31,7 +31,7 @@ class StepSeconds:
 class Tried:
     """A bound of growth in short runs on small copies of the photos (`tried_growth`)."""
 
-    level: float  # Gaussians at most, in times of the first points; 0: nothing grows
+    level: int  # pixels of the photos for each Gaussian, at least; 0: nothing grows
     gain: float  # dB over growth as it likes, mean over photos held back
     error: float  # standard error of that mean
     photos: int  # that were held back

@@ -30,7 +30,7 @@ def told_by_trial(facts: Facts) -> str:
     if not facts.tried:
         return ""
     gains = [
-        f"{f'{tried.level:g} times the first ones at most' if tried.level else 'none'} "
+        f"{f'one Gaussian for {tried.level} pixels at most' if tried.level else 'none'} "
         f"{tried.gain:+.2f} ± {tried.error:.2f} dB"
         for tried in facts.tried
     ]
@@ -49,7 +49,7 @@ def bound_of_growth(draft: Draft) -> Choice:
     if best is None or not best.level:
         return Choice(f"{most:,} Gaussians at most", "it bounds the memory")
     first = first_points_wanted(facts, min(settings.start_points, most))
-    most = min(most, max(round(best.level * first), facts.points))
+    most = min(most, max(facts.pixels // best.level, first, facts.points))
     why = "more of them explain each photo alone, and views between photos are worse"
     changes = {"densify.max_gaussians": most}
     return Choice(f"{most:,} Gaussians at most", why, told_by_trial(facts), changes=changes)

@@ -82,8 +82,9 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
     for offset in TRIAL_OFFSETS:
         held = range(offset, len(views), TRIAL_EACH)
         train = [view for k, view in enumerate(views) if k not in held]
+        pixels = sum(view.camera.width * view.camera.height for view in train)
         part = replace(scene, train=train, test=[views[k] for k in held])
-        for values, psnr in zip(found, _short_runs(begin(part, config)), strict=True):
+        for values, psnr in zip(found, _short_runs(begin(part, config), pixels), strict=True):
             values += psnr
     gains = np.array(found[1:]) - found[0]
     gains = gains[:, np.isfinite(gains).all(0)]
@@ -96,17 +97,15 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
     )
 
 
-def _short_runs(trainer: ShortRun) -> Iterator[list[float]]:
-    """PSNR of each held-out photo, brightness and tint set aside, after a run of each level."""
+def _short_runs(trainer: ShortRun, pixels: int) -> Iterator[list[float]]:
+    """PSNR of each held-out photo, brightness and tint set aside, after a run of each level; `pixels`: of
+    all photos that it trains on."""
     kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
     settings, first = trainer.plan.settings, trainer.plan.first_points
     for level in TRIAL_LEVELS:
         growth = settings.densify
-        growth = (
-            replace(growth, max_gaussians=round(level * first))
-            if level
-            else replace(growth, **no_growth(growth))
-        )
+        most = {"max_gaussians": max(pixels // level, first)} if level else no_growth(growth)
+        growth = replace(growth, **most)
         trainer.begin(replace(trainer.plan, settings=replace(settings, densify=growth)))
         trainer.method.load_state_dict(kept)
         while trainer.iteration < trainer.length:
