@@ -74,13 +74,13 @@ TOO_DARK = 0.02  # of white: below, gains are not told
 
 # The trial of growth: short runs on small copies of the photos. On ten captures its sign was that of runs of
 # 800 to 1,000 steps at 240 to 480 px wherever both were clear: no growth for tourists' photos of a building
-# and for a can on bare tiles, some for a street and a room of 8 photos, as it likes for six.
-TRIAL_SIDE, TRIAL_STEPS = 120, 300  # px; steps of each run. 160 px, 400 steps say the same for twice the time
-TRIAL_LEVELS = (10, 40, 0)  # pixels of the photos for each Gaussian, at least: as growth likes, less, none
-TRIAL_EACH, TRIAL_OFFSETS = 5, (1, 3)  # every so-manieth photo is held back, from these on
+# and for a can on bare tiles, as it likes for the others.
+TRIAL_SIDE, TRIAL_STEPS = 120, 600  # px; steps of each run: after 300 the building's photos do not tell yet
+TRIAL_PIXELS = 10  # of the photos for each Gaussian, at least, where growth is as it likes
+TRIAL_EACH, TRIAL_OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on
 TRIAL_VIEWS = 5  # photos: one is held back each time, and four are left
-TRIAL_SHARE = 0.12  # of the pixels that the run trains on: those of the trial, at most
-TRIAL_GAIN = 0.1  # dB on the photos held back, and its standard error: less growth must gain more
+TRIAL_SHARE = 1 / 6  # of the pixels that the run trains on: those of the trial, at most
+TRIAL_GAIN = 0.1  # dB on the photos held back, and its standard error: none must gain more
 
 # The guard. Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.
 GUARD_LIMIT = 1e18

@@ -29,10 +29,9 @@ class StepSeconds:
 
 @dataclass(frozen=True)
 class Tried:
-    """A bound of growth in short runs on small copies of the photos (`tried_growth`)."""
+    """What a run without growth gains over one with it, in short runs on small copies (`tried_growth`)."""
 
-    level: int  # pixels of the photos for each Gaussian, at least; 0: nothing grows
-    gain: float  # dB over growth as it likes, mean over photos held back
+    gain: float  # dB, mean over photos held back
     error: float  # standard error of that mean
     photos: int  # that were held back
 
@@ -52,7 +51,7 @@ class Facts:
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
     passed: int | None = None  # photos in which somebody passes by; None: not looked at
     passing: float = 0.0  # share of all pixels that these cover
-    tried: tuple[Tried, ...] = ()  # what bounds of growth gain; none: not tried
+    tried: Tried | None = None  # whether growth pays; None: not tried
     # What the method tells of the photos (`Method.facts`):
     as_photographed: bool = False  # renders are compared with photos as they are, of any size
     sizes: tuple[tuple[int, int], ...] = ()  # height and width of each photo as it was taken

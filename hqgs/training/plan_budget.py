@@ -6,8 +6,8 @@ import math
 
 from hqgs.photos.formula import Degradation
 from hqgs.training.config import DensifyConfig
-from hqgs.training.constants import DETERMINED, NOISE_HALVING, PIXELS, TIMES_OWN_POINTS, TRIAL_GAIN
-from hqgs.training.plan import Choice, Draft, Facts, Tried
+from hqgs.training.constants import DETERMINED, NOISE_HALVING, PIXELS, TIMES_OWN_POINTS
+from hqgs.training.plan import Facts
 
 
 def first_points_wanted(facts: Facts, most: int) -> int:
@@ -19,40 +19,9 @@ def first_points_wanted(facts: Facts, most: int) -> int:
     return min(most, max(facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))
 
 
-def best_tried(facts: Facts) -> Tried | None:
-    """What of the bounds of growth that were tried is best; None: growth as it likes."""
-    paying = [tried for tried in facts.tried if tried.gain > max(TRIAL_GAIN, tried.error)]
-    return max(paying, key=lambda tried: tried.gain, default=None)
-
-
-def told_by_trial(facts: Facts) -> str:
-    """The evidence of the rules that go by the trial."""
-    if not facts.tried:
-        return ""
-    gains = [
-        f"{f'one Gaussian for {tried.level} pixels at most' if tried.level else 'none'} "
-        f"{tried.gain:+.2f} ± {tried.error:.2f} dB"
-        for tried in facts.tried
-    ]
-    return f"on {facts.tried[0].photos} photos held back from short runs: {', '.join(gains)}"
-
-
 def no_growth(growth: DensifyConfig) -> dict[str, int]:
     """The fields of a schedule by which nothing grows, and nothing is removed."""
     return {"start": growth.stop, "reset_every": max(1, growth.stop)}
-
-
-def bound_of_growth(draft: Draft) -> Choice:
-    """How many Gaussians may come to be of photos without a fault: what the trial of growth says."""
-    facts, settings, best = draft.facts, draft.settings, best_tried(draft.facts)
-    most = settings.densify.max_gaussians
-    if best is None or not best.level:
-        return Choice(f"{most:,} Gaussians at most", "it bounds the memory")
-    first = first_points_wanted(facts, min(settings.start_points, most))
-    most = min(most, max(facts.pixels // best.level, first, facts.points))
-    why = "more of them explain each photo alone, and views between photos are worse"
-    changes = {"densify.max_gaussians": most}
-    return Choice(f"{most:,} Gaussians at most", why, told_by_trial(facts), changes=changes)
 
 
 def gaussians_determined(facts: Facts, formation: Degradation, per_pixel: float) -> int:

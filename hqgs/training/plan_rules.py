@@ -27,17 +27,15 @@ from hqgs.training.constants import (
     MOST_HELD,
     PIXELS,
     SMALLEST_SIDE,
+    TRIAL_GAIN,
 )
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import (
-    best_tried,
-    bound_of_growth,
     first_points_wanted,
     gaussians_determined,
     kept_gradient,
     no_growth,
     sharp_pixels,
-    told_by_trial,
 )
 from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
 from hqgs.training.plan_left_out import held_photos, needless
@@ -244,7 +242,7 @@ def budget(draft: Draft) -> Sequence[Choice]:
     facts, settings = draft.facts, draft.settings
     growth = settings.densify
     if not draft.formed or draft.undegraded or not facts.sizes:
-        return [bound_of_growth(draft)]
+        return [Choice(f"{growth.max_gaussians:,} Gaussians at most", "it bounds the memory")]
     degradation = draft.degradation
     wanted = max(gaussians_determined(facts, degradation, settings.hqgs.gaussians_per_pixel), facts.points)
     most = min(growth.max_gaussians, wanted)
@@ -279,13 +277,16 @@ def resets(draft: Draft) -> Sequence[Choice]:
 
 
 def growth(draft: Draft) -> Sequence[Choice]:
-    densify, told = draft.settings.densify, told_by_trial(draft.facts)
-    best = best_tried(draft.facts) if draft.undegraded and draft.dense else None
-    if best is not None and not best.level:
+    densify, tried, told = draft.settings.densify, draft.facts.tried, ""
+    if tried is not None:
+        gain = f"{tried.gain:+.2f} ± {tried.error:.2f} dB"
+        told = f"without it {gain} on {tried.photos} photos held back from short runs"
+    dense = draft.undegraded and draft.dense
+    if dense and tried is not None and tried.gain > max(TRIAL_GAIN, tried.error):
         why = "what grows explains each photo alone, and views between photos are worse"
         changes = {f"densify.{name}": value for name, value in no_growth(densify).items()}
         return [Choice("none", why, told, "growth", changes=changes)]
-    if draft.undegraded and draft.dense and densify.start < GROWS_FROM:
+    if dense and densify.start < GROWS_FROM:
         why = "until sizes and colours are about right, gradients do not tell where something is missing"
         left = f"growth in the first {GROWS_FROM} iterations"
         value = _growth(GROWS_FROM, densify.stop, densify.every)

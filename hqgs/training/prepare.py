@@ -67,7 +67,8 @@ class Prepared:
         self._on_stage = inspector.on_stage
         self._points: dict[int, tuple[Points, Colors]] = {}
         self._begin: Begin | None = begin
-        self._tried: tuple[Tried, ...] | None = None
+        self._tried: Tried | None = None
+        self._has_tried: bool = False
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
         """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""
@@ -82,7 +83,8 @@ class Prepared:
         begin = self._begin if timed and "growth" in self.asked.leave_out else None
         unsure = draft.undegraded and draft.dense and not in_agreement(facts)
         if begin is not None and unsure and calls_for_trial(self.scene, plan):
-            if self._tried is None:
+            if not self._has_tried:
+                self._has_tried = True
                 self._tried = tried_growth(self.scene, plan, begin, self._on_stage)
             plan = plan_run(replace(facts, tried=self._tried), self.diagnosis, self.asked)
         return plan

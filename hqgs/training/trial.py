@@ -3,17 +3,18 @@
 Where a photo is not yet shown as it is, growth adds Gaussians, whether or not other photos bear them out.
 Poses that are a little off, light that changes, mirrors and what a codec left ask for them without end: then
 they explain each photo alone, and views between photos are worse with every step. Short runs that differ in
-nothing but how many Gaussians there may be tell it, on training photos that they have not seen. Test views
+nothing but growth tell it, on training photos that they have not seen. Test views
 are never looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.evaluation.held_out import HeldOutViews
@@ -24,8 +25,8 @@ from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
 from hqgs.training.constants import (
     TRIAL_EACH,
-    TRIAL_LEVELS,
     TRIAL_OFFSETS,
+    TRIAL_PIXELS,
     TRIAL_SHARE,
     TRIAL_SIDE,
     TRIAL_STEPS,
@@ -66,52 +67,46 @@ def calls_for_trial(scene: Scene, plan: RunPlan) -> bool:
         return False
     sizes = np.array([(view.camera.width, view.camera.height) for view in views])
     small = np.minimum(1, TRIAL_SIDE / sizes.max(1)) ** 2 * sizes.prod(1)
-    shown = TRIAL_STEPS * len(TRIAL_LEVELS) * len(TRIAL_OFFSETS) * small.mean()
+    shown = 2 * TRIAL_STEPS * len(TRIAL_OFFSETS) * small.mean()
     return bool(shown <= TRIAL_SHARE * settings.iterations * sizes.prod(1).mean())
 
 
-def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = silent) -> tuple[Tried, ...]:
-    """What less growth than in TRIAL_LEVELS[0] gains on photos held back, for each of the other levels.
+def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = silent) -> Tried | None:
+    """What photos held back gain where nothing grows; None: no scatter is known.
 
     Every TRIAL_EACH-th photo is held back, twice, each time others. `plan`: of the run; `begin` makes
     trainers.
     """
     on_stage(Stage("growth", 0, 0, "trying on photos held back whether growth pays"))
     config, views = _settings(plan.settings), [_small(view) for view in scene.train]
-    found: list[list[float]] = [[] for _ in TRIAL_LEVELS]
+    found = list[float]()
     for offset in TRIAL_OFFSETS:
         held = range(offset, len(views), TRIAL_EACH)
         train = [view for k, view in enumerate(views) if k not in held]
         pixels = sum(view.camera.width * view.camera.height for view in train)
-        part = replace(scene, train=train, test=[views[k] for k in held])
-        for values, psnr in zip(found, _short_runs(begin(part, config), pixels), strict=True):
-            values += psnr
-    gains = np.array(found[1:]) - found[0]
-    gains = gains[:, np.isfinite(gains).all(0)]
-    if gains.shape[1] < 2:
-        return ()  # no scatter is known
-    errors = gains.std(1, ddof=1) / np.sqrt(gains.shape[1])
-    return tuple(
-        Tried(level, float(gain), float(error), gains.shape[1])
-        for level, gain, error in zip(TRIAL_LEVELS[1:], gains.mean(1), errors, strict=True)
-    )
+        trainer = begin(replace(scene, train=train, test=[views[k] for k in held]), config)
+        found.extend(_gains(trainer, pixels))
+    gains = np.array(found)[np.isfinite(found)]
+    if len(gains) < 2:
+        return None
+    return Tried(float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains))), len(gains))
 
 
-def _short_runs(trainer: ShortRun, pixels: int) -> Iterator[list[float]]:
-    """PSNR of each held-out photo, brightness and tint set aside, after a run of each level; `pixels`: of
-    all photos that it trains on."""
+def _gains(trainer: ShortRun, pixels: int) -> NDArray[np.float64]:
+    """PSNR of each held-out photo, brightness and tint set aside, of a run without growth over one with it;
+    `pixels`: of all photos that it trains on."""
     kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
-    settings, first = trainer.plan.settings, trainer.plan.first_points
-    for level in TRIAL_LEVELS:
-        growth = settings.densify
-        most = {"max_gaussians": max(pixels // level, first)} if level else no_growth(growth)
-        growth = replace(growth, **most)
-        trainer.begin(replace(trainer.plan, settings=replace(settings, densify=growth)))
+    plan, found = trainer.plan, list[NDArray[np.float64]]()
+    growth = plan.settings.densify
+    most = max(pixels // TRIAL_PIXELS, plan.first_points)
+    for changes in ({"max_gaussians": most}, no_growth(growth)):
+        trainer.begin(replace(plan, settings=replace(plan.settings, densify=replace(growth, **changes))))
         trainer.method.load_state_dict(kept)
         while trainer.iteration < trainer.length:
             trainer.step()
         values = [psnr_aligned(view.render, view.photo, view.mask) for view in trainer.held_out()]
-        yield [np.nan if value is None else value for value in values]  # None: a mask leaves nothing
+        found.append(np.array(values, np.float64))  # NaN: a mask leaves nothing
+    return found[1] - found[0]
 
 
 def _settings(settings: TrainConfig) -> TrainConfig:
