@@ -80,6 +80,8 @@ def run(options: Render) -> int:
             cameras = cameras[:1]
         trust = _trust(options, gaussians) if options.show == "trust" else None
         predicted = _predicted(options, gaussians, cameras, trust)
+        if options.look is not None and options.show != "color":
+            raise ValueError(f"--look is of colours, and --show is {options.show}")
         look = None if options.look is None else _look(source, options.look)
         started = time.perf_counter()
         render_frames(
