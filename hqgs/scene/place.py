@@ -112,7 +112,7 @@ def cut_outs(capture: Capture, notes: list[str]) -> bool:
         return False
     if not all(is_cut_out(photo.path) for photo in photos):
         return False
-    notes.append(f"the {len(photos)} photos are cut out: what is transparent is empty")
+    notes.append(f"the {len(photos)} photos are cut out: what is transparent is black, in photos and renders")
     return True
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,17 +54,12 @@ class TrainingViews:
     """The training views of a run, as its method judges renders of them."""
 
     def __init__(
-        self,
-        views: Sequence[View],
-        method: Method[Any],
-        background: tuple[float, float, float],
-        seed: int = 0,
+        self, views: Sequence[View], method: Method[Any], background: tuple[float, float, float]
     ) -> None:
-        """ValueError, which names it, for a view that the method cannot use. `seed`: of `against`."""
+        """ValueError, which names it, for a view that the method cannot use."""
         self.views = views
         self.method = method
         self.background = background
-        self.seed = seed
         with one_torch_thread():
             self.targets: list[Target] = [method.prepare(view) for view in views]
         self._small: dict[int, tuple[View, Target]] = {}
@@ -78,28 +73,12 @@ class TrainingViews:
             self._small[number] = small, self.method.prepare(small)
         return self._small[number]
 
-    def against(self, plan: StepPlan, view: View, target: Target) -> tuple[Target, Sequence[float]]:
-        """The target of a step and the background of its render: those of the run.
-
-        Behind a cut-out photo there is another colour in each step that no longer counts for growth, which
-        gradients of such colours would multiply. Before one and the same, what is empty and what has that
-        colour would look alike.
-        """
-        photo, empty = target.photo, view.empty
-        told = plan.observes or not self.method.any_background
-        if told or empty is None or photo.shape[:2] != empty.shape:
-            return target, self.background
-        color = np.random.default_rng([self.seed, plan.iteration, plan.view]).random(3).astype(np.float32)
-        behind = torch.from_numpy(empty)[..., None] / 255 * torch.from_numpy(color)
-        return replace(target, photo=floats(photo) + behind), color.tolist()
-
     def at(self, plan: StepPlan, gaussians: Gaussians) -> ForwardPass:
         """The forward pass that a plan asks for, of the Gaussians to rasterize, with a gradient history."""
         method, (view, target) = self.method, self.target(plan.view, plan.coarse)
         shot = method.shot(view, target)
         eps2d = low_pass(plan.coarse)
-        target, background = self.against(plan, view, target)
-        render, meta = render_view(gaussians, shot.camera, plan.degree, background, eps2d)
+        render, meta = render_view(gaussians, shot.camera, plan.degree, self.background, eps2d)
         pulls = coming_gradient(meta["means2d"])
         photo = shot.develop(render)
         image = method.compare(photo, target)

@@ -57,9 +57,7 @@ class Prepared:
         self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
         settings = plan_run(facts, self.diagnosis, asked).settings
         self.method: Method[Any] = make_method(scene, settings, inspector)
-        self.training_views: TrainingViews = TrainingViews(
-            scene.train, self.method, asked.background, asked.seed
-        )
+        self.training_views: TrainingViews = TrainingViews(scene.train, self.method, asked.background)
         self.facts: Facts = self.method.facts(facts, self.training_views.targets)
         self.shown_diagnosis: Diagnosis | None = (
             inspector.last

@@ -49,7 +49,6 @@ class Method(Generic[T]):
 
     name: str
     as_photographed: bool = False  # renders are compared with photos as they are, of any size
-    any_background: bool = False  # what lies behind a cut-out photo may be any colour, in it and the render
     noise: float = 0.0  # standard deviation of the photos' noise as far as it is known, where 1 is white
 
     @property
@@ -134,7 +133,6 @@ class ThreeDGS(Method[Target]):
 
     name = "3dgs"
     as_photographed = True
-    any_background = True
 
     def loss(self, image: Tensor, target: Target) -> Tensor:
         return photometric_loss(image, target.photo, target.mask)

@@ -30,8 +30,6 @@ from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
 
-KEEPS_COLORS = {"blur", "defocus", "motion", "shake", "focus", "noise", "grain"}  # of what is of one colour
-
 
 class HQGS(Method[FormedTarget]):
     """The image formation in the loss.
@@ -91,10 +89,6 @@ class HQGS(Method[FormedTarget]):
         self._plateau = Plateau(len(scene.train)) if holds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
         self._since = 0  # the iteration after which they were computed
-
-    @property
-    def any_background(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.formation.kinds <= KEEPS_COLORS
 
     @property
     def rate_left(self) -> float:
