@@ -195,8 +195,8 @@ def test_render_is_the_rasterizer_on_one_camera(degree: int | None) -> None:
     wanted, _, _ = hqgs.rasterization(
         model.means,
         model.quats,
-        model.scales.exp(),
-        model.opacities.sigmoid(),
+        model.scales.double().exp().float(),
+        model.opacities.double().sigmoid().float(),
         torch.cat([model.sh0, model.shN], dim=1),
         torch.tensor(camera.viewmat)[None],
         torch.tensor(camera.K)[None],
