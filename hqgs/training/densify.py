@@ -57,7 +57,7 @@ class Densifier:
     def observe(self, means2d_grad: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one view: `means2d_grad` [N, 2] in loss per pixel, `radii` [N, 2] (0: not visible)."""
         sums, views = self.grad_sum.numpy(), self.count.numpy()
-        gradient, seen = means2d_grad.contiguous().numpy(), radii.contiguous().numpy()
+        gradient, seen = means2d_grad.float().contiguous().numpy(), radii.contiguous().numpy()
         _rust.add_pulls(sums, views, gradient, seen, (width / 2, height / 2))
 
     def note(self, rows: Tensor, norms: Tensor) -> None:
