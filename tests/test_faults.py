@@ -226,10 +226,10 @@ def small_files(limit: int) -> Iterator[None]:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 256 KiB, where the system lets us have one."""
+    """A disk of 320 KiB, where the system lets us have one."""
     path = tmp_path / "disk"
     path.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(path)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=320k", "tmpfs", str(path)]
     if os.geteuid() != 0 or not shutil.which("mount"):
         pytest.skip("needs root for a small disk")
     if subprocess.run(mount, capture_output=True, check=False).returncode:

@@ -95,7 +95,7 @@ class Deblur(ThreeDGS):
         moved = torch.zeros_like(meta["means2d"][:1]).requires_grad_()
 
         def add_up(gradient: Tensor) -> None:
-            moved.grad = gradient.sum(dim=0, keepdim=True)
+            moved.backward(gradient.sum(dim=0, keepdim=True))  # which its own hooks see
 
         if meta["means2d"].requires_grad:
             meta["means2d"].register_hook(add_up)
