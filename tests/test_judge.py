@@ -72,6 +72,7 @@ def test_our_own_runs_bit_for_bit(run: Path, tmp_path: Path, capsys: pytest.Capt
     sure = f"{found[0]['mean']['psnr']:.2f} ± {found[0]['interval']['psnr']:.2f}"
     assert f"{sure} dB" in (run / "report.html").read_text()
     assert sure in told
+    assert "masked pixels of 1 do not count" in " ".join(told.split())
     assert found[0]["gaussians"] == report["gaussians"]
     assert found[0]["bytes"] == report["scene_bytes"]
     for view in found[0]["views"].values():

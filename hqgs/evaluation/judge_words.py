@@ -36,6 +36,8 @@ def told(found: dict[str, Any]) -> str:
     one, against = found["scene"], found.get("against")
     count, which = found["protocol"]["photos"], found["protocol"]["which"]
     title = f"{one['name']} on {count} photo{'s' * (count > 1)}: {which}"
+    if masked := found["protocol"]["masked"]:
+        title += f"; masked pixels of {masked} do not count"
     shown = [name for name in LABELS if one["mean"][name] is not None]
     lines = [markdown_table(title, ["", *(LABELS[name] for name in shown)], table_rows(found, shown)), ""]
     lines += [interval_words(one)] if count > 1 else []
