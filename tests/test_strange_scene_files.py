@@ -105,3 +105,13 @@ def test_points_alone_are_told(tmp_path: Path) -> None:
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
     with pytest.raises(ValueError, match="it holds points alone, of which `hqgs train` makes a scene"):
         Gaussians.load(tmp_path / "a.ply")
+
+
+def test_a_damaged_archive_gets_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "scene.sog"
+    with zipfile.ZipFile(path, "w") as packed:
+        packed.writestr("meta.json", "{}")
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"PK\1\2", b"PK\1\3"))  # its list of files; the end of it is found
+    with pytest.raises(ValueError, match=r"scene\.sog: not a readable SOG scene"):
+        Gaussians.load(path)

@@ -7,6 +7,7 @@ import zlib
 from pathlib import Path
 
 from hqgs.model.formats.spz_container import GZIP, MAGIC
+from hqgs.photos.files import DECODE_ERRORS
 
 _HEAD = 512  # bytes
 _SPZ = MAGIC.to_bytes(4, "little")
@@ -49,9 +50,12 @@ def _of_gzip(path: Path, head: bytes) -> str | None:
     return "spz" if inner == _SPZ else None
 
 
-def _of_zip(path: Path) -> str:
-    with zipfile.ZipFile(path) as packed:
-        names = [Path(name).name for name in packed.namelist()]
+def _of_zip(path: Path) -> str | None:
+    try:
+        with zipfile.ZipFile(path) as packed:
+            names = [Path(name).name for name in packed.namelist()]
+    except (*DECODE_ERRORS, zipfile.BadZipFile, RuntimeError):  # damaged; the last of a version to come
+        return None
     if "data.pkl" in names:
         raise ValueError(f"{path}: not a scene file, but a checkpoint of PyTorch: export the scene as .ply")
     if "meta.json" not in names:
