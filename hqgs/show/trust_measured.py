@@ -127,11 +127,13 @@ def predict_psnr(trust: Trust, cameras: Sequence[Camera], taken: Sequence[Camera
 
 def _away(cameras: Sequence[Camera], taken: Sequence[Camera]) -> NDArray[np.float64]:
     """How far each camera is from the nearest of the others, world units."""
-    return np.linalg.norm(_centers(cameras)[:, None] - _centers(taken)[None], axis=2).min(1)
+    return _apart(cameras, taken).min(1)
 
 
-def _centers(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    return np.stack([camera.center for camera in cameras])
+def _apart(cameras: Sequence[Camera], taken: Sequence[Camera]) -> NDArray[np.float64]:
+    """Distance of each camera from each of the others, world units."""
+    centers, others = (np.stack([camera.center for camera in some]) for some in (cameras, taken))
+    return np.linalg.norm(centers[:, None] - others[None], axis=2)
 
 
 def said_of(carried: Array, alpha: Array) -> float:
@@ -142,10 +144,7 @@ def said_of(carried: Array, alpha: Array) -> float:
 
 def _passed(cameras: Sequence[Camera], taken: Sequence[Camera]) -> int:
     """How many of the photos are nearest to one of the cameras."""
-    if not taken:
-        return 0
-    apart = np.linalg.norm(_centers(cameras)[:, None] - _centers(taken)[None], axis=2)
-    return len(set(apart.argmin(1).tolist()))
+    return len(set(_apart(cameras, taken).argmin(1).tolist())) if taken else 0
 
 
 def _ause(doubt: Array, error: Array) -> float:

@@ -3,8 +3,7 @@
 Where a photo is not yet shown as it is, growth adds Gaussians, whether or not other photos bear them out.
 Poses that are a little off, light that changes, mirrors and what a codec left ask for them without end: then
 they explain each photo alone, and views between photos are worse with every step. Short runs that differ in
-nothing but growth tell it, on training photos that they have not seen. Test views
-are never looked at.
+nothing but growth tell it, on training photos that they have not seen. Test views are never looked at.
 """
 
 from __future__ import annotations
