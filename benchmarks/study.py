@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -121,6 +122,7 @@ class Study:
         file = f"{name}_validation.csv" if args.validate else f"{name}.csv"
         self.table = Table(args.out / file, KEYS[name])
         self._last: tuple[tuple[str, str, int], Scene] | None = None
+        self.search_cpu_s = 0.0  # of all processes that found the poses of the last photos; 0: they were kept
         prints = {scene.name: scene_fingerprint(scene) for scene in scenes}
         self.digests = {cell: digest_of(cell, prints[cell.scene.name]) for cell in self.cells}
         lines = self.table.lines()
@@ -166,7 +168,9 @@ class Study:
         """What a cell trains on, the same for all rows: degraded photos, with `--sfm` poses from them."""
         if self._last is None or self._last[0] != cell.group:
             scene = degraded(cell.scene, cell.degradation, cell.seed)
+            before = _children_cpu_s()
             self._last = (cell.group, sfm_scene(scene, self.args.out / KEPT) if self.args.sfm else scene)
+            self.search_cpu_s = _children_cpu_s() - before
         return self._last[1]
 
     def beside(self, cell: Cell, name: str) -> Path:
@@ -186,6 +190,11 @@ class Study:
 
     def say(self, text: str) -> None:
         print(f"{self.name}: {text}", file=sys.stderr, flush=True)
+
+
+def _children_cpu_s() -> float:
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def chosen(

@@ -46,10 +46,31 @@ class Quality:
 
         fit = self.args.sfm or self.args.fit_cameras
         run = run_cell(cell, photos, pictures, fit, self.protocol.moments, keep)
-        if photos.sfm is not None:
-            line = {name: cell.key[name] for name in ("scene", "degradation", "seed", "downscale")}
-            Table(self.args.out / POSES).put([line | reconstruction(photos.sfm) | facts()])
+        self.note(cell, photos)
         return run
+
+    def note(self, cell: Cell, photos: Scene) -> None:
+        """A line of what COLMAP found in the cell's photos; seconds of a model that was kept stay."""
+        if photos.sfm is None:
+            return
+        table = Table(self.args.out / POSES)
+        line = {name: cell.key[name] for name in ("scene", "degradation", "seed", "downscale")}
+        known = (table.find(line) or {}).get("search_cpu_s")
+        seconds = {"search_cpu_s": self.study.search_cpu_s or known}
+        table.put([line | reconstruction(photos.sfm) | seconds | facts()])
+
+    def find_poses(self) -> list[str]:
+        """The lines of `note`, without training; which photos have no poses."""
+        lost = []
+        for cell in {cell.group: cell for cell in self.study.cells}.values():
+            try:
+                photos = self.study.photos(cell)
+            except ValueError as error:
+                lost.append(f"{cell.scene.name}, {cell.degradation}: {error}")
+                continue
+            self.note(cell, photos)
+            self.study.say(f"{cell.scene.name}, {cell.degradation}: {photos.sfm}")
+        return lost
 
     def render(self, cell: Cell, number: int) -> Path:
         return self.study.beside(cell, f"{number}.png")
@@ -103,7 +124,10 @@ def run(args: argparse.Namespace) -> list[str]:
     """Run and compare what was asked for."""
     if args.pictures < 0:
         raise ValueError(f"pictures is {args.pictures}, wanted at least 0")
+    args.sfm = args.sfm or args.poses_only
     quality = Quality(begin(args, PROTOCOLS))
+    if args.poses_only:
+        return quality.find_poses()
     quality.study.train(quality.measure)
     return [*quality.tables(), *quality.sheets(), *quality.study.missing()]
 
@@ -111,11 +135,13 @@ def run(args: argparse.Namespace) -> list[str]:
 LISTED = "; ".join(f"{name}: {protocol.help}" for name, protocol in PROTOCOLS.items())
 FIT = "measure a second time with each held-out camera fitted to the trained scene, as --sfm does"
 SFM = "poses and points from the degraded photos, the same for all rows"
+ALONE = "poses and points from the degraded photos against the scenes' own, without training"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": LISTED},
     "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
     "--validate": {"action": "store_true", "help": "for tuning: judge on training photos, not on test views"},
     "--sfm": {"action": "store_true", "help": SFM},
+    "--poses-only": {"action": "store_true", "help": ALONE},
     "--fit-cameras": {"action": "store_true", "help": FIT},
     "--pictures": {"type": int, "default": 1, "metavar": "N", "help": "sheets per scene and degradation"},
 }
