@@ -224,6 +224,13 @@ def test_with_sfm_all_rows_share_the_poses_of_the_degraded_photos(
     assert {name: line[name] for name in wanted} == wanted
     assert any("fitted" in text for text in bench.tables())
 
+    table = Table(tmp_path / "poses.csv")
+    table.put([table.rows()[0] | {"photos": "9", "search_cpu_s": "1.5"}])
+    again = quality.Quality(Study(bench.args, "quality", protocol, [tiny_scene()]))
+    assert again.find_poses() == []
+    (line,) = table.frame().to_dict("records")
+    assert (line["photos"], line["search_cpu_s"]) == (5, 1.5)  # the model was kept: no process found it anew
+
 
 def test_a_kill_or_a_failure_costs_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tiny_scene()
