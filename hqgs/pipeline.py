@@ -187,7 +187,7 @@ def open_run(
                 remove_leftovers(folder / file)
         going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
         inspector = Inspector(on_stage)
-        trainer = Trainer(scene, config, inspector, ranks)
+        trainer = Trainer(scene, config, inspector, ranks, tries=not going_on)
         if not going_on:
             fit_to_seconds(trainer)
         del inspector  # it holds what it has seen of the photos

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from tiny_scene import tiny_scene
 
+from hqgs.base.files import CHECKPOINT
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.scene.scene import Scene
 from hqgs.training import prepare, trial
@@ -121,6 +123,26 @@ def test_a_run_is_planned_by_its_trial_and_the_same_again(monkeypatch: pytest.Mo
     assert first == again
     assert "photos held back" in told(first)
     assert told(Trainer(replace(scene, seen=seen), replace(config, leave_out=())).plan) == ""
+
+
+def test_a_resumed_run_goes_by_the_trial_that_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prepare, "calls_for_trial", lambda scene, plan: True)
+    trials = list[None]()
+    monkeypatch.setattr(prepare, "tried_growth", lambda *of: trials.append(None) or Tried(1.0, 0.1, 6))
+    scene = tiny_scene(12, num_points=10)
+    scene = replace(scene, seen={view.name: np.arange(10) for view in scene.train})
+    config = run_config(iterations=2, method="hqgs", leave_out="growth", formation="none")
+    file = tmp_path / CHECKPOINT
+    for iterations in (2, 2, 4):  # as it was, and longer
+        going_on = file.exists()
+        trainer = Trainer(scene, replace(config, iterations=iterations), tries=not going_on)
+        if going_on:
+            trainer.restore(file)
+        while trainer.iteration < trainer.length:
+            trainer.step()
+        assert "photos held back" in told(trainer.plan)
+        trainer.save(file)
+    assert (trainer.iteration, len(trials)) == (4, 1)
 
 
 def test_a_run_of_seconds_is_tried_when_its_length_is_known(monkeypatch: pytest.MonkeyPatch) -> None:

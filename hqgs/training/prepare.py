@@ -22,7 +22,7 @@ from hqgs.training.forward import TrainingViews
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.passersby import without_passersby
-from hqgs.training.plan import Draft, Facts, RunPlan, StepSeconds, Tried, plan_by
+from hqgs.training.plan import Draft, Facts, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_few_photos import in_agreement
 from hqgs.training.plan_rules import RULES, plan_run
 from hqgs.training.trial import Begin, calls_for_trial, tried_growth
@@ -65,7 +65,6 @@ class Prepared:
         self._on_stage = inspector.on_stage
         self._points: dict[int, tuple[Points, Colors]] = {}
         self._begin: Begin | None = begin
-        self._tried: Tried | None = None
         self._has_tried: bool = False
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
@@ -83,8 +82,9 @@ class Prepared:
         if begin is not None and unsure and calls_for_trial(self.scene, plan):
             if not self._has_tried:
                 self._has_tried = True
-                self._tried = tried_growth(self.scene, plan, begin, self._on_stage)
-            plan = plan_run(replace(facts, tried=self._tried), self.diagnosis, self.asked)
+                tried = tried_growth(self.scene, plan, begin, self._on_stage)
+                self.facts = replace(self.facts, tried=tried)
+            plan = plan_run(replace(facts, tried=self.facts.tried), self.diagnosis, self.asked)
         return plan
 
     def first_gaussians(self, plan: RunPlan) -> Gaussians:

@@ -31,7 +31,7 @@ from hqgs.training.frugality import Frugality
 from hqgs.training.gradients import gradients_of
 from hqgs.training.guard import Fault, Guard, parameter_fault
 from hqgs.training.methods.base import Method
-from hqgs.training.plan import PlanRow, RunPlan, left_out_of
+from hqgs.training.plan import PlanRow, RunPlan, Tried, left_out_of
 from hqgs.training.prepare import Prepared
 from hqgs.training.schedule import Decisions, Schedule, StepPlan, learning_rates, on_the_way
 from hqgs.training.settings import config_values
@@ -56,12 +56,18 @@ class Trainer:
     judged, and its frugality what may be left out from then on."""
 
     def __init__(
-        self, scene: Scene, config: TrainConfig, inspector: Inspector | None = None, ranks: Ranks = ALONE
+        self,
+        scene: Scene,
+        config: TrainConfig,
+        inspector: Inspector | None = None,
+        ranks: Ranks = ALONE,
+        tries: bool = True,
     ) -> None:
         """`inspector`: what looks at the photos before the first step; `ranks`: the processes that train
-        together. ValueError if scene or configuration cannot be trained."""
+        together; `tries`: short runs may tell what pays, False where `restore` follows: a checkpoint holds
+        what they told. ValueError if scene or configuration cannot be trained."""
         self.ranks = ranks
-        self.prepared: Prepared = Prepared(scene, config, inspector, Trainer)
+        self.prepared: Prepared = Prepared(scene, config, inspector, Trainer if tries else None)
         self.asked: TrainConfig = config
         self.scene: Scene = self.prepared.scene
         self.method: Method[Any] = self.prepared.method
@@ -193,6 +199,7 @@ class Trainer:
             "frugality": self.frugality.state_dict(),
             "asked": config_values(self.asked),
             "plan": self.plan.values(),
+            "tried": self.prepared.facts.tried and asdict(self.prepared.facts.tried),
             "scene": checkpoint.scene_fingerprint(self.scene),
         }
         checkpoint.save_checkpoint(path, self.state.tensors() | of_method, meta)
@@ -213,7 +220,10 @@ class Trainer:
             more = self.plan.settings.iterations
             longer = ended and checkpoint.other_length(meta["asked"], asked) and more > done
             checkpoint.check_same(path, "", meta["asked"], asked, longer)
+            if tried := meta.get("tried"):
+                self.prepared.facts = replace(self.prepared.facts, tried=Tried(**tried))
             if longer:
+                self.begin(self.prepared.plan())
                 meta["decisions"] = decisions | {"length": more, "released": decisions["released"] or done}
             else:
                 self.begin(saved)
