@@ -32,6 +32,10 @@ def test_no_file_is_long() -> None:
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
 
 
+def test_a_file_begins_with_what_lives_there() -> None:
+    assert [relative(p) for p in FILES if not p.read_text(encoding="utf-8").startswith('"""')] == []
+
+
 @pytest.mark.parametrize("package", PACKAGES, ids=relative)
 def test_a_folder_says_in_a_sentence_what_lives_there(package: Path) -> None:
     told = ast.get_docstring(ast.parse(package.read_text(encoding="utf-8")))

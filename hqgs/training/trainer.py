@@ -64,8 +64,8 @@ class Trainer:
         tries: bool = True,
     ) -> None:
         """`inspector`: what looks at the photos before the first step; `ranks`: the processes that train
-        together; `tries`: short runs may tell what pays, False where `restore` follows: a checkpoint holds
-        what they told. ValueError if scene or configuration cannot be trained."""
+        together; `tries`: False where a checkpoint follows, which holds what was tried. ValueError if scene
+        or configuration cannot be trained."""
         self.ranks = ranks
         self.prepared: Prepared = Prepared(scene, config, inspector, Trainer if tries else None)
         self.asked: TrainConfig = config
@@ -253,8 +253,8 @@ class Trainer:
     def _set_rates(self, plan: StepPlan) -> None:
         """As far as the method leaves them; harmonics above the degree in use never had a gradient."""
         groups = {group["name"]: group for group in self.state.optimizer.param_groups}
-        extent, reach = self.state.densifier.extent, self.state.densifier.reach
-        rates = learning_rates(self.config, extent, plan.part, reach)
+        densifier = self.state.densifier
+        rates = learning_rates(self.config, densifier.extent, plan.part, densifier.reach)
         for name, rate in rates.items():
             groups[name]["lr"] = self.method.rate_left * rate
         for name, rate in self.method.rates(plan.part).items():
@@ -312,11 +312,8 @@ class Trainer:
 
     def _psnr(self, gaussians: Gaussians, numbers: Sequence[int]) -> float:
         """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize."""
-        iteration = self.state.iteration
-        degree = self.schedule.degree(iteration)
-        return self.prepared.training_views.psnr(
-            gaussians, numbers, degree, self.schedule.is_coarse(iteration), self.ranks
-        )
+        degree, coarse = self.schedule.degree(self.iteration), self.schedule.is_coarse(self.iteration)
+        return self.prepared.training_views.psnr(gaussians, numbers, degree, coarse, self.ranks)
 
     def _sound(self, views: Sequence[View], faults: Sequence[Fault | None], step: Step) -> bool:
         """Whether the step has gradients to go by, of one view at least; the guard notes its faults.
