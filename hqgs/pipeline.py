@@ -30,7 +30,7 @@ from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.passing import save_masks
 from hqgs.evaluation.photo_facts import photo_record
-from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, SfmRecord, WorldRecord
+from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
@@ -311,34 +311,35 @@ def _report(
     """The report, written into `out`, if there is one; what made it is in `trainer`."""
     scene, culled = trainer.scene, views.culled()
     rows = [row.known() for row in trainer.rows]
-    result = RunResult(
-        scene=scene.name,
-        source=scene.source,
-        notes=[*scene.notes, *run_notes(trainer)],
-        method=config.method,
-        seed=config.seed,
-        iterations=trainer.iteration,
-        seconds=trainer.seconds,
-        gaussians=len(trainer.gaussians),
-        peak_rss_mb=peak_rss_mb(),
-        history=trainer.history,
-        length=trainer.length,
-        left_out=[item.known() for item in left_out],
-        decision_seconds=trainer.frugality.memory.seconds,
-        scene_bytes=None if out is None else (out / PLY).stat().st_size,
-        config=asdict(config),
-        plan=rows,
-        world=cast(WorldRecord, {"metres": None} | replace(scene.world, place=None).json()),
-        place=None if scene.place is None else asdict(scene.place),
-        sfm=None if scene.sfm is None else cast(SfmRecord, asdict(scene.sfm)),
-        guard=trainer.guard.summary(),
-        culled_in_a_view=sum(culled) / len(culled) if culled else None,
-        views=views,
-        learned=[learned_record(found) for found in trainer.method.learned()],
-        photos=[] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
-        ranks=ranks,
-    )
-    pictures = {} if out is None else run_pictures(trainer, result.learned)
+    learned = [learned_record(found) for found in trainer.method.learned()]
+    record: RunRecord = {
+        "scene": scene.name,
+        "source": scene.source,
+        "notes": [*scene.notes, *run_notes(trainer)],
+        "method": config.method,
+        "seed": config.seed,
+        "iterations": trainer.iteration,
+        "length": trainer.length,
+        "seconds": trainer.seconds,
+        "decision_seconds": trainer.frugality.memory.seconds,
+        "gaussians": len(trainer.gaussians),
+        "scene_bytes": None if out is None else (out / PLY).stat().st_size,
+        "culled_in_a_view": sum(culled) / len(culled) if culled else None,
+        "peak_rss_mb": peak_rss_mb(),
+        "history": trainer.history,
+        "left_out": [item.known() for item in left_out],
+        "guard": trainer.guard.summary(),
+        "world": cast(WorldRecord, {"metres": None} | replace(scene.world, place=None).json()),
+        "place": None if scene.place is None else asdict(scene.place),
+        "sfm": None if scene.sfm is None else asdict(scene.sfm),
+        "photos": [] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
+        "ranks": ranks,
+        "learned": learned,
+        "config": asdict(config),
+        "plan": rows,
+    }
+    result = RunResult(record, views)
+    pictures = {} if out is None else run_pictures(trainer, learned)
     for name, picture in pictures.items():
         with atomic_path(cast(Path, out) / name) as tmp:
             picture.save(tmp)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from hqgs.base import machine
 from hqgs.evaluation import report
 from hqgs.evaluation.held_out import RenderedView, measured
 from hqgs.evaluation.metrics import METRICS, evaluate_view
+from hqgs.evaluation.records import RunRecord
 from hqgs.evaluation.report import RunResult, read_report, write_report
 
 HEIGHT, WIDTH = 40, 60
@@ -32,30 +32,36 @@ def view_of(name: str, error: float = 0.1, mask: np.ndarray | None = None) -> Re
 
 
 def result_of(*views: RenderedView, **changes: Any) -> RunResult:
-    result = RunResult(
-        scene="desk",
-        source="colmap",
-        notes=["one note"],
-        method="3dgs",
-        seed=7,
-        iterations=300,
-        seconds=12.5,
-        gaussians=1234,
-        peak_rss_mb=456.5,
-        history=[
+    record: dict[str, Any] = {
+        "scene": "desk",
+        "source": "colmap",
+        "notes": ["one note"],
+        "method": "3dgs",
+        "seed": 7,
+        "iterations": 300,
+        "seconds": 12.5,
+        "gaussians": 1234,
+        "peak_rss_mb": 456.5,
+        "history": [
             {"iteration": 100, "seconds": 4.0, "psnr": 18.0, "ssim": 0.6},
             {"iteration": 300, "seconds": 12.5, "psnr": 21.0, "ssim": None},
         ],
-        length=400,
-        left_out=[{"what": "pose refinement", "why": "off by default"}],
-        decision_seconds=0.25,
-        scene_bytes=4321,
-        config={"iterations": 300, "lr": 1e-3},
-        guard={"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []},
-        culled_in_a_view=12.5,
-        views=list(views),
-    )
-    return dataclasses.replace(result, **changes)
+        "length": 400,
+        "left_out": [{"what": "pose refinement", "why": "off by default"}],
+        "decision_seconds": 0.25,
+        "scene_bytes": 4321,
+        "config": {"iterations": 300, "lr": 1e-3},
+        "guard": {"skipped_steps": 0, "culled_gaussians": 0, "num_events": 0, "events": []},
+        "culled_in_a_view": 12.5,
+        "world": None,
+        "place": None,
+        "sfm": None,
+        "photos": [],
+        "ranks": [],
+        "learned": [],
+        "plan": [],
+    }
+    return RunResult(cast(RunRecord, record | changes), list(views))
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -255,9 +261,9 @@ def test_report_json_is_there_only_with_everything_else(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"config": {"lr": math.nan}}, "RunResult.config cannot be written as JSON"),
-        ({"seconds": math.inf}, "RunResult.seconds"),
-        ({"config": {"path": Path("x")}}, "RunResult.config"),
+        ({"config": {"lr": math.nan}}, "RunRecord.config cannot be written as JSON"),
+        ({"seconds": math.inf}, "RunRecord.seconds"),
+        ({"config": {"path": Path("x")}}, "RunRecord.config"),
     ],
 )
 def test_a_field_that_is_no_json_is_named_before_work_starts(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
-from typing import TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import MachineFacts
@@ -81,31 +81,6 @@ class GuardRecord(TypedDict):
     culled_gaussians: int
     num_events: int
     events: list[GuardEvent]  # the first ones
-
-
-class SfmRecord(TypedDict):
-    """`SfmReport` in the report."""
-
-    photos: int
-    not_registered: list[str]
-    outliers: list[str]
-    rotation_error_deg: dict[str, float] | None
-    translation_error: dict[str, float] | None
-    own_cameras_px: float | None
-    points: int
-    point_distance: float | None
-    track_length: float
-    reprojection_error_px: float
-    own_points: int | None
-    own_track_length: float | None
-    own_reprojection_error_px: float | None
-    unreadable: dict[str, str]
-    first_pass: int | None
-    advice: str | None
-    lost: dict[str, str]
-    learned: bool
-    sure_px: dict[str, float]
-    auc: dict[str, float] | None
 
 
 class PhotoRecord(TypedDict):
@@ -196,7 +171,7 @@ class RunRecord(TypedDict):
     guard: GuardRecord
     world: WorldRecord | None
     place: dict[str, Json] | None  # `Georeference`, by the photos' GPS; None: it does not tell
-    sfm: SfmRecord | None  # None: poses and points are the scene's own
+    sfm: dict[str, Any] | None  # `SfmReport`; None: poses and points are the scene's own
     photos: list[PhotoRecord]  # those that were looked at; empty where the method does not ask for it
     ranks: list[RankRecord]  # empty where one process did all
     learned: list[LearnedRecord]  # of the photos' cameras; empty where nothing of them is learned

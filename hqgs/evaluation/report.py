@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
@@ -16,28 +16,12 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.files import atomic_path, read_json, write_json
-from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED, PNG_LEVEL
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
 from hqgs.evaluation.intervals import half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
-from hqgs.evaluation.records import (
-    GuardRecord,
-    HistoryEntry,
-    Json,
-    LearnedRecord,
-    MetricsRecord,
-    MetricValues,
-    PhotoRecord,
-    PlanRowRecord,
-    RankRecord,
-    Report,
-    RunRecord,
-    SfmRecord,
-    WorldRecord,
-    alike,
-)
+from hqgs.evaluation.records import HistoryEntry, MetricsRecord, MetricValues, Report, RunRecord, alike
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.sheet import printable, sheet
@@ -51,33 +35,10 @@ REPORT, CHART, PICTURES = "report.json", "error_vs_time.png", "comparison"
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a training run hands to `write_report`; see `RunRecord`."""
+    """What a training run hands to `write_report`."""
 
-    scene: str
-    source: str  # format the scene was read from
-    notes: list[str]
-    method: str
-    seed: int
-    iterations: int
-    seconds: float  # training time, without loading and without this report
-    gaussians: int
-    peak_rss_mb: float | None
-    history: list[HistoryEntry]
-    length: int  # iterations of the whole run; fewer were done where it was stopped
-    left_out: list[LeftOutRecord]
-    decision_seconds: float  # of `seconds`: to find out what may be left out
-    scene_bytes: int | None  # of scene.ply; None: nothing was written
-    config: dict[str, Json]
-    guard: GuardRecord
-    culled_in_a_view: float | None  # Gaussians that a held-out view does not show, in the mean
-    views: Sequence[RenderedView] = field(repr=False)
-    plan: list[PlanRowRecord] = field(default_factory=list)
-    world: WorldRecord | None = None
-    place: dict[str, Json] | None = None
-    sfm: SfmRecord | None = None
-    learned: list[LearnedRecord] = field(default_factory=list)
-    photos: list[PhotoRecord] = field(default_factory=list)
-    ranks: list[RankRecord] = field(default_factory=list)
+    record: RunRecord
+    views: Sequence[RenderedView]
 
 
 def measure(result: RunResult) -> Report:
@@ -85,7 +46,7 @@ def measure(result: RunResult) -> Report:
 
     Raises ValueError where a field is no JSON value, or a view's render, photo and mask do not fit.
     """
-    _head(result)  # before work starts
+    _check(result.record)  # before work starts
     return _report(result, measured(result.views), None)
 
 
@@ -100,7 +61,7 @@ def write_report(out_dir: str | Path, result: RunResult) -> Report:
     Raises ValueError as `measure` does, OSError where a file cannot be written.
     """
     out_dir = Path(out_dir)
-    _head(result)  # before work starts
+    _check(result.record)  # before work starts
     made = not out_dir.exists()
     out_dir.mkdir(parents=True, exist_ok=True)
     try:
@@ -173,12 +134,13 @@ def error_chart(result: RunResult) -> Figure:
 
     figure = Figure(figsize=(7, 5.2), dpi=150, layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
-    some = {entry["views"] for entry in result.history if "views" in entry}
+    run, history = result.record, result.record["history"]
+    some = {entry["views"] for entry in history if "views" in entry}
     views = f"{max(some)} of {len(result.views)} held-out views" if some else "held-out views"
-    title = f"{result.scene}, {result.method}, seed {result.seed}: {views} while training"
+    title = f"{run['scene']}, {run['method']}, seed {run['seed']}: {views} while training"
     top.set_title(printable(title, 90), fontsize=11, loc="left", parse_math=False)
-    _curve(top, result.history, "psnr", "PSNR (dB)", "{:.2f} dB", "#1f6fb2")
-    _curve(bottom, result.history, "ssim", "SSIM", "{:.3f}", "#c2571a")
+    _curve(top, history, "psnr", "PSNR (dB)", "{:.2f} dB", "#1f6fb2")
+    _curve(bottom, history, "ssim", "SSIM", "{:.3f}", "#c2571a")
     bottom.set_xlabel("training time (s)")
     figure.align_ylabels()
     return figure
@@ -226,18 +188,16 @@ def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | No
         ],
         "reasons": mean.reasons,
     }
-    return {"metrics": measured, **_head(result), "machine": machine_facts(), "versions": version_facts()}
+    return {"metrics": measured, **result.record, "machine": machine_facts(), "versions": version_facts()}
 
 
-def _head(result: RunResult) -> RunRecord:
-    """The fields that go into the report as they are; all but the pictures."""
-    head = {name: value for name, value in vars(result).items() if name != "views"}
-    for name, value in head.items():
+def _check(record: RunRecord) -> None:
+    """ValueError where a field is no JSON value."""
+    for name, value in record.items():
         try:
             json.dumps(value, allow_nan=False)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"RunResult.{name} cannot be written as JSON: {error}") from error
-    return cast(RunRecord, head)
+            raise ValueError(f"RunRecord.{name} cannot be written as JSON: {error}") from error
 
 
 def _values(metrics: ViewMetrics) -> MetricValues:

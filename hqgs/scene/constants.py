@@ -63,12 +63,16 @@ DARK = 12  # of 255: corners outside of the circle that a fisheye throws
 FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST = 2.0, 30, 90
 SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
 
+# Similarities between frames.
+ORIENTATIONS = 0.1  # weight of cameras' orientations beside their centres; decides where those are in line
+HYPOTHESES = 100  # choices of two or three that are tried: enough where half of all are wrong
+OUTLIER = 3.0  # robust standard deviations
+ROUNDING = 1e-9  # residuals below it are none
+
 # GPS: what is asked of it before it tells a scale.
 GPS_LEAST = 4  # photos with a place
 GPS_ROBUST_FROM = 12  # photos; of fewer every one counts
 GPS_SPREAD = 3.0  # times what is left over: less, and GPS says nothing of the scale
-GPS_TRIPLES = 100  # of photos that are tried, at most
-GPS_FAR = 3.5  # median errors: what lies beyond does not count
 
 # Printed tags.
 TAG_PHOTOS = 3  # that show a tag, at least

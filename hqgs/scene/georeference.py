@@ -1,9 +1,8 @@
 """Where on Earth a scene is, and how large: from the places that GPS gave its photos.
 
-The similarity from camera centres to metres east, north and up (Umeyama 1991) is fitted to most photos: with
-twelve and more of them, those that lie far from the best fit of three (least median of squares, Rousseeuw
-1984) do not count. How sure its scale is follows from what is left over, per axis, as errors of GPS are
-larger upwards; errors that all photos share cannot be seen and do not count.
+The similarity from camera centres to metres east, north and up is fitted to all photos, or with twelve and
+more to those that agree (`robust`, from threes). How sure its scale is follows from what is left over, per
+axis, as errors of GPS are larger upwards; errors that all photos share cannot be seen and do not count.
 """
 
 from __future__ import annotations
@@ -11,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import GPS_FAR, GPS_LEAST, GPS_ROBUST_FROM, GPS_SPREAD, GPS_TRIPLES
+from hqgs.scene.constants import GPS_LEAST, GPS_ROBUST_FROM, GPS_SPREAD
+from hqgs.scene.similarity import robust, similarity
 
 _A, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: semi-major axis, m, and squared eccentricity
 
@@ -74,11 +73,18 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
         return None
     start = np.median(gps, axis=0)
     target = _enu(gps, start)
-    used = np.ones(len(target), bool) if len(target) < GPS_ROBUST_FROM else _agreeing(centers, target)
-    fit = similarity(centers[used], target[used])
-    if fit is None or used.sum() < max(GPS_LEAST, len(target) / 2):
+    if len(target) < GPS_ROBUST_FROM:
+        found = similarity(centers, target), np.ones(len(target), bool)
+    else:
+        found = robust(
+            len(target),
+            3,
+            lambda rows: similarity(centers[rows], target[rows]),
+            lambda one: np.linalg.norm(target - (one[0] * centers @ one[1].T + one[2]), axis=1),
+        )
+    if found is None or found[0] is None or found[1].sum() < max(GPS_LEAST, len(target) / 2):
         return None
-    scale, R, shift = fit
+    (scale, R, shift), used = found[0], found[1]
     off = target[used] - (scale * centers[used] @ R.T + shift)
     count = int(used.sum())
     axes = (off**2).sum(0) / max(count - 7 / 3, 1)  # variance along each; 7 values were fitted to 3 N
@@ -104,56 +110,6 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
         residual=residual,
         spread=spread,
     )
-
-
-def similarity(source: Array, target: Array) -> tuple[float, Array, Array] | None:
-    """Scale, rotation [3, 3] and shift [3] that take source [N, 3] to target in least squares (Umeyama 1991).
-
-    None where the source lies on a line, so that any turn about it would do.
-    """
-    middle, aim = source.mean(0), target.mean(0)
-    a, b = source - middle, target - aim
-    U, values, Vt = np.linalg.svd(b.T @ a)
-    own = np.linalg.svd(a, compute_uv=False)
-    if not own[1] > 1e-3 * own[0]:
-        return None
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt)) or 1.0])
-    R = (U * sign) @ Vt
-    scale = float((values * sign).sum() / (a**2).sum())
-    return (scale, R, aim - scale * R @ middle) if scale > 0 else None
-
-
-def _agreeing(source: Array, target: Array) -> NDArray[np.bool_]:
-    """Which of the points agree with most of the others, [N]."""
-    count = len(source)
-    rng = np.random.default_rng(0)
-    triples = list(combinations(range(count), 3)) if math.comb(count, 3) <= GPS_TRIPLES else []
-    while len(triples) < min(GPS_TRIPLES, math.comb(count, 3)):
-        triples.append(tuple(sorted(rng.choice(count, 3, replace=False).tolist())))
-    best, least = np.full(count, math.inf), math.inf
-    for triple in triples:
-        off = _off(source, target, np.array(triple))
-        if off is not None and (median := float(np.median(off))) < least:
-            best, least = off, median
-    used = best <= np.median(best)
-    for _ in range(5):  # it settles sooner
-        off = _off(source, target, np.flatnonzero(used))
-        if off is None:
-            break
-        again = off <= GPS_FAR * np.median(off)
-        if (again == used).all():
-            break
-        used = again
-    return used
-
-
-def _off(source: Array, target: Array, rows: NDArray[np.intp]) -> Array | None:
-    """How far each point lies from where the similarity of some rows takes it, [N]."""
-    fit = similarity(source[rows], target[rows])
-    if fit is None:
-        return None
-    scale, R, shift = fit
-    return np.linalg.norm(target - (scale * source @ R.T + shift), axis=1)
 
 
 def _ecef(gps: Array) -> Array:

@@ -28,10 +28,10 @@ from hqgs.scene.constants import (
     TAG_SURE,
     TAG_UNLIKE,
 )
-from hqgs.scene.georeference import similarity
 from hqgs.scene.metres import with_metres
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.similarity import similarity
 
 FAMILIES = ("APRILTAG_36h11", "ARUCO_ORIGINAL", "4X4_250", "5X5_250", "6X6_250")  # in this order
 

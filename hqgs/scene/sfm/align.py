@@ -9,15 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.sfm.constants import (
-    ALIGN_ROUNDS,
-    FARTHEST,
-    HUBER,
-    HYPOTHESES,
-    ORIENTATIONS,
-    OUTLIER,
-    ROUNDING,
-)
+from hqgs.scene.constants import ROUNDING
+from hqgs.scene.sfm.constants import ALIGN_ROUNDS, FARTHEST, HUBER
+from hqgs.scene.similarity import Rows, robust, similarity
 
 Floats = NDArray[np.float64]
 
@@ -56,9 +50,8 @@ def align(source: Floats, target: Floats) -> tuple[Similarity, NDArray[np.bool_]
     """The similarity from the frame of `source` to that of `target`, world-to-camera matrices [V, 4, 4].
 
     Least squares over the camera centres (Umeyama 1991), in which the orientations count a little, so that
-    cameras in a line, or two, are enough. Cameras that do not fit are left out: the start is the pair of
-    cameras whose similarity has the least median residual over all, of all pairs or a seeded choice of them;
-    from there on those within three robust standard deviations count. Also returns which do, [V].
+    cameras in a line, or two, are enough. Cameras that do not fit are left out (`robust`, from pairs). Also
+    returns which do, [V].
 
     ValueError for fewer than two cameras, or where all centres of a frame are one point.
     """
@@ -69,46 +62,19 @@ def align(source: Floats, target: Floats) -> tuple[Similarity, NDArray[np.bool_]
     turns = np.einsum("nji,njk->nik", target[:, :3, :3], source[:, :3, :3])
     spread = float(np.sqrt(np.square(centers[1] - centers[1].mean(0)).sum(1).mean()))
 
-    def fit(chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Similarity | None:
-        return _umeyama(centers[0][chosen], centers[1][chosen], turns[chosen])
+    def fit(chosen: Rows) -> Similarity | None:
+        found = similarity(centers[0][chosen], centers[1][chosen], turns[chosen])
+        return None if found is None else Similarity(*found)
 
-    def residuals(similarity: Similarity) -> Floats:
+    def residuals(one: Similarity) -> Floats:
         """[V] without unit: distance of the centres in spreads, with the angle between the orientations."""
-        apart = np.linalg.norm(similarity.points(centers[0]) - centers[1], axis=1) / spread
-        return np.hypot(apart, rotation_angles(similarity.R.T @ turns))
+        apart = np.linalg.norm(one.points(centers[0]) - centers[1], axis=1) / spread
+        return np.hypot(apart, rotation_angles(one.R.T @ turns))
 
-    pairs = np.stack(np.triu_indices(count, 1), axis=1)
-    if len(pairs) > HYPOTHESES:
-        pairs = np.random.default_rng(0).permutation(pairs)[:HYPOTHESES]
-    found = [similarity for pair in pairs if (similarity := fit(pair)) is not None]
-    if not found:
+    found = robust(count, 2, fit, residuals)
+    if found is None:
         raise ValueError(f"the {count} cameras of a frame have one centre, which leaves its scale open")
-    best = min(found, key=lambda similarity: float(np.median(residuals(similarity))))
-    inliers = np.zeros(count, bool)
-    for _ in range(ALIGN_ROUNDS):
-        rest = residuals(best)
-        now = rest <= max(OUTLIER * 1.4826 * float(np.median(rest)), ROUNDING)
-        better = fit(now)
-        if better is None or (now == inliers).all():
-            break
-        best, inliers = better, now
-    return best, inliers
-
-
-def _umeyama(source: Floats, target: Floats, turns: Floats) -> Similarity | None:
-    """The similarity from centres [n, 3] to others, with the rotations [n, 3, 3] that each camera gives.
-
-    None where it has no scale, or a negative one.
-    """
-    a, b = source - source.mean(0), target - target.mean(0)
-    lengths = [float(np.sqrt(np.square(x).sum())) for x in (a, b)]
-    smallest = [ROUNDING * float(np.abs(x).max()) for x in (source, target)]
-    if any(length <= least for length, least in zip(lengths, smallest, strict=True)):
-        return None
-    u, _, vt = np.linalg.svd(b.T @ a / (lengths[0] * lengths[1]) + ORIENTATIONS * turns.mean(0))
-    R = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    scale = float((b * (a @ R.T)).sum()) / lengths[0] ** 2
-    return Similarity(scale, R, target.mean(0) - scale * R @ source.mean(0)) if scale > 0 else None
+    return found
 
 
 def pose_auc(found: Floats, own: Floats, photos: int, limits: Sequence[float] = (1, 3, 5)) -> list[float]:

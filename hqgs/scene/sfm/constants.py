@@ -90,9 +90,5 @@ ANGLE = 1.5  # degrees between two rays, least, of a point
 GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
 
 # Frames laid onto each other.
-ORIENTATIONS = 0.1  # weight of cameras' orientations beside their centres; decides where those are in line
-HYPOTHESES = 300  # pairs of cameras that are tried
-OUTLIER = 3.0  # robust standard deviations
-ROUNDING = 1e-9  # residuals below it are none
 ALIGN_ROUNDS = 20
 HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more
