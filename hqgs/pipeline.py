@@ -286,17 +286,9 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
         left_out.append(LeftOut("held-out metrics", "the scene has no held-out view"))
     records = cast(list[RankRecord], ranks.tell(ranks.record()) if ranks.count > 1 else [])
     report = _report(trainer, views, model, left_out, config, records, out) if ranks.first else None
-    return Run(
-        model=model,
-        report=cast(Report, ranks.tell(report)[0]),
-        history=trainer.history,
-        left_out=left_out,
-        iterations=trainer.iteration,
-        length=trainer.length,
-        seconds=trainer.seconds,
-        views=views,
-        out=out,
-    )
+    report = cast(Report, ranks.tell(report)[0])
+    done, length = trainer.iteration, trainer.length
+    return Run(model, report, trainer.history, left_out, done, length, trainer.seconds, views, out)
 
 
 def _report(
@@ -311,6 +303,7 @@ def _report(
     """The report, written into `out`, if there is one; what made it is in `trainer`."""
     scene, culled = trainer.scene, views.culled()
     rows = [row.known() for row in trainer.rows]
+    place, sfm, diagnosis = scene.place, scene.sfm, trainer.diagnosis
     learned = [learned_record(found) for found in trainer.method.learned()]
     record: RunRecord = {
         "scene": scene.name,
@@ -330,22 +323,22 @@ def _report(
         "left_out": [item.known() for item in left_out],
         "guard": trainer.guard.summary(),
         "world": cast(WorldRecord, {"metres": None} | replace(scene.world, place=None).json()),
-        "place": None if scene.place is None else asdict(scene.place),
-        "sfm": None if scene.sfm is None else asdict(scene.sfm),
-        "photos": [] if trainer.diagnosis is None else [photo_record(p) for p in trainer.diagnosis.photos],
+        "place": place and asdict(place),
+        "sfm": sfm and asdict(sfm),
+        "photos": [photo_record(p) for p in diagnosis.photos] if diagnosis else [],
         "ranks": ranks,
         "learned": learned,
         "config": asdict(config),
         "plan": rows,
     }
-    result = RunResult(record, views)
     pictures = {} if out is None else run_pictures(trainer, learned)
     for name, picture in pictures.items():
         with atomic_path(cast(Path, out) / name) as tmp:
             picture.save(tmp)
     if out is not None and config.seconds is not None:
         write_json(out / PLAN, plan_values(config, rows))
+    result = RunResult(record, views)
     report = measure(result) if out is None else write_report(out, result)
     if out is not None:
-        write_page(out / PAGE, Page(report, scene, model, views, trainer.diagnosis, pictures, out))
+        write_page(out / PAGE, Page(report, scene, model, views, diagnosis, pictures, out))
     return report
