@@ -111,7 +111,7 @@ def test_patches_make_poses_and_observations_more_precise(
     assert better.compute_mean_track_length() > model.compute_mean_track_length()
     assert better.num_points3D() > 0.8 * model.num_points3D()
     assert better.compute_mean_reprojection_error() < 0.5 * off
-    monkeypatch.setattr(patches, "CANDIDATES", 200)  # what it holds at once changes no bit
+    monkeypatch.setattr(patches, "AT_ONCE", 200)  # what it holds at once changes no bit
     again = sharpened(model, folder, adjust)
     for k in range(1, 9):
         a, b = (m.images[k].cam_from_world().matrix() for m in (better, again))

@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TypedDict
 
+AT_ONCE = 1 << 20  # values of a kind that are made on the way together, so that memory is bounded
 PACKAGES = ("hqgs", "torch", "numpy", "pycolmap", "piq", "lpips", "pillow", "matplotlib")
 
 

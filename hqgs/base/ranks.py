@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 T = TypeVar("T")
-HEARTBEAT = 5.0  # s: a rank that has nothing to say yet says so as often
 # s without a word after which a rank counts as gone: torchrun takes up to 30 more to end a process that was
 # stopped, and all is to be over within a minute.
 SILENCE = 25.0
+HEARTBEAT = SILENCE / 5  # s: a rank that has nothing to say yet says so as often
 PIECE = 1 << 24  # bytes that are sent at once: on a slow network a long message is no silence
 NOTHING, DATA, FAILED, END = range(4)  # what a rank has to say in a round
 

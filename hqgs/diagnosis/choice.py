@@ -15,8 +15,8 @@ from hqgs.diagnosis.constants import (
     CHOICE_LEAST_BLUR,
     CHOICE_POINTS,
     CHOICE_SHARED,
+    ENOUGH_SHOW,
     MOST_TURNED,
-    OTHERS,
     UNUSUAL,
     WELL_SEEN,
 )
@@ -125,7 +125,7 @@ def _empty(
                 drops[k] = _Drop(view, "its mask hides all of it", "0 pixels count")
             continue
         others = int(full[peers[k]].sum())
-        if look.colour is None or others < OTHERS or 2 * others <= len(peers[k]):
+        if look.colour is None or others < ENOUGH_SHOW or 2 * others <= len(peers[k]):
             continue
         evidence = (
             f"its colour is {', '.join(f'{c:.0f}' for c in look.colour)} with a standard deviation of "
@@ -147,7 +147,7 @@ def _blurred(
     sigmas: dict[int, float] = {}
     for k in range(len(views)):
         others = np.array([p for p in peers[k] if p not in gone], np.int64)
-        if k not in gone and len(others) >= OTHERS:
+        if k not in gone and len(others) >= ENOUGH_SHOW:
             sigmas[k] = sharpness.extra_blur(k, others)
     if not sigmas:
         return {}
@@ -158,18 +158,18 @@ def _blurred(
     sharp = np.array([k not in gone and k not in found for k in range(len(views))])
     drops, needed = {}, []
     for k in found:
-        well_seen = float((sight.covered(k)[sharp].sum(0) >= OTHERS).mean())
+        well_seen = float((sight.covered(k)[sharp].sum(0) >= ENOUGH_SHOW).mean())
         if well_seen < WELL_SEEN:
             needed.append(f"{views[k].name} ({sigmas[k]:.1f} px; {1 - well_seen:.0%} of its points)")
             continue
         evidence = (
             f"its spectrum is the others' after a Gaussian blur of sigma {sigmas[k]:.1f} px (left out from "
-            f"{least:.1f} px); at least {OTHERS} sharper photos see {well_seen:.0%} of its points"
+            f"{least:.1f} px); at least {ENOUGH_SHOW} sharper photos see {well_seen:.0%} of its points"
         )
         drops[k] = _Drop(views[k], "it is far blurrier than other photos of the same things", evidence)
     if needed:
         notes.append(
-            f"blurred training photos kept, as fewer than {OTHERS} sharper ones see a part of their points: "
+            f"blurred training photos kept, as under {ENOUGH_SHOW} sharper ones see some of their points: "
             + some(needed)
         )
     return drops

@@ -10,6 +10,7 @@ import numpy as np
 
 # Of several files.
 FEWEST_PHOTOS = 5  # with fewer none is compared with the others
+ENOUGH_SHOW = 3  # photos: a point that fewer show, from near enough the same side, tells nothing of them
 LARGEST = 1024  # px a side: more of the middle of a photo is not looked at, but for its enlargement
 LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6, at JPEG's quality 10 0.8
 
@@ -29,7 +30,6 @@ UNKNOWN_FLOORS = (0.0, 0.1, 0.3, 1.0)
 PLANE_POINTS = 1_000  # frequencies at which motion is looked for
 
 # choice.py: the training photos that a scene does without: broken, empty or far too blurred
-OTHERS = 3  # photos that must see a point for it to be well seen
 WELL_SEEN = 0.98  # of the points of a blurred photo, without it
 CHOICE_POINTS = 600  # of the scene's, evenly spread, that are looked for in the photos
 MOST_TURNED = np.cos(np.deg2rad(45))  # between two rays to a point; beyond, it may be another side of a thing
@@ -74,7 +74,6 @@ FEWEST_PIXELS, FEWEST_LEVELS = 10, 48  # of each level of the luma that counts, 
 GOES_WITH_DEPTH, DIFFERS = 0.06, 0.4  # from these values of `FocusSigns` on, photos differ in focus
 MOST_PHOTOS, FOCUS_MOST_POINTS = 60, 4000  # that are looked at
 FEWEST_POINTS = 40  # of each photo on average
-FOCUS_SHARED = 3  # photos that show a point, at least
 # px: sigmas between which details lie, and the window around a point
 FOCUS_FINE, FOCUS_COARSE, FOCUS_WINDOW = 0.8, 2.4, 9
 FOCUS_LARGEST = 2000  # px: the longest side of what is looked at of a photo
@@ -139,7 +138,6 @@ CHOICE_SIGMAS = np.arange(-3, 10.01, 0.25)  # px; below 0: sharper than the othe
 CHOICE_DOUBT = 2.0  # of the log-likelihood: two standard deviations
 FLAT_LEVELS = 3.0  # that a block may be off the colour of an empty photo
 FLAT_SHARE = 0.99  # of the blocks of an empty photo
-FLAT_NOISE = 8.0  # levels: standard deviation of an empty photo's luma
 
 # spectrum.py: power spectrum of a photo and the law that photos follow: power falls like 1 / frequency^a
 FLOOR = 0.03  # levels^2: what rounding to 8 bits leaves in the luma; nothing below it is believed

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from hqgs.base.evenly import evenly
 from hqgs.diagnosis.constants import (
+    ENOUGH_SHOW,
     FEWEST_PHOTOS,
     FEWEST_POINTS,
     FOCUS_COARSE,
@@ -20,7 +21,6 @@ from hqgs.diagnosis.constants import (
     FOCUS_LEAST,
     FOCUS_MOST_POINTS,
     FOCUS_ROUNDS,
-    FOCUS_SHARED,
     FOCUS_WINDOW,
     MOST_PHOTOS,
     NEARNESS,
@@ -62,7 +62,7 @@ def focus_signs(scene: Scene) -> FocusSigns | None:
         rows = np.flatnonzero(np.isin(points, scene.seen.get(view.name, [])))
         _look(view, scene.points[points[rows]].astype(np.float64), rows, sharp[k], depths[k])
     told = np.isfinite(sharp)
-    keep = told.sum(0) >= FOCUS_SHARED
+    keep = told.sum(0) >= ENOUGH_SHOW
     if told[:, keep].sum() < FEWEST_POINTS * len(views):
         return None
     sharp, depths = sharp[:, keep], np.where(told, depths, np.nan)[:, keep]

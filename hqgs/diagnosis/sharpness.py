@@ -13,7 +13,6 @@ from hqgs.diagnosis.constants import (
     CHOICE_DOUBT,
     CHOICE_SIGMAS,
     FLAT_LEVELS,
-    FLAT_NOISE,
     FLAT_SHARE,
     RING_ERROR,
     SPECTRUM_SLOPE,
@@ -56,7 +55,7 @@ def _summary(photo: NDArray[Any], name: str, tile: int | None) -> PhotoSummary:
     grey = luma(levels)
     spread = float(grey.std())
     return PhotoSummary(
-        colour=_flat_colour(levels) if spread <= FLAT_NOISE else None,
+        colour=_flat_colour(levels),
         spread=spread,
         rings=None if tile is None else rings(power_spectrum(grey, tile)),
     )

@@ -16,7 +16,7 @@ import hashlib
 import importlib.util
 import math
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from hqgs import _rust
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.constants import HAARPSI_MIN_SIZE, LPIPS_MIN_SIZE
-
-METRICS = ("psnr", "ssim", "haarpsi", "lpips", "lpips_vgg", "psnr_aligned")
 
 # The files that torchvision keeps its ImageNet weights in; the name ends in the start of the file's SHA-256.
 LPIPS_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
@@ -46,6 +44,9 @@ class ViewMetrics:
     lpips_vgg: float | None  # VGG-16, down
     psnr_aligned: float | None  # dB, up; brightness and tint set aside
     reasons: dict[str, str] = field(default_factory=dict)  # metric -> why it is None
+
+
+METRICS = tuple(value.name for value in fields(ViewMetrics) if value.name != "reasons")
 
 
 def psnr(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float | None:

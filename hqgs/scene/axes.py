@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_NEAR, AXES_PAIRS, COPY_SIDE
+from hqgs.scene.constants import AXES_CLEAR, AXES_FEWEST, AXES_PAIRS, COPY_SIDE, EPIPOLAR
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import View
 from hqgs.scene.sfm.constants import LOWE_RATIO
@@ -52,7 +52,7 @@ def _fitting(first: View, second: View) -> NDArray[np.int_]:
     found = []
     for turn in (np.eye(4), TURNED):
         relative = turn @ two.camera.viewmat @ np.linalg.inv(one.camera.viewmat) @ turn
-        found.append(int((_distances(one, two, relative, points, others) < AXES_NEAR).sum()))
+        found.append(int((_distances(one, two, relative, points, others) < EPIPOLAR).sum()))
     return np.array([*found, len(points)])
 
 

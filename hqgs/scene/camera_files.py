@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import atomic_path, read_json, write_json
+from hqgs.photos.constants import LARGEST
 from hqgs.photos.pixels import to_uint8
-from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES, MOST_PIXELS
+from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.world import World
@@ -203,7 +204,7 @@ def _frame(frame: Any, width: int, height: int) -> Camera:
 
 def checked_camera(width: Any, height: Any, K: Any, viewmat: Any) -> Camera:
     """A pinhole camera of values from a file. ValueError for those that no camera has."""
-    if not all(type(side) is int and side > 0 for side in (width, height)) or width * height > MOST_PIXELS:
+    if not all(type(side) is int and side > 0 for side in (width, height)) or width * height > LARGEST:
         raise ValueError(f"a picture of {width!r:.20} x {height!r:.20} px")
     K, viewmat = np.array(K, np.float64), np.array(viewmat, np.float64)
     if K.shape != (3, 3) or viewmat.shape != (4, 4) or not (np.isfinite(K).all() and K[0, 0] * K[1, 1] > 0):

@@ -7,25 +7,23 @@ the tests and on fern, fox and horns; those of GPS, of tags and of where to phot
 
 # Every scene.
 TEST_EVERY = 8  # views: each 8th by name is held out (Mildenhall et al. 2019), where nothing else is said
-MOST_DEPTHS = 1 << 22  # that `Scene.reach` looks at: they and their median take some 120 MB
 STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
 PICTURE_MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
 
 # What files may hold.
 MOST_SIDE = 65_535  # px: the largest that a JPEG can have; larger ones come from damaged files
-MOST_PIXELS = 1 << 28  # of a camera in a file
 LARGEST = 1e15  # world units; beyond this, squared distances overflow 32-bit floats
 LENS_SHARES = 1000  # focal lengths and principal points in sides of the photo; damaged files go far beyond
 MOST_FRAMES = 100_000  # of a camera path in a file
 MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 1200 px would be 5.8 GB
-COPY_SIDE = 640  # px: small copies of photos and frames, which tell of axes and of sharpness
-COARSE = 640  # px: cameras for photos whose longer side is scaled down to no more need not be finer than that
+# px: small copies of photos and frames, which tell of axes and of sharpness; cameras for photos that are
+# scaled down to no more need not be finer than such photos tell.
+COPY_SIDE = 640
 
 # From photos on disk to views, and to photos that are stored for COLMAP.
 JPEG_QUALITY = 95
 STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is not resampled
 SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
-BAND = 1 << 20  # pixels mapped at a time, to bound memory
 MAX_WORKERS, GIVEN_BACK = 4, 10  # photos at their stored size at once; after which freed memory is given back
 DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
 LATTICE, EXACT = 8, 0.02  # px of such a grid: positions are computed so far apart, if that is exact enough
@@ -41,14 +39,17 @@ SHOWN, LOOKED_AT = 0.02, 1000  # of a photo's sides, which the points must span 
 SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 FAR_ORIGIN = 100.0  # sizes from the origin: from here on the origin is moved
+EPIPOLAR = 4.0  # px from its epipolar line that a match may be, as COLMAP has it
 AXES_PAIRS = 6  # of neighbours, spread over the photos
-AXES_NEAR = 3.0  # px from the epipolar line: a match fits
 AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
 EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 RANDOM_POINTS = 20_000  # to start from where a scene has none
 
 # Camera paths.
-PATH_SIZE, PATH_FOV = (504, 378), 60.0  # px, degrees, of a camera where nothing else is said
+PATH_SIZE, PATH_FOV = (
+    (504, 378),
+    60.0,
+)  # px (of photos of built-in rooms too), degrees, where nothing else is said
 MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
 TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 

@@ -15,7 +15,7 @@ from hqgs.base.text import some
 from hqgs.photos.files import UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
-from hqgs.scene.constants import COARSE, MOST_BYTES
+from hqgs.scene.constants import COPY_SIDE, MOST_BYTES
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
@@ -91,7 +91,7 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    coarse = longest is not None and longest <= COARSE
+    coarse = longest is not None and longest <= COPY_SIDE
     capture = with_faces(_read(root, downscale, keep_sfm, on_stage, sfm, coarse, features))
     if longest is not None:
         capture = bounded(capture, longest)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.machine import AT_ONCE
 from hqgs.base.text import some
-from hqgs.scene.constants import MOST_DEPTHS, STRAY
+from hqgs.scene.constants import STRAY
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.world import World
 
@@ -111,9 +112,9 @@ class Scene:
         """The extent, or the median depth of the points before the training views where that is larger.
 
         Photos taken side by side may show things that are many times farther away than the cameras are apart.
-        Of MOST_DEPTHS views times points and more, every k-th point stands for the others.
+        Of AT_ONCE views times points and more, every k-th point stands for the others.
         """
-        step = -(-len(self.train) * len(self.points) // MOST_DEPTHS) or 1
+        step = -(-len(self.train) * len(self.points) // AT_ONCE) or 1
         points, depths = self.points[::step].astype(np.float64), []
         for view in self.train:
             depth = points @ view.camera.viewmat[2, :3] + view.camera.viewmat[2, 3]

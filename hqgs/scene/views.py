@@ -20,14 +20,13 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from hqgs.base.machine import give_back_memory, keep_large_arrays_apart
+from hqgs.base.machine import AT_ONCE, give_back_memory, keep_large_arrays_apart
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.resize import Pixels, area_downscale
 from hqgs.scene.capture import Photo
 from hqgs.scene.constants import (
-    BAND,
     DENSE_SAMPLES,
     DENSER,
     EXACT,
@@ -252,7 +251,7 @@ def to_pinhole(
     guessed = _interpolated(camera, K, xs, ys, face) if coarser > 1 else None
     grid = np.empty((rows, columns, 2), np.float32)
     inside = np.empty((rows, columns), np.bool_)
-    step = max(1, BAND // columns)
+    step = max(1, AT_ONCE // columns)
     for top in range(0, rows, step):
         band = slice(top, top + step)
         at = _shares(camera, K, xs, ys[band], face) if guessed is None else guessed[band]

@@ -70,7 +70,6 @@ SMALLEST_PASSING = 20  # cells of a region
 DEPTHS_ASKED = 0.92, 1.08  # of the scene's: between them other photos are asked
 CONTRADICTED = 0.3  # of a region's cells: so many more look as in the scene than as in the photo
 BORNE_OUT = 0.5  # of them: most look as in the scene; where neither is borne out, photos only fail to agree
-TOO_DARK = 0.02  # of white: below, gains are not told
 
 # The trial of growth: short runs on small copies of the photos. It says that nothing should grow on two
 # captures, tourists' photos of a building and a can on bare tiles, which are about 0.4 and 3.1 dB better so
@@ -102,6 +101,9 @@ SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are compu
 # yet, at which short ones are given up, and of the rates at the end.
 CAMERAS_BEGIN, GIVE_UP_AT, CAMERA_RATES_LEFT = 0.1, (0.5, 0.75), 0.1
 SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle: with less a photo stands still
+SMALLEST_RADIUS = (
+    SHORTEST_TRAJECTORY / 2
+)  # px, of circles of confusion: smaller ones everywhere, and it is sharp
 # Of the photo's width, standard deviation and radius: from 0 neither has a direction to grow in.
 FIRST_TRAJECTORY, FIRST_RADIUS = 1e-3, 0.0015
 TRAJECTORY_RATE, LENS_RATE, GAIN_RATE = 8e-4, 4e-4, 0.005  # of the photo's width, twice; of the log gains
@@ -114,7 +116,6 @@ MOST_MARGIN = 48  # px around a render
 DEPTHS_REFRESH, DEPTHS_COARSER = 8, 4  # visits of a photo until its depths are rendered anew; px, as coarsely
 SATURATED = 254  # levels of 1/255
 LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
-SMALLEST_RADIUS = 0.35  # px: a photo whose circles of confusion are smaller everywhere is sharp
 FEWEST_SAMPLES, MOST_SAMPLES = 6, 24  # of the aperture
 GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
 

@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
+from hqgs.diagnosis.constants import GAINS_DARK
 from hqgs.model.consistency import Agreement
 from hqgs.model.constants import AGREE_SMOOTH, BACKGROUND
 from hqgs.model.first_points import points_along_edges
@@ -44,7 +45,6 @@ from hqgs.training.constants import (
     SCOUT_STEPS,
     SCOUT_STEPS_EACH,
     SMALLEST_PASSING,
-    TOO_DARK,
 )
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss
@@ -114,7 +114,7 @@ def _unlike(view: View, render: NDArray[np.float32]) -> Floats:
     channel; 0 where the photo does not count. Gains of the whole photo do not count either.
     """
     photo, own = _cells(as_floats(view.image)), _cells(render)
-    own *= np.median(photo / np.maximum(own, TOO_DARK), axis=(0, 1))
+    own *= np.median(photo / np.maximum(own, GAINS_DARK), axis=(0, 1))
     low, high = (f(own, size=(3, 3, 1)) for f in (ndimage.minimum_filter, ndimage.maximum_filter))
     unlike = np.maximum(np.maximum(low - photo, photo - high), 0).max(-1)
     return unlike if view.mask is None else np.where(_cells(view.mask[..., None])[..., 0] == 1, unlike, 0)

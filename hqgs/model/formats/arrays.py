@@ -30,3 +30,6 @@ class Arrays(Told):
     opacities: Floats  # [N], logits
     sh0: Floats  # [N, 1, 3]
     shN: Floats
+
+
+TENSORS = tuple(name for name in Arrays.__annotations__ if name in Arrays.__required_keys__)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.machine import AT_ONCE
+
 CODES = 256  # values of a codebook
 ROUNDS = 8  # of Lloyd's algorithm
-CHUNK = 4096  # rows whose distances to all centres are held at a time
 Array = NDArray[np.float64]
 
 
@@ -67,5 +68,6 @@ def _means(rows: Array, weights: Array, labels: NDArray[np.int64], count: int) -
 
 def _nearest(rows: Array, centers: Array) -> NDArray[np.int64]:
     half = 0.5 * np.square(centers).sum(1)
-    parts = [rows[at : at + CHUNK] for at in range(0, len(rows), CHUNK)]
+    step = max(1, AT_ONCE // len(centers))
+    parts = [rows[at : at + step] for at in range(0, len(rows), step)]
     return np.concatenate([np.argmin(half - part @ centers.T, axis=1) for part in parts])

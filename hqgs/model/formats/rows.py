@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.arrays import TENSORS, Arrays
 
 CURVE_BITS = 10  # of a cell along each axis
 
@@ -20,7 +20,7 @@ def finite_rows(arrays: Arrays) -> NDArray[np.bool_]:
 def whole_rows(arrays: Arrays) -> NDArray[np.bool_]:
     """Which Gaussians hold no NaN or Inf, [N]."""
     keep = np.ones(len(arrays["means"]), np.bool_)
-    for name in ("means", "scales", "quats", "opacities", "sh0", "shN"):
+    for name in TENSORS:
         values = arrays[name]
         keep &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     return keep
@@ -28,17 +28,8 @@ def whole_rows(arrays: Arrays) -> NDArray[np.bool_]:
 
 def pick(arrays: Arrays, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Arrays:
     """Those rows of each array."""
-    picked: Arrays = {
-        "means": arrays["means"][rows],
-        "scales": arrays["scales"][rows],
-        "quats": arrays["quats"][rows],
-        "opacities": arrays["opacities"][rows],
-        "sh0": arrays["sh0"][rows],
-        "shN": arrays["shN"][rows],
-    }
-    if "errors" in arrays:
-        picked["errors"] = arrays["errors"][rows]
-    return picked
+    names = (*TENSORS, "errors") if "errors" in arrays else TENSORS
+    return cast(Arrays, {name: arrays[name][rows] for name in names})
 
 
 def sound_errors(values: NDArray[Any]) -> NDArray[np.float32]:

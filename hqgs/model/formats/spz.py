@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.files import atomic_path
-from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.arrays import TENSORS, Arrays
 from hqgs.model.formats.spz_container import (
     MAX_FRACTION,
     MAX_GAUSSIANS,
@@ -46,7 +46,6 @@ VERSION = VERSIONS[0]  # what more programs read
 SH_BITS = (8, 8)  # of degree 1, of degrees 2 and 3; less rounds small values that many Gaussians share to 0
 
 LIMIT = (1 << 23) - 1  # of a 24-bit number; its negative is used alike
-TENSORS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 FINE = 1 / 64  # the error of a position, as a share of its Gaussian's largest scale, that is fine enough
 COARSE = 1 / 8  # and the one that shows
 MISFIT_SHARE = 0.01  # of the Gaussians, whose positions or sizes the format may miss

@@ -9,10 +9,9 @@ from hqgs.scene.builtin.panorama import WIDTH, panorama_room
 from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.builtin.sparse import PHOTOS, beyond_room, sparse_room
 from hqgs.scene.builtin.wild import parse_true_kind, wild_room
+from hqgs.scene.constants import PATH_SIZE
 from hqgs.scene.names import BEYOND, EMBEDDED, PANORAMA, SPARSE
 from hqgs.scene.scene import Scene
-
-SIZE = (504, 378)  # px, of the photos where nothing else is said
 
 
 def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, seed: int = 0) -> Scene:
@@ -26,7 +25,7 @@ def room(name: str | Path, cache: Path | None = None, downscale: float = 1.0, se
     name or a value out of range.
     """
     text = str(name)
-    width, height = (round(side / downscale) for side in SIZE)
+    width, height = (round(side / downscale) for side in PATH_SIZE)
     if text == EMBEDDED:
         return embedded_scene(cache, width, height)
     if text == SPARSE:

@@ -14,10 +14,11 @@ from hqgs.scene import paths
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.points import SparsePoints, sfm_points
 from hqgs.scene.builtin.shading import render_view
-from hqgs.scene.constants import TEST_EVERY
+from hqgs.scene.constants import PATH_SIZE, TEST_EVERY
 from hqgs.scene.scene import Camera, Scene, View
 
-FOCAL, WIDTH, HEIGHT = 410.0, 504, 378  # pixels; other sizes scale the intrinsics
+WIDTH, HEIGHT = PATH_SIZE
+FOCAL = 410.0  # px; other sizes scale the intrinsics
 FOCUS = (0.05, -0.12, 4.4)  # what the cameras look at
 REACH = (0.42, 0.28, 0.08)  # how far the cameras lie from (0, -0.15, 0)
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hqgs.scene.constants import ROUNDING
-from hqgs.scene.sfm.constants import ALIGN_ROUNDS, FARTHEST, HUBER
+from hqgs.scene.sfm.constants import FARTHEST, HUBER
 from hqgs.scene.similarity import Rows, robust, similarity
 
 Floats = NDArray[np.float64]
@@ -115,79 +116,34 @@ def refine(
 
     By centres alone a frame whose cameras lie close together, compared with what they look at, can be turned
     by a degree: the errors of centres and orientations go together so that the pictures stay the same. What
-    counts for other cameras of the target frame is the pictures. Gauss-Newton on the distances in pixels with
-    Huber's weights, from `start`. `Ks` [V, 3, 3] and `viewmats` [V, 4, 4] are the target's cameras. Also
+    counts for other cameras of the target frame is the pictures: distances in pixels, by Huber's loss along
+    either axis, from `start`. `Ks` [V, 3, 3] and `viewmats` [V, 4, 4] are the target's cameras. Also
     returns the distances [O], px; infinite where a camera has the point behind it.
     """
-    best = start
-    apart, cost = _distances(start, points, seen, Ks, viewmats)
-    damping = 1e-6
-    for _ in range(ALIGN_ROUNDS):
-        step = _gauss_newton(best, points, seen, Ks, viewmats, damping)
-        now, now_cost = _distances(step, points, seen, Ks, viewmats)
-        if now_cost < cost:
-            done = now_cost > cost * (1 - 1e-9)
-            best, apart, cost, damping = step, now, now_cost, damping / 10
-            if done:
-                break
-        else:
-            damping *= 100
-    return best, apart
+    center = start.points(points).mean(0)
+    R, t, K = viewmats[seen.camera, :3, :3], viewmats[seen.camera, :3, 3], Ks[seen.camera, :2]
 
+    def moved(by: Floats) -> Similarity:
+        """By a turn and the logarithm of a scale about the points' centroid, and a shift, [7]."""
+        turn, grow = Rotation.from_rotvec(by[:3]).as_matrix(), float(np.exp(np.clip(by[3], -1, 1)))
+        shift = grow * turn @ (start.t - center) + center + by[4:]
+        return Similarity(grow * start.scale, turn @ start.R, shift)
 
-def _view(
-    similarity: Similarity, points: Floats, seen: Observations, viewmats: Floats
-) -> tuple[Floats, Floats]:
-    """Each observation's point, moved: from the centroid [O, 3], and in its camera's frame [O, 3]."""
-    moved = similarity.points(points)
-    arms = (moved - moved.mean(0))[seen.point]
-    R, t = viewmats[seen.camera, :3, :3], viewmats[seen.camera, :3, 3]
-    return arms, np.einsum("nij,nj->ni", R, moved[seen.point]) + t
+    def off(by: Floats) -> Floats:
+        """[O, 2], px; infinite behind the camera."""
+        p = np.einsum("nij,nj->ni", R, moved(by).points(points)[seen.point]) + t
+        front = p[:, 2:] > 0
+        pixels = np.einsum("nij,nj->ni", K, p / np.where(front, p[:, 2:], 1))
+        return np.where(front, pixels - seen.pixels, np.inf)
 
-
-def _distances(
-    similarity: Similarity, points: Floats, seen: Observations, Ks: Floats, viewmats: Floats
-) -> tuple[Floats, float]:
-    """Distances [O] in px and their mean Huber cost."""
-    _, p = _view(similarity, points, seen, viewmats)
-    front = p[:, 2] > 0
-    p = np.where(front[:, None], p, 1.0)
-    pixels = np.einsum("nij,nj->ni", Ks[seen.camera, :2], p / p[:, 2:])
-    apart = np.where(front, np.linalg.norm(pixels - seen.pixels, axis=1), np.inf)
-    huber = np.where(apart <= HUBER, apart**2 / 2, HUBER * (np.minimum(apart, FARTHEST) - HUBER / 2))
-    return apart, float(huber.mean())
-
-
-def _gauss_newton(
-    similarity: Similarity,
-    points: Floats,
-    seen: Observations,
-    Ks: Floats,
-    viewmats: Floats,
-    damping: float,
-) -> Similarity:
-    """One step in the turn and the logarithm of the scale about the points' centroid, and in the shift."""
-    arms, p = _view(similarity, points, seen, viewmats)
-    front = p[:, 2] > 0
-    p = np.where(front[:, None], p, 1.0)
-    K, R = Ks[seen.camera], viewmats[seen.camera, :3, :3]
-    off = np.einsum("nij,nj->ni", K[:, :2], p / p[:, 2:]) - seen.pixels
-    apart = np.linalg.norm(off, axis=1)
-    weights = np.where(front & (apart < FARTHEST), np.minimum(1, HUBER / np.maximum(apart, ROUNDING)), 0)
-    project = np.zeros((len(p), 2, 3))  # d pixel / d camera frame
-    project[:, 0, 0], project[:, 1, 1] = K[:, 0, 0] / p[:, 2], K[:, 1, 1] / p[:, 2]
-    project[:, 0, 2] = -project[:, 0, 0] * p[:, 0] / p[:, 2]
-    project[:, 1, 2] = -project[:, 1, 1] * p[:, 1] / p[:, 2]
-    turns = np.cross(np.eye(3)[None], arms[:, None]).swapaxes(1, 2)  # columns: axis x arm
-    moves = np.concatenate([turns, arms[:, :, None], np.tile(np.eye(3), (len(p), 1, 1))], axis=2)
-    J = np.einsum("nij,njk,nkl->nil", project, R, moves)
-    normal = np.einsum("n,nij,nik->jk", weights, J, J)
-    slope = np.einsum("n,nij,ni->j", weights, J, off)
-    step = -np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), slope, rcond=None)[0]
-    turn, grow = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(np.clip(step[3], -1, 1)))
-    center = similarity.points(points).mean(0)
-    return Similarity(
-        grow * similarity.scale,
-        turn @ similarity.R,
-        grow * turn @ (similarity.t - center) + center + step[4:],
+    found = least_squares(
+        lambda by: off(by).clip(-FARTHEST, FARTHEST).ravel(),
+        np.zeros(7),
+        x_scale="jac",
+        loss="huber",
+        f_scale=HUBER,
+        ftol=1e-12,
+        xtol=1e-12,
+        gtol=1e-12,
     )
+    return moved(found.x), np.linalg.norm(off(found.x), axis=1)

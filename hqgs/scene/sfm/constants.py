@@ -33,7 +33,6 @@ LARGEST = 1600  # px a side: features of larger photos cost minutes and place no
 COARSE = 2048  # features of a photo looked at coarsely (before those with two directions count twice)
 RICH = 1000  # features (median of the probed photos) from where on coarse ones are enough
 SIGMAS = (1.0, 1.5)  # px of what SIFT sees; of the smoothed versions
-COPIES_QUALITY = 95  # of JPEG, of smoothed copies of photos whose names end so
 FOCAL = 1.2  # of the longer side, where nothing tells
 MATCHED_ALL = 60  # photos; of fewer each is matched with each
 LOWE_RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004; COLMAP's too)
@@ -41,9 +40,7 @@ COMPARED = 256  # features of a photo, the largest, that tell its partners
 PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those that follow it
 FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
-COMPARED_AT_ONCE = 64  # photos that are compared with one
 BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
-LISTED = 64  # blocks of pairs that are listed
 NETWORK_FEATURES = 1024  # of a photo
 NETWORK_SMALL, NETWORK_LARGE = 640, 1024  # px: photos are brought to a longest side between the two
 NETWORK_ALL, NETWORK_PARTNERS = 24, 12  # photos, of fewer each is matched with each; partners of one of more
@@ -56,7 +53,6 @@ FINER = 4 / math.pi  # times a face's pixels: in its middle as fine as the photo
 
 # Places by weaker evidence, and what photos say of places.
 GATES = ((15, 0.15), (12, 0.1))  # matches with points that agree on a place, and their share of all; least
-EPIPOLAR = 4.0  # px from its epipolar line that COLMAP lets a match be
 ALWAYS_CHECKED = 16  # photos, whose places are always checked
 SEARCHED = 60  # points of each photo that the others are searched for, those that most photos see
 DEVIATIONS, TIMES = 3.0, 1.5  # by which more must agree at the place than beside it; the same, as a ratio
@@ -79,7 +75,6 @@ PATCH_STEPS = 5  # of Gauss-Newton
 REACH = 3.0  # px that an observation may move
 SURE, NEW = 0.6, 0.7  # correlation with the others' mean, of what stays; of what no feature told of
 UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it
-CANDIDATES = 1 << 21  # of a point in a photo, looked at together: 100 MB
 PATCH_PHOTOS = 12  # that a point is looked for in, beside those whose features show it
 FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
@@ -90,5 +85,4 @@ ANGLE = 1.5  # degrees between two rays, least, of a point
 GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
 
 # Frames laid onto each other.
-ALIGN_ROUNDS = 20
 HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more

@@ -11,9 +11,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.base.machine import AT_ONCE
 from hqgs.scene.sfm.constants import (
     COMPARED,
-    COMPARED_AT_ONCE,
     DESCRIPTOR,
     FILM_NEAR,
     FILM_THIN,
@@ -32,8 +32,9 @@ def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
     scores = np.zeros((count, count), np.int64)
-    for start in range(0, count, COMPARED_AT_ONCE):
-        block = descriptors[start : start + COMPARED_AT_ONCE]
+    step = max(1, AT_ONCE // max(one.size for one in descriptors))  # photos at a time
+    for start in range(0, count, step):
+        block = descriptors[start : start + step]
         together = np.concatenate(block).T
         ends = np.cumsum([len(one) for one in block])
         for k, one in enumerate(descriptors):

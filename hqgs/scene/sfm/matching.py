@@ -12,7 +12,7 @@ from typing import Any
 
 import pycolmap
 
-from hqgs.scene.sfm.constants import BLOCKS, LISTED
+from hqgs.scene.sfm.constants import BLOCKS
 
 
 @contextmanager
@@ -39,7 +39,7 @@ def match(
     matching.skip_geometric_verification = True
     if pairs is not None:
         listed = pycolmap.ImportedPairingOptions()
-        listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // LISTED)
+        listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // BLOCKS**2)
         listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist()))
         with watched("matches", len(pairs)):
             pycolmap.match_image_pairs(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from hqgs.base.machine import AT_ONCE
 from hqgs.scene.sfm.constants import (
-    CANDIDATES,
     COARSER,
     FRONTAL,
     HALF,
@@ -210,7 +210,7 @@ def widened(views: list[PatchView], tracks: Tracks) -> tuple[Tracks, NDArray[np.
     normals = np.cross(axes[:, :, 0], axes[:, :, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     sizes = np.linalg.norm(axes[:, :, 0], axis=1)
-    step = max(1, CANDIDATES // len(views))  # points at a time
+    step = max(1, AT_ONCE // len(views))  # points at a time
     firsts = range(0, max(1, len(tracks.points)), step)
     found = [_candidates(views, tracks, normals, sizes, first, first + step) for first in firsts]
     view, point, xy = (np.concatenate(values) for values in zip(*found, strict=True))

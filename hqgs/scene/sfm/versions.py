@@ -15,7 +15,7 @@ import pycolmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from hqgs.scene.sfm.constants import COPIES_QUALITY
+from hqgs.scene.constants import JPEG_QUALITY
 
 
 def smoothed_copies(photos: Path, out: Path, names: Sequence[str], sigma: float, largest: int) -> None:
@@ -30,9 +30,7 @@ def smoothed_copies(photos: Path, out: Path, names: Sequence[str], sigma: float,
         with Image.open(photos / name) as image:
             gray = np.asarray(image.convert("L"), np.float32)
         smooth = gaussian_filter(gray, sigma * max(1, max(gray.shape) / largest), mode="nearest")
-        Image.fromarray(np.rint(smooth).astype(np.uint8)).save(
-            target, quality=COPIES_QUALITY, compress_level=1
-        )
+        Image.fromarray(np.rint(smooth).astype(np.uint8)).save(target, quality=JPEG_QUALITY, compress_level=1)
     new.rename(out)
 
 
