@@ -169,7 +169,7 @@ def _blurred(
         drops[k] = _Drop(views[k], "it is far blurrier than other photos of the same things", evidence)
     if needed:
         notes.append(
-            f"blurred training photos kept, as under {ENOUGH_SHOW} sharper ones see some of their points: "
-            + some(needed)
+            f"blurred training photos kept, as fewer than {ENOUGH_SHOW} sharper ones see a part of their "
+            f"points: {some(needed)}"
         )
     return drops
