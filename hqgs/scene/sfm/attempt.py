@@ -163,7 +163,7 @@ class Attempt:
         plain, unsure = self.model, self._off(self.model) > UNSURE
         if unsure:
             self._tell("sharpen", 0)
-            self.model = sharpened(plain, self.photos, self._adjust)
+            self.model = sharpened(plain, self.photos, self._adjust, not self.fixed)
         if self.model is plain and not self._sure >= placed_names(plain):
             self._settle(plain)
         if not (unsure or self.registered < len(self.names) or len(self.names) < ALWAYS_CHECKED):

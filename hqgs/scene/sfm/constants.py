@@ -78,11 +78,22 @@ UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tel
 PATCH_PHOTOS = 12  # that a point is looked for in, beside those whose features show it
 FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, least
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
-LAID = 150  # observations of a photo, of the points whose patches are laid
+LAID = 400  # observations of a photo, of the points whose patches are laid
 CELL = 2.0  # px, where points are the same
 STRAY = 3.0  # times the usual error; observations farther off are left out
 ANGLE = 1.5  # degrees between two rays, least, of a point
+ROUGH = 0.02  # of a patch's variance: what no patch fits better than, counted as noise
 GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
+
+# Adjustment by the precision of each observation.
+ADJUST_STEPS, LEVENBERG = 10, 1e-6  # at most; damping, of the diagonal
+ROBUST = 2.0  # medians of the errors, scale of Cauchy's function
+ALONG = 0.1  # of the usual precision; an observation that is less precise some way follows its point there
+NUDGE = 1e-6  # of a depth or parameter, by which slopes are taken
+SETTLED, TINY = (
+    1e-5,
+    1e-12,
+)  # of the cost: a step that gains less is the last; of the diagonal: what stays free
 
 # Frames laid onto each other.
 HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more

@@ -25,6 +25,7 @@ from hqgs.scene.sfm.constants import (
     PATCH_SIDE,
     PATCH_STEPS,
     REACH,
+    ROUGH,
     SMOOTH,
     SURE,
     UNLIKE,
@@ -138,14 +139,16 @@ def _means(patches: NDArray[np.float32], tracks: Tracks, counted: NDArray[np.boo
 
 def fitted(
     views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_]
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Where the patches of observations agree best with those of their points' other photos [O, 2], and
-    which of them are sure [O]. New ones do not count in the means.
+) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Where the patches of observations agree best with those of their points' other photos [O, 2], which of
+    them are sure [O], and how precisely each tells its place [O, 2, 2], 1 / px^2: by the slopes of its patch
+    and what it differs by. New ones do not count in the means.
     """
     turns, middles = _laid(views, tracks, axes_of(views, tracks))
     usable = _inside(views, tracks, turns, tracks.xy) & (middles > -1e5).all(axis=1)
     at, counted = tracks.xy, usable & ~new
     reach = REACH / np.array([view.ratio[0] for view in views])[tracks.view, None]
+    xx = xy = yy = np.zeros(len(at))
     for _ in range(PATCH_STEPS):
         patches = _patches(views, tracks, turns, at)
         mean = _means(patches, tracks, counted)
@@ -161,23 +164,29 @@ def fitted(
     patches = _patches(views, tracks, turns, at)
     alike = (patches * _means(patches, tracks, counted) * _WEIGHTS).sum(1)
     near = (np.abs(at - tracks.xy) < reach).all(1)
-    return at, usable & near & (alike >= np.where(new, NEW, SURE))
+    slopes = np.stack([xx, xy, xy, yy], 1).reshape(-1, 2, 2)
+    slopes /= np.maximum(2 - 2 * alike, ROUGH)[:, None, None]
+    nodes = np.linalg.inv(np.where(usable[:, None, None], turns, np.eye(2)))
+    information = np.einsum("oji,ojk,okl->oil", nodes, slopes, nodes)
+    return at, usable & near & (alike >= np.where(new, NEW, SURE)), information
 
 
 def aligned(
     views: list[PatchView], tracks: Tracks, new: NDArray[np.bool_]
-) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Observations moved to where they are `fitted`, and which of them are sure [O].
+) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_], Floats]:
+    """Observations moved to where they are `fitted`, which of them are sure [O], which photos look unlike the
+    others [V], and the precision of each [O, 2, 2].
 
-    A photo of which few are sure looks unlike the others: its own stay where features had them. Also returns
-    which photos do [V].
+    A photo of which few are sure is unlike: its own stay where features had them, usually precise each way.
     """
-    at, sure = fitted(views, tracks, new)
+    at, sure, information = fitted(views, tracks, new)
     known = np.bincount(tracks.view[~new], minlength=len(views))
     unlike = np.bincount(tracks.view[~new & sure], minlength=len(views)) < UNLIKE * known
     stay = unlike[tracks.view]
     at = np.where(stay[:, None], tracks.xy, at)
-    return replace(tracks, xy=at), np.where(stay, ~new, sure), unlike
+    usual = np.sqrt(np.median(np.linalg.det(information[sure]))) if sure.any() else 1.0
+    information[stay] = usual * np.eye(2)
+    return replace(tracks, xy=at), np.where(stay, ~new, sure), unlike, information
 
 
 def _candidates(

@@ -49,7 +49,8 @@ from hqgs.scene.sfm.failure import (
 
 PROGRAM = Path(__file__).with_name("program.py")
 IMPORTED = (  # by PROGRAM, of this folder
-    "agree attempt constants database facts home learned likely matching patches sharpen tracks versions"
+    "agree attempt constants database facts home learned likely matching patches sharpen tracks versions "
+    "weighted"
 )
 PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED.split())]
 FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
@@ -274,9 +275,11 @@ def _workplace(kept: Path | None) -> Iterator[Path]:
 
 
 def surroundings() -> dict[str, str]:
-    """The environment in which PROGRAM finds the other files of PARTS, whatever hqgs was started from."""
+    """The environment in which PROGRAM finds the other files of PARTS, whatever hqgs was started from, and
+    sums of linear algebra have one order."""
     paths = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    one = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1")
+    return os.environ | one | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
 def _run_program(directory: Path, on_stage: OnStage) -> None:

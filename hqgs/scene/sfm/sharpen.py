@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hqgs.scene.sfm.constants import ANGLE, CELL, GROWN, LAID, PATCH_SIDE, ROUNDS, STRAY
 from hqgs.scene.sfm.patches import PatchView, aligned, read_photo, widened
 from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, usual
+from hqgs.scene.sfm.weighted import weighted
 
 Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
 
@@ -26,11 +27,12 @@ def sharpened(
     model: pycolmap.Reconstruction,
     folder: Path,
     adjust: Adjust,
+    free: bool,
 ) -> pycolmap.Reconstruction:
     """The model after ROUNDS of patches and adjustment; as it is where the patches do not fit.
 
     `folder` holds the photos. `adjust` gets a model, the error in px from where on it counts an error less,
-    and whether the photos move or the points alone.
+    and whether the photos move or the points alone. `free`: focal lengths and distortion are adjusted, too.
 
     The points that most photos see, LAID in each photo, make the poses precise; the others follow them.
     """
@@ -39,24 +41,21 @@ def sharpened(
     before = usual(model)
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
     used, fresh = _used(tracks, len(names), CELL * max(1, float(np.median(sides)) / PATCH_SIDE))
-    now = rebuilt(model, names, tracks.chosen(used[tracks.point]))
+    now, some = rebuilt(model, names, tracks), tracks.chosen(used[tracks.point])
     for number in range(ROUNDS):
-        _, some = read_tracks(now)
         views = [PatchView(now, name, photos[name]) for name in names]
         new = np.zeros(len(some.view), bool)
         if number > 0:
             some, new = widened(views, some)
-        some, sure, unlike = aligned(views, some, new)
+        some, sure, unlike, information = aligned(views, some, new)
         if 2 * unlike.sum() > len(names):
             return model
-        now = rebuilt(now, names, some.chosen(sure))
-        adjust(now, usual(now), True)
-        _, some = read_tracks(now)
-        off = errors(now)
+        keep = some.kept(sure)
+        some, off = weighted(now, names, some.chosen(sure), information[keep], free)
         own = np.array([np.median([0, *off[some.view == k]]) for k in range(len(names))])
-        now = rebuilt(now, names, some.chosen(off <= STRAY * np.maximum(own, usual(now))[some.view]))
-        pycolmap.ObservationManager(now).filter_all_points3D(1e9, ANGLE)
-        adjust(now, usual(now), True)
+        some = some.chosen(off <= STRAY * np.maximum(own, np.median(off))[some.view])
+    now = rebuilt(now, names, some)
+    pycolmap.ObservationManager(now).filter_all_points3D(1e9, ANGLE)
     if usual(now) > GROWN * before:
         return model
     return _joined(now, names, tracks.chosen((fresh & ~used)[tracks.point]), adjust, STRAY * before)

@@ -27,9 +27,13 @@ class Tracks:
     point: Ints
     xy: Floats
 
+    def kept(self, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which observations are `chosen` [O]."""
+        return keep & (np.bincount(self.point[keep], minlength=len(self.points)) >= 2)[self.point]
+
     def chosen(self, keep: NDArray[np.bool_]) -> Tracks:
         """Without the other observations, and without points that fewer than two see."""
-        keep = keep & (np.bincount(self.point[keep], minlength=len(self.points)) >= 2)[self.point]
+        keep = self.kept(keep)
         rows, point = np.unique(self.point[keep], return_inverse=True)
         return Tracks(self.points[rows], self.colors[rows], self.view[keep], point, self.xy[keep])
 
