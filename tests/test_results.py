@@ -178,7 +178,10 @@ def test_what_leaving_out_saves_and_what_poses_cost() -> None:
         "| auto | +0.10 ± 1.26 | -0.10 | 0.50 | 0.40 | 0.30 |"
     ]
     posed = frame(run_of("hqgs", 30.0), run_of("hqgs", 29.0, poses="photos"), run_of("hqgs", 9.0, seed=1))
-    assert cost_of_poses(posed, ["blur"]).splitlines()[-1] == "| a, blur | 30.00 | 29.00 | -1.00 |"
+    assert cost_of_poses(posed).splitlines()[-1] == "| a, blur | 30.00 | 29.00 | -1.00 |"
+    both = cost_of_poses(posed.assign(psnr_fitted=posed["psnr"] + [0.5, 1.0, 0.0])).splitlines()
+    assert both[0] == "|  | own | photos | own, fitted | photos, fitted | cost | cost, fitted |"
+    assert both[-1] == "| a, blur | 30.00 | 29.00 | 30.50 | 30.00 | -1.00 | -0.50 |"
     seeds = [run_of("3dgs", 20.0 + k / 4, seed=k, degradation="none") for k in range(3)]
     assert seeds_apart(frame(*seeds)) == 0.5
 

@@ -16,6 +16,7 @@ from hqgs.scene.sfm import patches
 from hqgs.scene.sfm.sharpen import sharpened
 from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, sureness, usual
 from hqgs.scene.sfm.versions import join, smoothed_copies
+from hqgs.scene.sfm.weighted import weighted
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 160, 120, 150.0, 4.0
 NOISE = 12.0  # levels
@@ -103,7 +104,7 @@ def test_patches_make_poses_and_observations_more_precise(
     model, true, folder = made
     adjust(model, 1.0, True)
     by_features, off = turned(model, true), usual(model)
-    better = sharpened(model, folder, adjust)
+    better = sharpened(model, folder, adjust, False)
     assert better.num_reg_images() == 8
     assert usual(better) < 0.5 * off
     assert turned(better, true) < 0.5 * by_features
@@ -112,7 +113,7 @@ def test_patches_make_poses_and_observations_more_precise(
     assert better.num_points3D() > 0.8 * model.num_points3D()
     assert better.compute_mean_reprojection_error() < 0.5 * off
     monkeypatch.setattr(patches, "AT_ONCE", 200)  # what it holds at once changes no bit
-    again = sharpened(model, folder, adjust)
+    again = sharpened(model, folder, adjust, False)
     for k in range(1, 9):
         a, b = (m.images[k].cam_from_world().matrix() for m in (better, again))
         assert a.tobytes() == b.tobytes()
@@ -125,7 +126,7 @@ def test_large_photos_are_looked_at_smaller(
     adjust(model, 1.0, True)
     by_features, off = turned(model, true), usual(model)
     monkeypatch.setattr(patches, "PATCH_SIDE", 100)
-    better = sharpened(model, folder, adjust)
+    better = sharpened(model, folder, adjust, False)
     assert usual(better) < 0.6 * off
     assert turned(better, true) < 0.6 * by_features
 
@@ -138,7 +139,7 @@ def test_photos_that_do_not_fit_change_nothing(
     rng = np.random.default_rng(7)
     for file in folder.iterdir():
         Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)).save(file)
-    assert sharpened(model, folder, adjust) is model
+    assert sharpened(model, folder, adjust, False) is model
 
 
 def test_a_photo_unlike_the_others_keeps_its_observations(
@@ -149,7 +150,7 @@ def test_a_photo_unlike_the_others_keeps_its_observations(
     by_features = turned(model, true)
     grain = np.random.default_rng(7).integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)
     Image.fromarray(grain).save(folder / "3.png")
-    better = sharpened(model, folder, adjust)
+    better = sharpened(model, folder, adjust, False)
     assert better.num_reg_images() == 8
     before, after = (m.images[4].num_points3D for m in (model, better))
     assert after > 0.5 * before
@@ -238,3 +239,44 @@ def test_smoothed_copies_are_those_of_what_sift_sees(tmp_path: Path) -> None:
         with Image.open(out / "a" / "dot.png") as image:
             assert image.getpixel((30, 20)) == pytest.approx(255 / (2 * np.pi * sigma**2), rel=0.05)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out100", "out30", "photos"]
+
+
+def test_observations_count_by_their_precision_in_each_direction() -> None:
+    rng = np.random.default_rng(0)
+    model, names = pycolmap.Reconstruction(), [f"{k}.png" for k in range(6)]
+    params = np.array([FOCAL, WIDTH / 2, HEIGHT / 2, 0.02])
+    given = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params * [1.03, 1, 1, 0], camera_id=1
+    )
+    model.add_camera_with_trivial_rig(given)
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+    points = rng.uniform([-1, -0.7, 2], [1, 0.7, 6], (200, 3))
+    true, xy = [], []
+    for k, name in enumerate(names):
+        R = Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix()
+        t = rng.normal(0, 0.4, 3) * [1, 1, 0.3]
+        true.append(np.c_[R, t])
+        xy.append(camera.img_from_cam(points @ R.T + t))
+        near = pycolmap.Rotation3d(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix() @ R)
+        image = pycolmap.Image(name=name, keypoints=xy[-1], camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(near, t + rng.normal(0, 0.01, 3)))
+    angle = rng.uniform(0, np.pi, 1200)
+    ways = np.stack([np.cos(angle), np.sin(angle)], 1)  # along edges: ten times less is known there
+    other = np.stack([-ways[:, 1], ways[:, 0]], 1)
+    noise = rng.normal(0, 3.0, (1200, 1)) * ways + rng.normal(0, 0.1, (1200, 1)) * other
+    tracks = Tracks(
+        points + rng.normal(0, 0.02, points.shape), np.zeros((200, 3), np.uint8),
+        np.repeat(np.arange(6), 200), np.tile(np.arange(200), 6), np.concatenate(xy) + noise,
+    )  # fmt: skip
+    across = np.einsum("oi,oj->oij", ways, ways) / 9 + np.einsum("oi,oj->oij", other, other) / 0.01
+    found = {}
+    for name, information in (("each way", across), ("the same", np.tile(np.eye(2), (1200, 1, 1)))):
+        copy = pycolmap.Reconstruction(model)
+        weighted(copy, names, tracks, information, True)
+        found[name] = turned(copy, true), abs(copy.cameras[1].params[0] / FOCAL - 1)
+    assert found["each way"][0] < 0.2 * found["the same"][0], found
+    assert found["each way"][1] < 0.005, found
+    again, off = weighted(copy, names, tracks, across, True)
+    assert 0.5 < np.median(off) < 1.6  # deviations
+    left = np.abs(((again.xy - tracks.xy) * other).sum(1)), np.abs(((again.xy - tracks.xy) * ways).sum(1))
+    assert np.median(left[0]) < 0.05 < 0.5 < np.median(left[1])  # only along edges they follow their points

@@ -20,27 +20,41 @@ def then(history: str, seconds: float) -> float | None:
     return known[-1] if known else None
 
 
-def missing(poses: DataFrame) -> str:
-    """`12 of 43 (fox, noise:25)` for each line that lacks photos."""
+def placed(poses: DataFrame) -> str:
+    """`33 of 34`: in how many cells all photos have a place; and, of the others, how many lack."""
+    lines = records(poses)
     found = [
         f"{line['photos'] - line['registered']} of {line['photos']} ({line['scene']}, {line['degradation']})"
-        for line in records(poses)
+        for line in lines
+        if line["registered"] < line["photos"]
     ]
-    return and_list(found) or "none"
+    lack = f"; without a place are {and_list(found)}" if found else ""
+    return f"{len(lines) - len(found)} of {len(lines)}{lack}"
 
 
-def cost_of_poses(quality: DataFrame, kinds: Sequence[str], row: str = "hqgs") -> str:
-    """PSNR of a row with the scenes' own poses and with those from the photos, run by run."""
-    same = [name for name in RUN if name not in ("poses", "row")]
-    runs = pick(quality, degradation=kinds, row=row)
-    own, photos = (runs.loc[runs["poses"] == one].set_index(same)["psnr"] for one in ("own", "photos"))
-    both = pd.concat([own, photos], axis=1, join="inner", keys=["own", "photos"]).reset_index()
+def poses_beside(runs: DataFrame, value: str = "psnr") -> DataFrame:
+    """A metric of the runs with the scenes' own poses and with those from the photos, of those that have both."""
+    same = [name for name in RUN if name != "poses"]
+    own, photos = (runs.loc[runs["poses"] == one].set_index(same)[value] for one in ("own", "photos"))
+    both = pd.concat([own, photos], axis=1, join="inner", keys=["own", "photos"]).dropna().reset_index()
+    return both.assign(cost=both["photos"] - both["own"])
+
+
+def cost_of_poses(runs: DataFrame) -> str:
+    """What poses from the photos cost, run by run: as held-out cameras are, and with them fitted."""
+    kinds = ("psnr", *(["psnr_fitted"] if "psnr_fitted" in runs else []))
+    tables = [poses_beside(runs, value) for value in kinds]
     rows = []
-    for line in records(both):
-        psnrs = [number(line[name], ".2f") for name in ("own", "photos")]
-        cost = number(line["photos"] - line["own"], "+.2f")
-        rows.append([f"{line['scene']}, {line['degradation']}", *psnrs, cost])
-    return table(["", "own poses", "poses from the photos", "cost (dB)"], rows)
+    for lines in zip(*map(records, tables), strict=True):
+        cells = [number(line[name], ".2f") for line in lines for name in ("own", "photos")]
+        costs = [number(line["cost"], "+.2f") for line in lines]
+        rows.append([f"{lines[0]['scene']}, {lines[0]['degradation']}", *cells, *costs])
+    heads = [
+        f"{poses}{how}"
+        for _, how in zip(kinds, ("", ", fitted"), strict=False)
+        for poses in ("own", "photos")
+    ]
+    return table(["", *heads, *("cost", "cost, fitted")[: len(kinds)]], rows)
 
 
 def reconstructions(poses: DataFrame) -> str:
@@ -54,12 +68,10 @@ def reconstructions(poses: DataFrame) -> str:
         name, registered = f"{line['scene']}, {line['degradation']}", f"{line['registered']}/{line['photos']}"
         points = f"{line['points']:,} ({line['own_points']:,})"
         auc = "/".join(number(line.get(f"auc_{degrees}"), ".2f") for degrees in (1, 3, 5))
-        off = number(line["cameras_px"], ".2f")
-        rows.append([name, registered, rotation, *([auc] if "auc_1" in poses else []), center, off, points])
-    heads = ("rotation (deg), median, max", "centre, median, max", "own cameras off (px)", "points (own)")
-    first, *others = heads
-    told = ["AUC at 1/3/5 deg"] if "auc_1" in poses else []
-    return table(["", "registered", first, *told, *others], rows)
+        off, seconds = number(line["cameras_px"], ".2f"), number(line.get("search_cpu_s"), ".0f")
+        rows.append([name, registered, rotation, auc, center, off, points, seconds])
+    first = ("registered", "rotation (deg), median, max", "AUC at 1/3/5 deg", "centre, median, max")
+    return table(["", *first, "own cameras off (px)", "points (own)", "CPU (s)"], rows)
 
 
 def after(times: DataFrame, scene: str, row: str, seconds: float) -> float | None:
