@@ -33,7 +33,7 @@ def placed(poses: DataFrame) -> str:
 
 
 def poses_beside(runs: DataFrame, value: str = "psnr") -> DataFrame:
-    """A metric of the runs with the scenes' own poses and with those from the photos, of those that have both."""
+    """A metric of runs with the scenes' own poses and with those from the photos, where there are both."""
     same = [name for name in RUN if name != "poses"]
     own, photos = (runs.loc[runs["poses"] == one].set_index(same)[value] for one in ("own", "photos"))
     both = pd.concat([own, photos], axis=1, join="inner", keys=["own", "photos"]).dropna().reset_index()
