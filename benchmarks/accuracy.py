@@ -140,7 +140,7 @@ def trained_inputs(scene: Scene, steps: int, most: int, seed: int) -> RasterInpu
     config = Row("3dgs").train_config(seed, steps, {"densify": {"max_gaussians": most}, "sh_interval": 1})
     done = Training(scene, config)
     done.steps(steps)
-    g, view = done.trainer.gaussians.detached(), scene.train[0]
+    g, view = done.trainer.gaussians.detached(), done.trainer.scene.train[0]
     with one_torch_thread():
         image, _ = render_view(g, view.camera, 3, config.background)
         image.requires_grad_()

@@ -60,7 +60,7 @@ class Features:
         with cell.row.switched():
             done = train(photos, cell.config)
         if cell.row == DEFAULT:
-            done.trainer.shown().save(self.grown(cell))
+            done.trainer.model().save(self.grown(cell))
         refined = self.refined(cell, cell.row) if cell.row.refinable else None
         psnr = done.trainer.history[-1]["psnr"]
         return {"psnr": psnr, "refined_psnr": refined} | done.record()

@@ -36,7 +36,7 @@ def run_cell(cell: Cell, photos: Scene) -> Run:
     trainer, peak = done.trainer, done.peak_rss_mb()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / PLY
-        trainer.shown().save(path)
+        trainer.model().save(path)
         size = path.stat().st_size
     return done.judged() | {
         "cpu_seconds": done.setup_cpu_seconds + done.cpu_seconds,  # with the choice of photos

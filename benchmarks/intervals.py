@@ -61,7 +61,7 @@ def pools(scene: Scene, sets: list[list[View]], iterations: int) -> list[list[li
     done, found = Training(scene, Row("3dgs").train_config(0, iterations, {})), []
     for steps in (iterations * 3 // 4, iterations - iterations * 3 // 4):
         done.steps(steps)
-        shown = done.trainer.shown()
+        shown = done.trainer.model()
         found.append([measured(held_out_renders(replace(scene, test=views), shown)) for views in sets])
     return found
 

@@ -14,6 +14,7 @@ from hqgs.evaluation.held_out import HeldOutViews, held_out_means
 from hqgs.evaluation.metrics import haarpsi, psnr, ssim
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
+from hqgs.training.frame import Frame
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.trainer import Step, Trainer
 
@@ -37,7 +38,7 @@ class Training:
 
     def __init__(self, photos: Scene, config: TrainConfig) -> None:
         self._resets, started, clock = reset_peak_rss(), time.perf_counter(), time.process_time()
-        self.trainer = Trainer(photos, config)
+        self.trainer = Trainer(Frame.of(photos), config)
         # Of the choice of photos, diagnosis, operators, tokens.
         self.setup_seconds = time.perf_counter() - started
         self.setup_cpu_seconds = time.process_time() - clock

@@ -39,6 +39,7 @@ from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, summary_html, write_page
 from hqgs.training.checkpoint import checksum, scene_fingerprint
 from hqgs.training.config import AUTO, FORMATION, DensifyConfig, TrainConfig, run_config
+from hqgs.training.frame import Frame
 from hqgs.training.notes import learned_record, run_notes, run_pictures
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import essential
@@ -186,11 +187,9 @@ def open_run(
             for file in (CHECKPOINT, PLY):
                 remove_leftovers(folder / file)
         going_on = ranks.tell(resume and checkpoint is not None and checkpoint.exists())[0]
-        inspector = Inspector(on_stage)
-        trainer = Trainer(scene, config, inspector, ranks, tries=not going_on)
+        trainer = Trainer(Frame.of(scene), config, Inspector(on_stage), ranks, tries=not going_on)
         if not going_on:
             fit_to_seconds(trainer)
-        del inspector  # it holds what it has seen of the photos
         give_back_memory()  # of the start
         if going_on:
             with _for_all(checkpoint, ranks) as path:
@@ -235,9 +234,9 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     ranks.count_anew()
     with deferred_interrupt() as interrupted:
         if out is not None:
-            save_cameras(out, trainer.scene)
+            save_cameras(out, trainer.prepared.given)
             if trainer.prepared.passersby:
-                save_masks(out, trainer.scene.train)
+                save_masks(out, trainer.prepared.given.train)
         while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):
             before = trainer.iteration
             step = trainer.step()
@@ -266,11 +265,11 @@ def _results(trainer: Trainer, views: HeldOutViews, out: Path | None) -> Run:
 
     Of several ranks the first one measures, and tells the others.
     """
-    scene, guard, ranks = trainer.scene, trainer.guard, trainer.ranks
+    scene, guard, ranks = trainer.prepared.given, trainer.guard, trainer.ranks
     config, decisions = trainer.config, trainer.state.decisions
     if decisions.turned:
         config = replace(config, turn=(decisions.turned, decisions.length))
-    model, left_out = trainer.shown(), trainer.left_out()
+    model, left_out = trainer.model(), trainer.left_out()
     model.look, model.world = (scene.test or scene.train)[0].camera, scene.world
     if out is not None and (rows := model.save(out / PLY)):
         left_out.append(LeftOut(f"{rows} Gaussians in {PLY}", "they hold NaN or Inf"))
@@ -301,7 +300,7 @@ def _report(
     out: Path | None,
 ) -> Report:
     """The report, written into `out`, if there is one; what made it is in `trainer`."""
-    scene, culled = trainer.scene, views.culled()
+    scene, culled = trainer.prepared.given, views.culled()
     rows = [row.known() for row in trainer.rows]
     place, sfm, diagnosis = scene.place, scene.sfm, trainer.diagnosis
     learned = [learned_record(found) for found in trainer.method.learned()]

@@ -108,7 +108,7 @@ def trained(args: argparse.Namespace, ranks: Any, out: Path) -> list[dict[str, A
             records.append(step)
         if ranks.first:
             out.mkdir(exist_ok=True)
-            trainer.shown().save(out / PLY)
+            trainer.model().save(out / PLY)
     return records
 
 

@@ -391,8 +391,8 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 def test_the_ply_holds_what_is_rasterized(tmp_path: Path) -> None:
     with open_run(tiny_scene(), tiny_config(6, method="V7"), tmp_path) as trainer:
         run_to_end(trainer, tmp_path)
-        shown = trainer.method.modulate(trainer.gaussians).means.detach()
-    assert torch.equal(Gaussians.load(tmp_path / PLY).means, shown)
+        shown = trainer.shown().means
+        assert torch.equal(Gaussians.load(tmp_path / PLY).means, trainer.model().means)
     assert (shown - trainer.gaussians.means).abs().max() > 0.5
 
 

@@ -301,7 +301,7 @@ def test_blurred_photos_give_a_sharper_scene_than_3dgs() -> None:
 
 def psnr_of(trainer: Trainer, photos: list, scene: Scene) -> float:
     """Mean PSNR of renders of the training cameras against the clean photos."""
-    trainer.scene = replace(scene, test=photos)
+    trainer.prepared.given = replace(scene, test=photos)
     values = [psnr(v.render.clip(0, 1), v.photo) for v in list(trainer.held_out())]
     return float(np.mean([value for value in values if value is not None]))
 

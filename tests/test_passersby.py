@@ -24,6 +24,7 @@ from hqgs.scene.capture import find_mask
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import Scene, View
 from hqgs.training import passersby
+from hqgs.training.frame import Frame
 from hqgs.training.passersby import without_passersby
 from hqgs.training.prepare import Prepared
 from hqgs.training.trainer import Trainer
@@ -140,7 +141,7 @@ def test_what_cannot_be_told_is_left_as_it_is(crowd: WildRoom) -> None:
 def test_the_run_goes_by_the_masks_and_tells(crowd: WildRoom, tmp_path: Path) -> None:
     asked = tiny_config(4, leave_out=("passersby",))
     run = hqgs.train(crowd.scene, config=asked, out=tmp_path / "run")
-    prepared = Prepared(crowd.scene, asked)
+    prepared = Prepared(Frame.of(crowd.scene), asked)
     names = list(prepared.passersby)
     row = next(row for row in prepared.plan().rows if row.what == "passers-by")
     share = sum(mask.sum() for mask in prepared.passersby.values()) / (11 * 96 * 128)
@@ -156,7 +157,7 @@ def test_the_run_goes_by_the_masks_and_tells(crowd: WildRoom, tmp_path: Path) ->
     assert 'alt="photos, what was masked in red"' in (tmp_path / "run" / "report.html").read_text()
     with Image.open(tmp_path / "run" / "passersby.png") as picture:
         assert picture.width > picture.height > 90
-    trainer = Trainer(crowd.scene, asked)
+    trainer = Trainer(Frame.of(crowd.scene), asked)
     trainer.restore(tmp_path / "run" / "checkpoint.safetensors")
     assert trainer.iteration == 4
 

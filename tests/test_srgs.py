@@ -190,7 +190,7 @@ def test_photos_come_out_sharper_than_those_of_3dgs(monkeypatch: pytest.MonkeyPa
         trainer = Trainer(scene, tiny_config(300, method=method, densify=DensifyConfig(stop=0)))
         for _ in range(300):
             trainer.step()
-        trainer.scene = replace(scene, test=scene.train)
+        trainer.prepared.given = replace(scene, test=scene.train)
         renders = [view.render for view in list(trainer.held_out())]
         values[method] = np.mean([psnr(r, c) or 0 for r, c in zip(renders, clean, strict=True)])
     assert values["srgs"] > values["3dgs"] + 1, values

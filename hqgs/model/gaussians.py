@@ -282,7 +282,7 @@ class Gaussians:
 
     @classmethod
     def from_points(
-        cls, points: NDArray[np.float32], colors: NDArray[np.uint8], sh_degree: int = MAX_SH_DEGREE
+        cls, points: NDArray[np.floating], colors: NDArray[np.uint8], sh_degree: int = MAX_SH_DEGREE
     ) -> Gaussians:
         """One Gaussian for each point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
@@ -307,12 +307,12 @@ class Gaussians:
             raise ValueError(
                 f"points has {bad.size} rows that are not finite, the first is row {bad[0]}: {points[bad[0]]}"
             )
-        n = len(points)
+        n, points = len(points), points.astype(np.float32)
         square = np.maximum(mean_square_distance(points), MIN_SQUARE_DISTANCE)
         log_scale = torch.from_numpy(0.5 * np.log(square)).float()
         sh0 = (torch.from_numpy(colors.astype(np.float32)) / 255.0 - 0.5) / SH_C0
         return cls(
-            means=torch.from_numpy(points.astype(np.float32, copy=True)),
+            means=torch.from_numpy(points),
             scales=log_scale[:, None].repeat(1, 3),
             quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             opacities=torch.full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),

@@ -127,7 +127,7 @@ def load_scene(
                 f"{len(gone)} of {len(those)} {what} photos cannot be used and were left out: "
                 f"{some(sorted(gone))}; of the first: {gone[min(gone)]}"
             )
-    points, colors = capture.points.astype(np.float32), capture.point_colors
+    points, colors = capture.points.astype(np.float64), capture.point_colors
     if len(points) == 0:
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)

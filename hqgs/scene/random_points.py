@@ -13,7 +13,7 @@ from hqgs.scene.scene import View
 
 def random_points(
     views: list[View], near_far: dict[str, tuple[float, float]]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], str]:
     """Seeded random points in the frusta of the training `views`, coloured by the pixel they were drawn at.
 
     Depths are uniform in the logarithm between the view's near and far bound. Where a view has none in
@@ -44,7 +44,7 @@ def random_points(
         f"no points in the scene: {RANDOM_POINTS} random points within {depths} of the training views; "
         "`--sfm` finds cameras and points from the photos"
     )
-    return np.concatenate(points).astype(np.float32), np.concatenate(colors), note
+    return np.concatenate(points), np.concatenate(colors), note
 
 
 def _guess_near_far(views: list[View]) -> dict[str, tuple[float, float]]:

@@ -66,7 +66,7 @@ class Scene:
     name: str
     train: list[View]
     test: list[View]
-    points: NDArray[np.float32]  # [P, 3], world
+    points: NDArray[np.floating]  # [P, 3], world; float64 from files
     point_colors: NDArray[np.uint8]  # [P, 3]
     source: str  # the format it was read from: "colmap", "llff", "transforms", "photos", "embedded"
     notes: list[str] = field(default_factory=list)  # what a reader of the report should know

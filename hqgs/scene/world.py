@@ -108,16 +108,22 @@ class World:
         return " and ".join(words) or "the frame of the files"
 
 
-def world_for(centers: Array, points: Array) -> World:
-    """The frame for a scene with cameras at `centers` [C, 3] and `points` [P, 3], P may be 0.
+def middle_and_size(centers: Array, points: Array) -> tuple[Array, float]:
+    """Of a scene with cameras at `centers` [C, 3] and `points` [P, 3], P may be 0.
 
-    Its size is the median distance of cameras and of points from the cameras' middle (a median too), the
-    larger of the two: none that lies far off moves it.
+    Its middle [3] is the cameras', a median. Its size is the median distance from there of cameras and of
+    points, the larger of the two: none that lies far off moves it.
     """
     middle = np.median(centers, axis=0)
     size = float(np.median(np.linalg.norm(centers - middle, axis=1)))
     if len(points):
         size = max(size, float(np.median(np.linalg.norm(points.astype(np.float64) - middle, axis=1))))
+    return middle, size
+
+
+def world_for(centers: Array, points: Array) -> World:
+    """The frame for a scene with cameras at `centers` [C, 3] and `points` [P, 3], P may be 0."""
+    middle, size = middle_and_size(centers, points)
     if not ONE_PLACE * float(np.abs(middle).max()) < size < math.inf:
         return World()
     shift = (0.0, 0.0, 0.0)

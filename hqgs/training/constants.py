@@ -22,6 +22,10 @@ FEWEST_ITERATIONS, MOST_ITERATIONS = 50, 30_000  # of a run that has a number of
 CLOCK_LEAST, CLOCK_MOST = 0.1, 4.0  # of the rest of such a run as it was planned, by the clock
 WARM, TIMED = 3, 7  # steps of each size before it: the first ones start threads and fill caches
 
+# The frame of training, in which a scene has the size USUAL. Rounding of the files below 1e-10 of it crosses
+# a step of the grids once in many thousand points; 5e-7 of a turn are 1e-3 px at a focal length of 2,000 px.
+POSE_GRID, POINT_GRID = 2.0**-20, 2.0**-16
+
 # The schedule.
 COARSE_PART, COARSE_MOST = 0.6, 1_500  # of the run, and iterations, at the smaller size, at most
 COARSE_FACTOR, SMALLEST_SIDE = 2, 32  # of the sides; px that are left

@@ -19,6 +19,7 @@ from hqgs.model.shapes import as_discs
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
 from hqgs.training.forward import TrainingViews
+from hqgs.training.frame import Frame, Trainable
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.passersby import without_passersby
@@ -33,13 +34,15 @@ class Prepared:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Trainable,
         asked: TrainConfig,
         inspector: Inspector | None = None,
         begin: Begin | None = None,
     ) -> None:
         """`inspector`: what looks at the photos; `begin` makes trainers of short runs that try what pays,
         None: nothing is tried. ValueError if the scene cannot be trained."""
+        self._frame: Frame | None = scene if isinstance(scene, Frame) else None
+        scene = scene.scene() if isinstance(scene, Frame) else scene
         scene.check_trainable()
         inspector = inspector or Inspector()
         unused = list[LeftOut]()
@@ -49,6 +52,7 @@ class Prepared:
         if "passersby" in asked.leave_out:
             scene, self.passersby = without_passersby(scene, asked.seed, inspector.on_stage)
         self.scene: Scene = scene
+        self.given: Scene = scene if self._frame is None else self._frame.outward(scene)
         self.asked: TrainConfig = asked
         facts = facts_of(scene, unused)
         if "passersby" in asked.leave_out:
@@ -96,6 +100,10 @@ class Prepared:
             if plan.discs and len(points) > len(self.scene.points):
                 gaussians = as_discs(gaussians)
             return self.method.start(gaussians, settings.iterations)
+
+    def outward(self, trained: Gaussians) -> Gaussians:
+        """Gaussians of `scene` in the frame of `given`."""
+        return trained if self._frame is None else self._frame.gaussians(trained)
 
     def _first_points(self, wanted: int) -> tuple[Points, Colors]:
         """The scene's points and more along the photos' edges that other photos agree with, at most `wanted`

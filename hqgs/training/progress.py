@@ -29,11 +29,11 @@ class Progress:
     evaluated: HistoryEntry | None  # where the held-out views were measured after this step
     diagnosis: Diagnosis | None = field(repr=False)  # of the photos; None: the method asked for none
     _step: Step = field(repr=False)
-    _shown: Callable[[], Gaussians] = field(repr=False)
+    _model: Callable[[], Gaussians] = field(repr=False)
 
     def model(self) -> Gaussians:
         """The scene as it is rasterized now; its memory changes with the next step."""
-        return self._shown()
+        return self._model()
 
     def psnr(self) -> float | None:
         """Of the render against the training photo, dB. None where it is infinite or nothing counts."""
@@ -57,5 +57,5 @@ def progress_of(trainer: Trainer, step: Step, evaluated: HistoryEntry | None) ->
         evaluated=evaluated,
         diagnosis=trainer.diagnosis,
         _step=step,
-        _shown=trainer.shown,
+        _model=trainer.model,
     )

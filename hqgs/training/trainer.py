@@ -27,6 +27,7 @@ from hqgs.training.config import TrainConfig
 from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.densify import Densification, Densifier
 from hqgs.training.few_photos import decay_opacities
+from hqgs.training.frame import Trainable
 from hqgs.training.frugality import Frugality
 from hqgs.training.gradients import gradients_of
 from hqgs.training.guard import Fault, Guard, parameter_fault
@@ -57,7 +58,7 @@ class Trainer:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Trainable,
         config: TrainConfig,
         inspector: Inspector | None = None,
         ranks: Ranks = ALONE,
@@ -166,15 +167,21 @@ class Trainer:
         with one_torch_thread(), torch.no_grad():
             return self.method.modulate(self.state.average.of(self.state.gaussians)).detached()
 
+    def model(self) -> Gaussians:
+        """The same in the frame of `given`: what is written."""
+        return self.prepared.outward(self.shown())
+
     def left_out(self) -> list[LeftOut]:
         """What the run did without so far."""
         return [*left_out_of(self.plan.rows), *self.frugality.left_out()]
 
     def held_out(self, numbers: Sequence[int] | None = None) -> HeldOutViews:
         """The held-out views of these numbers (None: all), for use before the next step."""
-        views = self.scene.test if numbers is None else [self.scene.test[k] for k in numbers]
+        views = (
+            self.prepared.given.test if numbers is None else [self.prepared.given.test[k] for k in numbers]
+        )
         degree = self.schedule.degree(self.iteration)
-        return HeldOutViews(views, self.shown(), degree, self.config.background)
+        return HeldOutViews(views, self.model(), degree, self.config.background)
 
     def evaluate(self, views: HeldOutViews | None = None) -> None:
         """Add the held-out means at this iteration to the history, once. Takes no training time.
