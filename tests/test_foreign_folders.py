@@ -228,5 +228,8 @@ def test_names_in_a_text_model_are_text(tmp_path: Path) -> None:
     root = write_colmap(truth, tmp_path / "latin", binary=False)
     file = next(root.rglob("images.txt"))
     file.write_bytes(file.read_bytes().replace(b"view_01", b"view_\xe9"))
+    (root / "images/view_01.png").rename(root / "images/view_\u00e9.png")
+    assert len(load_scene(root, test_every=0).train) == 4  # as Windows writes it
+    file.write_bytes(file.read_bytes().replace(b"view_\xe9", b"view_\x81"))
     with pytest.raises(ValueError, match=r"the name of image \d+ is no text in UTF-8"):
         load_scene(root)

@@ -31,16 +31,21 @@ def draw(seed: int, count: int, noise: float, wrong: int = 0) -> tuple[np.ndarra
 
 
 @pytest.mark.parametrize(("count", "wrong"), [(5, 0), (30, 7)])
-def test_the_true_scale_lies_in_the_interval(count: int, wrong: int) -> None:
-    hits = []
+def test_true_scale_and_up_lie_in_their_intervals(count: int, wrong: int) -> None:
+    hits, upright = list[bool](), list[bool]()
     for seed in range(100):
         centers, gps, up = draw(seed, count, 1.0, wrong)
         found = georeference(centers, gps)
         hits.append(found is not None and found.interval[0] <= 20 <= found.interval[1])
-        if found is not None and count == 30:
-            assert np.degrees(np.arccos(np.clip(up @ found.up, -1, 1))) < 10
+        if found is None:
+            continue
+        assert found.tilt is not None
+        upright.append(np.degrees(np.arccos(np.clip(up @ found.up, -1, 1))) < found.tilt)
+        if count == 30:
+            assert found.tilt < 10
             np.testing.assert_allclose(found.origin[:2], [NORTH, EAST], atol=3e-5)
     assert sum(hits) >= 90
+    assert np.mean(upright) >= 0.9
 
 
 def test_what_gps_cannot_tell_is_not_told() -> None:

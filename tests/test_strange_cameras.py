@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,13 @@ def marked(root: Path) -> None:
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
 
 
+def commas(root: Path) -> None:
+    for path in (root / "sparse/0").iterdir():
+        path.write_text(re.sub(r"(\d)\.(\d)", r"\1,\2", path.read_text()))
+
+
 MODELS: dict[str, Change] = {
+    "decimal commas": commas,
     "no lines of what photos show": lines(lambda text: text[::2]),
     "some without": lines(lambda text: [*text[:4], text[4], *text[6:8], *text[8::2]]),
     "empty lines of what photos show": lines(lambda t: [x for k in t[::2] for x in (k, "")]),
@@ -174,7 +181,10 @@ def test_poses_of_nan_in_a_text_model(tmp_path: Path) -> None:
     [
         (values(cx=0.52, cy=0.48), "are shares of w, h = 48, 36: multiply fl_x, fl_y, cx and cy by them"),
         (poses(lambda m: np.eye(4).tolist()), "all 9 photos have the same pose, so that it is none"),
-        (poses(lambda m: (np.diag([1, 1, -1, 1]) @ m).tolist()), "the world is left-handed"),
+        (
+            poses(lambda m: (np.diag([1, 1, -1, 1]) @ m).tolist()),
+            "the world is left-handed: negate one axis of it",
+        ),
     ],
 )
 def test_cameras_that_can_be_none_are_refused(change: Change, told: str, tmp_path: Path) -> None:

@@ -151,7 +151,7 @@ def decode(
             if least is not None:
                 photo.draft(None, least)  # pyright: ignore[reportArgumentType]  (None keeps the mode)
             if photo.mode == "F":
-                raise ValueError("floating-point pixels have no agreed white")
+                raise ValueError("floating-point pixels have no agreed white: save it with 8 or 16 bits")
             if photo.mode.startswith("I"):
                 grey = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
                 if grey.min() < 0 or grey.max() > 65535:

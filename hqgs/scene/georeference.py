@@ -38,6 +38,7 @@ class Georeference:
     used: int  # of them
     residual: float  # m, root of the mean square of what is left over
     spread: float  # m, root of the mean square distance of the photos' places from their middle
+    tilt: float | None = None  # degrees: up is no farther off in 95 % of cases
 
     def of_units(self, metres: float) -> Georeference:
         """The same place, of a frame whose unit is so many of this one's metres."""
@@ -49,9 +50,10 @@ class Georeference:
         lower, upper = self.interval
         place = f"{north:.6f}, {east:.6f}" + "".join(f", {value:.1f} m" for value in above)
         up = ", ".join(f"{value:.3f}" for value in self.up)
+        sure = "" if self.tilt is None else f", 95 % of it within {self.tilt:.2g} degrees"
         return (
             f"GPS of {self.used} of {self.photos} photos: a unit is {self.scale:.4g} m (95 % interval "
-            f"{lower:.4g} to {upper:.4g}), up is ({up}), the origin lies at {place}; places are "
+            f"{lower:.4g} to {upper:.4g}), up is ({up}){sure}, the origin lies at {place}; places are "
             f"{self.residual:.2g} m off (they spread over {self.spread:.3g} m)"
         )
 
@@ -92,12 +94,14 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     residual = math.sqrt(float(axes.sum()))
     if not spread > GPS_SPREAD * residual:
         return None
-    from scipy.special import stdtrit  # here: to read a scene does not need it
+    from scipy.special import fdtri, stdtrit  # here: to read a scene does not need it
 
     turned = (centers[used] - centers[used].mean(0)) @ R.T
     power = float((turned**2).sum())
     error = math.sqrt(float((turned**2 @ axes).sum())) / power
     sure = float(stdtrit(3 * count - 7, 0.975)) * error
+    flat, free = scale * turned[:, :2], count - 7 / 3
+    tilt = math.sqrt(2 * fdtri(2, free, 0.95) * axes[2] * np.trace(np.linalg.pinv(flat.T @ flat)) / 2)
     north, east, above = _geodetic(shift, start)
     return Georeference(
         scale=scale,
@@ -109,6 +113,7 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
         used=count,
         residual=residual,
         spread=spread,
+        tilt=math.degrees(tilt),
     )
 
 

@@ -104,8 +104,12 @@ def load_scene(
     capture = placed(without_strays(capture, notes), notes)
     names = frozenset(photo.name for photo in capture.photos)
     optional = names if skip_unreadable else frozenset[str]()
-    over = BEHIND if cut_outs(capture, notes) else None
+    over = BEHIND if cut_outs(capture) else None
     views, unreadable = load_views(capture.photos, capture.downscale, optional, on_stage, over)
+    if any(view.empty is not None for view in views):
+        notes.append(
+            f"the {len(views)} photos are cut out: what is transparent is black, in photos and renders"
+        )
     if degraded is not None and downscale == 1:
         views = _with_lows(views, degraded, root, optional, unreadable)
     if capture.source == "transforms" and not len(capture.points):

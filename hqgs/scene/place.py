@@ -102,18 +102,15 @@ def masks_told(root: Path, capture: Capture) -> list[str]:
     return [f"masks are in {MASKS}, but {which}"]
 
 
-def cut_outs(capture: Capture, notes: list[str]) -> bool:
-    """Whether the photos are of cut-out objects, so that what is transparent is empty; `notes` says so.
+def cut_outs(capture: Capture) -> bool:
+    """Whether the photos are of cut-out objects, so that what is transparent is empty.
 
     They are where each of them can be transparent and none has a mask file. In other sets alpha is a mask.
     """
     photos = [photo for photo in capture.photos if photo.path.is_file()]
     if not photos or any(photo.mask_path is not None for photo in photos):
         return False
-    if not all(is_cut_out(photo.path) for photo in photos):
-        return False
-    notes.append(f"the {len(photos)} photos are cut out: what is transparent is black, in photos and renders")
-    return True
+    return all(is_cut_out(photo.path) for photo in photos)
 
 
 def placed(capture: Capture, notes: list[str]) -> Capture:

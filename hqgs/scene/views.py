@@ -151,7 +151,7 @@ def _load_view(
         raise ValueError(f"the camera of photo {photo.name!r} cannot be undistorted: {e}") from e
     width, height = round(flat.width / downscale), round(flat.height / downscale)
     if min(width, height) < SMALLEST_SIDE:
-        raise ValueError(
+        raise UnreadableError(
             f"photo {photo.name!r} is {width} x {height} pixels after downscale {downscale:g}; "
             f"each side needs {SMALLEST_SIDE}"
         )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,6 +14,7 @@ from hqgs.base.text import some
 
 NEEDED, POINTS = ("cameras", "images"), "points3D"
 HEAD = 9  # id, rotation, translation and camera of a photo in images.txt, before its name
+_COMMA = re.compile(rb"(?<!\S)(-?\d+),(\d+(?:[eE][-+]?\d+)?)(?!\S)")  # a number as some languages write it
 _BOM = b"\xef\xbb\xbf"  # that Windows puts before a text
 
 
@@ -32,14 +34,17 @@ def kind_of(folder: Path) -> str:
 def mended(folder: Path, notes: list[str]) -> Iterator[Path]:
     """The folder of a model, or of a copy of it that COLMAP reads as it was meant.
 
-    Texts lose byte order marks. In images.txt COLMAP takes every other line for a photo: where the lines that
-    list what photos show are missing, it would lose half of them without a word. Photos without a pose
-    (nan) are left out, and missing points are none; `notes` tells both.
+    Texts lose byte order marks, numbers their decimal commas. In images.txt COLMAP takes every other line for
+    a photo: where the lines that list what photos show are missing, it would lose half of them without a
+    word. Photos without a pose (nan) are left out, and missing points are none; `notes` tells what was done.
     """
     kind = kind_of(folder)
     texts = {path.name: path.read_bytes() for path in folder.glob("*.txt")} if kind == "txt" else {}
     plain = {name: text.removeprefix(_BOM) for name, text in texts.items()}
     if kind == "txt":
+        if _COMMA.search(plain["cameras.txt"]):
+            plain = {name: _COMMA.sub(rb"\1.\2", text) for name, text in plain.items()}
+            notes.append("the model's numbers have decimal commas, which were read as points")
         plain["images.txt"] = _photo_lines(plain["images.txt"], notes)
     points = f"{POINTS}.{kind}"
     bare = not (folder / points).is_file()
@@ -63,9 +68,20 @@ def mended(folder: Path, notes: list[str]) -> Iterator[Path]:
 
 
 def whole_names(path: Path) -> dict[int, str]:
-    """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces."""
+    """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces.
+
+    What is no UTF-8 was written by an older Windows.
+    """
     words = (line.strip().split(None, HEAD) for line in _decoded(path.read_bytes()) if _is_photo(line))
-    return {int(found[0]): found[HEAD] for found in words}
+    return {int(found[0]): _of_windows(found[HEAD]) for found in words}
+
+
+def _of_windows(name: str) -> str:
+    raw = name.encode("utf-8", "surrogateescape")
+    for code in ("utf-8", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            return raw.decode(code)
+    return name
 
 
 def _decoded(text: bytes) -> list[str]:
