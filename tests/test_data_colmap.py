@@ -34,7 +34,7 @@ def test_cameras_points_and_photos(tmp_path: Path, binary: bool, model: str) -> 
         np.testing.assert_array_equal(view.image, truth.photos[i])
         assert view.image.dtype == np.uint8
         assert view.mask is None
-    np.testing.assert_array_equal(scene.points, truth.points.astype(np.float32))
+    np.testing.assert_array_equal(scene.points, truth.points)
     np.testing.assert_array_equal(scene.point_colors, truth.colors)
     assert scene.notes == []
 
@@ -120,7 +120,7 @@ def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
     struct.pack_into("<d", data, 8 + 8, np.nan)
     path.write_bytes(data)
     scene = load_scene(tmp_path)
-    np.testing.assert_array_equal(scene.points, np.delete(truth.points, first, 0).astype(np.float32))
+    np.testing.assert_array_equal(scene.points, np.delete(truth.points, first, 0))
     np.testing.assert_array_equal(scene.point_colors, np.delete(truth.colors, first, 0))
     assert scene.notes == ["1 of 12 points are not finite and were dropped"]
 

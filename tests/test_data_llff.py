@@ -78,7 +78,7 @@ def test_colmap_model_wins_where_it_has_photos(tmp_path: Path) -> None:
     write_colmap(truth, tmp_path)
     scene = load_scene(tmp_path)
     np.testing.assert_allclose(scene.train[0].camera.viewmat, truth.viewmats[1], atol=1e-12)
-    np.testing.assert_array_equal(scene.points, truth.points.astype(np.float32))
+    np.testing.assert_array_equal(scene.points, truth.points)
     assert scene.source == "colmap"
     assert "cameras and points are both the COLMAP model's" in scene.notes[0]
     (tmp_path / "sparse/0/images.bin").unlink()  # half a model is none
