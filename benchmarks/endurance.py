@@ -20,7 +20,8 @@ from benchmarks.protocol import Row, read_protocols
 from benchmarks.study import Cell, finished
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
-from hqgs.training.trainer import Step, TrainingError
+from hqgs.training.gradients import Step
+from hqgs.training.trainer import TrainingError
 
 RECORDS = 20  # in the course of a run
 NOISE_SHARE = 0.3  # of the training photos

@@ -15,8 +15,9 @@ from hqgs.evaluation.metrics import haarpsi, psnr, ssim
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.frame import Frame
+from hqgs.training.gradients import Step
 from hqgs.training.pace import fit_to_seconds
-from hqgs.training.trainer import Step, Trainer
+from hqgs.training.trainer import Trainer
 
 Run = dict[str, Any]  # plain JSON values
 MEASURED = {"psnr": psnr, "ssim": ssim, "haarpsi": haarpsi}  # at the moments of a run

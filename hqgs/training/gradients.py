@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,6 +17,15 @@ from hqgs.training.forward import ForwardPass, TrainingViews
 from hqgs.training.guard import Fault
 from hqgs.training.schedule import StepPlan
 from hqgs.training.state import TrainState
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a training step has seen."""
+
+    loss: float
+    render: Tensor  # [H, W, 3], detached
+    view: View
 
 
 class Gradients:

@@ -12,7 +12,8 @@ from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.metrics import psnr
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
-from hqgs.training.trainer import Step, Trainer
+from hqgs.training.gradients import Step
+from hqgs.training.trainer import Trainer
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from hqgs.training.densify import Densification, Densifier
 from hqgs.training.few_photos import decay_opacities
 from hqgs.training.frame import Trainable
 from hqgs.training.frugality import Frugality
-from hqgs.training.gradients import gradients_of
+from hqgs.training.gradients import Step, gradients_of
 from hqgs.training.guard import Fault, Guard, parameter_fault
 from hqgs.training.methods.base import Method
 from hqgs.training.plan import PlanRow, RunPlan, Tried, left_out_of
@@ -41,15 +41,6 @@ from hqgs.training.state import TrainState
 
 class TrainingError(RuntimeError):
     """The training cannot go on; the message says why and at which iteration."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """What a training step has seen."""
-
-    loss: float
-    render: Tensor  # [H, W, 3], detached
-    view: View
 
 
 class Trainer:
