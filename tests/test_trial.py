@@ -36,18 +36,18 @@ def told(plan: RunPlan) -> str:
 
 
 @pytest.mark.parametrize(
-    ("gain", "error", "grows"),
-    [(-1.98, 0.4, True), (0.99, 0.4, False), (0.3, 0.4, True), (0.02, 0.01, True)],
+    ("gain", "sure", "grows"),
+    [(-1.98, -5.0, True), (0.99, 2.5, False), (0.5, 1.2, False), (0.3, 0.8, True), (0.02, 2.0, True)],
 )
 def test_nothing_grows_where_photos_held_back_are_better_for_it(
-    gain: float, error: float, grows: bool
+    gain: float, sure: float, grows: bool
 ) -> None:
-    tried = Tried(gain, error, photos=6)
+    tried = Tried(gain, 0.4, photos=6, sure=sure)
     plan = plan_run(facts(tried), None, ASKED)
     densify = plan.settings.densify
     assert (next(row.value for row in plan.rows if row.what == "growth") != "none") == grows
     assert (densify.start < densify.stop) == grows
-    assert f"{gain:+.2f} ± {error:.2f} dB on 6 photos" in told(plan)
+    assert f"{gain:+.2f} ± 0.40 dB on 6 photos" in told(plan)
     long = plan_run(facts(tried), None, run_config(iterations=7000, method="hqgs", formation="none"))
     assert (long.settings.densify.reset_every < long.settings.densify.stop) == grows
     noisy = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="noise:25"))  # which have a budget of their own
@@ -91,7 +91,7 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
         assert (config.opacity_decay, config.hqgs.formation) == (0.0, "none")
         return FakeRun(part, config)
 
-    plan = RunPlan(replace(ASKED, leave_out=("growth",)), FIRST, True, 0, 0, False)
+    plan = RunPlan(replace(ASKED, iterations=10**6, leave_out=("growth",)), FIRST, True, 0, 0, False)
     found = trial.tried_growth(scene, plan, begin)  # type: ignore[arg-type]
     names = [view.name for view in scene.train]
     for part, offset in zip(seen, TRIAL_OFFSETS, strict=True):
@@ -101,6 +101,7 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
     assert found.photos == sum(len(part.test) for part in seen)
     assert found.gain == pytest.approx(20 * np.log10(GAUSSIAN / TRIAL_PIXELS), abs=0.3)  # as errors are
     assert found.error < 0.1
+    assert found.sure > 1  # renders without growth are better by each measure
 
 
 def test_a_trial_takes_a_small_share_of_a_run_and_needs_photos_to_spare() -> None:
@@ -128,7 +129,7 @@ def test_a_run_is_planned_by_its_trial_and_the_same_again(monkeypatch: pytest.Mo
 def test_a_resumed_run_goes_by_the_trial_that_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(prepare, "calls_for_trial", lambda scene, plan: True)
     trials = list[None]()
-    monkeypatch.setattr(prepare, "tried_growth", lambda *of: trials.append(None) or Tried(1.0, 0.1, 6))
+    monkeypatch.setattr(prepare, "tried_growth", lambda *of: trials.append(None) or Tried(1.0, 0.1, 6, 10.0))
     scene = tiny_scene(12, num_points=10)
     scene = replace(scene, seen={view.name: np.arange(10) for view in scene.train})
     config = run_config(iterations=2, method="hqgs", leave_out="growth", formation="none")

@@ -34,6 +34,7 @@ class Tried:
     gain: float  # dB, mean over photos held back
     error: float  # standard error of that mean
     photos: int  # that were held back
+    sure: float  # mean gain over its standard error, the mean for PSNR, SSIM and HaarPSI
 
 
 @dataclass(frozen=True)

@@ -281,8 +281,9 @@ def growth(draft: Draft) -> Sequence[Choice]:
     if tried is not None:
         gain = f"{tried.gain:+.2f} ± {tried.error:.2f} dB"
         told = f"without it {gain} on {tried.photos} photos held back from short runs"
+        told += f"; PSNR, SSIM and HaarPSI gain {tried.sure:.1f} times their error"
     dense = draft.undegraded and draft.dense
-    if dense and tried is not None and tried.gain > max(TRIAL_GAIN, tried.error):
+    if dense and tried is not None and tried.gain > TRIAL_GAIN and tried.sure > 1:
         why = "what grows explains each photo alone, and views between photos are worse"
         changes = {f"densify.{name}": value for name, value in no_growth(densify).items()}
         return [Choice("none", why, told, "growth", changes=changes)]

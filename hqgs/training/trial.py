@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.evaluation.held_out import HeldOutViews
-from hqgs.evaluation.metrics import psnr_aligned
+from hqgs.evaluation.metrics import haarpsi, psnr_aligned, ssim
 from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
@@ -27,7 +27,7 @@ from hqgs.training.constants import (
     TRIAL_OFFSETS,
     TRIAL_PIXELS,
     TRIAL_SHARE,
-    TRIAL_SIDE,
+    TRIAL_SIDES,
     TRIAL_STEPS,
     TRIAL_VIEWS,
 )
@@ -58,16 +58,20 @@ Begin = Callable[[Scene, TrainConfig], ShortRun]  # a trainer before its first s
 def calls_for_trial(scene: Scene, plan: RunPlan) -> bool:
     """Whether growth is to be tried before a run of this plan.
 
-    Not where nothing grows, where no photo can be spared, or where the trial would show more than TRIAL_SHARE
-    of the pixels that the run trains on.
+    Not where nothing grows, where no photo can be spared, or where the run is so short that its share of
+    pixels leaves too small ones.
     """
     settings, views = plan.settings, scene.train
     if settings.densify.stop <= settings.densify.start or len(views) < TRIAL_VIEWS or not len(scene.points):
         return False
-    sizes = np.array([(view.camera.width, view.camera.height) for view in views])
-    small = np.minimum(1, TRIAL_SIDE / sizes.max(1)) ** 2 * sizes.prod(1)
-    shown = 2 * TRIAL_STEPS * len(TRIAL_OFFSETS) * small.mean()
-    return bool(shown <= TRIAL_SHARE * settings.iterations * sizes.prod(1).mean())
+    return _side(scene, settings.iterations) >= TRIAL_SIDES[0]
+
+
+def _side(scene: Scene, iterations: int) -> int:
+    """Of the copies' longer sides, px: a trial shows TRIAL_SHARE of the pixels that the run trains on."""
+    part = TRIAL_SHARE * iterations / (2 * TRIAL_STEPS * len(TRIAL_OFFSETS))
+    longest = max(max(view.camera.width, view.camera.height) for view in scene.train)
+    return round(min(longest * np.sqrt(part), TRIAL_SIDES[1]))
 
 
 def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = silent) -> Tried | None:
@@ -77,23 +81,28 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
     trainers.
     """
     on_stage(Stage("growth", 0, 0, "trying on photos held back whether growth pays"))
-    config, views = _settings(plan.settings), [_small(view) for view in scene.train]
-    found = list[float]()
+    side = _side(scene, plan.settings.iterations)
+    config, views = _settings(plan.settings), [_small(view, side) for view in scene.train]
+    found = list[NDArray[np.float64]]()
     for offset in TRIAL_OFFSETS:
         held = range(offset, len(views), TRIAL_EACH)
         train = [view for k, view in enumerate(views) if k not in held]
         pixels = sum(view.camera.width * view.camera.height for view in train)
         trainer = begin(replace(scene, train=train, test=[views[k] for k in held]), config)
-        found.extend(_gains(trainer, pixels))
-    gains = np.array(found)[np.isfinite(found)]
+        found.append(_gains(trainer, pixels))
+    gains = np.concatenate(found)
+    gains = gains[np.isfinite(gains[:, 0])]  # a mask may leave nothing
+    gains = gains[:, np.isfinite(gains).all(0)]  # photos may be too small for HaarPSI
     if len(gains) < 2:
         return None
-    return Tried(float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains))), len(gains))
+    mean, errors = gains.mean(0), gains.std(0, ddof=1) / np.sqrt(len(gains))
+    sure = (mean / np.maximum(errors, np.finfo(float).tiny)).mean()
+    return Tried(float(mean[0]), float(errors[0]), len(gains), float(sure))
 
 
 def _gains(trainer: ShortRun, pixels: int) -> NDArray[np.float64]:
-    """PSNR of each held-out photo, brightness and tint set aside, of a run without growth over one with it;
-    `pixels`: of all photos that it trains on."""
+    """PSNR, brightness and tint set aside, SSIM and HaarPSI of each held-out photo, [V, 3], of a run without
+    growth over one with it; `pixels`: of all photos that it trains on."""
     kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
     plan, found = trainer.plan, list[NDArray[np.float64]]()
     growth = plan.settings.densify
@@ -103,7 +112,10 @@ def _gains(trainer: ShortRun, pixels: int) -> NDArray[np.float64]:
         trainer.method.load_state_dict(kept)
         while trainer.iteration < trainer.length:
             trainer.step()
-        values = [psnr_aligned(view.render, view.photo, view.mask) for view in trainer.held_out()]
+        values = [
+            [measure(view.render, view.photo, view.mask) for measure in (psnr_aligned, ssim, haarpsi)]
+            for view in trainer.held_out()
+        ]
         found.append(np.array(values, np.float64))  # NaN: a mask leaves nothing
     return found[1] - found[0]
 
@@ -120,7 +132,7 @@ def _settings(settings: TrainConfig) -> TrainConfig:
     )
 
 
-def _small(view: View) -> View:
+def _small(view: View, side: int) -> View:
     camera = view.camera
-    factor = max(1.0, max(camera.width, camera.height) / TRIAL_SIDE)
+    factor = max(1.0, max(camera.width, camera.height) / side)
     return resized(view, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))
