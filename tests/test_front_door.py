@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fixtures_scenes import make_truth, write_transforms
 from PIL import Image
@@ -12,11 +13,13 @@ from test_bare_photos import exif, picture
 from test_sfm import HEIGHT, WIDTH, cards  # noqa: F401
 
 from hqgs.base.stages import Stage
-from hqgs.photos.exif import read_exif
+from hqgs.photos.exif import Exif, read_exif
+from hqgs.photos.files import Glance
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
 from hqgs.scene.sfm.folder import write_colmap_folder
+from hqgs.scene.sfm.front_door import strays
 from hqgs.scene.source import load, pictures
 
 
@@ -164,6 +167,15 @@ def test_a_screenshot_is_left_out_where_it_has_no_place_and_used_where_it_has(
         "the photos all the same, and is used",
         f"shot.png looks like a screenshot (PNG of {size}, no camera in EXIF): it was left out",
     ]
+
+
+@pytest.mark.parametrize(("sizes", "found"), [([(4, 3)] * 6, ["Screenshot 1.png"]), ([(6, 13)] * 6, [])])
+def test_photos_that_tell_no_camera_and_screenshots_by_name(
+    sizes: list[tuple[int, int]], found: list[str]
+) -> None:
+    seen = {f"{k}.jpg": size for k, size in enumerate(sizes)} | {"Screenshot 1.png": (6, 13)}
+    looked = {name: Glance(size, "PNG", np.zeros((2, 2), np.uint8)) for name, size in seen.items()}
+    assert list(strays(looked, dict.fromkeys(seen, Exif()))) == found
 
 
 def test_masks_are_looked_at_before_colmap_works(tmp_path: Path) -> None:

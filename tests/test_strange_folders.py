@@ -79,6 +79,8 @@ def test_photos_beside_the_folder_of_images_are_told(tmp_path: Path) -> None:
         ("reconstruction.json", "OpenSfM"),
         ("mesh_info.json", "Polycam"),
         ("poses.txt", "poses"),
+        ("cameras.json", "3DGS"),
+        ("0.pose.txt", "poses"),
     ],
 )
 def test_cameras_of_other_programs_are_told_not_to_be_read(file: str, program: str, tmp_path: Path) -> None:

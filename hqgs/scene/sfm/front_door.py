@@ -22,11 +22,14 @@ _CAMERAS = {  # files of other programs, by what they are called
     ),
     "Bundler": re.compile(r"^bundler?.*\.out$", re.IGNORECASE),
     "VisualSFM": re.compile(r"\.nvm$", re.IGNORECASE),
-    "OpenMVG or Meshroom": re.compile(r"^(sfm_data.*\.(json|bin)|cameras\.sfm|.*\.mg)$", re.IGNORECASE),
-    "OpenSfM": re.compile(r"^reconstruction\.(json|meshed\.json)$"),
+    "OpenMVG or Meshroom": re.compile(r"^(sfm(_data.*)?\.(json|bin)|cameras\.sfm|.*\.mg)$", re.IGNORECASE),
+    "OpenSfM": re.compile(r"^(opensfm|reconstruction\.(json|meshed\.json))$"),
     "Polycam": re.compile(r"^(corrected_)?cameras$|^mesh_info\.json$"),
+    "3DGS": re.compile(r"^cameras\.json$"),
     "poses": re.compile(
-        r"^(poses?|trajectory|traj|groundtruth|camera_poses)\.(txt|csv|json|log)$", re.IGNORECASE
+        r"^(poses?|trajectory|traj|groundtruth|camera_poses)\.(txt|csv|json|log|np[yz])$"
+        r"|(\.pose|_cam)\.txt$|^cameras\.np[yz]$|^(poses?|cams)$",
+        re.IGNORECASE,
     ),
 }
 _NO_PHOTOS = re.compile(
@@ -37,6 +40,7 @@ _NOT_HERE = (".icloud", ".crdownload", ".part", ".partial", ".download")
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
 _OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
 _LEAST = 3  # photos of that camera
+_SCREEN = re.compile(r"screen.?shot|bildschirmfoto|capture d.{1,2}cran|captura de pantalla", re.IGNORECASE)
 _DRAWN = ("PNG", "WEBP", "GIF", "BMP")  # what screens are stored as
 
 
@@ -77,9 +81,12 @@ def _digest(path: Path) -> bytes:
 def strays(looked: dict[str, Glance], exif: dict[str, Exif]) -> dict[str, str]:
     """Pictures among the photos of one camera that it did not take, by name, and what they look like.
 
-    They say nothing of a camera, and have a size that none of its photos has, upright or turned.
+    They say nothing of a camera, and have a size that none of its photos has, upright or turned. Where no
+    photo says anything, those that are called screenshots count.
     """
-    own = [name for name, tags in exif.items() if any(tags.camera[:2])]
+    own = [name for name, tags in exif.items() if any(tags.camera[:2])] or [
+        name for name in looked if not _SCREEN.search(name)
+    ]
     enough = len(own) >= max(_LEAST, _OF_ONE_CAMERA * len(looked))
     if not enough or len({exif[name].camera[:2] for name in own}) > 1:
         return {}
