@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures_scenes import make_truth, write_photos, write_transforms
+from fixtures_scenes import make_truth, write_colmap, write_photos, write_transforms
 
 from hqgs.cli.main import main
 from hqgs.model.gaussians import Gaussians
@@ -21,6 +21,8 @@ MISTAKES = {
     "train https://a.b/photos.zip --out run": "is an address: download what it names",
     "train photos/view_00.png photos/view_01.png --out run": "photos/view_01.png; give their folder",
     "train scene/transforms.json --out run": "is a folder with photos, or a film: perhaps {root}/scene is",
+    "train colmap/sparse --out run": "; it holds 0; perhaps {root}/colmap is meant",
+    "train colmap/sparse/0 --out run": "has a COLMAP model but no photos: looked for ",
     "train a.ply --out run": "is a scene file, trained already: hqgs view shows it",
     "train raws --out run": "holds no photos, but a.CR2: raw data of a camera: develop them to JPEG",
     "train films --out run": "holds no photos, but a.mp4, b.MOV: several films: give one of them",
@@ -76,6 +78,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a newcomer's folder may hold."""
     root = tmp_path_factory.mktemp("first")
     write_transforms(make_truth(), root / "scene")
+    write_colmap(make_truth(), root / "colmap")
     write_photos(make_truth(), root / "photos")
     write_photos(make_truth(2), root / "two")
     for name in ("empty", "texts", "others", "raws", "films", "film"):

@@ -162,6 +162,12 @@ def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] 
     return None
 
 
+def perhaps(root: Path) -> str:
+    """The folder above that has photos, where one inside of a scene was given, as advice; or nothing."""
+    meant = next((folder for folder in [*root.absolute().parents][:2] if photo_folder(folder, 1.0)), None)
+    return "" if meant is None else f"; perhaps {meant} is meant"
+
+
 def find_mask(root: Path, name: str) -> Path | None:
     """The mask of photo `name` in `masks/`: the same name, with a suffix added, or with another suffix."""
     masks = root / MASKS

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, RAW_SUFFIXES
+from hqgs.scene.capture import perhaps
 from hqgs.scene.formats.colmap import find_models, half_model
 from hqgs.scene.formats.llff import POSES
 from hqgs.scene.formats.transforms import SINGLE, TRAIN
@@ -44,5 +45,5 @@ def nothing(root: Path) -> str:
             return f"{root} holds no photos, but {some(found)}: {advice}"
     return (
         f"{root} holds no photos ({', '.join(PHOTO_SUFFIXES)}), here or in a folder further down, and no "
-        f"scene (a COLMAP model, {SINGLE}, {TRAIN} or {POSES}); it holds {some(entries)}"
+        f"scene (a COLMAP model, {SINGLE}, {TRAIN} or {POSES}); it holds {some(entries)}{perhaps(root)}"
     )

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from hqgs.base.text import some
-from hqgs.scene.capture import found_inside, inside, list_photos, photo_folder
+from hqgs.scene.capture import found_inside, inside, list_photos, perhaps, photo_folder
 from hqgs.scene.photo_files import MASKS, Named, is_run
 
 INPUT = "input"  # 3DGS's convert.py: photos as they were before they were undistorted
@@ -40,7 +40,7 @@ def photos_of(
     if not (list_photos(best) if best != root else list_photos(root)):
         raise ValueError(
             f"{root} has a COLMAP model but no photos: looked for images, images_{downscale:g}, and in "
-            f"{some([p.relative_to(root).as_posix() for p in options])}"
+            f"{some([p.relative_to(root).as_posix() for p in options])}{perhaps(root)}"
         )
     if files := match_some(names, root, best, notes):
         if best != (root / "images"):
