@@ -10,6 +10,7 @@ import numpy as np
 
 # Of several files.
 FEWEST_PHOTOS = 5  # with fewer none is compared with the others
+ROUNDS = 30  # of means and medians of photos and points in turn
 ENOUGH_SHOW = 3  # photos: a point that fewer show, from near enough the same side, tells nothing of them
 LARGEST = 1024  # px a side: more of the middle of a photo is not looked at, but for its enlargement
 LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6, at JPEG's quality 10 0.8
@@ -80,7 +81,6 @@ FOCUS_LARGEST = 2000  # px: the longest side of what is looked at of a photo
 FOCUS_DARK = 0.5 / 255  # contrast below which there is nothing to be sharp
 NEARNESS = (0.2, 3.0)  # that count; the photo's median depth has 1
 FOCUS_LEAST = 0.25  # added to the sum of squares of a photo's nearness: few points tell no slope
-FOCUS_ROUNDS = 12  # of medians and least squares in turn
 
 # gains.py: the gain of each photo, from the colours in which the photos show the same points
 GAINS_WINDOW = 5  # px around a point, whose mean is its colour there
@@ -88,7 +88,6 @@ GAINS_WINDOW = 5  # px around a point, whose mean is its colour there
 GAINS_DARK, BRIGHT = 0.02, 0.9
 GAINS_FEWEST = 20  # points that a photo must share with others
 MOST_VALUES = 8_000_000  # photos times points that are looked at: 200 MB a table
-GAINS_ROUNDS = 30  # of means and medians in turn
 GAINS_LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
 SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
 GAINS_DOUBT = 3.0  # of the log-likelihood: less does not tell neighbours that go together from chance

@@ -20,10 +20,10 @@ from hqgs.diagnosis.constants import (
     FOCUS_LARGEST,
     FOCUS_LEAST,
     FOCUS_MOST_POINTS,
-    FOCUS_ROUNDS,
     FOCUS_WINDOW,
     MOST_PHOTOS,
     NEARNESS,
+    ROUNDS,
 )
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.photos.resize import area_downscale
@@ -104,7 +104,7 @@ def _of_photos(sharp: Floats, depths: Floats) -> tuple[Floats, Floats]:
         squares = np.nansum(near**2, axis=1)
         slope, rest = np.zeros(len(sharp)), np.zeros(len(sharp))
         with_distance = 0.0
-        for _ in range(FOCUS_ROUNDS):
+        for _ in range(ROUNDS):
             told = sharp - with_distance * farther
             own = np.nanmedian(told - rest[:, None] - slope[:, None] * near, axis=0)
             left = told - own

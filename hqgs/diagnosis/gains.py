@@ -18,10 +18,10 @@ from hqgs.diagnosis.constants import (
     GAINS_DOUBT,
     GAINS_FEWEST,
     GAINS_LENGTHS,
-    GAINS_ROUNDS,
     GAINS_WINDOW,
     MOST_VALUES,
     OPPONENTS,
+    ROUNDS,
     SHARES,
 )
 from hqgs.photos.light import to_linear
@@ -78,7 +78,7 @@ def log_gains(scene: Scene, shared: SharedColors | None = None) -> Floats | None
     gains: Floats = np.zeros((len(scene.train), 3))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of points that no photo tells
-        for _ in range(GAINS_ROUNDS):
+        for _ in range(ROUNDS):
             own = np.nanmean(logs - gains[:, None], axis=0)
             gains = np.nanmedian(logs - own, axis=1)
             gains -= gains.mean(0)

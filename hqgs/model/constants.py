@@ -1,6 +1,8 @@
 """Numbers that all of the model goes by."""
 
-SH_C0 = 0.28209479177387814  # the constant basis function: 1 / (2 sqrt(pi))
+import math
+
+SH_C0 = math.sqrt(1 / math.pi) / 2  # the constant basis function
 MAX_SH_DEGREE = 3
 BACKGROUND = (0.0, 0.0, 0.0)  # RGB
 LEAST_SCALE = 1e-30  # that files are read with: a scale of 0 has no log

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hqgs.base.threads import one_torch_thread
 from hqgs.photos.camera import draw_gains, expose
 from hqgs.photos.constants import CHAT_QUALITIES, FULL_WELL, KERNEL_REACH
-from hqgs.photos.formula import VIDEOS, Degradation, DegradationStep, small_side
+from hqgs.photos.formula import KINDS, Degradation, DegradationStep, small_side
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.kernels import disc_kernel, motion_kernel
 from hqgs.photos.light import to_linear, to_srgb
@@ -28,8 +28,6 @@ from hqgs.photos.resize import resize
 from hqgs.photos.shake import draw_path, draw_strength, path_length, shake_kernel
 from hqgs.photos.video import film
 from hqgs.photos.walkers import walk_in
-
-JPEG_FILES = ("jpeg", "phone")  # these kinds end in a JPEG file
 
 Record = dict[str, Any]  # what one step did to one photo: "kind", "value" and the kind's own values, for JSON
 
@@ -87,7 +85,7 @@ def degrade_sequence(
     photos = [_Photo(image, rng) for image, rng in zip(images, rngs, strict=True)]
     all_steps = [degradation.for_width(*photo.size).steps for photo in photos]
     for k, step in enumerate(degradation.steps):
-        if step.kind in VIDEOS:
+        if KINDS[step.kind].film:
             crf = int(all_steps[0][k].value or 0)
             frames = film([photo.now for photo in photos], crf, step.kind)
             for photo, frame in zip(photos, frames, strict=True):

@@ -18,33 +18,39 @@ class Kind:
     default: float | None = None  # the same, for a value that does not depend on the photo's size
     formation: bool = True  # whether a method can be told of it
     some: bool = True  # whether it may happen to some of the photos only
+    longest: bool = False  # whether its value is of the photo's longest side, not of its width
+    file: bool = False  # whether it ends in a JPEG file
+    film: bool = False  # whether it happens to all photos together, as the frames of a film
+    own: str | None = None  # of each "photo" or "camera" its own, learned with the scene; or "found" before
 
 
 KINDS = {
-    "jpeg": Kind(1, 95, "a quality", integer=True),
+    "jpeg": Kind(1, 95, "a quality", integer=True, file=True),
     "noise": Kind(0.01, 255, "a standard deviation, where white is 255"),
     "lowres": Kind(2, 16, "a factor", integer=True, some=False),
     "blur": Kind(0.1, 50, "sigma in px", at_504=2.5),
     "defocus": Kind(0.5, 50, "a radius in px", at_504=5.0),
     "motion": Kind(1, 200, "a length in px", at_504=15.0),
-    "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0),
-    "focus": Kind(0, math.inf, "no value", default=0, some=False),
-    "vignetting": Kind(0, math.inf, "no value", default=0, some=False),
-    "response": Kind(0, math.inf, "no value", default=0, some=False),
-    "grain": Kind(0, math.inf, "no value", default=0, some=False),
-    "exposure": Kind(0.01, 4, "the most stops to either side", default=1),
-    "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False),
-    "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False),
-    "video": Kind(0, 51, "a constant rate factor", integer=True, default=36, some=False),
-    "video265": Kind(0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False),
+    "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0, own="photo"),
+    "focus": Kind(0, math.inf, "no value", default=0, some=False, own="photo"),
+    "exposure": Kind(0.01, 4, "the most stops to either side", default=1, own="photo"),
+    "vignetting": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
+    "response": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
+    "grain": Kind(0, math.inf, "no value", default=0, some=False, own="found"),
+    "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False, longest=True),
+    "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False, file=True),
+    "video": Kind(
+        0, 51, "a constant rate factor", integer=True, default=36, some=False, film=True, own="found"
+    ),
+    "video265": Kind(
+        0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False, film=True
+    ),
     "crowd": Kind(1, 99, "the most walkers in a photo", integer=True, default=3, formation=False),
 }
 NONE, MIXED, SOME = "none", "mixed", "some"
-LONGEST = ("chat",)  # their values are of the photo's longest side, not of its width
-VIDEOS = ("video", "video265")
-DEVICES = ("vignetting", "response")  # of each camera its own, in all its photos
-LEARNED = ("shake", "focus", "exposure", *DEVICES)  # of each photo its own, which is learned with the scene
-OWN = (*LEARNED, "grain", "video")  # of each photo its own; the last two are noise and a film's codec
+DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  # in all photos of a camera
+LEARNED = tuple(name for name, kind in KINDS.items() if kind.own in ("photo", "camera"))
+OWN = tuple(name for name, kind in KINDS.items() if kind.own)  # of each photo its own
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
     "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
@@ -111,7 +117,7 @@ class Degradation:
                 kind = KINDS[step.kind]
                 value = kind.default
                 if value is None:
-                    value = (kind.at_504 or 0.0) * (longest if step.kind in LONGEST else width) / 504
+                    value = (kind.at_504 or 0.0) * (longest if kind.longest else width) / 504
                 step = replace(step, value=_within(kind, value))
             elif step.kind == "lowres":
                 width, longest = (small_side(side, int(step.value)) for side in (width, longest))

@@ -39,7 +39,6 @@ SHOWN, LOOKED_AT = 0.02, 1000  # of a photo's sides, which the points must span 
 SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 FAR_ORIGIN = 16.0  # sizes from the origin: from here on it is moved, before float32 is 1e-3 of 1,000 px off
-EPIPOLAR = 4.0  # px from its epipolar line that a match may be, as COLMAP has it
 AXES_PAIRS = 6  # of neighbours, spread over the photos
 AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
 EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything

@@ -13,9 +13,9 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, new_folder
 from hqgs.base.text import some
-from hqgs.photos.degrade import JPEG_FILES, Degraded, Record, degrade_image, degrade_sequence
+from hqgs.photos.degrade import Degraded, Record, degrade_image, degrade_sequence
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.photos.formula import VIDEOS, Degradation
+from hqgs.photos.formula import KINDS, Degradation
 from hqgs.photos.pixels import to_uint8
 from hqgs.scene.capture import inside
 from hqgs.scene.constants import SOME_FACTORS
@@ -62,7 +62,7 @@ def write_degraded_scene(scene: Scene, out: str | Path, degradation: Degradation
     the new suffixes would mix up the photos' names.
     """
     last_step = degradation.steps[-1] if degradation.steps else None
-    jpeg_last = last_step is not None and last_step.kind in JPEG_FILES and not last_step.some
+    jpeg_last = last_step is not None and KINDS[last_step.kind].file and not last_step.some
     enlarged = any(step.kind == "lowres" for step in degradation.steps)
     suffix = ".jpg" if jpeg_last else ".png"
     names = {view.name: _with_suffix(view.name, ".png" if enlarged else suffix) for view in scene.train}
@@ -120,7 +120,7 @@ def degraded_views(scene: Scene, degradation: Degradation, seed: int) -> Iterato
     """The training views with what becomes of their photos, as `degrade_scene` says."""
     if seed < 0:
         raise ValueError(f"seed is {seed}, wanted at least 0")
-    if any(step.kind in VIDEOS for step in degradation.steps):
+    if any(KINDS[step.kind].film for step in degradation.steps):
         yield from _filmed(scene, degradation, seed)
         return
     factors = _factors(scene, seed) if degradation.partial else {}

@@ -39,7 +39,7 @@ from hqgs.scene.random_points import random_points
 from hqgs.scene.refused import above, broken, nothing
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
-from hqgs.scene.sfm.photos_alone import read_photos
+from hqgs.scene.sfm.photos_alone import Search, read_photos
 from hqgs.scene.sfm.run import SIFT
 from hqgs.scene.views import load_views
 from hqgs.scene.wide import with_faces
@@ -92,7 +92,7 @@ def load_scene(
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
     coarse = longest is not None and longest <= COPY_SIDE
-    capture = with_faces(_read(root, downscale, keep_sfm, on_stage, sfm, coarse, features))
+    capture = with_faces(_read(root, downscale, sfm, Search(keep_sfm, on_stage, coarse, features)))
     if longest is not None:
         capture = bounded(capture, longest)
     degraded = read_degraded_folder(root)
@@ -203,15 +203,7 @@ def formats_of(root: Path, downscale: float) -> list[str]:
     return [COLMAP, *others] if has_model and (has_photos or not others) else others
 
 
-def _read(
-    root: Path,
-    downscale: float,
-    keep_sfm: Path | None,
-    on_stage: OnStage,
-    sfm: bool,
-    coarse: bool,
-    features: str,
-) -> Capture:
+def _read(root: Path, downscale: float, sfm: bool, search: Search) -> Capture:
     formats = formats_of(root, downscale)
     others = [name for name in formats if name != COLMAP]
     if COLMAP in formats:
@@ -231,8 +223,8 @@ def _read(
     if (photos := bare_photos(root, downscale)) is not None:
         told = [] if sfm else above(root)
         if told:
-            on_stage(Stage("COLMAP", 0, len(photos.names), told[0]))
-        capture = read_photos(root, photos, keep_sfm, on_stage, coarse, features)
+            search.on_stage(Stage("COLMAP", 0, len(photos.names), told[0]))
+        capture = read_photos(root, photos, search)
         return replace(capture, notes=[*capture.notes, *told])
     raise ValueError(nothing(root))
 

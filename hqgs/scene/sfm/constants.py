@@ -6,12 +6,24 @@ COLMAP's process.
 
 import math
 
+import pycolmap
+
+# COLMAP's own.
+_pair = pycolmap.TwoViewGeometryOptions()
+EPIPOLAR = _pair.ransac.max_error  # px from its epipolar line that a match may be
+MATCHES = _pair.min_num_inliers  # that agree, which are asked of a pair
+LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio  # of the nearest descriptor's distance to the
+# second's, at most (Lowe 2004)
+FOCAL = pycolmap.ImageReaderOptions().default_focal_length_factor  # of the longer side, where nothing tells
+ANGLE = (
+    pycolmap.IncrementalMapperOptions().filter_min_tri_angle
+)  # degrees between two rays, least, of a point
+
 # What is asked of photos and models.
 LEAST_PHOTOS = 3  # of a scene or model: one alone shows no depth
 LEAST_SHARE = 0.5  # of the photos must find their place in a model
 ALMOST = 0.95  # of the photos: with fewer, they are looked at again, more closely
 ENOUGH_PLACED = 0.7  # of the photos: with fewer, the second pass follows
-MATCHES = 15  # that agree, which COLMAP asks of a pair
 FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can be found again
 POOR = 0.25  # of the features of the others: the same
 ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
@@ -33,9 +45,7 @@ LARGEST = 1600  # px a side: features of larger photos cost minutes and place no
 COARSE = 2048  # features of a photo looked at coarsely (before those with two directions count twice)
 RICH = 1000  # features (median of the probed photos) from where on coarse ones are enough
 SIGMAS = (1.0, 1.5)  # px of what SIFT sees; of the smoothed versions
-FOCAL = 1.2  # of the longer side, where nothing tells
 MATCHED_ALL = 60  # photos; of fewer each is matched with each
-LOWE_RATIO = 0.8  # of the nearest descriptor's distance to the second's, at most (Lowe 2004; COLMAP's too)
 COMPARED = 256  # features of a photo, the largest, that tell its partners
 PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those that follow it
 FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
@@ -81,7 +91,6 @@ COARSER = 2.0  # px of a photo in which a point is looked for, in px of the fine
 LAID = 400  # observations of a photo, of the points whose patches are laid
 CELL = 2.0  # px, where points are the same
 STRAY = 3.0  # times the usual error; observations farther off are left out
-ANGLE = 1.5  # degrees between two rays, least, of a point
 ROUGH = 0.02  # of a patch's variance: what no patch fits better than, counted as noise
 GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from hqgs.scene.constants import EPIPOLAR
+from hqgs.scene.sfm.constants import EPIPOLAR
 
 
 def counts(database: Path, placed: set[str]) -> dict[str, Any]:

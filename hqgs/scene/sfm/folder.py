@@ -19,7 +19,7 @@ from hqgs.scene.photo_files import film_at
 from hqgs.scene.refused import nothing
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import FOR_COLMAP, bare_photos, readable
-from hqgs.scene.sfm.photos_alone import find_cameras
+from hqgs.scene.sfm.photos_alone import Search, find_cameras
 from hqgs.scene.sfm.run import SIFT, check_features
 
 
@@ -48,7 +48,7 @@ def write_colmap_folder(
         photos = bare_photos(root, 1.0)
         if photos is None:
             raise ValueError(nothing(root))
-        found = find_cameras(root, readable(photos, on_stage), work, on_stage, features=features)
+        found = find_cameras(root, readable(photos, on_stage), Search(work, on_stage, features=features))
         images = out / "images"
         details = frame_details(found.photos.folder)
         kept: dict[str, float] = {}

@@ -27,6 +27,16 @@ from hqgs.scene.sfm.tracks import sureness
 
 
 @dataclass(frozen=True)
+class Search:
+    """How cameras are looked for; see `run_colmap`."""
+
+    keep: Path | None = None
+    on_stage: OnStage = silent
+    coarse: bool = False
+    features: str = SIFT
+
+
+@dataclass(frozen=True)
 class FoundCameras:
     """What COLMAP found in photos alone, upright."""
 
@@ -35,14 +45,7 @@ class FoundCameras:
     report: SfmReport
 
 
-def find_cameras(
-    root: Path,
-    photos: BarePhotos,
-    keep: Path | None = None,
-    on_stage: OnStage = silent,
-    coarse: bool = False,
-    features: str = SIFT,
-) -> FoundCameras:
+def find_cameras(root: Path, photos: BarePhotos, search: Search) -> FoundCameras:
     """Cameras and points of photos that are readable, by COLMAP, as `read_photos` has them."""
     names = photos.colmap_names
     files = {name: file for file, name in reversed(names.items())}  # of a panorama its first face
@@ -52,11 +55,8 @@ def find_cameras(
             photos.contents(),
             photos.guess(),
             photos.write,
-            keep,
-            on_stage,
-            coarse,
-            names,
-            features,
+            called=names,
+            **vars(search),
         )
         poses = {names[file]: viewmat for file, viewmat in ran.poses().items() if file in files.values()}
     except ValueError as error:
@@ -89,29 +89,21 @@ def find_cameras(
     return FoundCameras(photos, model, report)
 
 
-def read_photos(
-    root: Path,
-    photos: BarePhotos,
-    keep: Path | None = None,
-    on_stage: OnStage = silent,
-    coarse: bool = False,
-    features: str = SIFT,
-) -> Capture:
+def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
     """Cameras and points of a folder of photos, from all of them, by COLMAP.
 
     Photos of one size share a camera (SIMPLE_RADIAL), unless EXIF tells cameras or zooms apart; it is
     found as well, from the focal length in EXIF where that has one. Held-out views are among the photos:
     without them they would have no pose. The report says so, and names the photos that have no place. The
-    world is turned so that the photos' mean up is -y; up is what EXIF says of how each was held. `keep`:
-    a folder for the reconstruction; `coarse`: a first look, for small pictures; `features`: their kind;
-    see `run_colmap`. ValueError where COLMAP cannot make a model of half of the photos.
+    world is turned so that the photos' mean up is -y; up is what EXIF says of how each was held.
+    ValueError where COLMAP cannot make a model of half of the photos.
     """
-    photos = readable(photos, on_stage)
+    photos = readable(photos, search.on_stage)
     masks = {name: find_mask(root, name) for name in photos.names}
     for name, size in zip(photos.names, photos.sizes, strict=True):
         if (mask := masks[name]) is not None:
             check_mask(mask, *size)
-    cameras = find_cameras(root, photos, keep, on_stage, coarse, features)
+    cameras = find_cameras(root, photos, search)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     sizes = dict(zip(cameras.photos.names, cameras.photos.sizes, strict=True))
