@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hqgs.cli.errors import fail
+from hqgs.photos.formula import grammar
 from hqgs.scene.names import existing_folder, is_room
 from hqgs.scene.photo_files import film_at
 
@@ -35,9 +36,7 @@ Features = Annotated[
 ]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 KINDS = (
-    "jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH], shake[:PX], "
-    "exposure[:EV], phone[:EV], crowd[:N], chat[:SIDE], video[:CRF], some:KIND (half of the photos only), "
-    "several joined by + in their order, mixed, or none"
+    f"{grammar()}, some:KIND (half of the photos only), several joined by + in their order, mixed, or none"
 )
 Kind = Annotated[str, tyro.conf.arg(metavar="KIND", help=f"what happens to the training photos: {KINDS}")]
 

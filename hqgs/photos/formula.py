@@ -13,6 +13,7 @@ class Kind:
     lowest: float
     highest: float
     unit: str
+    takes: str = ""  # what its value is, in a word
     integer: bool = False
     at_504: float | None = None  # the value where none is written, in px of a photo 504 px wide
     default: float | None = None  # the same, for a value that does not depend on the photo's size
@@ -25,27 +26,37 @@ class Kind:
 
 
 KINDS = {
-    "jpeg": Kind(1, 95, "a quality", integer=True, file=True),
-    "noise": Kind(0.01, 255, "a standard deviation, where white is 255"),
-    "lowres": Kind(2, 16, "a factor", integer=True, some=False),
-    "blur": Kind(0.1, 50, "sigma in px", at_504=2.5),
-    "defocus": Kind(0.5, 50, "a radius in px", at_504=5.0),
-    "motion": Kind(1, 200, "a length in px", at_504=15.0),
-    "shake": Kind(0.5, 200, "the longest extent of a shake in px", at_504=12.0, own="photo"),
+    "jpeg": Kind(1, 95, "a quality", "QUALITY", integer=True, file=True),
+    "noise": Kind(0.01, 255, "a standard deviation, where white is 255", "SIGMA"),
+    "lowres": Kind(2, 16, "a factor", "FACTOR", integer=True, some=False),
+    "blur": Kind(0.1, 50, "sigma in px", "SIGMA", at_504=2.5),
+    "defocus": Kind(0.5, 50, "a radius in px", "RADIUS", at_504=5.0),
+    "motion": Kind(1, 200, "a length in px", "LENGTH", at_504=15.0),
+    "shake": Kind(0.5, 200, "the longest extent of a shake in px", "PX", at_504=12.0, own="photo"),
     "focus": Kind(0, math.inf, "no value", default=0, some=False, own="photo"),
-    "exposure": Kind(0.01, 4, "the most stops to either side", default=1, own="photo"),
+    "exposure": Kind(0.01, 4, "the most stops to either side", "EV", default=1, own="photo"),
     "vignetting": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "response": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "grain": Kind(0, math.inf, "no value", default=0, some=False, own="found"),
-    "chat": Kind(8, 10000, "the longest side in px", integer=True, at_504=252, formation=False, longest=True),
-    "phone": Kind(0, 12, "stops of light that are missing", default=4, formation=False, file=True),
+    "chat": Kind(
+        8, 10000, "the longest side in px", "SIDE", integer=True, at_504=252, formation=False, longest=True
+    ),
+    "phone": Kind(0, 12, "stops of light that are missing", "EV", default=4, formation=False, file=True),
     "video": Kind(
-        0, 51, "a constant rate factor", integer=True, default=36, some=False, film=True, own="found"
+        0, 51, "a constant rate factor", "CRF", integer=True, default=36, some=False, film=True, own="found"
     ),
     "video265": Kind(
-        0, 51, "a constant rate factor", integer=True, default=36, formation=False, some=False, film=True
+        0,
+        51,
+        "a constant rate factor",
+        "CRF",
+        integer=True,
+        default=36,
+        formation=False,
+        some=False,
+        film=True,
     ),
-    "crowd": Kind(1, 99, "the most walkers in a photo", integer=True, default=3, formation=False),
+    "crowd": Kind(1, 99, "the most walkers in a photo", "N", integer=True, default=3, formation=False),
 }
 NONE, MIXED, SOME = "none", "mixed", "some"
 DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  # in all photos of a camera
@@ -60,6 +71,15 @@ NOT_MADE = {
     "true-devices is photographed by several",
     "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
 }  # what a method can be told of only, and what to write for photos
+
+
+def grammar() -> str:
+    """The steps that photos can be degraded by, as they are written."""
+    made = [(name, kind) for name, kind in KINDS.items() if name not in NOT_MADE]
+    return ", ".join(
+        f"{name}:{kind.takes}" if kind.at_504 is None and kind.default is None else f"{name}[:{kind.takes}]"
+        for name, kind in made
+    )
 
 
 @dataclass(frozen=True)
