@@ -12,7 +12,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.judge import check_source, read_photos
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, tell_read
-from hqgs.model.formats.files import ANTIALIASED, format_of
+from hqgs.model.formats.files import FORMATS, format_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ def run(options: Clean) -> int:
     except OSError as error:
         return fail(1, f"{options.out}: {error}")
     tell_read(gaussians)
-    if gaussians.antialiased and format not in ANTIALIASED:
+    if gaussians.antialiased and not FORMATS[format].antialiased:
         print(f"left out: the antialias flag: a .{format} file has no place for it")
     print(f"{options.out}: {words}; {done.removed:,} of {kept + done.removed:,} Gaussians faded and are gone")
     return 0

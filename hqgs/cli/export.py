@@ -13,7 +13,7 @@ from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Flag, Photos, cameras_beside, load, ready, tell_read
-from hqgs.model.formats.files import ERRORS, WRITERS, format_of, scene_file
+from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class ExportScene:
     """The file to write."""
     format: Annotated[
         str | None,
-        tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITERS)} (as FILE ends)."),
+        tyro.conf.arg(metavar="FORMAT", help_behavior_hint="", help=f"{', '.join(WRITTEN)} (as FILE ends)."),
     ] = None
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
     """Of the harmonics, at most."""
@@ -67,8 +67,8 @@ def run(args: ExportScene) -> int:
         source = scene_file(args.source)
         if args.out.exists() and args.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is left out would be lost")
-        if args.trust and options.format not in ERRORS:
-            places = " and ".join(f".{name}" for name in ERRORS)
+        if args.trust and not FORMATS[options.format].errors:
+            places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
             raise ValueError(f"--trust: a .{options.format} file has no place for it; {places} files have")
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
         from hqgs.model.gaussians import Gaussians

@@ -14,7 +14,7 @@ from hqgs.base.files import CONFIG
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
 from hqgs.evaluation.verdict import judged_by, verdict
-from hqgs.model.formats.files import READERS, has_format, scene_file
+from hqgs.model.formats.files import FORMATS, has_format, scene_file
 from hqgs.scene.names import existing_folder
 
 
@@ -89,7 +89,7 @@ def _photos(path: Path) -> list[str]:
     formats = formats_of(root, 1.0)
     found = bare_photos(root, 1.0)
     if found is None:
-        raise ValueError(f"{root} holds no photos, no run and no scene file ({', '.join(READERS)})")
+        raise ValueError(f"{root} holds no photos, no run and no scene file ({', '.join(FORMATS)})")
     photos = readable(found)
     sizes = sorted(set(photos.sizes))
     guess = photos.guess()

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hqgs._rust import ALPHA_MIN, QUAT_NORM2_MIN
 from hqgs.base.left_out import LeftOut
-from hqgs.model.formats.files import ANTIALIASED, ERRORS
+from hqgs.model.formats.files import FORMATS
 from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.sog_writer import encode_sog
 from hqgs.model.formats.spz import encode_spz, write_spz
@@ -65,10 +65,10 @@ def export(gaussians: Gaussians, path: str | Path, options: ExportOptions) -> Ex
     for step, (before, after) in zip(steps, pairwise(sizes), strict=True):
         saved = None if before is None or after is None else before - after
         left_out.append(LeftOut(step.what, step.why, step.evidence, bytes=saved))
-    if gaussians.antialiased and options.format not in ANTIALIASED:
+    if gaussians.antialiased and not FORMATS[options.format].antialiased:
         why = f"a .{options.format} file has no place for it: what is finer than a pixel is shown too opaque"
         left_out.append(LeftOut("the antialias flag", why))
-    if gaussians.errors is not None and options.format not in ERRORS:
+    if gaussians.errors is not None and not FORMATS[options.format].errors:
         left_out.append(LeftOut("trust of the Gaussians", f"a .{options.format} file has no place for it"))
     return Export(path, written, len(reduced), reduced.sh_degree, left_out, clipped)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -21,14 +22,10 @@ from hqgs.model.formats.spz import read_spz, write_spz
 from hqgs.model.formats.world_file import keep_world, read_world
 from hqgs.scene.world import World
 
-OWN_PLACE = ("ply", "glb", "gltf")  # formats that hold the frame themselves
-ERRORS = ("ply", "glb")  # formats that hold what trust was learned
-ANTIALIASED = ("ply", "full.ply", "spz", "sog")  # formats that are written with that flag
-
 
 def read_scene(path: Path, format: str) -> Arrays:
     """What a scene file holds, with the frame that stands beside it, if one does."""
-    arrays = in_data_frame(path, READERS[format](path))
+    arrays = in_data_frame(path, FORMATS[format].read(path))
     if "world" not in arrays and (world := read_world(path)) != World():
         arrays["world"] = world
     return arrays
@@ -36,8 +33,10 @@ def read_scene(path: Path, format: str) -> Arrays:
 
 def write_scene(path: Path, arrays: Arrays, format: str) -> int:
     """Write a scene file, and its frame beside it where the format has no place for that."""
-    left_out = WRITERS[format](path, arrays)
-    keep_world(path, World() if format in OWN_PLACE else arrays.get("world", World()))
+    write = FORMATS[format].write
+    assert write is not None
+    left_out = write(path, arrays)
+    keep_world(path, World() if FORMATS[format].world else arrays.get("world", World()))
     return left_out
 
 
@@ -45,34 +44,37 @@ def _read_any_ply(path: Path) -> Arrays:
     return read_compressed_ply(path) if is_compressed_ply(path) else read_ply(path)
 
 
+@dataclass(frozen=True)
+class Format:
+    """How scenes are read and written, and what such a file has a place for."""
+
+    read: Callable[[Path], Arrays]
+    write: Callable[[Path, Arrays], int] | None = None  # None: it is only read
+    of: str | None = None  # the format whose content it has, where that is another's
+    world: bool = False  # the frame of the scene
+    errors: bool = False  # what trust was learned
+    antialiased: bool = False  # that flag
+
+
 # By the ends of their files' names; where two fit, the longer counts.
-READERS: dict[str, Callable[[Path], Arrays]] = {
-    "ply": _read_any_ply,
-    "spz": read_spz,
-    "splat": read_splat,
-    "compressed.ply": read_compressed_ply,
-    "glb": read_gltf,
-    "gltf": read_gltf,
-    "full.ply": _read_any_ply,
-    "sog": read_sog,
-    "meta.json": read_sog,
-    "ksplat": read_ksplat,
+FORMATS = {
+    "ply": Format(_read_any_ply, write_ply, world=True, errors=True, antialiased=True),
+    "spz": Format(read_spz, lambda path, arrays: write_spz(path, arrays).left_out, antialiased=True),
+    "splat": Format(read_splat, write_splat),
+    "compressed.ply": Format(read_compressed_ply, write_compressed_ply, of="ply"),
+    "glb": Format(read_gltf, write_gltf, world=True, errors=True),
+    "gltf": Format(read_gltf, world=True),
+    "full.ply": Format(_read_any_ply, partial(write_ply, full=True), of="ply", antialiased=True),
+    "sog": Format(read_sog, write_sog, antialiased=True),
+    "meta.json": Format(read_sog, of="sog"),
+    "ksplat": Format(read_ksplat),
 }
-_CONTENT = {"compressed.ply": "ply", "full.ply": "ply", "meta.json": "sog"}  # of which those are kinds
-WRITERS: dict[str, Callable[[Path, Arrays], int]] = {
-    "ply": write_ply,
-    "spz": lambda path, arrays: write_spz(path, arrays).left_out,
-    "splat": write_splat,
-    "compressed.ply": write_compressed_ply,
-    "glb": write_gltf,
-    "full.ply": partial(write_ply, full=True),
-    "sog": write_sog,
-}
+WRITTEN = [name for name, format in FORMATS.items() if format.write is not None]
 
 
 def has_format(path: Path) -> bool:
     """Whether the name of a file, or what it holds, says a format that is read."""
-    return bool(_fitting(path, [*READERS])) or format_held(path) is not None
+    return bool(_fitting(path, [*FORMATS])) or format_held(path) is not None
 
 
 def _fitting(path: Path, known: Sequence[str]) -> list[str]:
@@ -85,7 +87,7 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
 
     ValueError where there is none, or, of a file that is to be `written`, where it is only read.
     """
-    known = [*WRITERS] if written else [*READERS]
+    known = WRITTEN if written else [*FORMATS]
     if name is not None:
         if name not in known:
             raise ValueError(f"format is {name!r}, wanted one of: {', '.join(known)}")
@@ -94,7 +96,7 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
         return "meta.json"
     fitting = _fitting(path, known)
     held = None if written or not path.is_file() else format_held(path)
-    if held is not None and not any(_CONTENT.get(format, format) == held for format in fitting):
+    if held is not None and not any((FORMATS[format].of or format) == held for format in fitting):
         return held
     if not fitting:
         raise ValueError(f"{path}: the suffix says no format; wanted .{', .'.join(known)}")
