@@ -8,16 +8,15 @@ import math
 
 import pycolmap
 
-# COLMAP's own.
+# COLMAP's own: px from its epipolar line that a match may be; matches that agree, of a pair; of the nearest
+# descriptor's distance to the second's, at most (Lowe 2004); focal length, in longer sides, where nothing
+# tells; degrees between two rays to a point, least.
 _pair = pycolmap.TwoViewGeometryOptions()
-EPIPOLAR = _pair.ransac.max_error  # px from its epipolar line that a match may be
-MATCHES = _pair.min_num_inliers  # that agree, which are asked of a pair
-LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio  # of the nearest descriptor's distance to the
-# second's, at most (Lowe 2004)
-FOCAL = pycolmap.ImageReaderOptions().default_focal_length_factor  # of the longer side, where nothing tells
-ANGLE = (
-    pycolmap.IncrementalMapperOptions().filter_min_tri_angle
-)  # degrees between two rays, least, of a point
+EPIPOLAR = _pair.ransac.max_error
+MATCHES = _pair.min_num_inliers
+LOWE_RATIO = pycolmap.FeatureMatchingOptions().sift.max_ratio
+FOCAL = pycolmap.ImageReaderOptions().default_focal_length_factor
+ANGLE = pycolmap.IncrementalMapperOptions().filter_min_tri_angle
 
 # What is asked of photos and models.
 LEAST_PHOTOS = 3  # of a scene or model: one alone shows no depth
