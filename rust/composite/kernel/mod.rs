@@ -149,7 +149,6 @@ pub(super) struct Decision<S: Simd, T: Real> {
     /// Transmittance at which a pixel is finished.
     least: Lanes<T, S>,
     one: Lanes<T, S>,
-    zero: Lanes<T, S>,
 }
 
 /// What becomes of pixels that meet a layer.
@@ -158,7 +157,7 @@ pub(super) struct Met<S: Simd, T: Real> {
     pub blended: <Lanes<T, S> as SimdBase<S>>::Mask,
     /// Transmittance behind the layer, where it is blended.
     pub behind: Lanes<T, S>,
-    /// What the next layer meets: the transmittance, 0 where the pixel is finished.
+    /// What the next layer meets: the transmittance, `least` where the pixel is finished.
     pub open: Lanes<T, S>,
 }
 
@@ -169,7 +168,6 @@ impl<S: Simd, T: Real> Decision<S, T> {
             floor: Lanes::<T, S>::splat(simd, layers.floor),
             least: Lanes::<T, S>::splat(simd, layers.least),
             one: Lanes::<T, S>::splat(simd, T::ONE),
-            zero: Lanes::<T, S>::splat(simd, T::ZERO),
         }
     }
 
@@ -177,15 +175,14 @@ impl<S: Simd, T: Real> Decision<S, T> {
     /// they cannot disagree.
     #[inline(always)]
     pub fn meet(&self, alpha: Lanes<T, S>, open: Lanes<T, S>) -> Met<S, T> {
-        // From layer to layer a product, a comparison and a choice depend on each other, and no more: what `open` holds
-        // is 0 or larger than `least`, so that a layer which is too clear leaves it.
+        // From layer to layer a product and a maximum depend on each other, and no more. No factor is above 1, so that
+        // what was `least` or below stays there, and the pixel finished.
         let opaque = alpha.simd_ge(self.floor);
         let behind = open * opaque.select(self.one - alpha, self.one);
-        let left = behind.simd_gt(self.least);
         Met {
-            blended: opaque & left,
+            blended: opaque & behind.simd_gt(self.least),
             behind,
-            open: left.select(behind, self.zero),
+            open: behind.max(self.least),
         }
     }
 
@@ -194,7 +191,7 @@ impl<S: Simd, T: Real> Decision<S, T> {
     pub fn finished<const V: usize>(&self, open: &[Lanes<T, S>; V]) -> bool {
         let mut unfinished = 0;
         for open in open {
-            unfinished |= open.simd_gt(self.zero).to_bitmask();
+            unfinished |= open.simd_gt(self.least).to_bitmask();
         }
         unfinished == 0
     }

@@ -218,16 +218,16 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
             vectors = vectors.div_ceil(2);
             lanes /= 2;
         }
-        let sum = |k: usize| sums[k / width::<S, T>()].as_slice()[k % width::<S, T>()];
-        let first = if D > 0 { count } else { MOMENTS };
-        for (k, out) in out[..first].iter_mut().enumerate() {
-            *out = sum(k);
+        // Through memory: numbers taken out of vectors one by one take longer.
+        let mut stored = [T::ZERO; BLOCK_PIXELS];
+        for (vector, stored) in sums.iter().zip(stored.chunks_exact_mut(width::<S, T>())) {
+            vector.store_slice(stored);
         }
         // Without compiled channels the colours lie between the moments and the absolute gradients.
+        let first = if D > 0 { count } else { MOMENTS };
         let at = out.len() + first - count;
-        for (k, out) in out[at..].iter_mut().enumerate() {
-            *out = sum(first + k);
-        }
+        out[..first].copy_from_slice(&stored[..first]);
+        out[at..].copy_from_slice(&stored[first..count]);
     }
 }
 
