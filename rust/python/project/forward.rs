@@ -21,8 +21,7 @@ use std::sync::Arc;
 fn cameras(
     viewmats: &Bound<'_, PyAny>,
     ks: &Bound<'_, PyAny>,
-    width: usize,
-    height: usize,
+    [width, height]: [usize; 2],
 ) -> BindingResult<Vec<Camera>> {
     let viewmats = Array::<f64>::new("viewmats", viewmats)?;
     let &[c, 4, 4] = viewmats.shape() else {
@@ -65,6 +64,37 @@ fn accuracy_knobs(knobs: Option<Knobs>) -> Result<AccuracyKnobs, Error> {
     Ok(knobs)
 }
 
+/// What an image is made from, as it was given.
+struct Inputs<'a, 'py> {
+    /// Means, quaternions, scales, opacities.
+    gaussians: [&'a Bound<'py, PyAny>; 4],
+    colors: &'a Bound<'py, PyAny>,
+    rest: Optional<'a, 'py>,
+    viewmats: &'a Bound<'py, PyAny>,
+    ks: &'a Bound<'py, PyAny>,
+    /// Width and height.
+    size: [usize; 2],
+    sh_degree: Option<usize>,
+    options: RenderOptions,
+}
+
+/// Its arrays, borrowed, and the cameras.
+struct Held<'py, T: Element> {
+    arrays: Arrays<'py, T>,
+    shades: Shades<'py, T>,
+    cameras: Vec<Camera>,
+}
+
+impl<'py> Inputs<'_, 'py> {
+    fn hold<T: Scalar>(&self) -> BindingResult<Held<'py, T>> {
+        Ok(Held {
+            arrays: Arrays::new(self.gaussians)?,
+            shades: Shades::new(self.colors, self.rest)?,
+            cameras: cameras(self.viewmats, self.ks, self.size)?,
+        })
+    }
+}
+
 /// Pictures of Gaussians in 8 bits, [C, H, W, channels], without a way back; arguments as for `project_forward`.
 #[pyfunction]
 #[pyo3(signature = (means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options, sh_degree, backgrounds))]
@@ -83,68 +113,50 @@ pub(super) fn pictures<'py>(
     sh_degree: Option<usize>,
     backgrounds: Optional<'_, 'py>,
 ) -> BindingResult<Bound<'py, PyArray1<u8>>> {
-    let options = options_of(options);
+    let inputs = Inputs {
+        gaussians: [means, quats, scales, opacities],
+        colors,
+        rest,
+        viewmats,
+        ks,
+        size: [width, height],
+        sh_degree,
+        options: options_of(options),
+    };
     by_dtype!(
         "means",
         means,
-        pictures_as(
-            means,
-            quats,
-            scales,
-            opacities,
-            colors,
-            rest,
-            viewmats,
-            ks,
-            width,
-            height,
-            options,
-            sh_degree,
-            backgrounds
-        )
+        pictures_as(means.py(), &inputs, backgrounds)
     )
 }
 
 fn pictures_as<'py, T: Scalar>(
-    means: &Bound<'py, PyAny>,
-    quats: &Bound<'py, PyAny>,
-    scales: &Bound<'py, PyAny>,
-    opacities: &Bound<'py, PyAny>,
-    colors: &Bound<'py, PyAny>,
-    rest: Optional<'_, 'py>,
-    viewmats: &Bound<'py, PyAny>,
-    ks: &Bound<'py, PyAny>,
-    width: usize,
-    height: usize,
-    options: RenderOptions,
-    sh_degree: Option<usize>,
+    py: Python<'py>,
+    inputs: &Inputs<'_, 'py>,
     backgrounds: Optional<'_, 'py>,
 ) -> BindingResult<Bound<'py, PyArray1<u8>>> {
-    let py = means.py();
-    let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
-    let shades = Shades::<T>::new(colors, rest)?;
-    let cameras = cameras(viewmats, ks, width, height)?;
+    let Held {
+        arrays,
+        shades,
+        cameras,
+    } = &inputs.hold::<T>()?;
     let gaussians = arrays.gaussians()?;
-    let colors = shades.of(gaussians.len(), cameras.len(), sh_degree)?;
-    let channels = colors(0).channels();
+    let colors = shades.of(gaussians.len(), cameras.len(), inputs.sh_degree)?;
+    let (channels, options) = (colors(0).channels(), inputs.options);
     let backgrounds =
         optional_of_shape::<T>("backgrounds", backgrounds, &[cameras.len(), channels])?;
     let backgrounds = backgrounds.as_ref().map(Array::slice).transpose()?;
-    let pictures = py.detach(|| {
-        threads::install(|| -> Result<_, Error> {
-            let mut all = Vec::new();
-            for (i, camera) in cameras.iter().enumerate() {
+    let mut pictures: Vec<_> = py.detach(|| {
+        threads::install(|| {
+            let picture = |(i, camera)| {
                 let behind = backgrounds.map(|b| &b[i * channels..(i + 1) * channels]);
-                let picture = render::picture(gaussians, colors(i), behind, camera, &options)?;
-                if cameras.len() == 1 {
-                    return Ok(picture);
-                }
-                all.extend_from_slice(&picture);
-            }
-            Ok(all)
+                render::picture(gaussians, colors(i), behind, camera, &options)
+            };
+            let cameras = cameras.iter().enumerate();
+            cameras.map(picture).collect::<Result<_, Error>>()
         })
     })??;
-    Ok(pictures.into_pyarray(py))
+    Ok(join(&mut pictures, |picture| picture)?.into_pyarray(py))
 }
 
 /// The options of an image: near, far, radius_clip, eps2d, antialiased, and whether it is differentiated.
@@ -223,42 +235,35 @@ pub(super) fn project_forward<'py>(
     activate: bool,
     knobs: Option<Knobs>,
 ) -> BindingResult<Bound<'py, PyAny>> {
-    let options = RenderOptions {
-        activate,
-        knobs: accuracy_knobs(knobs)?,
-        ..options_of(options)
+    let inputs = Inputs {
+        gaussians: [means, quats, scales, opacities],
+        colors,
+        rest,
+        viewmats,
+        ks,
+        size: [width, height],
+        sh_degree,
+        options: RenderOptions {
+            activate,
+            knobs: accuracy_knobs(knobs)?,
+            ..options_of(options)
+        },
     };
-    by_dtype!(
-        "means",
-        means,
-        project_as(
-            means, quats, scales, opacities, colors, rest, viewmats, ks, width, height, options,
-            sh_degree
-        )
-    )
+    by_dtype!("means", means, project_as(means.py(), &inputs))
 }
 
 fn project_as<'py, T: Scalar>(
-    means: &Bound<'py, PyAny>,
-    quats: &Bound<'py, PyAny>,
-    scales: &Bound<'py, PyAny>,
-    opacities: &Bound<'py, PyAny>,
-    colors: &Bound<'py, PyAny>,
-    rest: Optional<'_, 'py>,
-    viewmats: &Bound<'py, PyAny>,
-    ks: &Bound<'py, PyAny>,
-    width: usize,
-    height: usize,
-    options: RenderOptions,
-    sh_degree: Option<usize>,
+    py: Python<'py>,
+    inputs: &Inputs<'_, 'py>,
 ) -> BindingResult<Bound<'py, PyAny>> {
-    let py = means.py();
-    let arrays = Arrays::<T>::new(means, quats, scales, opacities)?;
-    let shades = Shades::<T>::new(colors, rest)?;
-    let cameras = cameras(viewmats, ks, width, height)?;
-    let gaussians = arrays.gaussians()?;
+    let Held {
+        arrays,
+        shades,
+        cameras,
+    } = inputs.hold::<T>()?;
+    let (gaussians, options) = (arrays.gaussians()?, inputs.options);
     let n = gaussians.len();
-    let colors = shades.of(n, cameras.len(), sh_degree)?;
+    let colors = shades.of(n, cameras.len(), inputs.sh_degree)?;
     let mut outs: Vec<_> = py.detach(|| {
         threads::install(|| {
             let project = |(i, camera)| project::forward(&gaussians, colors(i), camera, &options);

@@ -71,12 +71,7 @@ struct Arrays<'py, T: Element> {
 
 impl<'py, T: Scalar> Arrays<'py, T> {
     /// Arrays of as many Gaussians as there are means.
-    fn new(
-        means: &Bound<'py, PyAny>,
-        quats: &Bound<'py, PyAny>,
-        scales: &Bound<'py, PyAny>,
-        opacities: &Bound<'py, PyAny>,
-    ) -> BindingResult<Self> {
+    fn new([means, quats, scales, opacities]: [&Bound<'py, PyAny>; 4]) -> BindingResult<Self> {
         let (means, n) = Array::new("means", means)?.of_width(3)?;
         Ok(Self {
             means,
