@@ -91,8 +91,5 @@ pub mod internals {
 
     pub mod scene {
         pub use crate::scene::{camera::CameraGrad, *};
-        pub mod synthetic {
-            pub use crate::scene::synthetic::*;
-        }
     }
 }

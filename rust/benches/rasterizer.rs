@@ -1,16 +1,21 @@
 //! `cargo bench`: the stages of the rasterizer at three sizes, 504 x 378, degree 3, f32, all threads, for a
 //! cloud and for a room as a trained scene looks like.
 
+mod synthetic;
 mod table;
 
 use criterion::{BenchmarkId, Criterion};
-use hqgs::internals::{
-    composite::{self, CompositeCotangents, CompositeInput},
-    project::{self, ProjectCotangents, Projected, RenderOptions},
-    scene::{Colors, Harmonics, synthetic::Synthetic},
-    tiles,
+use hqgs::{
+    Error, Real,
+    internals::{
+        composite::{self, CompositeCotangents, CompositeInput},
+        project::{self, ProjectCotangents, Projected, RenderOptions},
+        scene::{self, Colors, Harmonics},
+        tiles,
+    },
 };
 use std::time::Duration;
+use synthetic::Synthetic;
 
 const SIZES: [usize; 3] = [10_000, 100_000, 500_000];
 const WIDTH: usize = 504;
