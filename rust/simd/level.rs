@@ -1,7 +1,7 @@
 //! Which vector instructions are used: the best that the CPU has, or those that `HQGS_SIMD` names.
 
 use crate::error::Error;
-use std::{fmt, sync::OnceLock};
+use std::{cell::Cell, fmt, sync::OnceLock};
 
 /// The environment variable that forces a level.
 const VARIABLE: &str = "HQGS_SIMD";
@@ -101,12 +101,26 @@ pub fn levels() -> Vec<Level> {
 /// When it names no level, or one that this CPU does not have.
 pub fn level() -> Result<Level, Error> {
     static LEVEL: OnceLock<Result<Level, Error>> = OnceLock::new();
+    if let Some(level) = FORCED.get() {
+        return Ok(level);
+    }
     LEVEL
         .get_or_init(|| match std::env::var_os(VARIABLE) {
             Some(value) => choose(&value.to_string_lossy()),
             None => Ok(levels()[0]),
         })
         .clone()
+}
+
+thread_local!(static FORCED: Cell<Option<Level>> = const { Cell::new(None) });
+
+/// Let what `f` calls on this thread use `level`, for the tests.
+#[doc(hidden)]
+pub fn at_level<R>(level: Level, f: impl FnOnce() -> R) -> R {
+    let before = FORCED.replace(Some(level));
+    let out = f();
+    FORCED.set(before);
+    out
 }
 
 /// The level that the variable names; the best one if it is empty.

@@ -10,7 +10,7 @@ pub mod vec3;
 use fearless_simd::{Simd, SimdBase};
 #[cfg(test)]
 pub(crate) use level::at_each_level;
-pub use level::{Level, level, levels};
+pub use level::{Level, at_level, level, levels};
 pub use scalar::{Lanes, Real};
 
 /// f64 lanes: the projection is computed in f64 for either input type.

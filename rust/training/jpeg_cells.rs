@@ -4,7 +4,7 @@ use fearless_simd::{Select, Simd, SimdBase, dispatch};
 use hqgs::internals::{
     Error, check_len,
     simd::{
-        self, Lanes, Level, Real,
+        self, Lanes, Real,
         sums::{MAX_PARTS, parts},
     },
 };
@@ -25,18 +25,6 @@ pub fn distance<T: Real>(
     scale: f64,
     grad: Option<&mut [T]>,
 ) -> Result<f64, Error> {
-    distance_at(simd::level()?, x, centres, widths, scale, grad)
-}
-
-/// [`distance`] with the vector instructions of `level`.
-fn distance_at<T: Real>(
-    level: Level,
-    x: &[T],
-    centres: &[T],
-    widths: &[T],
-    scale: f64,
-    grad: Option<&mut [T]>,
-) -> Result<f64, Error> {
     check_len("centres", centres, x.len())?;
     check_len("widths", widths, x.len())?;
     let mut none = Vec::new();
@@ -51,7 +39,7 @@ fn distance_at<T: Real>(
     // One piece of the gradient for each chunk, empty where it is not wanted.
     let mut grads: Vec<&mut [T]> = grad.chunks_mut(CHUNK).collect();
     grads.resize_with(sums.len(), Default::default);
-    let level = level.token();
+    let level = simd::level()?.token();
     sums.par_iter_mut()
         .zip(grads)
         .zip(x.par_chunks(CHUNK))
@@ -116,7 +104,7 @@ fn load<S: Simd, T: Real>(simd: S, data: &[T], at: usize) -> Lanes<T, S> {
 mod tests {
     use super::*;
     use crate::at_each_level;
-    use hqgs::levels;
+    use hqgs::{Level, internals::simd::at_level, levels};
     use rayon::ThreadPoolBuilder;
 
     fn numbers<T: Real>(n: usize, k: f64) -> Vec<T> {
@@ -133,7 +121,10 @@ mod tests {
                 .map(|w| T::from_f64(w.to_f64().abs()))
                 .collect();
             let mut grad = vec![T::ONE; n];
-            let value = distance_at(level, &x, &centres, &widths, 0.25, Some(&mut grad)).unwrap();
+            let value = at_level(level, || {
+                distance(&x, &centres, &widths, 0.25, Some(&mut grad))
+            })
+            .unwrap();
             let mut expected = 0.0;
             for i in 0..n {
                 let d = x[i].to_f64() - centres[i].to_f64();
@@ -149,7 +140,7 @@ mod tests {
                 }
             }
             assert!((value - expected).abs() <= tolerance * expected, "{n}");
-            let alone = distance_at(level, &x, &centres, &widths, 0.25, None).unwrap();
+            let alone = at_level(level, || distance(&x, &centres, &widths, 0.25, None)).unwrap();
             assert_eq!(alone, value);
         }
     }
@@ -170,22 +161,29 @@ mod tests {
     fn check_border(level: Level) {
         let (centres, widths) = ([0.0_f32; 4], [1.0; 4]);
         let mut grad = [1.0; 4];
-        let value = distance_at(
-            level,
-            &[0.0, 0.5, -0.5, 0.4],
-            &centres,
-            &widths,
-            1.0,
-            Some(&mut grad),
-        );
+        let value = at_level(level, || {
+            distance(
+                &[0.0, 0.5, -0.5, 0.4],
+                &centres,
+                &widths,
+                1.0,
+                Some(&mut grad),
+            )
+        });
         assert_eq!((value.unwrap(), grad), (0.0, [0.0; 4]));
         let x = [f32::NAN, 0.0, 0.0, 0.0];
-        let value = distance_at(level, &x, &centres, &widths, 1.0, None);
+        let value = at_level(level, || distance(&x, &centres, &widths, 1.0, None));
         assert!(value.unwrap().is_nan());
         assert_eq!(
-            distance_at(level, &[0.0; 4], &centres[1..], &widths, 1.0, None)
-                .unwrap_err()
-                .name(),
+            at_level(level, || distance(
+                &[0.0; 4],
+                &centres[1..],
+                &widths,
+                1.0,
+                None
+            ))
+            .unwrap_err()
+            .name(),
             "centres"
         );
     }
@@ -198,8 +196,10 @@ mod tests {
             let pool = ThreadPoolBuilder::new().num_threads(threads).build();
             pool.unwrap().install(|| {
                 let mut grad = vec![0.0; n];
-                let value =
-                    distance_at(level, &x, &centres, &widths, 0.3, Some(&mut grad)).unwrap();
+                let value = at_level(level, || {
+                    distance(&x, &centres, &widths, 0.3, Some(&mut grad))
+                })
+                .unwrap();
                 (value, grad)
             })
         };

@@ -6,7 +6,7 @@
 use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use hqgs::internals::{
     Error, check_len,
-    simd::{self, Lanes, Level, Real},
+    simd::{self, Lanes, Real},
 };
 use rayon::prelude::*;
 
@@ -113,7 +113,12 @@ pub fn step<T: Real>(
     options: &AdamOptions,
     selection: &Selection,
 ) -> Result<(), Error> {
-    step_at(simd::level()?, arrays, step, options, selection)
+    steps(vec![AdamStep {
+        arrays,
+        step,
+        options: *options,
+        selection: *selection,
+    }])
 }
 
 /// The steps of several arrays, shared out among the threads together.
@@ -121,7 +126,17 @@ pub fn step<T: Real>(
 /// # Errors
 /// As for [`step`]; then none has been made.
 pub fn steps<T: Real>(steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
-    steps_at(simd::level()?, steps)
+    let mut tasks: Vec<Task<'_, T>> = Vec::new();
+    for step in steps {
+        step.cut(&mut tasks)?;
+    }
+    let level = simd::level()?.token();
+    tasks
+        .into_par_iter()
+        .for_each(|(arrays, factors, width, used)| {
+            dispatch!(level, simd => update_rows(simd, &factors, arrays, width, used));
+        });
+    Ok(())
 }
 
 /// Check several steps.
@@ -134,37 +149,6 @@ pub fn check<T: Real>(steps: &[AdamStep<'_, T>]) -> Result<(), Error> {
 
 /// One task: what it moves, the factors, the numbers of a row and how many of them are moved.
 type Task<'a, T> = (AdamArrays<'a, T>, Factors<T>, usize, usize);
-
-fn steps_at<T: Real>(level: Level, steps: Vec<AdamStep<'_, T>>) -> Result<(), Error> {
-    let mut tasks: Vec<Task<'_, T>> = Vec::new();
-    for step in steps {
-        step.cut(&mut tasks)?;
-    }
-    let level = level.token();
-    tasks
-        .into_par_iter()
-        .for_each(|(arrays, factors, width, used)| {
-            dispatch!(level, simd => update_rows(simd, &factors, arrays, width, used));
-        });
-    Ok(())
-}
-
-/// [`step`] with the vector instructions of `level`.
-fn step_at<T: Real>(
-    level: Level,
-    arrays: AdamArrays<'_, T>,
-    step: u64,
-    options: &AdamOptions,
-    selection: &Selection,
-) -> Result<(), Error> {
-    let step = AdamStep {
-        arrays,
-        step,
-        options: *options,
-        selection: *selection,
-    };
-    steps_at(level, vec![step])
-}
 
 impl<'a, T: Real> AdamStep<'a, T> {
     /// Its factors, if its arrays and settings fit.

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::{at_each_level, noise};
+use hqgs::{Level, internals::simd::at_level};
 
 /// torch's formulas, one element at a time.
 macro_rules! reference {
@@ -45,7 +46,7 @@ fn run<T: Real>(level: Level, n: usize, steps: u64, selection: &Selection) -> [V
             exp_avg,
             exp_avg_sq,
         };
-        step_at(level, arrays, at, &OPTIONS, selection).unwrap();
+        at_level(level, || step(arrays, at, &OPTIONS, selection)).unwrap();
     }
     arrays
 }

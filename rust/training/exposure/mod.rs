@@ -11,9 +11,8 @@ pub use curve::Light;
 use curve::{Tables, tables};
 use fearless_simd::{Simd, dispatch};
 use hqgs::internals::{
-    Error, check_len, memory,
-    simd::{self, Level},
-    uninit::{UninitPiece, UninitVec},
+    Error, check_len, memory, simd,
+    uninit::{UninitPiece, UninitVec, zeros},
 };
 use rayon::prelude::*;
 
@@ -117,17 +116,6 @@ impl<T: Light> Photograph<T> {
         warps: &[Warp],
         gains: [f64; 3],
     ) -> Result<Self, Error> {
-        Self::take_at(simd::level()?, frame, image, nearness, warps, gains)
-    }
-
-    fn take_at(
-        level: Level,
-        frame: Frame,
-        image: &[T],
-        nearness: &[T],
-        warps: &[Warp],
-        gains: [f64; 3],
-    ) -> Result<Self, Error> {
         let [height, width] = frame.check()?;
         check_len("image", image, height * width * 3)?;
         if !nearness.is_empty() {
@@ -167,7 +155,7 @@ impl<T: Light> Photograph<T> {
         };
         let mut mean = UninitVec::new(frame.pixels(), "mean")?;
         let mut photo = UninitVec::new(frame.pixels() * 3, "photo")?;
-        let (across, token) = (frame.size[1], level.token());
+        let (across, token) = (frame.size[1], simd::level()?.token());
         pieces(&mut mean, frame.pixels(), across)
             .into_par_iter()
             .zip(pieces(&mut photo, frame.pixels() * 3, across * 3))
@@ -190,14 +178,10 @@ impl<T: Light> Photograph<T> {
     /// # Errors
     /// Names the array when its length differs from that of the photo.
     pub fn backward(&self, v_photo: &[T]) -> Result<PhotographGradients<T>, Error> {
-        self.backward_at(simd::level()?, v_photo)
-    }
-
-    fn backward_at(&self, level: Level, v_photo: &[T]) -> Result<PhotographGradients<T>, Error> {
         check_len("v_photo", v_photo, self.photo.len())?;
         let ([height, width], across) = (self.frame.render_size(), self.frame.size[1]);
-        let token = level.token();
-        let mut image = memory::filled(T::ZERO, height * width * 3, "gradient")?;
+        let token = simd::level()?.token();
+        let mut image = zeros::<T>(height * width * 3, "gradient")?;
         let mut warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
         let mut gains = [0.0; 3];
         let across = BAND * across;

@@ -1,6 +1,6 @@
 use super::*;
 use crate::at_each_level;
-use hqgs::levels;
+use hqgs::{internals::simd::at_level, levels};
 use rayon::ThreadPoolBuilder;
 
 const FRAME: Frame = Frame {
@@ -152,20 +152,18 @@ fn gradients_are_those_of_differences() {
 fn f32_is_near_f64() {
     at_each_level(|level| {
         let (single, double) = (case::<f32>(), case::<f64>());
-        let a = Photograph::take_at(
-            level,
-            FRAME,
-            &single.image,
-            &single.nearness,
-            &warps(),
-            GAINS,
-        );
+        let a = at_level(level, || {
+            Photograph::take(FRAME, &single.image, &single.nearness, &warps(), GAINS)
+        });
         let b = Photograph::take(FRAME, &double.image, &double.nearness, &warps(), GAINS);
         let (a, b) = (a.unwrap(), b.unwrap());
         for (a, b) in a.photo.iter().zip(&b.photo) {
             assert!((f64::from(*a) - b).abs() < 1e-5);
         }
-        let (a, b) = (a.backward_at(level, &single.v), b.backward(&double.v));
+        let (a, b) = (
+            at_level(level, || a.backward(&single.v)),
+            b.backward(&double.v),
+        );
         let (a, b) = (a.unwrap(), b.unwrap());
         for (a, b) in a.image.iter().zip(&b.image) {
             assert!((f64::from(*a) - b).abs() < 1e-3, "{a} {b}");
@@ -185,10 +183,11 @@ fn any_number_of_threads_gives_the_same_bits() {
             .build()
             .unwrap();
         pool.install(|| {
-            let taken =
-                Photograph::take_at(level, FRAME, &case.image, &case.nearness, &warps(), GAINS);
+            let taken = at_level(level, || {
+                Photograph::take(FRAME, &case.image, &case.nearness, &warps(), GAINS)
+            });
             let taken = taken.unwrap();
-            let v = taken.backward_at(level, &case.v).unwrap();
+            let v = at_level(level, || taken.backward(&case.v)).unwrap();
             (taken.photo, v.image, v.warps, v.gains)
         })
     };

@@ -20,7 +20,7 @@ use band::Band;
 use fearless_simd::dispatch;
 use hqgs::internals::{
     Error, check_len, memory,
-    simd::{self, Level, Real},
+    simd::{self, Real},
 };
 use rayon::prelude::*;
 
@@ -139,17 +139,6 @@ pub fn photometric<T: Real, Y: Sample<T>>(
     grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Photometric, Error> {
-    photometric_at(simd::level()?, images, options, grad, scratch)
-}
-
-/// [`photometric`] with the vector instructions of `level`.
-fn photometric_at<T: Real, Y: Sample<T>>(
-    level: Level,
-    images: Images<'_, T, Y>,
-    options: &LossOptions,
-    grad: Option<&mut [T]>,
-    scratch: &mut LossScratch<T>,
-) -> Result<Photometric, Error> {
     let LossOptions { lambda, knee } = *options;
     if !(0.0..=1.0).contains(&lambda) {
         return Err(Error::new(
@@ -180,7 +169,7 @@ fn photometric_at<T: Real, Y: Sample<T>>(
         l1_scale: (1.0 - lambda) / counted.max(1) as f64,
         ssim_scale: lambda / render.len() as f64,
     };
-    let sums = run(level, images, plan, grad, scratch)?;
+    let sums = run(images, plan, grad, scratch)?;
     let l1 = sums.l1 / counted.max(1) as f64;
     if !plan.ssim {
         return Ok(Photometric {
@@ -205,15 +194,6 @@ pub fn ssim<T: Real, Y: Sample<T>>(
     images: Images<'_, T, Y>,
     scratch: &mut LossScratch<T>,
 ) -> Result<f64, Error> {
-    ssim_at(simd::level()?, images, scratch)
-}
-
-/// [`ssim`] with the vector instructions of `level`.
-fn ssim_at<T: Real, Y: Sample<T>>(
-    level: Level,
-    images: Images<'_, T, Y>,
-    scratch: &mut LossScratch<T>,
-) -> Result<f64, Error> {
     images.check()?;
     let plan = Plan {
         ssim: true,
@@ -221,7 +201,7 @@ fn ssim_at<T: Real, Y: Sample<T>>(
         l1_scale: 0.0,
         ssim_scale: 0.0,
     };
-    let sums = run(level, images, plan, None, scratch)?;
+    let sums = run(images, plan, None, scratch)?;
     Ok(1.0 - sums.dissimilarity / images.render.len() as f64)
 }
 
@@ -261,12 +241,12 @@ impl<T, Y> Images<'_, T, Y> {
 /// The bits do not depend on the bands: every number depends on its own neighbourhood only, and sums are
 /// taken per row and then over the rows in order.
 fn run<T: Real, Y: Sample<T>>(
-    level: Level,
     images: Images<'_, T, Y>,
     plan: Plan,
     mut grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
 ) -> Result<Sums, Error> {
+    let level = simd::level()?.token();
     let [height, width, channels] = images.size;
     let n = width * channels;
     let threads = rayon::current_num_threads();
@@ -289,7 +269,7 @@ fn run<T: Real, Y: Sample<T>>(
     jobs.into_par_iter()
         .try_for_each(|(first, sums, buffer, grad)| {
             let band = Band::new(images, plan, first, buffer)?;
-            dispatch!(level.token(), simd => band.run(simd, grad, sums));
+            dispatch!(level, simd => band.run(simd, grad, sums));
             Ok(())
         })?;
     Ok(scratch.sums.iter().fold(Sums::default(), |a, b| Sums {

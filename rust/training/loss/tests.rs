@@ -5,7 +5,7 @@ use super::{
     *,
 };
 use crate::{at_each_level, noise};
-use hqgs::levels;
+use hqgs::{Level, internals::simd::at_level, levels};
 
 /// The textbook formula with direct 11 x 11 sums: (L1, SSIM).
 fn reference(x: &[f64], y: &[f64], mask: Option<&[u8]>, [h, w, c]: [usize; 3]) -> (f64, f64) {
@@ -79,8 +79,8 @@ fn loss<T: Real>(
     let mut scratch = LossScratch::default();
     let (out, s) = (Some(&mut grad[..]), &mut scratch);
     let (images, options) = (images(x, y, mask, size), LossOptions { lambda, knee: 0.0 });
-    let value = photometric_at(level, images, &options, out, s).unwrap();
-    let alone = photometric_at(level, images, &options, None, s).unwrap();
+    let value = at_level(level, || photometric(images, &options, out, s)).unwrap();
+    let alone = at_level(level, || photometric(images, &options, None, s)).unwrap();
     assert!(
         value == alone || value.loss.is_nan(),
         "{value:?} with the gradient, {alone:?} without"
@@ -368,13 +368,8 @@ fn each_level_agrees_with_the_best() {
     };
     let at = |level| {
         let mut grad = vec![0.0; n];
-        let sums = run(
-            level,
-            images,
-            plan,
-            Some(&mut grad),
-            &mut LossScratch::default(),
-        );
+        let mut scratch = LossScratch::default();
+        let sums = at_level(level, || run(images, plan, Some(&mut grad), &mut scratch));
         (sums.unwrap(), grad)
     };
     let best = at(levels()[0]);
@@ -402,11 +397,9 @@ fn ssim_of_two_float_images() {
 fn check_ssim(level: Level) {
     let size @ [h, w, c] = [21, 14, 3];
     let (a, b) = (noise(1, h * w * c), noise(2, h * w * c));
-    let got = ssim_at(
-        level,
-        images(&a, &b, None, size),
-        &mut LossScratch::default(),
-    )
+    let got = at_level(level, || {
+        ssim(images(&a, &b, None, size), &mut LossScratch::default())
+    })
     .unwrap();
     assert!((got - reference(&a, &b, None, size).1).abs() < 1e-13);
 }
@@ -420,13 +413,14 @@ fn check_scratch(level: Level) {
     let mut scratch = LossScratch::default();
     for size @ [h, w, c] in SIZES.into_iter().rev() {
         let (x, y) = (noise(1, h * w * c), photo(2, h * w * c));
-        let got = photometric_at(
-            level,
-            images(&x, &y, None, size),
-            &LossOptions::default(),
-            None,
-            &mut scratch,
-        )
+        let got = at_level(level, || {
+            photometric(
+                images(&x, &y, None, size),
+                &LossOptions::default(),
+                None,
+                &mut scratch,
+            )
+        })
         .unwrap();
         assert_eq!(got, loss(level, &x, &y, None, size, 0.2).0);
     }
@@ -458,7 +452,10 @@ fn check_knee(level: Level) {
     let (y, m) = (&y[..], Some(&mask[..]));
     let images = images(&x, y, m, size);
     let options = LossOptions { lambda: 0.0, knee };
-    let got = photometric_at(level, images, &options, Some(&mut grad), &mut scratch).unwrap();
+    let got = at_level(level, || {
+        photometric(images, &options, Some(&mut grad), &mut scratch)
+    })
+    .unwrap();
     assert!((got.loss - huber.sum::<f64>()).abs() < 1e-14);
     for (i, (&g, &d)) in grad.iter().zip(&difference).enumerate() {
         assert!(
@@ -468,7 +465,7 @@ fn check_knee(level: Level) {
     }
     assert!(difference.iter().any(|d| d.abs() < knee) && difference.iter().any(|d| d.abs() > knee));
     let options = LossOptions { lambda: 0.4, knee };
-    let both = photometric_at(level, images, &options, None, &mut scratch).unwrap();
+    let both = at_level(level, || photometric(images, &options, None, &mut scratch)).unwrap();
     let plain = loss(level, &x, y, m, size, 0.4).0;
     assert_eq!(both.ssim, plain.ssim);
     assert!((both.loss - plain.loss - 0.6 * (got.loss - plain.l1)).abs() < 1e-14);

@@ -4,7 +4,8 @@ use fearless_simd::{Simd, SimdBase, SimdFloat, dispatch};
 use hqgs::internals::{
     Error, check_len, memory,
     simd::groups::{GROUP, turned},
-    simd::{self, Lanes, Level, Real},
+    simd::{self, Lanes, Real},
+    uninit::UninitVec,
 };
 use rayon::prelude::*;
 
@@ -167,11 +168,6 @@ impl<T: Real> Separable<T> {
     /// # Errors
     /// As for [`Self::shape`], or when `image` has another length.
     pub fn apply(&self, image: &[T], shape: &[usize]) -> Result<Vec<T>, Error> {
-        self.apply_at(simd::level()?, image, shape)
-    }
-
-    /// [`Self::apply`] with the vector instructions of `level`.
-    fn apply_at(&self, level: Level, image: &[T], shape: &[usize]) -> Result<Vec<T>, Error> {
         let [h, w, d] = self.shape(shape)?;
         let (row, mut pitch) = (shape[1] * shape[2], shape[1] * shape[2]);
         check_len("image", image, shape[0] * row)?;
@@ -189,15 +185,17 @@ impl<T: Real> Separable<T> {
             pitch,
             channels: shape[2],
         };
-        let mut out = memory::filled(T::ZERO, h * w * d, "image")?;
-        let level = level.token();
-        out.par_chunks_mut(GROUP * w * d).enumerate().try_for_each_init(
+        let mut out = UninitVec::new(h * w * d, "image")?;
+        let level = simd::level()?.token();
+        let pieces = out.cut((0..h).step_by(GROUP).map(|row| GROUP.min(h - row) * w * d));
+        pieces.into_par_iter().enumerate().try_for_each_init(
             Buffers::default,
             |buffers, (group, out)| {
+                let out = out.fill(T::ZERO);
                 dispatch!(level, simd => self.group(simd, &picture, group * GROUP, d, buffers, out))
             },
         )?;
-        Ok(out)
+        Ok(out.finish())
     }
 
     /// The output rows `first..`, one for each lane.

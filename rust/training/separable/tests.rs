@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::at_each_level;
-use hqgs::levels;
+use hqgs::{Level, internals::simd::at_level, levels};
 use rayon::ThreadPoolBuilder;
 
 /// A number in [-1, 1] for each (a, b).
@@ -78,7 +78,7 @@ fn check<T: Real>(level: Level, tolerance: f64) {
         let channels = (d > 0).then_some(mix);
         let (there, back) = Separable::<T>::pair(m, k, channels).unwrap();
         let typed: Vec<T> = image.iter().map(|x| T::from_f64(*x)).collect();
-        let out = there.apply_at(level, &typed, &[h, w, c]).unwrap();
+        let out = at_level(level, || there.apply(&typed, &[h, w, c])).unwrap();
         let right = expected(&image, [h, w], c, m, k, mix);
         assert_eq!(out.len(), right.len());
         for (a, b) in out.iter().zip(&right) {
@@ -86,9 +86,7 @@ fn check<T: Real>(level: Level, tolerance: f64) {
         }
         // <A x, y> = <x, A^T y>
         let y: Vec<T> = (0..out.len()).map(|i| T::from_f64(noise(i, 5))).collect();
-        let v = back
-            .apply_at(level, &y, &[rows, columns, mix.height])
-            .unwrap();
+        let v = at_level(level, || back.apply(&y, &[rows, columns, mix.height])).unwrap();
         let dot = |a: &[T], b: &[T]| -> f64 {
             a.iter().zip(b).map(|(a, b)| a.to_f64() * b.to_f64()).sum()
         };
@@ -114,7 +112,7 @@ fn any_number_of_threads_gives_the_same_bits() {
     let run = |level, threads| {
         let pool = ThreadPoolBuilder::new().num_threads(threads).build();
         pool.unwrap()
-            .install(|| there.apply_at(level, &image, &[90, 80, 3]).unwrap())
+            .install(|| at_level(level, || there.apply(&image, &[90, 80, 3])).unwrap())
     };
     at_each_level(|level| {
         let one = run(level, 1);
@@ -136,7 +134,7 @@ fn check_reach(level: Level) {
     for bad in [f32::NAN, f32::INFINITY] {
         let mut image = vec![1.0; 900];
         image[10 * 30 + 20] = bad;
-        let out = there.apply_at(level, &image, &[30, 30, 1]).unwrap();
+        let out = at_level(level, || there.apply(&image, &[30, 30, 1])).unwrap();
         for (i, x) in out.iter().enumerate() {
             let reached = m[i / 30 * 30 + 10] != 0.0 && m[i % 30 * 30 + 20] != 0.0;
             assert_eq!(x.is_finite(), !reached, "{i}");

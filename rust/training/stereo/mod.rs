@@ -8,10 +8,7 @@
 mod tests;
 
 use fearless_simd::{Simd, dispatch};
-use hqgs::internals::{
-    Error, check_len, memory,
-    simd::{self, Level},
-};
+use hqgs::internals::{Error, check_len, memory, simd};
 use rayon::prelude::*;
 
 /// Samples to each side of a patch's middle.
@@ -97,17 +94,6 @@ impl Sweep {
         pixels: &[[f64; 2]],
         ranges: &[[f64; 2]],
     ) -> Result<Vec<(f64, f32)>, Error> {
-        self.depths_at(simd::level()?, first, others, pixels, ranges)
-    }
-
-    fn depths_at(
-        &self,
-        level: Level,
-        first: Picture<'_>,
-        others: &[Other<'_>],
-        pixels: &[[f64; 2]],
-        ranges: &[[f64; 2]],
-    ) -> Result<Vec<(f64, f32)>, Error> {
         if self.agreeing == 0 {
             return Err(Error::new("agreeing", "must be at least 1"));
         }
@@ -134,7 +120,7 @@ impl Sweep {
             return Err(Error::new("pixels", format!("must be finite, got {bad:?}")));
         }
         let mut found = memory::filled((0.0, NOTHING), pixels.len(), "depths")?;
-        let token = level.token();
+        let token = simd::level()?.token();
         found
             .par_chunks_mut(CHUNK)
             .zip(pixels.par_chunks(CHUNK).zip(ranges.par_chunks(CHUNK)))

@@ -1,4 +1,5 @@
 use super::*;
+use hqgs::internals::simd::at_level;
 
 const SIZE: [usize; 2] = [60, 80];
 
@@ -155,8 +156,12 @@ fn each_level_and_number_of_threads_gives_the_same_bits() {
             .num_threads(threads)
             .build()
             .unwrap();
-        pool.install(|| sweep.depths_at(level, picture(0), &others, &pixels, &ranges))
-            .unwrap()
+        pool.install(|| {
+            at_level(level, || {
+                sweep.depths(picture(0), &others, &pixels, &ranges)
+            })
+        })
+        .unwrap()
     };
     let all: Vec<_> = simd::levels().iter().map(|&level| run(level, 1)).collect();
     for found in &all {
