@@ -10,6 +10,7 @@ use crate::{
 };
 use rayon::prelude::*;
 use std::{
+    array,
     marker::PhantomData,
     mem::MaybeUninit,
     ptr,
@@ -123,6 +124,28 @@ impl<T: Copy> UninitVec<T> {
                     set,
                     streamed,
                 }
+            })
+            .collect()
+    }
+
+    /// Several cut alike, into pieces of so many rows each; a row of the k-th has `rows[k]` elements.
+    pub fn cut_rows<const N: usize>(
+        vectors: &mut [Self; N],
+        rows: [usize; N],
+        counts: impl Iterator<Item = usize> + Clone,
+    ) -> Vec<[UninitPiece<'_, T>; N]> {
+        let mut all = vectors.each_mut().into_iter().zip(rows);
+        let mut pieces: [_; N] = array::from_fn(|_| {
+            let (vector, row) = all.next().expect("N of both");
+            vector
+                .cut(counts.clone().map(|count| count * row))
+                .into_iter()
+        });
+        counts
+            .map(|_| {
+                pieces
+                    .each_mut()
+                    .map(|of_one| of_one.next().expect("one for each count"))
             })
             .collect()
     }
@@ -262,6 +285,13 @@ pub(crate) fn prefetch_all<T: Copy>(data: &[T]) {
     for element in data.iter().step_by((64 / size_of::<T>()).max(1)) {
         prefetch(element);
     }
+}
+
+/// The same for `count` rows of `width` numbers from row `first` on, as far as there are any.
+#[inline(always)]
+pub(crate) fn prefetch_rows<T: Copy>(data: &[T], width: usize, first: usize, count: usize) {
+    let end = data.len().min((first + count) * width);
+    prefetch_all(data.get(first * width..end).unwrap_or(&[]));
 }
 
 #[cfg(test)]

@@ -51,32 +51,24 @@ pub(super) fn gather<T: Real>(
     .map(|(wanted, row)| if wanted { row } else { 0 });
     let n = input.projection.splats.len();
     let mut arrays = UninitVec::several(rows.map(|row| row * n), NAME)?;
-    let cut = |array, row| UninitVec::cut(array, chunks.iter().map(|c| (c.end - c.begin) * row));
-    let [means2d, whitened, opacities, absolute, colors] = &mut arrays;
-    let jobs: Vec<_> = chunks
-        .iter()
-        .zip(cut(means2d, rows[0]))
-        .zip(cut(whitened, rows[1]))
-        .zip(cut(opacities, rows[2]))
-        .zip(cut(absolute, rows[3]))
-        .zip(cut(colors, rows[4]))
-        .collect();
+    let jobs = UninitVec::cut_rows(&mut arrays, rows, chunks.iter().map(|c| c.end - c.begin));
     let level = input.projection.level.token;
-    jobs.into_par_iter().try_for_each(
-        |(((((chunk, means2d), whitened), opacities), absolute), colors)| {
-            let out = Gather {
-                chunk,
-                means2d: means2d.fill(T::ZERO),
-                whitened: whitened.fill(T::ZERO),
-                opacities: opacities.fill(T::ZERO),
-                absolute: absolute.fill(T::ZERO),
-                colors: colors.fill(T::ZERO),
-            };
-            dispatch!(level, simd => for_channels!(
-                channels, gather_chunk, simd, T, (input, pair_grads, layout, out)
-            ))
-        },
-    )?;
+    let jobs = jobs.into_par_iter().zip(chunks);
+    jobs.try_for_each(|(pieces, chunk)| {
+        let [means2d, whitened, opacities, absolute, colors] =
+            pieces.map(|piece| piece.fill(T::ZERO));
+        let out = Gather {
+            chunk,
+            means2d,
+            whitened,
+            opacities,
+            absolute,
+            colors,
+        };
+        dispatch!(level, simd => for_channels!(
+            channels, gather_chunk, simd, T, (input, pair_grads, layout, out)
+        ))
+    })?;
     let [means2d, whitened, opacities, absolute, colors] = arrays.map(UninitVec::finish);
     Ok(CompositeGrads {
         means2d,
@@ -169,6 +161,7 @@ fn gather_chunk<S: Simd, T: Real, const D: usize>(
     let mut look_up = |spans: Option<&[Span]>, rows: &mut Vec<_>| {
         rows.clear();
         for span in spans.unwrap_or(&[]) {
+            prefetch(&input.projection.splats[span.gaussian as usize]);
             for tile in span.tiles(tiles_x) {
                 let place = next[tile] as usize;
                 next[tile] += 1;

@@ -20,7 +20,7 @@ use crate::{
         sums::{self, MAX_PARTS},
         vec3::splat3,
     },
-    uninit::{PieceWriter, UninitPiece, UninitVec},
+    uninit::{PieceWriter, UninitPiece, UninitVec, prefetch_rows},
 };
 use fearless_simd::{Select, Simd, dispatch};
 use rayon::prelude::*;
@@ -43,20 +43,37 @@ pub struct ProjectCotangents<'a, T> {
     pub colors: Option<&'a [T]>,
 }
 
-impl<T> ProjectCotangents<'_, T> {
-    /// Check that they are those of `n` Gaussians.
-    fn check(&self, n: usize) -> Result<(), Error> {
-        for (name, row, array) in [
+impl<'a, T: Copy> ProjectCotangents<'a, T> {
+    /// Their names, numbers per Gaussian and arrays.
+    fn arrays(&self) -> [(&'static str, usize, Option<&'a [T]>); 6] {
+        [
             ("v_means2d", 2, self.means2d),
             ("v_whitened", 3, self.whitened),
             ("v_opacities", 1, self.opacities),
             ("v_depths", 1, self.depths),
             ("v_conics", 3, self.conics),
             ("v_colors", 3, self.colors),
-        ] {
-            array.map_or(Ok(()), |array| check_len(name, array, row * n))?;
+        ]
+    }
+
+    /// Check that they are those of `n` Gaussians.
+    fn check(&self, n: usize) -> Result<(), Error> {
+        let mut arrays = self.arrays().into_iter();
+        arrays.try_for_each(|(name, row, array)| {
+            array.map_or(Ok(()), |array| check_len(name, array, row * n))
+        })
+    }
+
+    /// Send for those of the group from `first` on, and for its Gaussians: a processor does not follow so many arrays
+    /// by itself.
+    #[inline(always)]
+    fn prefetch(&self, g: &Gaussians<T>, first: usize) {
+        for (data, width) in [(g.means, 3), (g.quats, 4), (g.scales, 3), (g.opacities, 1)] {
+            prefetch_rows(data, width, first, GROUP);
         }
-        Ok(())
+        for (_, row, array) in self.arrays() {
+            prefetch_rows(array.unwrap_or(&[]), row, first, GROUP);
+        }
     }
 }
 
@@ -272,23 +289,14 @@ pub fn backward<T: Real>(
     ]
     .map(|(wanted, row)| if wanted { row } else { 0 });
     let mut arrays = UninitVec::<T>::several(rows.map(|row| row * n), "gradients")?;
-    let [means, quats, scales, opacities, covars, sh, rest] = &mut arrays;
-    let jobs: Vec<_> = chunks(means, n, rows[0])
-        .into_iter()
-        .zip(chunks(quats, n, rows[1]))
-        .zip(chunks(scales, n, rows[2]))
-        .zip(chunks(opacities, n, rows[3]))
-        .zip(chunks(covars, n, rows[4]))
-        .zip(chunks(sh, n, rows[5]))
-        .zip(chunks(rest, n, rows[6]))
-        .collect();
+    let jobs = UninitVec::cut_rows(&mut arrays, rows, chunks(n, PROJECT_CHUNK));
     let level = projection.level.token;
     let parts: Vec<_> = jobs
         .into_par_iter()
         .enumerate()
-        .map(|(chunk, ((((((means, quats), scales), opacities), covars), sh), rest))| {
+        .map(|(chunk, pieces)| {
             let out = BackwardChunk {
-                outs: [means, quats, scales, opacities, covars, sh, rest].map(UninitPiece::writer),
+                outs: pieces.map(UninitPiece::writer),
                 rows,
             };
             dispatch!(level, simd => backward_chunk(
@@ -356,6 +364,10 @@ fn backward_chunk<S: Simd, T: Real>(
     let end = gaussians.len().min(begin + PROJECT_CHUNK);
     for first in (begin..end).step_by(GROUP) {
         let rows = GROUP.min(end - first);
+        v.prefetch(gaussians, first + GROUP);
+        if let Some(shading) = shading {
+            shading.prefetch(first / GROUP + 1);
+        }
         let mut visible = 0u16;
         for (lane, depth) in projection.depths[first..first + rows].iter().enumerate() {
             visible |= u16::from(*depth > 0.0) << lane;

@@ -9,7 +9,7 @@ use crate::{
         lanes, splat as splat_lanes,
         vec3::V3,
     },
-    uninit::prefetch_all,
+    uninit::{prefetch_all, prefetch_rows},
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
 
@@ -25,6 +25,16 @@ pub struct Shading<T> {
     pub(super) slopes: Vec<Slopes<T>>,
     /// For each group and channel the Gaussians whose colour is clamped at 0.
     pub(super) clamped: Vec<[u16; 3]>,
+}
+
+impl<T: Real> Shading<T> {
+    /// Send for what a group of Gaussians has.
+    #[inline(always)]
+    pub(super) fn prefetch(&self, group: usize) {
+        for column in self.slopes.get(group).into_iter().flatten() {
+            prefetch_all(&column.0);
+        }
+    }
 }
 
 /// Derivatives of channel c along axis a of the unit vector from the camera centre, at 3 c + a, as if its three
@@ -99,11 +109,8 @@ impl<T: Real> Coefficients<T> {
     #[inline(always)]
     pub fn prefetch(h: &Harmonics<T>, first: usize) {
         let (row, rest_row) = h.rows();
-        for (data, row) in [(h.coefficients, row), (h.rest.unwrap_or(&[]), rest_row)] {
-            if let Some(rows) = data.get(first * row..(first + GROUP) * row) {
-                prefetch_all(rows);
-            }
-        }
+        prefetch_rows(h.coefficients, row, first, GROUP);
+        prefetch_rows(h.rest.unwrap_or(&[]), rest_row, first, GROUP);
     }
 
     /// The coefficients in use of the Gaussians `first..`.

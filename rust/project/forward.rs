@@ -51,12 +51,9 @@ struct ForwardChunk<'a, T> {
     splats: PieceWriter<'a, Splat>,
     /// The depths of `Projection`.
     keys: PieceWriter<'a, f64>,
-    means2d: PieceWriter<'a, T>,
-    depths: PieceWriter<'a, T>,
-    conics: PieceWriter<'a, T>,
     radii: PieceWriter<'a, i32>,
-    opacities: PieceWriter<'a, T>,
-    colors: PieceWriter<'a, T>,
+    /// `means2d`, depths, conics, opacities, colours.
+    outs: [PieceWriter<'a, T>; 5],
     slopes: PieceWriter<'a, Slopes<T>>,
     clamped: PieceWriter<'a, [u16; 3]>,
     /// Whether what no image needs is asked for, the colours, and how they change.
@@ -98,19 +95,20 @@ impl<T: Real> ForwardChunk<'_, T> {
         if !self.asked[0] {
             return;
         }
-        self.depths.put(&kept::<T>(&group.depth, keep)[..rows]);
-        self.opacities.put(&kept::<T>(&group.opacity, keep)[..rows]);
+        let [means2d, depths, all_conics, opacities, _] = &mut self.outs;
+        depths.put(&kept::<T>(&group.depth, keep)[..rows]);
+        opacities.put(&kept::<T>(&group.opacity, keep)[..rows]);
         let mut pairs = [T::ZERO; 2 * GROUP];
         let (x, y) = (kept(&group.mean[0], keep), kept(&group.mean[1], keep));
         groups::write([&x, &y], &mut pairs);
-        self.means2d.put(&pairs[..2 * rows]);
+        means2d.put(&pairs[..2 * rows]);
         let mut conics = [T::ZERO; 3 * GROUP];
         let [a, b, c] = &group.conic;
         groups::write(
             [&kept(a, keep), &kept(b, keep), &kept(c, keep)],
             &mut conics,
         );
-        self.conics.put(&conics[..3 * rows]);
+        all_conics.put(&conics[..3 * rows]);
     }
 
     /// The same where none is kept.
@@ -120,10 +118,9 @@ impl<T: Real> ForwardChunk<'_, T> {
         self.keys.put(&[0.0; GROUP][..rows]);
         self.radii.put(&[0; 2 * GROUP][..2 * rows]);
         if self.asked[0] {
-            self.depths.put(&[T::ZERO; GROUP][..rows]);
-            self.opacities.put(&[T::ZERO; GROUP][..rows]);
-            self.means2d.put(&[T::ZERO; 2 * GROUP][..2 * rows]);
-            self.conics.put(&[T::ZERO; 3 * GROUP][..3 * rows]);
+            for (out, row) in self.outs.iter_mut().zip([2, 1, 3, 1]) {
+                out.put(&[T::ZERO; 3 * GROUP][..row * rows]);
+            }
         }
     }
 
@@ -132,7 +129,7 @@ impl<T: Real> ForwardChunk<'_, T> {
     fn put_colors(&mut self, shaded: &Shaded<T>, rows: usize) {
         let [_, colors, clamped, slopes] = self.asked;
         if colors {
-            self.colors.put(&shaded.colors[..3 * rows]);
+            self.outs[4].put(&shaded.colors[..3 * rows]);
         }
         if clamped {
             self.clamped.put(slice::from_ref(&shaded.clamped));
@@ -141,18 +138,6 @@ impl<T: Real> ForwardChunk<'_, T> {
             self.slopes.put(slice::from_ref(&shaded.slopes));
         }
     }
-}
-
-/// As [`chunks`], for an array with `row` entries for each group of Gaussians, of which a chunk holds a whole
-/// number.
-fn group_chunks<T: Copy>(
-    array: &mut UninitVec<T>,
-    n: usize,
-    row: usize,
-) -> Vec<UninitPiece<'_, T>> {
-    const GROUPS: usize = PROJECT_CHUNK / GROUP;
-    let (groups, count) = (n.div_ceil(GROUP), n.div_ceil(PROJECT_CHUNK));
-    array.cut((0..count).map(|c| GROUPS.min(groups - c * GROUPS) * row))
 }
 
 /// Project all Gaussians into `camera`.
@@ -207,48 +192,32 @@ fn project<T: Real>(
     let groups = n.div_ceil(GROUP);
     let name = "splats";
     let (mut splats, mut keys) = (UninitVec::new(n, name)?, UninitVec::new(n, name)?);
-    let [mut means2d, mut depths, mut conics, mut opacities, mut rgb] = UninitVec::several(
-        [2 * all * n, all * n, 3 * all * n, all * n, channels * n],
-        name,
-    )?;
+    let rows = [2 * all, all, 3 * all, all, channels];
+    let mut outs = UninitVec::several(rows.map(|row| row * n), name)?;
     let mut radii = UninitVec::new(2 * n, name)?;
     let mut slopes = UninitVec::new(sloped * groups, name)?;
     let mut clamps = UninitVec::new(clamped_rows * groups, name)?;
-    let jobs: Vec<_> = chunks(&mut splats, n, 1)
+    let of = |row| chunks(n, PROJECT_CHUNK).map(move |count| count * row);
+    let of_groups = |row| chunks(groups, PROJECT_CHUNK / GROUP).map(move |count| count * row);
+    let jobs: Vec<_> = splats
+        .cut(of(1))
         .into_iter()
-        .zip(chunks(&mut keys, n, 1))
-        .zip(chunks(&mut means2d, n, 2 * all))
-        .zip(chunks(&mut depths, n, all))
-        .zip(chunks(&mut conics, n, 3 * all))
-        .zip(chunks(&mut radii, n, 2))
-        .zip(chunks(&mut opacities, n, all))
-        .zip(chunks(&mut rgb, n, channels))
-        .zip(group_chunks(&mut slopes, n, sloped))
-        .zip(group_chunks(&mut clamps, n, clamped_rows))
+        .zip(keys.cut(of(1)))
+        .zip(radii.cut(of(2)))
+        .zip(UninitVec::cut_rows(&mut outs, rows, of(1)))
+        .zip(slopes.cut(of_groups(sloped)))
+        .zip(clamps.cut(of_groups(clamped_rows)))
         .collect();
     let counts = jobs
         .into_par_iter()
         .enumerate()
         .map(
-            |(
-                chunk,
-                (
-                    (
-                        (((((((splats, keys), means2d), depths), conics), radii), opacities), rgb),
-                        slopes,
-                    ),
-                    clamped,
-                ),
-            )| {
+            |(chunk, (((((splats, keys), radii), outs), slopes), clamped))| {
                 let out = ForwardChunk {
                     splats: splats.writer(),
                     keys: keys.writer(),
-                    means2d: means2d.writer(),
-                    depths: depths.writer(),
-                    conics: conics.writer(),
                     radii: radii.writer(),
-                    opacities: opacities.writer(),
-                    colors: rgb.writer(),
+                    outs: outs.map(UninitPiece::writer),
                     slopes: slopes.writer(),
                     clamped: clamped.writer(),
                     asked: [all, channels, clamped_rows, sloped].map(|row| row > 0),
@@ -259,6 +228,7 @@ fn project<T: Real>(
             },
         )
         .reduce(Counts::default, Counts::plus);
+    let [means2d, depths, conics, opacities, colors] = outs.map(UninitVec::finish);
     Ok(Projected {
         projection: Projection {
             splats: splats.finish(),
@@ -266,12 +236,12 @@ fn project<T: Real>(
             knobs: options.knobs,
             level,
         },
-        means2d: means2d.finish(),
-        depths: depths.finish(),
-        conics: conics.finish(),
+        means2d,
+        depths,
+        conics,
         radii: radii.finish(),
-        opacities: opacities.finish(),
-        colors: rgb.finish(),
+        opacities,
+        colors,
         shading: shaded.map(|h| Shading {
             rows: h.rows(),
             degree: h.degree,

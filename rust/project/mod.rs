@@ -14,7 +14,7 @@ pub use forward::{Projected, forward, forward_for_image};
 
 use crate::{
     accuracy_knobs::AccuracyKnobs,
-    constants::{EPS2D, FAR_PLANE, NEAR_PLANE, PROJECT_CHUNK},
+    constants::{EPS2D, FAR_PLANE, NEAR_PLANE},
     error::Error,
     scene::Gaussians,
     simd::{
@@ -24,7 +24,6 @@ use crate::{
         math::exp,
         splat,
     },
-    uninit::{UninitPiece, UninitVec},
 };
 use camera_lanes::CameraLanes;
 use fearless_simd::{Simd, SimdBase};
@@ -144,10 +143,9 @@ pub struct Projection {
     pub level: Level,
 }
 
-/// Cut an array with `row` numbers for each of n Gaussians into chunks of `PROJECT_CHUNK` of them.
-fn chunks<T: Copy>(array: &mut UninitVec<T>, n: usize, row: usize) -> Vec<UninitPiece<'_, T>> {
-    let rows = |c| PROJECT_CHUNK.min(n - c * PROJECT_CHUNK);
-    array.cut((0..n.div_ceil(PROJECT_CHUNK)).map(|c| rows(c) * row))
+/// How many of n are in each chunk of `chunk` of them.
+fn chunks(n: usize, chunk: usize) -> impl Iterator<Item = usize> + Clone {
+    (0..n.div_ceil(chunk)).map(move |c| chunk.min(n - c * chunk))
 }
 
 /// The lanes of a mask of f64.

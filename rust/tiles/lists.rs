@@ -38,11 +38,12 @@ impl<T: Copy> List<T> {
         self.begins = [0; TILE_BLOCKS + 1];
     }
 
-    /// Send for the records and colours, for which the blocks will ask one by one.
+    /// Send for what the blocks will ask for one by one.
     #[inline(always)]
     pub fn prefetch(&self) {
         prefetch_all(&self.records);
         prefetch_all(&self.colors);
+        prefetch_all(&self.blocks);
     }
 }
 
