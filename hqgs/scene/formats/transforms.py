@@ -245,7 +245,7 @@ def _focal(focal: float | None, angle: float | None, size: float, where: str) ->
     if focal is not None or angle is None:
         return focal
     if not 0 < angle < math.pi:
-        raise ValueError(f"{where}: the angle of view {angle} is not between 0 and pi")
+        raise ValueError(f"{where}: the angle of view {angle} is not between 0 and pi: radians are wanted")
     return 0.5 * size / math.tan(0.5 * angle)
 
 

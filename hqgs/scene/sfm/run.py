@@ -162,9 +162,9 @@ def expected_time(sizes: NDArray[Any], pairs: int | None, threads: int, coarse: 
     advice = "; 100 photos are plenty for most scenes" if count > MANY else ""
     return (
         f"{count} photos of {stored.mean():.1f} megapixels{shrunk}: finding their cameras takes "
-        f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} threads, more the "
-        f"more detail they show; where photos find no place, smoothed copies are looked at as well: up to "
-        f"{AGAIN * max(2, round(most / 60))} minutes in all{advice}"
+        f"{max(1, round(least / 60))} to {max(2, round(most / 60))} minutes on {threads} "
+        f"thread{'s' * (threads > 1)}, more the more detail they show; where photos find no place, smoothed "
+        f"copies are looked at as well: up to {AGAIN * max(2, round(most / 60))} minutes in all{advice}"
     )
 
 
