@@ -52,6 +52,7 @@ def run(options: PlanOptions) -> int:
         )
         ready(options.scene)
         from hqgs.scene.source import load, pictures  # here: they load torch
+        from hqgs.training.frame import Frame
         from hqgs.training.prepare import Prepared, plan_of_photos
         from hqgs.training.trainer import Trainer
 
@@ -71,7 +72,7 @@ def run(options: PlanOptions) -> int:
                 scene = pictures(options.scene, downscale=downscale, longest=longest)
             later: list[str] = []
             if len(scene.points):
-                plan = Prepared(scene, config, begin=Trainer).plan()
+                plan = Prepared(Frame.of(scene), config, begin=Trainer).plan()
             else:
                 plan, later = plan_of_photos(scene, config)
     except BAD_INPUT as error:
