@@ -163,7 +163,9 @@ class Attempt:
         plain, unsure = self.model, self._off(self.model) > UNSURE
         if unsure:
             self._tell("sharpen", 0)
-            self.model = sharpened(plain, self.photos, self._adjust, not self.fixed)
+            # Weaker evidence leaves photos farther off than patches reach at once.
+            for _ in range(1 if self._sure >= placed_names(plain) else 2):
+                self.model = sharpened(self.model, self.photos, self._adjust, not self.fixed)
         if self.model is plain and not self._sure >= placed_names(plain):
             self._settle(plain)
         if not (unsure or self.registered < len(self.names) or len(self.names) < ALWAYS_CHECKED):

@@ -70,7 +70,7 @@ JOINT = 20  # points that a part shares with the rest: wrong ones 12 and 15, rig
 # What is left out, and adjusted.
 ROUNDS = 3  # of patches, or of leaving out what lies far off, and adjustment
 FALSE = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
-UNSURE = 0.36  # px of what SIFT sees that observations are usually off, from where on patches tell more
+UNSURE = 0.3  # px of what SIFT sees that observations are usually off, from where on patches tell more
 SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
 POSE_LEAST = 4  # observations of a photo that tell a pose and more
 RAYLEIGH = math.sqrt(2 * math.log(2))  # median distance of points in a plane that scatter by 1 each way
@@ -91,7 +91,7 @@ LAID = 400  # observations of a photo, of the points whose patches are laid
 CELL = 2.0  # px, where points are the same
 STRAY = 3.0  # times the usual error; observations farther off are left out
 ROUGH = 0.02  # of a patch's variance: what no patch fits better than, counted as noise
-GROWN = 1.1  # times: patches that leave the observations farther off than they were do not fit these photos
+GROWN = 1.3  # times: patches that leave the observations so much farther off do not fit these photos
 
 # Adjustment by the precision of each observation.
 ADJUST_STEPS, LEVENBERG = 10, 1e-6  # at most; damping, of the diagonal
