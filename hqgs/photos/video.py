@@ -34,7 +34,7 @@ _FRAME_KINDS = {1: "I", 2: "P", 3: "B"}  # libavutil's AVPictureType
 
 
 @dataclass(frozen=True)
-class Frame:
+class FilmFrame:
     """A photo that came out of a film."""
 
     image: Float32  # [H, W, 3], multiples of 1/255
@@ -42,7 +42,7 @@ class Frame:
     bytes: int  # of the compressed frame, in the first one with the headers
 
 
-def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[Frame]:
+def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[FilmFrame]:
     """Encode photos [H, W, 3] of one size, clipped and rounded to 8 bits, as one film, and decode it.
 
     x264 (`video`) or x265 (`video265`) at a constant rate factor, preset medium, 30 frames per second, on one
@@ -89,7 +89,7 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[Frame
         decode(packet)
     decode(None)
     return [
-        Frame(
+        FilmFrame(
             as_floats(_from_planes(planes, out.width)[:height, :width]),
             frame_kind,
             sizes_by_time[time],
