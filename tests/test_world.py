@@ -26,6 +26,7 @@ from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
 from hqgs.training.config import run_config
+from hqgs.training.frame import Frame
 
 UTM = np.array([500000.0, 5200000.0, 300.0])
 PLACES = [(1e-3, 0.0), (1e3, 0.0), (1.0, 5e6), (1e-3, 5e6), (1e3, 5e6)]
@@ -240,6 +241,17 @@ def test_a_run_has_the_same_bits_in_any_frame(strayed: bool, tmp_path: Path) -> 
         for name, tensor in tensors.items():
             assert torch.equal(tensor, found[0][2][name]), name
         assert same(shown, found[0][3], 2e-5)
+
+
+def test_what_is_left_of_a_scene_has_the_cameras_that_were_given(tmp_path: Path) -> None:
+    scene = load(placed(make_truth(), 3.0, UTM, 1), tmp_path)
+    given = replace(scene, test=[replace(view, name="a") for view in scene.train[:3]])
+    frame = Frame.of(given)
+    trained = frame.scene()
+    left = frame.outward(replace(trained, train=trained.train[2:7:2]))
+    assert [view.camera for view in left.train] == [view.camera for view in given.train[2:7:2]]
+    assert [view.camera for view in left.test] == [view.camera for view in given.test]
+    assert (left.points is given.points, left.world) == (True, given.world)
 
 
 def test_a_walk_away_from_most_photos_is_no_mistake(tmp_path: Path) -> None:

@@ -78,8 +78,10 @@ Trainable = Scene | Frame  # as its coordinates are, or in a frame of its own
 
 
 def _with_cameras(views: Sequence[View], given: Sequence[View]) -> list[View]:
-    cameras = {view.name: view.camera for view in given}
-    return [replace(view, camera=cameras[view.name]) for view in views]
+    """Those of the given views that are left, in their order; names of held-out ones may be alike."""
+    kept = {view.name for view in views}
+    cameras = (view.camera for view in given if view.name in kept)
+    return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
 
 
 def _turned(points: NDArray[np.floating], axes: Array) -> Array:
