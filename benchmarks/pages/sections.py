@@ -58,7 +58,7 @@ def cost_of_poses(runs: DataFrame) -> str:
 
 
 def reconstructions(poses: DataFrame) -> str:
-    """Poses and points from degraded photos against the scenes' own."""
+    """Poses from degraded photos against the scenes' own."""
     rows = []
     for line in records(poses):
         rotation, center = (
@@ -66,12 +66,10 @@ def reconstructions(poses: DataFrame) -> str:
             for name, form in (("rotation", ".3f"), ("centre", ".1%"))
         )
         name, registered = f"{line['scene']}, {line['degradation']}", f"{line['registered']}/{line['photos']}"
-        points = f"{line['points']:,} ({line['own_points']:,})"
         auc = "/".join(number(line.get(f"auc_{degrees}"), ".2f") for degrees in (1, 3, 5))
-        off, seconds = number(line["cameras_px"], ".2f"), number(line.get("search_cpu_s"), ".0f")
-        rows.append([name, registered, rotation, auc, center, off, points, seconds])
+        rows.append([name, registered, rotation, auc, center, number(line.get("search_cpu_s"), ".0f")])
     first = ("registered", "rotation (deg), median, max", "AUC at 1/3/5 deg", "centre, median, max")
-    return table(["", *first, "own cameras off (px)", "points (own)", "CPU (s)"], rows)
+    return table(["", *first, "CPU (s)"], rows)
 
 
 def after(times: DataFrame, scene: str, row: str, seconds: float) -> float | None:
