@@ -18,6 +18,7 @@ from hqgs.scene.builtin import embedded_scene, room
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.formats.degradation_json import FILE
 from hqgs.scene.formats.llff import hold_marker
+from hqgs.scene.known_points import with_points
 from hqgs.scene.load import load_scene
 from hqgs.scene.names import is_room
 from hqgs.scene.scene import Scene, View
@@ -191,6 +192,7 @@ def load_scenes(sources: Sequence[Path], protocol: Protocol, cache: Path, valida
                 )
             kept = cache / f"{source.name}_sfm"
             scene = load_scene(source, downscale=downscale, keep_sfm=kept, longest=protocol.longest)
+            scene = with_points(scene, kept)
         if not scene.test:
             raise ValueError(f"scene {scene.name!r} has no held-out view to judge by")
         scene = validation_split(scene) if validate else scene

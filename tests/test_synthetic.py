@@ -11,12 +11,17 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.scene import known_points
 from hqgs.scene.builtin import embedded_cameras, embedded_scene, render_depth, render_view, scene, shading
 from hqgs.scene.builtin.points import SparsePoints, sfm_points, surface_points
 from hqgs.scene.builtin.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
 from hqgs.scene.builtin.scene import look_at
 from hqgs.scene.builtin.studio import studio
+from hqgs.scene.known_points import with_points
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.sfm import triangulated
+from hqgs.scene.sfm.constants import PARTNERS
+from hqgs.scene.sfm.triangulated import pairs_of
 
 Points3 = NDArray[np.float64]
 
@@ -219,7 +224,7 @@ def depth_error(views: list[View], points: NDArray[np.float32]) -> NDArray[np.fl
     return error
 
 
-def test_points_by_colmap() -> None:
+def test_points_by_colmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(252, 189, 5)
     points, colors, photos, rows, note = sfm_points(views)
     assert note == f"{len(points)} points by COLMAP with the known cameras"
@@ -228,15 +233,40 @@ def test_points_by_colmap() -> None:
     assert colors.dtype == np.uint8
     assert np.median(depth_error(views, points)) < 0.01
     assert sorted(points.tolist()) == points.tolist()
-    again = sfm_points(views)
-    assert [a.tobytes() for a in again[:4]] == [a.tobytes() for a in (points, colors, photos, rows)]
+    guesses = ["no points in the scene: 1 random one", "another note"]
+    scene = Scene("a", views, [], np.zeros((1, 3), np.float32), colors[:1], "llff", guesses, guessed=True)
+    found = with_points(scene, tmp_path)
+    monkeypatch.setattr(known_points, "triangulated", lambda views: "it was asked again")
+    for again in (found, with_points(scene, tmp_path)):
+        assert (again.points.tobytes(), again.point_colors.tobytes()) == (points.tobytes(), colors.tobytes())
+        assert again.seen is not None
+        assert all((again.seen[v.name] == np.unique(rows[photos == k])).all() for k, v in enumerate(views))
+        assert again.notes == ["another note", f"no points in the scene: {note}"]
+        assert with_points(again) is again
+    none = with_points(scene)
+    assert none.points is scene.points
+    assert none.notes == [*guesses, "COLMAP finds no points for these cameras: it was asked again"]
     assert set(rows) == set(range(len(points)))
     assert len(rows) >= 3 * len(points)
     off = [depth_error([views[photo]], points[rows[photos == photo]]) for photo in range(5)]
     assert np.median(np.concatenate(off)) < 0.01
 
 
-def test_points_when_colmap_is_late_or_fails() -> None:
+def test_of_many_views_those_are_matched_that_are_near_and_look_alike() -> None:
+    (camera,) = embedded_cameras(63, 47, 1)
+    axis, views = np.zeros((4, 4)), []
+    for k in range(50):  # in a row, the odd ones turned round
+        viewmat = np.diag([1.0, 1, 1, 1]) if k % 2 == 0 else np.diag([-1.0, 1, -1, 1])
+        axis[:3, 3] = -viewmat[:3, 0] * k
+        views.append(View(f"{k}", replace(camera, viewmat=viewmat + axis), np.zeros((47, 63, 3), np.uint8)))
+    pairs = pairs_of(views)
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    assert ((pairs[:, 1] - pairs[:, 0]) % 2 == 0).all()
+    assert {tuple(pair) for pair in pairs.tolist()} >= {(k, k + 2) for k in range(48)}
+    assert np.bincount(pairs.ravel()).min() >= PARTNERS
+
+
+def test_points_when_colmap_is_late_or_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(63, 47, 3)
     points, _, _, _, note = sfm_points(views, time_limit=0)
     assert note == "4000 points cast onto the surfaces, as COLMAP gave none: it took more than 0 s"
@@ -255,8 +285,8 @@ def test_points_when_colmap_is_late_or_fails() -> None:
 
     flat = [replace(v, image=np.full_like(v.image, 128)) for v in views]
     assert "as COLMAP gave none: it found only 0 points" in sfm_points(flat).note
-    clash = [replace(v, name="same.png") for v in views]
-    assert "as COLMAP gave none: it ended with status 1" in sfm_points(clash).note
+    monkeypatch.setattr(triangulated, "PROGRAM", Path("there", "is", "none"))
+    assert "as COLMAP gave none: it ended with status 2" in sfm_points(views).note
 
 
 def same_scene(a: Scene, b: Scene) -> bool:

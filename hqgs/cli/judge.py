@@ -185,6 +185,7 @@ def read_photos(
         longest=longest_side("standard", downscale),
         test_every=TEST_EVERY if test_every is None else test_every,
         skip_unreadable=False,
+        points=False,
         cache=run,
         on_stage=screen.stage,
     )

@@ -108,4 +108,5 @@ def load(photos: Photos, screen: LoadingScreen) -> Scene:
     from hqgs.scene.source import load as load_source  # here: it loads torch
 
     downscale = 1.0 if photos.downscale is None else photos.downscale
-    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, on_stage=screen.stage)
+    stage = screen.stage
+    return load_source(photos.scene, downscale=downscale, skip_unreadable=False, points=False, on_stage=stage)

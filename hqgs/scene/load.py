@@ -132,7 +132,8 @@ def load_scene(
                 f"{some(sorted(gone))}; of the first: {gone[min(gone)]}"
             )
     points, colors = capture.points.astype(np.float64), capture.point_colors
-    if len(points) == 0:
+    guessed = len(points) == 0
+    if guessed:
         points, colors, note = random_points(train, capture.near_far)
         notes.append(note)
     tracks = _tracks(capture, views)
@@ -150,6 +151,7 @@ def load_scene(
         capture.seen,
         capture.sfm,
         world=replace(capture.world, place=place),
+        guessed=guessed,
     )
 
 

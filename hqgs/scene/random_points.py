@@ -10,6 +10,8 @@ from hqgs.scene.geometry import unproject
 from hqgs.scene.paths import sight_lines
 from hqgs.scene.scene import View
 
+NO_POINTS = "no points in the scene"
+
 
 def random_points(
     views: list[View], near_far: dict[str, tuple[float, float]]
@@ -41,7 +43,7 @@ def random_points(
         raise ValueError("the masks hide every pixel of every training view")
     depths = "a guessed depth range" if guessed else "the given depth bounds"
     note = (
-        f"no points in the scene: {RANDOM_POINTS} random points within {depths} of the training views; "
+        f"{NO_POINTS}: {RANDOM_POINTS} random points within {depths} of the training views; "
         "`--sfm` finds cameras and points from the photos"
     )
     return np.concatenate(points), np.concatenate(colors), note

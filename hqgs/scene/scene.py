@@ -77,6 +77,7 @@ class Scene:
         None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
     )
     world: World = field(default_factory=World)  # the frame of its files, where that is another
+    guessed: bool = False  # whether its points lie at random depths
 
     @property
     def place(self) -> Georeference | None:

@@ -19,6 +19,7 @@ from hqgs.scene.builtin import room
 from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
+from hqgs.scene.known_points import with_points
 from hqgs.scene.load import check_names, load_pictures, load_scene
 from hqgs.scene.metres import distance_of, in_metres
 from hqgs.scene.names import KEPT, is_room
@@ -46,6 +47,7 @@ def load(
     frames: int | None = None,
     distance: Sequence[str | float] | None = None,
     tag_size: float | None = None,
+    points: bool = True,
     on_stage: OnStage = silent,
 ) -> Scene:
     """Read a scene into memory: training views, held-out views, pinhole cameras, starting points.
@@ -76,6 +78,7 @@ def load(
             files: what is written is in metres then.
         tag_size: metres; the width of the black square of printed tags (AprilTag 36h11, ArUco) that photos
             show: what is written is in metres then, and upright where a tag lies (the extra `tags`).
+        points: where the files have cameras and no points, let COLMAP find points; False: random ones.
         on_stage: hears what is being done, and how far it is.
 
     Returns:
@@ -145,6 +148,7 @@ def load(
     if sfm and (scene.source != "photos" or degradation.steps):
         scene = sfm_scene(scene, models, on_stage, features)
     scene = scene if restore is None else restore_scene(scene, restore)
+    scene = with_points(scene, models, on_stage) if points else scene
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if tag_size is None else by_tags(scene, tag_size)
     return replace(scene, origin=origin)
@@ -176,7 +180,7 @@ def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = 
             source = path if film is None else film_frames(film, Path(name))[0]
             if (scene := load_pictures(source, downscale, longest=longest)) is not None:
                 return scene if film is None else replace(scene, name=film.stem)
-    return load(path, downscale=downscale, longest=longest, skip_unreadable=False)
+    return load(path, downscale=downscale, longest=longest, skip_unreadable=False, points=False)
 
 
 def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:

@@ -105,3 +105,8 @@ SETTLED, TINY = (
 
 # Frames laid onto each other.
 HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more
+
+# Points for known poses: photos, of fewer each is matched with each; cosine of the angle between the
+# directions in which two of more must look, at least; points and px of the photos, below which there is no
+# basis; s for a COLMAP that hangs.
+ALL_PAIRS, ALIKE, POINTS_WANTED, TOO_SMALL, TRIANGULATION = 60, 0.5, 200, 100, 1800.0

@@ -5,7 +5,8 @@ that it starts at once. DIRECTORY holds `input.npz`: photos (the folder), names 
 sizes [V, 2] as width and height and Ks [V, 3, 3], of known poses viewmats [V, 4, 4]. If DIRECTORY has a
 folder `masks`, each photo has a mask `NAME.png` there. COLMAP's files and the answer go into DIRECTORY:
 
-`triangulate`: points for known cameras and poses, `points.npz` (points [P, 3] float32, colors [P, 3] uint8,
+`triangulate`: points for known cameras and poses, from the pairs [P, 2], numbers of photos, where it has
+some, else from all; `points.npz` (points [P, 3] float32, colors [P, 3] uint8,
 and of each observation the numbers of the photo and of the point: photos [O], rows [O]).
 
 `reconstruct THREADS`: poses and points, the folder `model` with the largest COLMAP model; none if there is no
@@ -54,7 +55,7 @@ def triangulate(directory: Path) -> None:
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = 1
     extraction.sift.max_num_features = COARSE
-    match(directory, photos, names, extraction, 1, database)
+    match(directory, photos, names, extraction, 1, database, wanted=lambda: given.get("pairs"))
     pycolmap.guided_geometric_verification(known, database, num_threads=1)
     (directory / "model").mkdir()
     model = pycolmap.triangulate_points(
