@@ -39,7 +39,7 @@ import numpy as np
 import pycolmap
 
 from hqgs.scene.sfm.attempt import Attempt
-from hqgs.scene.sfm.constants import ALMOST, COARSE, ENOUGH_PLACED, MAX_ERROR, MIN_TRACK
+from hqgs.scene.sfm.constants import ALMOST, COARSE, ENOUGH_PLACED, LARGEST, MAX_ERROR, MIN_TRACK
 from hqgs.scene.sfm.database import known_cameras
 from hqgs.scene.sfm.matching import match, pipeline_options
 
@@ -53,7 +53,7 @@ def triangulate(directory: Path) -> None:
     known = known_cameras(given, database)
     photos, names = Path(str(given["photos"])), given["names"].tolist()
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = 1
+    extraction.num_threads, extraction.max_image_size = 1, LARGEST
     extraction.sift.max_num_features = COARSE
     match(directory, photos, names, extraction, 1, database, wanted=lambda: given.get("pairs"))
     pycolmap.guided_geometric_verification(known, database, num_threads=1)
