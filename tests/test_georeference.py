@@ -40,7 +40,7 @@ def test_true_scale_and_up_lie_in_their_intervals(count: int, wrong: int) -> Non
         if found is None:
             continue
         assert found.tilt is not None
-        upright.append(np.degrees(np.arccos(np.clip(up @ found.up, -1, 1))) < found.tilt)
+        upright.append(bool(np.degrees(np.arccos(np.clip(up @ found.up, -1, 1))) < found.tilt))
         if count == 30:
             assert found.tilt < 10
             np.testing.assert_allclose(found.origin[:2], [NORTH, EAST], atol=3e-5)
