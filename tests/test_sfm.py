@@ -70,7 +70,7 @@ def cards() -> Scene:
 
 @pytest.fixture(scope="module")
 def found(cards: Scene) -> Scene:
-    return sfm_scene(cards)
+    return sfm_scene(replace(cards, guessed=True))
 
 
 def test_poses_and_points_are_those_of_the_scene(cards: Scene, found: Scene) -> None:
@@ -82,6 +82,7 @@ def test_poses_and_points_are_those_of_the_scene(cards: Scene, found: Scene) -> 
         assert new.camera.K is own.camera.K
         assert new.image is own.image
     assert found.test is cards.test
+    assert not found.guessed
     depth = found.points[:, 2, None]
     away = np.abs(depth - [card[0] for card in CARDS]).min(1)
     assert len(found.points) > 150

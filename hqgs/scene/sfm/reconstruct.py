@@ -96,6 +96,7 @@ def sfm_scene(
         tracks=tracks,
         seen={views[file].name: rows for file, rows in seen_points(model).items()},
         sfm=report,
+        guessed=False,
     )
 
 
