@@ -28,7 +28,7 @@ DONE = "studies.csv"
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Where captures, tables and pages are."""
     add = parser.add_argument
-    add("--captures", type=Path, metavar="DIR", help="of the captures, a folder each: fern, fox, horns")
+    add("--captures", type=Path, metavar="DIR", help="of the captures, a folder each: fern, fox, ...")
     add("--out", type=Path, default=Path("out", "all"), metavar="DIR", help="for the tables (%(default)s)")
     add("--only", nargs="+", metavar="STUDY", help=f"of: {', '.join(pages.STUDIES)}")
     add("--quick", action="store_true", help="each benchmark once in seconds, no pages: only a test")

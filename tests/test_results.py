@@ -145,9 +145,7 @@ def test_where_runs_are_from_is_said_once() -> None:
     one = frame(run_of("3dgs", 20.0))
     assert made(one) == "1 lines; commit abc; CPU; 2026-11-26."
     two = made(one, frame(run_of("hqgs", 20.0, commit="def", date="2026-11-25")))
-    assert two.startswith(
-        "2 lines; commits def, abc; CPU; 2026-11-25 to 2026-11-26. They are not of one commit"
-    )
+    assert two.startswith("2 lines; commits def, abc; CPU; 2026-11-25 to 2026-11-26. Not of one commit")
     many = [frame(run_of("3dgs", 20.0, commit=str(k))) for k in range(13)]
     assert "13 commits, 0 to 9" in made(*many)
     assert made(one.iloc[:0]) == "Not measured yet."

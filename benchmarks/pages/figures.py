@@ -203,7 +203,7 @@ def made(*frames: DataFrame) -> str:
         else f"commit{'s' * (len(commits) > 1)} {', '.join(commits)}"
     )
     text = f"{len(runs)} lines; {several}; {machines}; {when}."
-    mixed = " They are not of one commit and machine: single cells and seconds compare roughly."
+    mixed = " Not of one commit and machine: cells compare roughly."
     return text + (mixed if len(commits) > 1 else "")
 
 
