@@ -67,9 +67,5 @@ def test_the_split_of_few_photos() -> None:
 
 
 def test_a_fall_counts_moments_that_measured_as_many_views() -> None:
-    history = [
-        {"psnr": 30.0, "views": 2},
-        {"psnr": 21.0, "views": 5},
-        {"psnr": 20.5, "views": 5},
-    ]
+    history = [{"psnr": 30.0, "views": 2}, {"psnr": 21.0, "views": 5}, {"psnr": 20.5, "views": 5}]
     assert fall(history) == pytest.approx(0.5)

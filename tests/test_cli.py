@@ -72,11 +72,7 @@ def test_train_on_degraded_photos(asked: list[dict[str, Any]], tmp_path: Path) -
 
 @pytest.mark.parametrize(("form", "kind"), [("colmap", "none"), ("photos", "none"), ("photos", "noise:9")])
 def test_sfm_replaces_poses_and_points_once(
-    form: str,
-    kind: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    form: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A folder of photos alone has its poses from clean photos already; degraded ones give others."""
     error = {"median": 0.1, "max": 0.2}

@@ -15,10 +15,7 @@ from torch import Tensor
 import hqgs
 
 F32, F64 = torch.float32, torch.float64
-OPTIONS = {
-    "classic": {},
-    "antialiased-RGB+ED": {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"},
-}
+OPTIONS = {"classic": {}, "antialiased-RGB+ED": {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"}}
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:

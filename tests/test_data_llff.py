@@ -8,17 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures_scenes import (
-    CX,
-    CY,
-    FX,
-    HEIGHT,
-    WIDTH,
-    make_truth,
-    write_colmap,
-    write_llff,
-    write_photos,
-)
+from fixtures_scenes import CX, CY, FX, HEIGHT, WIDTH, make_truth, write_colmap, write_llff, write_photos
 
 from hqgs.scene.load import load_scene
 

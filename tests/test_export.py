@@ -21,13 +21,7 @@ from hqgs.model.render import render_view
 from hqgs.scene import source as scene_source
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.scene import Camera
-from hqgs.show.export import (
-    along_a_curve,
-    export,
-    file_degree,
-    needed_degrees,
-    reduce_gaussians,
-)
+from hqgs.show.export import along_a_curve, export, file_degree, needed_degrees, reduce_gaussians
 from hqgs.show.export_change import measure
 from hqgs.show.export_options import ExportOptions
 

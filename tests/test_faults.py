@@ -265,10 +265,7 @@ def test_a_limit_on_files_is_exit_code_1_and_names_the_folder(
 def test_a_full_disk_leaves_the_older_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, {"a": torch.zeros(4)}, {"iteration": 1})
-    with (
-        small_files(50_000),
-        pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors: "),
-    ):
+    with small_files(50_000), pytest.raises(OSError, match=r"cannot write the checkpoint .*a\.safetensors: "):
         save_checkpoint(path, {"a": torch.zeros(40_000)}, {"iteration": 2})
     assert load_checkpoint(path)[1] == {"iteration": 1}
     assert [p.name for p in tmp_path.iterdir()] == [path.name]

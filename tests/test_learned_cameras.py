@@ -334,11 +334,7 @@ def test_ways_are_learned_and_the_scene_gets_sharper() -> None:
     angles = rng.uniform(0, np.pi, len(clean.train))
     ways = [8 * np.array([np.cos(a), np.sin(a)]) for a in angles]
     shaken = moved_along(clean, ways)
-    plain, learned, still = (
-        trained(shaken, "none"),
-        trained(shaken, "shake"),
-        trained(clean, "shake"),
-    )
+    plain, learned, still = (trained(shaken, "none"), trained(shaken, "shake"), trained(clean, "shake"))
     cosines = []
     for photo, way in zip(learned.method.learned(), ways, strict=True):
         along = photo.trajectory[-1] - photo.trajectory[0]

@@ -102,11 +102,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("command", "told"), MISTAKES.items(), ids=MISTAKES)
 def test_a_mistake_is_one_sentence_and_nothing_is_written(
-    command: str,
-    told: str,
-    root: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    command: str, told: str, root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(root)
     before = sorted(root.rglob("*"))

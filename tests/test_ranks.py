@@ -108,12 +108,7 @@ def work(out: str, what: str) -> None:
 
                 folder = Path(out, case, str(threads))
                 run = hqgs.train(
-                    tiny_scene(9),
-                    out=folder,
-                    config=config_of(case),
-                    resume=True,
-                    progress=show,
-                    ranks=ranks,
+                    tiny_scene(9), out=folder, config=config_of(case), resume=True, progress=show, ranks=ranks
                 )
                 assert run.finished
                 assert len(run.report["ranks"]) == (ranks.count if ranks.count > 1 else 0)

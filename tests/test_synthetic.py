@@ -28,10 +28,7 @@ Points3 = NDArray[np.float64]
 INSIDE: list[tuple[Shape, Callable[[Points3], NDArray[np.float64]]]] = [  # negative inside
     (Box((0.5, 0.3, 0.7)), lambda p: np.max(np.abs(p) - [0.5, 0.3, 0.7], -1)),
     (Ellipsoid((0.5, 0.3, 0.7)), lambda p: np.sum((p / [0.5, 0.3, 0.7]) ** 2, -1) - 1),
-    (
-        Cylinder(0.4, 1.2),
-        lambda p: np.maximum(np.hypot(p[..., 0], p[..., 2]) - 0.4, np.abs(p[..., 1]) - 0.6),
-    ),
+    (Cylinder(0.4, 1.2), lambda p: np.maximum(np.hypot(p[..., 0], p[..., 2]) - 0.4, np.abs(p[..., 1]) - 0.6)),
     (Torus(0.6, 0.2), lambda p: np.hypot(np.hypot(p[..., 0], p[..., 2]) - 0.6, p[..., 1]) - 0.2),
 ]
 

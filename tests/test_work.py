@@ -181,10 +181,7 @@ def test_tiles_and_blocks_without_a_cotangent_are_skipped() -> None:
 def test_hidden_gaussians_are_not_differentiated() -> None:
     """Those behind opaque ones get zero gradients without arithmetic, in groups of 16."""
     front, behind = one_gaussian_at(40, 24, n=16), one_gaussian_at(40, 24, n=64)
-    s = replace(
-        front,
-        **{name: torch.cat([getattr(front, name), getattr(behind, name)]) for name in ALL},
-    )
+    s = replace(front, **{name: torch.cat([getattr(front, name), getattr(behind, name)]) for name in ALL})
     s.opacities[:16] = 0.99
     s.scales[:16] = 0.5
     s.means[:16, 2] = 1.0 + 0.01 * torch.arange(16)

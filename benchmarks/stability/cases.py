@@ -121,10 +121,7 @@ def harmonics() -> dict[str, Array]:
     found = {f"normal {k}": 0.3 * rng.standard_normal((2, 16, 3)) for k in range(4)}
     for coefficients in found.values():
         coefficients[:, 0] += 1.0
-    return found | {
-        "large": 1e6 * rng.uniform(0.1, 1.0, (2, 16, 3)),
-        "negative": -np.abs(found["normal 3"]),
-    }
+    return found | {"large": 1e6 * rng.uniform(0.1, 1.0, (2, 16, 3)), "negative": -np.abs(found["normal 3"])}
 
 
 def _intrinsics(f: float, cx: float, cy: float) -> Array:

@@ -130,11 +130,7 @@ class _Joined(Ranks):
         # torchrun's store outlives a restart, with the addresses of those who were there before.
         store = PrefixStore(f"start {_restarts()}", store)
         dist.init_process_group(
-            "gloo",
-            store=store,
-            rank=self.rank,
-            world_size=self.count,
-            timeout=timedelta(seconds=SILENCE),
+            "gloo", store=store, rank=self.rank, world_size=self.count, timeout=timedelta(seconds=SILENCE)
         )
         self.local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
         self._others = [k for k in range(self.count) if k != self.rank]

@@ -26,14 +26,7 @@ from hqgs.diagnosis.constants import (
     SPECTRUM_SLOPE,
     UNKNOWN_FLOORS,
 )
-from hqgs.diagnosis.spectrum import (
-    Fit,
-    Spectrum,
-    fit_blurs,
-    power_spectrum,
-    rings,
-    tile_size,
-)
+from hqgs.diagnosis.spectrum import Fit, Spectrum, fit_blurs, power_spectrum, rings, tile_size
 from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 Kind = Literal["gaussian", "defocus", "motion"]

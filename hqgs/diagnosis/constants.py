@@ -53,10 +53,7 @@ DCT_LEAST = 6.0  # levels; below it fine texture is taken for noise at any table
 PAYS = {"vignetting": 0.05, "response": 0.1}
 DEVICE_PHOTOS, DEVICES_MOST = 4, 16  # that a camera must have taken; cameras that are told apart
 DEVICE_VALUES = 12_000  # colours of points in photos that are looked at
-DEVICE_ROUNDS, DEVICE_WEIGHTED = (
-    8,
-    4,
-)  # of means over photos and points in turn; of weights
+DEVICE_ROUNDS, DEVICE_WEIGHTED = (8, 4)  # of means over photos and points in turn; of weights
 DEVICE_RIDGE = 1e-4  # of the weights: what no photo tells stays 0
 
 # differences.py: whether photos differ in sharpness, each in a direction of its own, or in their gains

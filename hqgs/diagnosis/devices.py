@@ -94,10 +94,7 @@ def device_signs(views: Sequence[View], shared: SharedColors) -> DeviceSigns | N
     corner = 1 - np.exp(-vignetting.sum(1)).min()
     less = 1 - errors["v"] / base
     return DeviceSigns(
-        Devices(of_photo, vignetting, response),
-        less,
-        (errors["v"] - errors[kinds[-1]]) / base,
-        float(corner),
+        Devices(of_photo, vignetting, response), less, (errors["v"] - errors[kinds[-1]]) / base, float(corner)
     )
 
 

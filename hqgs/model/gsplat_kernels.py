@@ -19,8 +19,7 @@ def gsplat_on_cpu() -> None:
 
     if _backend._C is None:
         _backend._C = SimpleNamespace(  # pyright: ignore[reportAttributeAccessIssue]
-            relocation=relocation,
-            quat_scale_to_covar_preci_fwd=_torch_impl._quat_scale_to_covar_preci,
+            relocation=relocation, quat_scale_to_covar_preci_fwd=_torch_impl._quat_scale_to_covar_preci
         )
 
 

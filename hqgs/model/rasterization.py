@@ -282,14 +282,7 @@ def _composite(
         if backgrounds is not None:
             backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(c, 1)], dim=-1)
     image, alphas, work = _Composite.apply(
-        splats["frame"],
-        means2d,
-        splats["link"],
-        splats["opacities"],
-        channels,
-        backgrounds,
-        absgrad,
-        ids,
+        splats["frame"], means2d, splats["link"], splats["opacities"], channels, backgrounds, absgrad, ids
     )
     if render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)

@@ -90,9 +90,7 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[FilmF
     decode(None)
     return [
         FilmFrame(
-            as_floats(_from_planes(planes, out.width)[:height, :width]),
-            frame_kind,
-            sizes_by_time[time],
+            as_floats(_from_planes(planes, out.width)[:height, :width]), frame_kind, sizes_by_time[time]
         )
         for time, (planes, frame_kind) in sorted(frames.items())
     ]

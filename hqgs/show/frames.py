@@ -209,9 +209,7 @@ class Activated:
         )
 
 
-def depth_range(
-    samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
-) -> tuple[float, float]:
+def depth_range(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> tuple[float, float]:
     """The nearest and farthest depth that pictures of these depths and alphas tell apart."""
     seen = np.concatenate([depth[alpha > 0.5] for depth, alpha in samples])
     if not seen.size:

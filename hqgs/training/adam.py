@@ -42,11 +42,7 @@ class Adam(torch.optim.Optimizer):
     """
 
     def __init__(
-        self,
-        params: ParamsT,
-        lr: float = 1e-3,
-        betas: tuple[float, float] = (0.9, 0.999),
-        eps: float = 1e-8,
+        self, params: ParamsT, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
@@ -70,9 +66,7 @@ class Adam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(  # pyright: ignore[reportIncompatibleMethodOverride]  (torch's base says None)
-        self,
-        closure: Callable[[], Tensor] | None = None,
-        views: Mapping[Tensor, int] | None = None,
+        self, closure: Callable[[], Tensor] | None = None, views: Mapping[Tensor, int] | None = None
     ) -> Tensor | None:
         """Update every parameter that has a gradient.
 

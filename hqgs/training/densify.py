@@ -66,11 +66,7 @@ class Densifier:
         self.count[rows] += 1
 
     def update(
-        self,
-        iteration: int,
-        gaussians: Gaussians,
-        optimizer: Optimizer,
-        finest: Tensor | None = None,
+        self, iteration: int, gaussians: Gaussians, optimizer: Optimizer, finest: Tensor | None = None
     ) -> Densification:
         """One round of densification after this iteration (1, 2, ...).
 

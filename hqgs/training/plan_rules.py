@@ -313,11 +313,7 @@ RULES = (
     Rule("smallest Gaussian", smallest, "the 3D smoothing of Mip-Splatting, Yu et al. 2024"),
     Rule("photos' size", half_size, CHOSEN),
     Rule("length", length, f"{ENOUGH:,}, or {FOR_EACH_PHOTO} for each photo: {CHOSEN}"),
-    Rule(
-        "half size",
-        half_size_until,
-        f"{COARSE_PART:.0%} of the run, {COARSE_MOST:,} at most: {CHOSEN}",
-    ),
+    Rule("half size", half_size_until, f"{COARSE_PART:.0%} of the run, {COARSE_MOST:,} at most: {CHOSEN}"),
     Rule("growth", growth, f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}; none: tried"),
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
     Rule("opacity decay", opacity_decay, f"Han et al. 2024, arXiv 2410.18822; {WHERE}"),

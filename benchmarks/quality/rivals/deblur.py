@@ -68,12 +68,7 @@ class Deblur(ThreeDGS):
         return torch.linalg.matrix_exp(twists) @ torch.from_numpy(camera.viewmat)
 
     def render(
-        self,
-        gaussians: Gaussians,
-        camera: Camera,
-        sh_degree: int,
-        background: Sequence[float],
-        eps2d: float,
+        self, gaussians: Gaussians, camera: Camera, sh_degree: int, background: Sequence[float], eps2d: float
     ) -> tuple[Tensor, RasterizationMeta]:
         """In the place of `hqgs.model.render.render_view`, for the view that `shot` was last asked for."""
         images, _, meta = rasterization(
@@ -106,8 +101,5 @@ class Deblur(ThreeDGS):
 def train_deblur(photos: Scene, config: TrainConfig) -> Training:
     """A run of it, with the configuration of a run of 3dgs."""
     method = Deblur(photos, config)
-    with (
-        patch.dict(MAKERS, {"3dgs": lambda *_: method}),
-        patch.object(*RENDER_VIEW, method.render),
-    ):
+    with patch.dict(MAKERS, {"3dgs": lambda *_: method}), patch.object(*RENDER_VIEW, method.render):
         return train(photos, config)

@@ -54,11 +54,7 @@ def face_cameras(viewmat: NDArray[np.float64], width: int) -> dict[str, Camera]:
     return found
 
 
-def panorama_room(
-    cache: Path | None = None,
-    width: int = WIDTH,
-    places: int = PLACES,
-) -> WildRoom:
+def panorama_room(cache: Path | None = None, width: int = WIDTH, places: int = PLACES) -> WildRoom:
     """The room by a camera that sees all around: ray-cast panoramas of `width` px, cut into faces of cubes.
 
     The faces of every 4th place are held out and ray-cast as pinhole photos, which the clean scene also has

@@ -24,10 +24,7 @@ REACH = (0.42, 0.28, 0.08)  # how far the cameras lie from (0, -0.15, 0)
 
 
 def embedded_scene(
-    cache: Path | None = None,
-    width: int = WIDTH,
-    height: int = HEIGHT,
-    num_views: int = 24,
+    cache: Path | None = None, width: int = WIDTH, height: int = HEIGHT, num_views: int = 24
 ) -> Scene:
     """A room, ray-cast from `num_views` forward-facing cameras; every 8th view is a test view.
 

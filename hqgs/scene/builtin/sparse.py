@@ -57,12 +57,7 @@ def sparse_cameras(
 
 
 def camera_on_arc(
-    angle: float,
-    y: float,
-    jitter: NDArray[np.float64],
-    width: int,
-    height: int,
-    radius: float = RADIUS,
+    angle: float, y: float, jitter: NDArray[np.float64], width: int, height: int, radius: float = RADIUS
 ) -> Camera:
     """One that looks at the table from `radius` away.
 
@@ -96,10 +91,7 @@ def thinned(points: SparsePoints, count: int) -> SparsePoints:
 
 
 def beyond_room(
-    photos: int = PHOTOS,
-    cache: Path | None = None,
-    width: int = WIDTH,
-    height: int = HEIGHT,
+    photos: int = PHOTOS, cache: Path | None = None, width: int = WIDTH, height: int = HEIGHT
 ) -> Scene:
     """The room by `photos` cameras on the arc of `sparse_room`, all of which are trained on.
 

@@ -15,14 +15,7 @@ from PIL import Image
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
-from hqgs.photos.files import (
-    PHOTO_SUFFIXES,
-    Glance,
-    UnreadableError,
-    decode,
-    glance,
-    needs_heic,
-)
+from hqgs.photos.files import PHOTO_SUFFIXES, Glance, UnreadableError, decode, glance, needs_heic
 from hqgs.scene.capture import photo_folder
 from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.faces import CUBE, face_name

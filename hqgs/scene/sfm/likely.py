@@ -12,15 +12,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.base.machine import AT_ONCE
-from hqgs.scene.sfm.constants import (
-    COMPARED,
-    DESCRIPTOR,
-    FILM_NEAR,
-    FILM_THIN,
-    LOWE_RATIO,
-    NEXT,
-    PARTNERS,
-)
+from hqgs.scene.sfm.constants import COMPARED, DESCRIPTOR, FILM_NEAR, FILM_THIN, LOWE_RATIO, NEXT, PARTNERS
 
 
 def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:

@@ -51,12 +51,7 @@ def find_cameras(root: Path, photos: BarePhotos, search: Search) -> FoundCameras
     files = {name: file for file, name in reversed(names.items())}  # of a panorama its first face
     try:
         ran = run_colmap(
-            list(names),
-            photos.contents(),
-            photos.guess(),
-            photos.write,
-            called=names,
-            **vars(search),
+            list(names), photos.contents(), photos.guess(), photos.write, called=names, **vars(search)
         )
         poses = {names[file]: viewmat for file, viewmat in ran.poses().items() if file in files.values()}
     except ValueError as error:

@@ -287,12 +287,7 @@ def _run_program(directory: Path, on_stage: OnStage) -> None:
     program = [sys.executable, str(PROGRAM), "reconstruct", str(directory), str(get_num_threads())]
     with (directory / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            program,
-            stdin=subprocess.PIPE,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            env=surroundings(),
+            program, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True, env=surroundings()
         )
         try:
             while True:

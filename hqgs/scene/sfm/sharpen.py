@@ -24,10 +24,7 @@ Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
 
 
 def sharpened(
-    model: pycolmap.Reconstruction,
-    folder: Path,
-    adjust: Adjust,
-    free: bool,
+    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, free: bool
 ) -> pycolmap.Reconstruction:
     """The model after ROUNDS of patches and adjustment; as it is where the patches do not fit.
 
@@ -87,11 +84,7 @@ def _used(tracks: Tracks, photos: int, cell: float) -> tuple[NDArray[np.bool_], 
 
 
 def _joined(
-    model: pycolmap.Reconstruction,
-    names: list[str],
-    others: Tracks,
-    adjust: Adjust,
-    far: float,
+    model: pycolmap.Reconstruction, names: list[str], others: Tracks, adjust: Adjust, far: float
 ) -> pycolmap.Reconstruction:
     """The model, and the points that were not used where its cameras see them."""
     _, own = read_tracks(model)

@@ -81,10 +81,7 @@ def beside(picture: Picture, camera: Camera, photo: Picture, taken: Camera, shar
     a = focal * scale
     b = (taken.K[:2, 2] - focal * camera.K[:2, 2]) * scale
     found = Image.fromarray(photo).transform(
-        (width, height),
-        Image.Transform.AFFINE,
-        (a[0], 0, b[0], 0, a[1], b[1]),
-        Image.Resampling.BILINEAR,
+        (width, height), Image.Transform.AFFINE, (a[0], 0, b[0], 0, a[1], b[1]), Image.Resampling.BILINEAR
     )
     x = (np.arange(width) + 0.5) * a[0] + b[0]
     y = (np.arange(height) + 0.5) * a[1] + b[1]

@@ -22,11 +22,7 @@ from hqgs.photos.operators import Separable
 
 BLOCK = 8
 # R, G, B to Y, Cb, Cr (ITU-T T.871, without the offset of the chroma, which no difference sees).
-TO_YCBCR = (
-    (0.299, 0.587, 0.114),
-    (-0.168735892, -0.331264108, 0.5),
-    (0.5, -0.418687589, -0.081312411),
-)
+TO_YCBCR = ((0.299, 0.587, 0.114), (-0.168735892, -0.331264108, 0.5), (0.5, -0.418687589, -0.081312411))
 
 
 @dataclass(frozen=True)
