@@ -15,12 +15,12 @@ from hqgs.diagnosis.constants import (
     CHOICE_LEAST_BLUR,
     CHOICE_POINTS,
     CHOICE_SHARED,
-    ENOUGH_SHOW,
     MOST_TURNED,
     UNUSUAL,
     WELL_SEEN,
 )
 from hqgs.diagnosis.sharpness import PhotoSummary, Sharpness, summarised
+from hqgs.scene.constants import ENOUGH_SHOW
 from hqgs.scene.geometry import in_frame
 from hqgs.scene.scene import Scene, View
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 # Of several files.
-FEWEST_PHOTOS = 5  # with fewer none is compared with the others
 ROUNDS = 30  # of means and medians of photos and points in turn
-ENOUGH_SHOW = 3  # photos: a point that fewer show, from near enough the same side, tells nothing of them
 LARGEST = 1024  # px a side: more of the middle of a photo is not looked at, but for its enlargement
 LEAST_BLUR = 0.7  # px, a Gaussian's sigma; photos that count as sharp reach 0.6, at JPEG's quality 10 0.8
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.constants import FEWEST_PHOTOS, LARGEST, SECTORS, UNLIKE_COARSE, UNLIKE_FINE
+from hqgs.diagnosis.constants import LARGEST, SECTORS, UNLIKE_COARSE, UNLIKE_FINE
 from hqgs.diagnosis.sharpness import Sharpness, summarised
 from hqgs.photos.pixels import as_floats, luma
+from hqgs.scene.constants import FEWEST_PHOTOS
 from hqgs.scene.scene import Scene
 
 

@@ -11,8 +11,6 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
 from hqgs.base.evenly import evenly
 from hqgs.diagnosis.constants import (
-    ENOUGH_SHOW,
-    FEWEST_PHOTOS,
     FEWEST_POINTS,
     FOCUS_COARSE,
     FOCUS_DARK,
@@ -27,6 +25,7 @@ from hqgs.diagnosis.constants import (
 )
 from hqgs.photos.pixels import as_floats, luma
 from hqgs.photos.resize import area_downscale
+from hqgs.scene.constants import ENOUGH_SHOW, FEWEST_PHOTOS
 from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
 

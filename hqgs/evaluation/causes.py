@@ -18,11 +18,12 @@ from scipy.ndimage import gaussian_filter
 
 from hqgs.base.evenly import evenly
 from hqgs.diagnosis.noise import estimate_noise
-from hqgs.evaluation.constants import BEFORE, FEW, FINE, FOG, MOST_VIEWS, PATCH
+from hqgs.evaluation.constants import BEFORE, FINE, FOG, MOST_CAMERAS, PATCH
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import color_factors
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_levels
+from hqgs.scene.constants import ENOUGH_SHOW
 from hqgs.scene.geometry import in_frame, project
 from hqgs.scene.scene import Camera, View
 
@@ -58,10 +59,10 @@ class Maps:
 
 
 def shown_by(gaussians: Gaussians, cameras: Sequence[Camera]) -> torch.Tensor:
-    """How many of the cameras, of MOST_VIEWS at most, have each Gaussian's centre in view, [N]."""
+    """How many of the cameras, of MOST_CAMERAS at most, have each Gaussian's centre in view, [N]."""
     means = gaussians.means.detach().double().numpy()
     counts = np.zeros(len(means), np.float32)
-    for k in evenly(len(cameras), MOST_VIEWS):
+    for k in evenly(len(cameras), MOST_CAMERAS):
         counts += in_frame(cameras[k], means)
     return torch.from_numpy(counts)
 
@@ -95,7 +96,7 @@ def causes(seen: RenderedView, maps: Maps, noise: float, fitted: RenderedView | 
         if now < after:
             off, pose = other, after - now
     error, fine = np.square(off).mean(-1), np.square(off - _smooth(off)).mean(-1)
-    edge = counted & (maps.photos < FEW)
+    edge = counted & (maps.photos < ENOUGH_SHOW)
     fog = counted & ~edge & (maps.fog > FOG)
     rest, pixels = counted & ~edge & ~fog, int(counted.sum())
     detail = min(float(fine[rest].sum()), float(error[rest].sum())) / pixels

@@ -10,7 +10,7 @@ CONFIDENCE = 0.9  # of every interval of a metric
 # between them: what a few photos that happen to agree are held against.
 SPREADS = {"psnr": 2.0, "psnr_aligned": 2.0, "ssim": 0.025, "haarpsi": 0.04}
 SPREAD_LOGS = 0.7
-SCATTER = 0.1  # dB that a run may end below its best: no more than what two seeds differ by
+SCATTER = 0.1  # dB: two runs that differ by no more are alike, as two seeds are
 HAARPSI_MIN_SIZE = 16  # px: the coarsest Haar filter
 LPIPS_MIN_SIZE = 63  # px: AlexNet's smallest input
 KEPT_BYTES = 256e6  # of renders that are held; 12 of 1600 x 1067 px
@@ -18,8 +18,7 @@ KEPT_BYTES = 256e6  # of renders that are held; 12 of 1600 x 1067 px
 # Where an error comes from.
 PATCH = 32  # px, of the map of errors
 FINE = 2.0  # px: what a Gaussian of this deviation smooths away is fine detail
-FEW = 3  # training photos: a pixel that fewer show is at the edge of the capture
-MOST_VIEWS = 100  # training views that are asked what they show
+MOST_CAMERAS = 200  # evenly chosen, that stand for all: asked what they show; in a page; drawn by the viewer
 BEFORE = 0.75  # of the depth in its pixel: a Gaussian nearer than that hangs before the surface
 FOG = 0.1  # of a pixel's colour from such Gaussians, and it lies behind fog
 WORST, LEAST = 3, 0.005  # photos that the screen names; share of the error that is named
@@ -38,11 +37,10 @@ APART = 0.7  # of what the next fault's imitation leaves: nearer ones are not to
 SEARCH_STEPS, SEARCH_ROUNDS = 6, 4  # values that are tried between two, and how often closer together
 
 # Pictures.
-AMPLIFICATION = 4  # of the difference
+AMPLIFICATION = 4  # times: so much larger differences and trajectories are drawn
 PNG_LEVEL = 2  # a tenth larger than zlib's default makes it, in two thirds of the time
 MASKED = 150, 158, 170  # difference where the mask leaves the photo out: no grey that a difference has
-SHEET_PHOTOS, SHEET_COLUMNS = 12, 4  # on a sheet, at most; side by side
-TILE_SIDE, TILE_GAP = 260, 6  # px: of a photo on a sheet, and between two
+SHEET_PHOTOS = 12  # on a sheet or in judge.html, at most
+TILE_SIDE = 260  # px, of a photo on a sheet
 CAPTION = 18  # px
-LARGER = 4  # times: trajectories are drawn so much larger than the photo
 RED, PAINT = (220, 30, 30), 0.6  # of the masked part, and its share

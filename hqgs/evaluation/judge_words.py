@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from hqgs.base.text import markdown_table
-from hqgs.evaluation.constants import FEW, FINE, FOG, LEAST, WORST
+from hqgs.evaluation.constants import FINE, FOG, LEAST, WORST
 from hqgs.evaluation.intervals import with_half
 from hqgs.evaluation.verdict import verdict
+from hqgs.scene.constants import ENOUGH_SHOW
 
 LABELS = {
     "psnr": "PSNR (dB)",
@@ -23,7 +24,10 @@ FORMS = dict.fromkeys(LABELS, ".4f") | {"psnr": ".2f", "psnr_aligned": ".2f"}
 CAUSES = {
     "color": ("colour", "what one factor for each channel of each photo sets right"),
     "pose": ("pose", "what fitting each camera sets right; without --fit-cameras it counts as detail"),
-    "edge": ("edge of the capture", f"pixels whose Gaussians fewer than {FEW} training photos have in view"),
+    "edge": (
+        "edge of the capture",
+        f"pixels of Gaussians that under {ENOUGH_SHOW} training photos have in view",
+    ),
     "fog": ("fog", f"pixels with more than {FOG:.0%} of their colour from far before the surface"),
     "noise": ("noise of the photos", "in no scene, where it can be told from texture"),
     "detail": ("missing detail", f"what is finer than some {2 * FINE:.0f} px"),

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from hqgs.base.evenly import evenly
-from hqgs.evaluation.constants import CAPTION, LARGER, SHEET_PHOTOS, TILE_SIDE
+from hqgs.evaluation.constants import AMPLIFICATION, CAPTION, SHEET_PHOTOS, TILE_SIDE
 from hqgs.evaluation.records import LearnedRecord
-from hqgs.evaluation.sheet import sheet_of
 from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.photos.sheet import tiled
 
 
 def learned_picture(
@@ -24,8 +24,7 @@ def learned_picture(
     """
     order = sorted(range(len(learned)), key=lambda k: -learned[k]["shake_px"] - 2 * learned[k]["defocus_px"])
     chosen = [order[k] for k in evenly(len(order), SHEET_PHOTOS)]
-    tiles = [_tile(photos[k], learned[k]) for k in chosen]
-    return sheet_of(tiles)
+    return tiled([_tile(photos[k], learned[k]) for k in chosen])
 
 
 def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord) -> Image.Image:
@@ -41,9 +40,10 @@ def _tile(photo: NDArray[np.uint8] | NDArray[np.float32], record: LearnedRecord)
     facts += [f"{stops:+.2f} stops"] if np.ptp(record["gains"]) or stops else []
     draw.text((2, 3), f"{Path(record['name']).stem[-16:]}  {', '.join(facts)}", fill=(25, 25, 25))
     middle = np.array([picture.width / 2, CAPTION + picture.height / 2])
-    trajectory = [tuple(middle + LARGER * scale * np.array(point)) for point in record["trajectory_px"]]
+    scale *= AMPLIFICATION
+    trajectory = [tuple(middle + scale * np.array(point)) for point in record["trajectory_px"]]
     if record["defocus_px"]:
-        radius = LARGER * scale * record["defocus_px"]
+        radius = scale * record["defocus_px"]
         for width, color in ((3, (0, 0, 0)), (1, (255, 210, 0))):
             draw.circle(tuple(middle), radius, outline=color, width=width)
     if record["shake_px"]:

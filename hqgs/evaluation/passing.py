@@ -11,8 +11,8 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path
 from hqgs.evaluation.constants import PAINT, RED, SHEET_PHOTOS, TILE_SIDE
-from hqgs.evaluation.sheet import sheet_of
 from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.photos.sheet import tiled
 from hqgs.scene.capture import inside
 from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import View
@@ -30,8 +30,7 @@ def passing_picture(views: Sequence[View], passing: Mapping[str, NDArray[np.bool
     """Up to 12 photos, those first of which most was masked, with that part in red."""
     shown = [view for view in views if view.name in passing]
     shown = sorted(shown, key=lambda view: -passing[view.name].mean())[:SHEET_PHOTOS]
-    tiles = [_tile(view, passing[view.name]) for view in shown]
-    return sheet_of(tiles)
+    return tiled([_tile(view, passing[view.name]) for view in shown])
 
 
 def _tile(view: View, passing: NDArray[np.bool_]) -> Image.Image:

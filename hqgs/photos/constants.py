@@ -31,9 +31,8 @@ FULL_WELL = 6000.0  # photoelectrons of white in green where no light is missing
 READ_NOISE = 2.5  # electrons, standard deviation
 # Gains of red, green and blue: the sensor sees white as 1/1.9, 1, 1/1.6.
 PHONE_WHITE_BALANCE = (1.9, 1.0, 1.6)
-DENOISE_RADIUS, DENOISE_SIGMA = 2, 1.5  # px: a bilateral filter over 5 x 5 pixels
-DENOISE_RANGE = 1.5  # of its range weight, in standard deviations of the noise
-CHROMA_SIGMA = 1.5  # px, Gaussian blur of the chroma
+# A bilateral filter over 5 x 5 pixels; its sigma in px, in deviations of the noise, and of the chroma's blur.
+DENOISE_RADIUS, DENOISE_SIGMA = 2, 1.5
 SHARPEN_SIGMA, SHARPEN_AMOUNT = 1.0, 0.8  # px and gain of the unsharp mask
 PHONE_QUALITY = 70  # of the JPEG file, 4:2:0
 

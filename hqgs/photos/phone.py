@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter
 
 from hqgs.photos.constants import (
-    CHROMA_SIGMA,
     DENOISE_RADIUS,
-    DENOISE_RANGE,
     DENOISE_SIGMA,
     FULL_WELL,
     PHONE_QUALITY,
@@ -106,10 +104,10 @@ def denoise(linear: Floats, white: float) -> Floats:
         for dx in range(2 * reach + 1):
             other = padded[dy : dy + height, dx : dx + width]
             far = ((dy - reach) ** 2 + (dx - reach) ** 2) / (2 * DENOISE_SIGMA**2)
-            unlike = (np.square(other - linear) / variance).mean(-1) / (2 * DENOISE_RANGE**2)
+            unlike = (np.square(other - linear) / variance).mean(-1) / (2 * DENOISE_SIGMA**2)
             weight = np.exp(-far - unlike)
             total += weight[..., None] * other
             weights += weight
     smooth = total / weights[..., None]
     luma = (smooth @ LUMA)[..., None]
-    return luma + gaussian_filter(smooth - luma, (CHROMA_SIGMA, CHROMA_SIGMA, 0), mode="mirror")
+    return luma + gaussian_filter(smooth - luma, (DENOISE_SIGMA, DENOISE_SIGMA, 0), mode="mirror")

@@ -1,7 +1,8 @@
-"""Pictures side by side in rows, each with a caption above it."""
+"""Pictures side by side in rows."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 
@@ -13,7 +14,7 @@ GAP = 8  # pixels between the pictures
 
 
 def sheet(rows: Sequence[Sequence[tuple[str, NDArray[np.uint8]]]]) -> Image.Image:
-    """Captions and pictures [H, W, 3] of one size, as many in each row.
+    """Captions above pictures [H, W, 3] of one size, as many in each row.
 
     The font is the largest, in proportion to the pictures, in which all captions fit; those that never do
     are cut where it shows, so that none runs into the next picture. Below 9 px nothing is read.
@@ -36,6 +37,16 @@ def sheet(rows: Sequence[Sequence[tuple[str, NDArray[np.uint8]]]]) -> Image.Imag
             x, y = c * (width + GAP), r * (height + line + GAP)
             made.paste(strip, (x, y))
             made.paste(Image.fromarray(picture), (x, y + line))
+    return made
+
+
+def tiled(tiles: Sequence[Image.Image]) -> Image.Image:
+    """One or more small pictures in rows of four, on white."""
+    width, height = (max(getattr(tile, side) for tile in tiles) + GAP for side in ("width", "height"))
+    columns = min(4, len(tiles))
+    made = Image.new("RGB", (columns * width, math.ceil(len(tiles) / columns) * height), "white")
+    for k, tile in enumerate(tiles):
+        made.paste(tile, (k % columns * width, k // columns * height))
     return made
 
 

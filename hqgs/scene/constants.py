@@ -7,6 +7,8 @@ the tests and on fern, fox and horns; those of GPS, of tags and of where to phot
 
 # Every scene.
 TEST_EVERY = 8  # views: each 8th by name is held out (Mildenhall et al. 2019), where nothing else is said
+FEWEST_PHOTOS = 5  # with fewer none is compared with the others, nor is told where to photograph next
+ENOUGH_SHOW = 3  # photos: a point, tag or pixel that fewer show tells nothing
 STRAY = 10.0  # median distances from the cameras' middle: one so far off says nothing of a scene's size
 PICTURE_MARGIN = 1.15  # of the half field of view: a Gaussian just outside the picture still reaches into it
 
@@ -22,11 +24,12 @@ COPY_SIDE = 640
 
 # From photos on disk to views, and to photos that are stored for COLMAP.
 JPEG_QUALITY = 95
-STRAIGHT = 0.01  # px: a camera this close to a pinhole is one, and its photo is not resampled
 SMALLEST_SIDE = 8  # px; below this no metric or tile means anything
 MAX_WORKERS, GIVEN_BACK = 4, 10  # photos at their stored size at once; after which freed memory is given back
 DENSER = 2.0  # new pixels a wanted one, along each side, at which a photo is undistorted
-LATTICE, EXACT = 8, 0.02  # px of such a grid: positions are computed so far apart, if that is exact enough
+# px of such a grid: positions are computed so far apart; px: where that is exact enough, and a camera that is
+# no farther from a pinhole is one, its photo not resampled.
+LATTICE, EXACT = 8, 0.02
 # Pixels of the photo between samples: where they are farther apart, means come first; and at which it may be
 # decoded: 6000 px go to 1600 by way of 3000.
 FAR_SAMPLES, DENSE_SAMPLES = 1.25, 1.75
@@ -35,7 +38,8 @@ KEPT_SIDE = 800  # px, of the photos beside cameras.json: to look at, not to tra
 
 # Where cameras stand, and which way up.
 FAR_OFF = 20.0  # median distances: from here on a camera is asked what of the points it shows
-SHOWN, LOOKED_AT = 0.02, 1000  # of a photo's sides, which the points must span at least; of points
+# Of a photo's sides, which its points must span, and of a face, which its photo must show; points.
+SHOWN, LOOKED_AT = 0.02, 1000
 SMALLEST, GREATEST, USUAL = 0.25, 256.0, 4.0  # sizes, world units: ordinary ones; what others are brought to
 ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in one place, but for rounding
 FAR_ORIGIN = 16.0  # sizes from the origin: from here on it is moved, before float32 is 1e-3 of 1,000 px off
@@ -55,7 +59,6 @@ TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a tu
 # Photos that see more than a flat picture holds, and films.
 WIDE = 120.0  # degrees across or up and down that a flat picture shows at most
 FACE_LATTICE = 128  # rays each way that tell which part of a face a photo shows
-FACE_SHOWN = 0.02  # of a face; one that shows less is left out
 FACE_SPAN = 0.1  # of a face's side that what it shows must span: a strip would have no pixels when scaled
 THETAS = 1024  # angles at which a lens is asked whether its picture still grows
 DARK = 12  # of 255: corners outside of the circle that a fisheye throws
@@ -66,18 +69,15 @@ SOME_FACTORS = (0.5, 1.5)  # of a `some` step's value: the least and the most
 # Similarities between frames.
 ORIENTATIONS = 0.1  # weight of cameras' orientations beside their centres; decides where those are in line
 HYPOTHESES = 100  # choices of two or three that are tried: enough where half of all are wrong
-OUTLIER = 3.0  # robust standard deviations
-ROUNDING = 1e-9  # residuals below it are none
+OUTLIER = 3.0  # times the usual error, or robust standard deviations: what lies farther off is no scatter
+ROUNDING = 1e-9  # residuals and shares below it are none
 
 # GPS: what is asked of it before it tells a scale.
 GPS_LEAST = 4  # photos with a place
 GPS_ROBUST_FROM = 12  # photos; of fewer every one counts
-GPS_SPREAD = 3.0  # times what is left over: less, and GPS says nothing of the scale
 
 # Printed tags.
-TAG_PHOTOS = 3  # that show a tag, at least
 TAG_FITS = 2.0  # px: what the corners of a tag may be off a square, median; more, and two tags look the same
-TAG_SIDE = 1000  # px: smaller photos are enlarged to show their tags better
 TAG_BORDER = 0.125  # sides of white around a tag, least that is printed
 TAG_CELL = 16  # px of a cell of the drawing
 TAG_BLUR = 0.5  # px of the photo, sigma: what a pixel's square and a good lens do
@@ -86,7 +86,6 @@ TAG_SURE = 1e-3  # of a side: errors of the cameras, and of printing, are not le
 TAG_LEVEL = 20.0  # degrees between a tag's normal and the cameras' up: it lies on something level
 
 # Where to photograph next.
-NEXT_FEWEST = 5  # photos: of fewer nothing is told but that they are few
 GAP, WIDER = 20.0, 2.5  # degrees around the middle between neighbours, and times the usual: a gap
 LOOSE, LOOSER = 0.5, 3.0  # px that a pose may be off, and times the usual: a loose one
 ALONE, LONELIER = 0.5, 2.0  # of a photo's points that no third photo shows, and times the usual

@@ -16,7 +16,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from hqgs.scene.constants import DARK, FACE_LATTICE, FACE_SHOWN, FACE_SPAN, SMALLEST_SIDE, THETAS, WIDE
+from hqgs.scene.constants import DARK, FACE_LATTICE, FACE_SPAN, SHOWN, SMALLEST_SIDE, THETAS, WIDE
 
 AROUND = "EQUIRECTANGULAR"  # COLMAP's model of photos of 360 x 180 degrees
 # rotations, face from camera: x, y and z of each face in the camera's frame (x right, y down, z forward)
@@ -85,7 +85,7 @@ def _faces(model: str, params: tuple[float, ...], width: int, height: int, finer
     found = []
     for name, rotation in CUBE.items():
         shown = inside(camera, rays @ rotation, limit)
-        if shown.mean() < FACE_SHOWN:
+        if shown.mean() < SHOWN:
             continue
         (left, right), (top, bottom) = (_span(shown, axis, side) for axis in (0, 1))
         if min(right - left, bottom - top) < max(SMALLEST_SIDE, FACE_SPAN * side):

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import GPS_LEAST, GPS_ROBUST_FROM, GPS_SPREAD
+from hqgs.scene.constants import GPS_LEAST, GPS_ROBUST_FROM, OUTLIER
 from hqgs.scene.similarity import robust, similarity
 
 _A, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: semi-major axis, m, and squared eccentricity
@@ -62,7 +62,7 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     """The place of a scene with camera centres [N, 3] in the frame of its files, and GPS of each.
 
     None where that does not tell: fewer than GPS_LEAST photos or different places, or places that spread less
-    than GPS_SPREAD times as far as they are off. Fewer than GPS_LEAST altitudes: all count as equally high.
+    than OUTLIER times as far as they are off. Fewer than GPS_LEAST altitudes: all count as equally high.
     """
     gps = np.asarray(places, np.float64).reshape(-1, 3)
     high = np.isfinite(gps[:, 2])
@@ -92,7 +92,7 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     axes = (off**2).sum(0) / max(count - 7 / 3, 1)  # variance along each; 7 values were fitted to 3 N
     spread = math.sqrt(float(((target[used] - target[used].mean(0)) ** 2).sum() / count))
     residual = math.sqrt(float(axes.sum()))
-    if not spread > GPS_SPREAD * residual:
+    if not spread > OUTLIER * residual:
         return None
     from scipy.special import fdtri, stdtrit  # here: to read a scene does not need it
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import ALONE, GAP, LONELIER, LOOSE, LOOSER, NEXT_FEWEST, NEXT_MOST, WIDER
+from hqgs.scene.constants import ALONE, FEWEST_PHOTOS, GAP, LONELIER, LOOSE, LOOSER, NEXT_MOST, WIDER
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Scene, View
 
@@ -26,7 +26,7 @@ class Spot:
 def next_photos(scene: Scene) -> list[Spot]:
     """The places where another photo would help most, the most helpful first; none: nothing stands out."""
     views = sorted([*scene.train, *scene.test], key=lambda view: view.name)
-    if len(views) < NEXT_FEWEST:
+    if len(views) < FEWEST_PHOTOS:
         return []
     centers = np.stack([view.camera.center for view in views])
     return [*_gaps(scene, views, centers), *_loose(scene, views, centers), *_alone(scene, views, centers)][

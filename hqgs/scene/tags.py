@@ -18,19 +18,19 @@ from hqgs.base.text import some
 from hqgs.photos.light import to_linear
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.constants import (
+    ENOUGH_SHOW,
     TAG_BLUR,
     TAG_BORDER,
     TAG_CELL,
     TAG_FITS,
     TAG_LEVEL,
-    TAG_PHOTOS,
-    TAG_SIDE,
     TAG_SURE,
     TAG_UNLIKE,
 )
 from hqgs.scene.metres import with_metres
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.sfm.constants import PATCH_SIDE
 from hqgs.scene.similarity import similarity
 
 FAMILIES = ("APRILTAG_36h11", "ARUCO_ORIGINAL", "4X4_250", "5X5_250", "6X6_250")  # in this order
@@ -61,7 +61,7 @@ def by_tags(scene: Scene, size: float) -> Scene:
     tags = [tag for name, at in seen.items() if (tag := lay(name, at, views)) is not None]
     good = [tag for tag in tags if tag.off <= TAG_FITS]
     if not good:
-        why = f"{TAG_PHOTOS} photos and more must show the same one sharply"
+        why = f"{ENOUGH_SHOW} photos and more must show the same one sharply"
         if tags:
             why = f"{some([tag.name for tag in tags])} lies in several places: print each number once"
         found = f"{len(seen)} numbers in {len({k for at in seen.values() for k in at})} photos"
@@ -90,7 +90,7 @@ def check_tag_size(size: float, distance: object = None) -> None:
 
 
 def sightings(views: Sequence[View]) -> dict[str, dict[int, Floats]]:
-    """Corners [4, 2] in px of each tag by its name and the view's number, where TAG_PHOTOS show it."""
+    """Corners [4, 2] in px of each tag by its name and the view's number, where ENOUGH_SHOW show it."""
     cv2 = _opencv()
     options = cv2.aruco.DetectorParameters()
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -103,7 +103,7 @@ def sightings(views: Sequence[View]) -> dict[str, dict[int, Floats]]:
     found: dict[str, dict[int, Floats]] = {}
     for k, view in enumerate(views):
         gray = np.ascontiguousarray(to_uint8(as_floats(view.image).mean(-1, keepdims=True))[..., 0])
-        larger = -(-TAG_SIDE // max(gray.shape))
+        larger = -(-PATCH_SIDE // max(gray.shape))
         gray = cv2.resize(gray, None, fx=larger, fy=larger, interpolation=cv2.INTER_CUBIC)
         for family, finder in finders.items():
             corners, numbers, _ = finder.detectMarkers(gray)
@@ -111,7 +111,7 @@ def sightings(views: Sequence[View]) -> dict[str, dict[int, Floats]]:
                 found.setdefault(f"{family} {number}", {})[k] = (
                     at.reshape(4, 2).astype(np.float64) + 0.5
                 ) / larger
-    return {name: at for name, at in sorted(found.items()) if len(at) >= TAG_PHOTOS}
+    return {name: at for name, at in sorted(found.items()) if len(at) >= ENOUGH_SHOW}
 
 
 def _opencv() -> Any:

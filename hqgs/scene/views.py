@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from hqgs.base.machine import AT_ONCE, give_back_memory, keep_large_arrays_apart
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.photos.constants import CUBIC_RADIUS
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.resize import Pixels, area_downscale
@@ -36,7 +37,6 @@ from hqgs.scene.constants import (
     LATTICE,
     MAX_WORKERS,
     SMALLEST_SIDE,
-    STRAIGHT,
 )
 from hqgs.scene.faces import AROUND, Face, faces_of, lit, projected
 from hqgs.scene.geometry import parts_of
@@ -44,7 +44,6 @@ from hqgs.scene.lenses import check_camera, check_size, fits
 from hqgs.scene.scene import Camera, View
 
 _CAMERAS_KEPT = 2  # sampling grids kept for the next photo of the same camera; one is 8 bytes a pixel
-SEAM = 2  # columns repeated beyond both ends of a photo of all around, as bicubic interpolation reads them
 _CameraKey = tuple[str, tuple[float, ...], int, int, int, int, str]
 
 
@@ -199,8 +198,9 @@ class Pinhole:
             grid = (grid + 1) * torch.tensor([size[0] / width, size[1] / height]) - 1
         channels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
         if self.around:
-            channels = torch.nn.functional.pad(channels, (SEAM, SEAM, 0, 0), mode="circular")
-            grid = grid * torch.tensor([width / (width + 2 * SEAM), 1.0])
+            seam = CUBIC_RADIUS  # columns beyond both ends that the interpolation reads
+            channels = torch.nn.functional.pad(channels, (seam, seam, 0, 0), mode="circular")
+            grid = grid * torch.tensor([width / (width + 2 * seam), 1.0])
         out = torch.nn.functional.grid_sample(
             channels, grid, mode="bicubic", padding_mode="border", align_corners=False
         )
@@ -320,4 +320,4 @@ def _is_straight(camera: pycolmap.Camera, K: NDArray[np.float64]) -> bool:
     ys = np.linspace(0, camera.height, 33)
     pixels = np.stack(np.meshgrid(xs, ys), -1)
     moved = projected(camera, _rays(K, pixels)) - pixels
-    return bool(np.abs(moved).max() < STRAIGHT)
+    return bool(np.abs(moved).max() < EXACT)

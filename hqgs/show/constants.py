@@ -5,7 +5,6 @@ The layout of charts is beside them.
 
 # Films.
 FPS = 30.0
-MOST_CAMERAS = 200  # to jump to in a page; that the viewer draws, evenly chosen
 # Frames that say which depths a film shows; ends of its colours.
 DEPTH_SAMPLES, DEPTH_PERCENTILES = 8, (2, 98)
 
@@ -46,7 +45,6 @@ GAUSSIANS_A_SET, LEAST_SETS, MOST_SETS = (
     1 << 13,
 )  # of harmonics: 50,000 Gaussians of degree 3 take less than 3 MB
 BAND_COVERED = 0.999  # of a band's coefficients that its largest stored value covers
-WORST_PAIRS = 12  # photos with pictures in judge.html
 DIFFERENCE_SHOWN = 16.0  # levels between two scenes: the deepest blue and red
 PAIRS, PAIR_SIDE, SHEET_SIDE = 8, 720, 1080  # pictures of photo and render, best, worst and between; px
 PAGE_QUALITY = 82  # of JPEG

@@ -60,12 +60,10 @@ DROPPED = -20.0  # logit of a dropped one's opacity, 2e-9: no pixel blends it
 # and what its scales are divided by (section 5.2; its code).
 LAMBDA_DSSIM = 0.2
 SPLIT_CHILDREN = 2
-SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN
 
 # Passers-by, by a small scene of small photos. CONTRADICTED was chosen on walkers in the room, fern, horns,
 # whose regions score 0.6 in the median. Of 217 regions that differ in the room, fern, horns, fox, can and
 # drinks without walkers none scores more than 0.28; of 71 smaller ones 3 do.
-FEWEST_SCOUTED = 3  # photos: one, and two that contradict it
 SCOUT_SIDE, SCOUT_CELL = 160, 2  # px: of the copies, and of the cells whose mean colours are compared
 SCOUT_STEPS, SCOUT_STEPS_EACH = 200, 4  # so many, or so many for each photo where that is more
 SCOUT_PIXELS, SCOUT_DEGREE = 50, 1  # of the copies, for each first point; of the harmonics
@@ -82,13 +80,11 @@ BORNE_OUT = 0.5  # of them: most look as in the scene; where neither is borne ou
 TRIAL_STEPS, TRIAL_SIDES = 400, (120, 320)  # of each run; px, at least and at most
 TRIAL_PIXELS = 10  # of the photos for each Gaussian, at least, where growth is as it likes
 TRIAL_EACH, TRIAL_OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on
-TRIAL_VIEWS = 5  # photos: one is held back each time, and four are left
 TRIAL_SHARE = 0.15  # of the pixels that the run trains on: those of the trial
-TRIAL_GAIN = 0.1  # dB on the photos held back: none must gain more, and all measures more than their errors
 
 # The guard. Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.
 GUARD_LIMIT = 1e18
-LOG_LIMIT = 88.7228  # of the scales' logarithms: exp of more overflows 32 bits
+LOG_LIMIT = math.log(2.0**128)  # of the scales' logarithms: exp of more overflows 32 bits
 EVENTS_KEPT, GAUSSIANS_LISTED = 20, 10  # the first events, and the first Gaussians that an event names
 MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
@@ -105,10 +101,7 @@ SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are compu
 # Cameras of each photo: shares of the run before which trajectories would hide what the scene does not show
 # yet, at which short ones are given up, and of the rates at the end.
 CAMERAS_BEGIN, GIVE_UP_AT, CAMERA_RATES_LEFT = 0.1, (0.5, 0.75), 0.1
-SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle: with less a photo stands still
-SMALLEST_RADIUS = (
-    SHORTEST_TRAJECTORY / 2
-)  # px, of circles of confusion: smaller ones everywhere, and it is sharp
+SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle, and the widest disc: a photo with less is sharp
 # Of the photo's width, standard deviation and radius: from 0 neither has a direction to grow in.
 FIRST_TRAJECTORY, FIRST_RADIUS = 1e-3, 0.0015
 TRAJECTORY_RATE, LENS_RATE, GAIN_RATE = 8e-4, 4e-4, 0.005  # of the photo's width, twice; of the log gains

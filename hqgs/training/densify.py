@@ -18,7 +18,7 @@ from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
-from hqgs.training.constants import SPLIT_CHILDREN, SPLIT_SHRINK
+from hqgs.training.constants import SPLIT_CHILDREN
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Densifier:
             normal = torch.from_numpy(rng.standard_normal(tuple(scales.shape), dtype=np.float32))
             rotation = quats_to_matrices(gaussians.quats[children])
             gaussians.means[children] += (rotation @ (scales * normal)[:, :, None])[:, :, 0]
-            gaussians.scales[children] -= math.log(SPLIT_SHRINK)
+            gaussians.scales[children] -= math.log(0.8 * SPLIT_CHILDREN)
         grown = len(cloned) or len(split)
         return Densification(len(cloned), len(split), 0, refused, parents if grown else None)
 

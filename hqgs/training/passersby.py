@@ -21,7 +21,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.constants import GAINS_DARK
 from hqgs.model.consistency import Agreement
-from hqgs.model.constants import AGREE_SMOOTH, BACKGROUND
+from hqgs.model.constants import AGREE_SMOOTH, AGREEING, BACKGROUND
 from hqgs.model.first_points import points_along_edges
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map, render_view
@@ -37,7 +37,6 @@ from hqgs.training.constants import (
     DEPTHS_ASKED,
     DIFFERS,
     DIFFERS_MUCH,
-    FEWEST_SCOUTED,
     SCOUT_CELL,
     SCOUT_DEGREE,
     SCOUT_PIXELS,
@@ -62,7 +61,7 @@ def without_passersby(scene: Scene, seed: int, on_stage: OnStage = silent) -> tu
     Photos in which nobody does are not named, and stay as they are. Nothing is found in fewer than 3 photos,
     or where the scene does not tell which points they see.
     """
-    if len(scene.train) < FEWEST_SCOUTED or scene.seen is None:
+    if len(scene.train) <= AGREEING or scene.seen is None:
         return scene, {}
     on_stage(Stage("passers-by", 0, 0, "looking for what other photos contradict"))
     views = [shrunk(view, SCOUT_SIDE) for view in scene.train]

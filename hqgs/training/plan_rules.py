@@ -12,6 +12,7 @@ from dataclasses import replace
 from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
+from hqgs.evaluation.constants import SCATTER
 from hqgs.photos.formula import LEARNED, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
@@ -27,7 +28,6 @@ from hqgs.training.constants import (
     MOST_HELD,
     PIXELS,
     SMALLEST_SIDE,
-    TRIAL_GAIN,
 )
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import (
@@ -283,7 +283,7 @@ def growth(draft: Draft) -> Sequence[Choice]:
         told = f"without it {gain} on {tried.photos} photos held back from short runs"
         told += f"; PSNR, SSIM and HaarPSI gain {tried.sure:.1f} times their error"
     dense = draft.undegraded and draft.dense
-    if dense and tried is not None and tried.gain > TRIAL_GAIN and tried.sure > 1:
+    if dense and tried is not None and tried.gain > SCATTER and tried.sure > 1:
         why = "what grows explains each photo alone, and views between photos are worse"
         changes = {f"densify.{name}": value for name, value in no_growth(densify).items()}
         return [Choice("none", why, told, "growth", changes=changes)]

@@ -12,9 +12,6 @@ from hqgs.base.files import PLAN, read_json
 from hqgs.base.typed import build
 from hqgs.training.config import TrainConfig, run_config
 
-SCHEDULE = ("sh_interval", "eval_every", "checkpoint_every")  # fields that follow from the length
-GROWTH = ("start", "stop", "every")  # those of `TrainConfig.densify`
-
 
 @dataclass(frozen=True)
 class Preset:
@@ -70,16 +67,17 @@ def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
     """
     before, after = run_config(iterations=config.iterations), run_config(iterations=iterations)
 
-    def fitted(mine: Any, old: Any, new: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    def fitted(mine: Any, old: Any, new: Any, *names: str) -> dict[str, Any]:
         same = [name for name in names if getattr(mine, name) == getattr(old, name)]
         return {name: getattr(new, name) for name in same}
 
+    growth = fitted(config.densify, before.densify, after.densify, "start", "stop", "every")
     return replace(
         config,
         iterations=iterations,
         leave_out=tuple(item for item in config.leave_out if item != "iterations"),
-        densify=replace(config.densify, **fitted(config.densify, before.densify, after.densify, GROWTH)),
-        **fitted(config, before, after, SCHEDULE),
+        densify=replace(config.densify, **growth),
+        **fitted(config, before, after, "sh_interval", "eval_every", "checkpoint_every"),
     )
 
 

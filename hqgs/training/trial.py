@@ -29,7 +29,6 @@ from hqgs.training.constants import (
     TRIAL_SHARE,
     TRIAL_SIDES,
     TRIAL_STEPS,
-    TRIAL_VIEWS,
 )
 from hqgs.training.plan import RunPlan, Tried
 from hqgs.training.plan_budget import no_growth
@@ -62,7 +61,7 @@ def calls_for_trial(scene: Scene, plan: RunPlan) -> bool:
     pixels leaves too small ones.
     """
     settings, views = plan.settings, scene.train
-    if settings.densify.stop <= settings.densify.start or len(views) < TRIAL_VIEWS or not len(scene.points):
+    if settings.densify.stop <= settings.densify.start or len(views) <= TRIAL_EACH or not len(scene.points):
         return False
     return _side(scene, settings.iterations) >= TRIAL_SIDES[0]
 

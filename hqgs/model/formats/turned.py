@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from hqgs.model.constants import LEAST_SCALE
 from hqgs.model.formats.arrays import Arrays
+from hqgs.scene.constants import ROUNDING
 
-SAME = 1e-9  # of a map's linear part, from a rotation times a number: then rotations are only turned
 Array = NDArray[np.float64]
 
 
@@ -26,7 +26,7 @@ def mapped(arrays: Arrays, linear: Array, shift: Array) -> Arrays:
         raise ValueError(f"a map that is singular: {linear.tolist()}")
     rotation = u @ vt
     quats, logs = arrays["quats"].astype(np.float64), arrays["scales"].astype(np.float64)
-    if np.ptp(stretch) < SAME * stretch[0] and np.linalg.det(rotation) > 0:
+    if np.ptp(stretch) < ROUNDING * stretch[0] and np.linalg.det(rotation) > 0:
         quats, logs = _times(_quat(rotation[None]), quats), logs + np.log(stretch[0])
     else:
         factor = linear @ matrices(quats) * np.exp(logs)[:, None, :]

@@ -79,7 +79,7 @@ RAYLEIGH = math.sqrt(2 * math.log(2))  # median distance of points in a plane th
 HALF = 6  # nodes of a patch to each side of its middle
 WINDOW = 3.5  # nodes, sigma of the weights over a patch
 SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
-PATCH_SIDE = 1000  # px, of these photos
+PATCH_SIDE = 1000  # px, of these photos, and of those in which tags are looked for
 PATCH_STEPS = 5  # of Gauss-Newton
 REACH = 3.0  # px that an observation may move
 SURE, NEW = 0.6, 0.7  # correlation with the others' mean, of what stays; of what no feature told of
@@ -89,7 +89,6 @@ FRONTAL = 0.8  # cosine of the angle between a patch's normal and a new ray, lea
 COARSER = 2.0  # px of a photo in which a point is looked for, in px of the finest that shows it, most
 LAID = 400  # observations of a photo, of the points whose patches are laid
 CELL = 2.0  # px, where points are the same
-STRAY = 3.0  # times the usual error; observations farther off are left out
 ROUGH = 0.02  # of a patch's variance: what no patch fits better than, counted as noise
 GROWN = 1.3  # times: patches that leave the observations so much farther off do not fit these photos
 

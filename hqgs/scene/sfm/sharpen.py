@@ -15,7 +15,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.scene.sfm.constants import ANGLE, CELL, GROWN, LAID, PATCH_SIDE, ROUNDS, STRAY
+from hqgs.scene.constants import OUTLIER
+from hqgs.scene.sfm.constants import ANGLE, CELL, GROWN, LAID, PATCH_SIDE, ROUNDS
 from hqgs.scene.sfm.patches import PatchView, aligned, read_photo, widened
 from hqgs.scene.sfm.tracks import Tracks, errors, read_tracks, rebuilt, usual
 from hqgs.scene.sfm.weighted import weighted
@@ -50,12 +51,12 @@ def sharpened(
         keep = some.kept(sure)
         some, off = weighted(now, names, some.chosen(sure), information[keep], free)
         own = np.array([np.median([0, *off[some.view == k]]) for k in range(len(names))])
-        some = some.chosen(off <= STRAY * np.maximum(own, np.median(off))[some.view])
+        some = some.chosen(off <= OUTLIER * np.maximum(own, np.median(off))[some.view])
     now = rebuilt(now, names, some)
     pycolmap.ObservationManager(now).filter_all_points3D(1e9, ANGLE)
     if usual(now) > GROWN * before:
         return model
-    return _joined(now, names, tracks.chosen((fresh & ~used)[tracks.point]), adjust, STRAY * before)
+    return _joined(now, names, tracks.chosen((fresh & ~used)[tracks.point]), adjust, OUTLIER * before)
 
 
 def _used(tracks: Tracks, photos: int, cell: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.files import write_text
-from hqgs.evaluation.constants import PATCH
+from hqgs.evaluation.constants import PATCH, SHEET_PHOTOS
 from hqgs.evaluation.judge import Judged
 from hqgs.evaluation.judge_words import (
     CAUSES,
@@ -26,7 +26,7 @@ from hqgs.evaluation.judge_words import (
 )
 from hqgs.evaluation.verdict import verdict
 from hqgs.photos.pixels import png, upright
-from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_PAIRS, WORST_SHOWN
+from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_SHOWN
 from hqgs.show.page.page import pair, rendered
 
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
@@ -44,7 +44,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
     psnr = one["mean"]["psnr"]
     word, why = verdict(psnr)
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
-    chosen = [judged[0].names.index(name) for name in order[:WORST_PAIRS]]
+    chosen = [judged[0].names.index(name) for name in order[:SHEET_PHOTOS]]
     return rendered(
         "judge.html.j2",
         title=f"{Path(one['name']).name} on {protocol['photos']} photos",

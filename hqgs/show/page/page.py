@@ -19,6 +19,7 @@ from hqgs.base.evenly import evenly
 from hqgs.base.files import write_text
 from hqgs.base.left_out import CORRECTION, LeftOutRecord
 from hqgs.diagnosis.scene import Diagnosis
+from hqgs.evaluation.constants import MOST_CAMERAS
 from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
 from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMetricValues, alike
@@ -28,7 +29,7 @@ from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.next_photos import next_photos
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
-from hqgs.show.constants import MOST_CAMERAS, PAGE_QUALITY, PAIR_SIDE, PAIRS, SHEET_SIDE
+from hqgs.show.constants import PAGE_QUALITY, PAIR_SIDE, PAIRS, SHEET_SIDE
 from hqgs.show.page.charts import line_chart
 from hqgs.show.page.packing import pack_scene
 from hqgs.show.page.places import places_chart

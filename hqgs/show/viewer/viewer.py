@@ -15,13 +15,14 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.evenly import evenly
+from hqgs.evaluation.constants import MOST_CAMERAS
 from hqgs.model.content import content
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
 from hqgs.scene.paths import UP, camera_path, focus
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import MOST_CAMERAS, PORT, SHARP, THUMB
+from hqgs.show.constants import PORT, SHARP, THUMB
 from hqgs.show.frames import Activated
 from hqgs.show.trust import LazyTrust
 from hqgs.show.viewer.client import Client

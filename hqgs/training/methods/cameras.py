@@ -36,7 +36,6 @@ from hqgs.training.constants import (
     NARROW,
     SATURATED,
     SHORTEST_TRAJECTORY,
-    SMALLEST_RADIUS,
     TRAJECTORY_POINTS,
     TRAJECTORY_RATE,
     WARP_SPACING,
@@ -182,7 +181,7 @@ class LearnedCameras:
             for k, path in enumerate(self._paths):
                 self._still[k] |= _longest(_middle(path)) < SHORTEST_TRAJECTORY
             for k, lens in enumerate(self._lenses):
-                self._sharp[k] |= widest(*lens.tolist()) < SMALLEST_RADIUS
+                self._sharp[k] |= widest(*lens.tolist()) < SHORTEST_TRAJECTORY / 2
             for k in range(len(self._nearness)):
                 if not self._blurs(k):
                     self._nearness[k] = None
