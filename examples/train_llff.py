@@ -3,8 +3,8 @@
     python examples/train_llff.py                 # the scene that is built in, under 2 minutes on 2 cores
     python examples/train_llff.py FOLDER          # a COLMAP, LLFF or nerfstudio folder
 
-The output folder then holds report.json, comparison/*.png (photo | render | difference), error_vs_time.png
-and scene.ply for any 3DGS viewer. A second call begins anew.
+The output folder then holds report.html, report.json, comparison/*.png (photo | render | difference) and
+scene.ply for any 3DGS viewer. A second call begins anew.
 """
 
 import argparse

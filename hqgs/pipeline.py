@@ -102,7 +102,7 @@ def train(
     Args:
         scene: from `hqgs.load`, or made of `hqgs.View` and points.
         out: a folder for checkpoint.safetensors, scene.ply, config.json, report.json, report.html,
-            `comparison/*.png`, error_vs_time.png, cameras.json and `photos/*.jpg`; None: nothing is written.
+            `comparison/*.png`, cameras.json and `photos/*.jpg`; None: nothing is written.
         iterations: training views to see; None: as many as pay (docs/start.md), at most 30,000.
         batch: of them in a step: one after the other in one process, shared out by several.
         seconds: of training, in place of `iterations`: as many as fit in and pay, by the steps of this

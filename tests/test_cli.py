@@ -390,20 +390,17 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert now == f"now look at it: hqgs view {tmp_path}"
     assert call("info", tmp_path) == 0
     assert "3 of 3 iterations" in capsys.readouterr().out
-    assert call("eval", tmp_path) == 0
-    told = capsys.readouterr().out
-    assert "view0.png" in told
-    assert "fitted" not in told
+    assert call("judge", tmp_path) == 0
+    assert "fitted" not in capsys.readouterr().out
     report = json.loads((tmp_path / "report.json").read_text())
     report["learned"] = [{"name": "view1.png", "gains": [1.2, 1.0, 1.0]}]
     (tmp_path / "report.json").write_text(json.dumps(report))
-    assert call("eval", tmp_path) == 0
+    assert call("judge", tmp_path, "--fit-cameras", "--out", tmp_path / "judged") == 0
     aligned = report["metrics"]["mean"]["psnr_aligned"]
-    told = capsys.readouterr().out.splitlines()[-1]
-    assert told.endswith(f"{aligned:.2f} dB PSNR with each photo's brightness and tint set aside")
-    assert call("eval", tmp_path, "--fit-cameras", "--out", tmp_path / "eval.json") == 0
-    assert "cameras moved by" in capsys.readouterr().out
-    numbers = json.loads((tmp_path / "eval.json").read_text())
+    told = capsys.readouterr().out
+    assert f"{aligned:.2f} dB PSNR with each photo's brightness and tint set aside" in told
+    assert "cameras moved by" in told
+    numbers = json.loads((tmp_path / "judged" / "judge.json").read_text())["scene"]
     assert numbers["fitted"]["mean"]["psnr"] >= numbers["mean"]["psnr"]
     assert set(numbers["fitted"]["views"]) == set(numbers["views"])
 

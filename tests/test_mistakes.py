@@ -64,7 +64,6 @@ MISTAKES = {
     "export a.ply --out a.ply": "is the source a.ply itself; what is left out would be lost",
     "export a.ply --out a.obj": "the suffix says no format; wanted .ply, ",
     "export half.ply --out b.ply": "half.ply: not a PLY file",
-    "eval a.ply": "--scene names the photos to measure it with",
     "clean a.ply --out b.ply": "--photos names the photos to measure it with",
     "degrade scene --kind noise:25 --out photos": "photos exists and is not an empty folder",
     "diagnose nowhere": "there is no scene folder {root}/nowhere",

@@ -153,29 +153,6 @@ def test_comparison_shows_photo_render_and_amplified_difference(tmp_path: Path) 
     assert (clamped[-1, -1] == 255).all()  # 4 x 0.4 is cut at white
 
 
-@pytest.mark.parametrize("history", [[], [{"iteration": 1, "seconds": 0.0, "psnr": None, "ssim": 0.5}]])
-def test_chart_is_drawn_from_the_history_there_is(tmp_path: Path, history: list[dict[str, Any]]) -> None:
-    write_report(tmp_path / "full", result_of(view_of("a")))
-    write_report(tmp_path / "short", result_of(view_of("a"), history=history))
-    charts = []
-    for name in ("full", "short"):
-        with Image.open(tmp_path / name / "error_vs_time.png") as file:
-            assert file.format == "PNG"
-            assert min(file.size) >= 600
-            charts.append(np.asarray(file.convert("RGB")))
-    assert (charts[0] < 128).any()
-    assert not np.array_equal(charts[0], charts[1])
-
-
-def test_chart_plots_the_measured_points() -> None:
-    axes = report.error_chart(result_of(scene="$bad \\mathtext", method="x\ny")).axes
-    lines = [a.lines[0].get_xydata() for a in axes]
-    np.testing.assert_array_equal(np.asarray(lines[0]), [[4.0, 18.0], [12.5, 21.0]])
-    np.testing.assert_array_equal(np.asarray(lines[1]), [[4.0, 0.6]])
-    assert [a.get_ylabel() for a in axes] == ["PSNR (dB)", "SSIM"]
-    assert axes[1].get_xlabel() == "training time (s)"
-
-
 def test_hostile_view_names_stay_in_the_folder(tmp_path: Path) -> None:
     names = [
         "../../outside.png",
@@ -199,7 +176,7 @@ def test_hostile_view_names_stay_in_the_folder(tmp_path: Path) -> None:
     files = tree(tmp_path)
     pictures = [f"deep/er/out/{v['picture']}" for v in got["metrics"]["views"]]
     assert len({p.lower() for p in pictures}) == len(names)
-    assert set(files) == {*pictures, "deep/er/out/report.json", "deep/er/out/error_vs_time.png"}
+    assert set(files) == {*pictures, "deep/er/out/report.json"}
     for picture in pictures:
         name = Path(picture).name
         assert name.isascii()
@@ -210,7 +187,7 @@ def test_hostile_view_names_stay_in_the_folder(tmp_path: Path) -> None:
     assert [v["name"] for v in read["metrics"]["views"]] == names
 
 
-@pytest.mark.parametrize("broken", ["comparison_picture", "error_chart", "write_json"])
+@pytest.mark.parametrize("broken", ["comparison_picture", "write_json"])
 def test_failure_midway_leaves_the_old_report_and_no_scraps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
 ) -> None:
@@ -255,7 +232,7 @@ def test_report_json_is_there_only_with_everything_else(
 
     monkeypatch.setattr(Path, "replace", recording)
     write_report(tmp_path, result_of(view_of("a"), view_of("b")))
-    assert moved == ["comparison/a.png", "comparison/b.png", "error_vs_time.png", "report.json"]
+    assert moved == ["comparison/a.png", "comparison/b.png", "report.json"]
 
 
 @pytest.mark.parametrize(
@@ -308,7 +285,6 @@ def test_scene_without_held_out_views_gets_a_report(tmp_path: Path) -> None:
     got = write_report(tmp_path, result_of())
     assert got["metrics"]["mean"] == dict.fromkeys(METRICS)
     assert got["metrics"]["reasons"] == dict.fromkeys(METRICS, "there is no held-out view")
-    assert (tmp_path / "error_vs_time.png").is_file()
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_everything_is_written(tmp_path: Path) -> None:
     assert report["left_out"] == []
     names = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert names == {
-        ".lock", CHECKPOINT, PLY, "config.json", "report.json", "error_vs_time.png", "comparison/view0.png",
+        ".lock", CHECKPOINT, PLY, "config.json", "report.json", "comparison/view0.png",
         "cameras.json", "report.html", *(f"photos/0000{k}.jpg" for k in range(6)),
     }  # fmt: skip
 

@@ -204,10 +204,9 @@ def test_cameras_are_fitted_in_the_frame_of_the_photos(tmp_path: Path) -> None:
     root = write_colmap(truth, tmp_path / "scene", binary=False)
     small = {"means": model.means * 1e-3, "scales": model.scales + np.log(1e-3)}
     replace(model, **small).save(tmp_path / "foreign.ply")
-    out = tmp_path / "eval.json"
-    options = [str(tmp_path / "foreign.ply"), "--scene", str(root), "--fit-cameras", "--out", str(out)]
-    assert main(["eval", *options]) == 0
-    found = json.loads(out.read_text())
+    options = [str(tmp_path / "foreign.ply"), "--photos", str(root), "--fit-cameras", "--out", str(tmp_path)]
+    assert main(["judge", *options]) == 0
+    found = json.loads((tmp_path / "judge.json").read_text())["scene"]
     assert found["fitted"]["mean"]["psnr"] > found["mean"]["psnr"] + 3
 
 

@@ -16,6 +16,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, ready
 from hqgs.evaluation.judge_words import told
+from hqgs.evaluation.verdict import judged_by
 from hqgs.model.formats.files import format_of, scene_file
 from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import is_room
@@ -98,6 +99,9 @@ def run(options: Judge) -> int:
         if known is not None or other is not None:
             found["against"] = known["scene"] if known is not None else judged[1].json()
             found["difference"] = compared(found["scene"], found["against"])
+        report = report_of(options.source)
+        psnr, name = judged_by({**report, "metrics": {"mean": found["scene"]["mean"]}})
+        found["judged_by"] = {"psnr": psnr, "name": name}
         if options.out is not None:
             from hqgs.show.page.judge_page import write_judge_page
 
@@ -142,13 +146,13 @@ def viewers(options: Judge) -> int:
     return 0
 
 
-def check_source(source: Path, photos: str | None, option: str = "--photos") -> Path:
+def check_source(source: Path, photos: str | None) -> Path:
     """The scene file that is meant, before anything that takes seconds. BAD_INPUT errors."""
     file = scene_file(source)
     format_of(file)
     if photos is None and not (source.is_dir() and (source / CONFIG).is_file()):
         raise ValueError(
-            f"{source} is no folder of a run: {option} names the photos to measure it with, in a folder with "
+            f"{source} is no folder of a run: --photos names the photos to measure it with, in a folder with "
             "their cameras (COLMAP, nerfstudio, ...)"
         )
     if photos is not None:
@@ -191,6 +195,12 @@ def read_photos(
     )
 
 
+def report_of(source: Path) -> dict[str, Any]:
+    """Of the run in a folder; empty for a file, or where there is none."""
+    path = source / "report.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
 def background_of(source: Path) -> tuple[float, float, float]:
     """What a run was trained on, or black."""
     from hqgs.model.constants import BACKGROUND
@@ -207,7 +217,6 @@ def judge_file(
     background: tuple[float, float, float],
     screen: LoadingScreen,
     fit: bool = False,
-    look: bool = True,
 ) -> Judged:
     """A scene file, measured; what its reading left out is told."""
     from hqgs.evaluation.judge import judge
@@ -218,4 +227,4 @@ def judge_file(
         screen.say(f"read: {note}")
     parts = [file] if file.name != META else [path for path in file.parent.iterdir() if path.is_file()]
     size, held = sum(path.stat().st_size for path in parts), gaussians.in_world(scene.world)
-    return judge(str(file), size, held, scene, views, background, fit, look, screen.stage)
+    return judge(str(file), size, held, scene, views, background, fit, screen.stage)

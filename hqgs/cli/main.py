@@ -29,8 +29,9 @@ class Command(NamedTuple):
 COMMANDS = {
     "train": Command("hqgs.cli.train", "photos, or a film, to a scene and a report"),
     "sfm": Command("hqgs.cli.sfm", "photos, or a film, to cameras and points (COLMAP)"),
-    "eval": Command("hqgs.cli.evaluate", "measure a trained scene on photos that were held out"),
-    "judge": Command("hqgs.cli.judge", "say how good a scene of any program is, how sure that is, and why"),
+    "judge": Command(
+        "hqgs.cli.judge", "say how good a run, or any scene file, is, how sure that is, and why"
+    ),
     "render": Command("hqgs.cli.render", "pictures and films of a trained scene"),
     "view": Command("hqgs.cli.view", "look at a scene in a browser (train --view: while it trains)"),
     "export": Command("hqgs.cli.export", "write a scene file with what the scene needs alone"),

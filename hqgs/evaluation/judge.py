@@ -1,4 +1,4 @@
-"""A scene measured on photos, as `hqgs judge` and `hqgs eval` do: the numbers, how sure they are, and why."""
+"""A scene measured on photos, as `hqgs judge` does: the numbers, how sure they are, and why."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Judged:
     each: list[ViewMetrics]
     fits: list[Fitted]  # empty where cameras were not fitted
     again: list[ViewMetrics]  # with fitted cameras
-    causes: list[Causes | None]  # of each photo, None: its mask leaves no pixel; empty where not asked for
-    render_seconds: float | None  # of a photo, median, on all threads
+    causes: list[Causes | None]  # of each photo, None: its mask leaves no pixel
+    render_seconds: float  # of a photo, median, on all threads
     worse_than_flat: int  # photos to which one colour, their mean, is nearer than the render
 
     @property
@@ -65,17 +65,16 @@ class Judged:
             "sh_degree": self.sh_degree,
             "antialiased": self.antialiased,
             "worse_than_flat": self.worse_than_flat,
+            "render_seconds": self.render_seconds,
+            "threads": get_num_threads(),
             **numbers(self.names, self.each),
         }
-        if self.render_seconds is not None:
-            known |= {"render_seconds": self.render_seconds, "threads": get_num_threads()}
         if self.fits:
             moved = [{"rotation_deg": fit.rotation_deg, "moved_px": fit.pixels} for fit in self.fits]
             known["fitted"] = numbers(self.names, self.again, moved)
-        if self.causes:
-            known["causes"] = shares([one for one in self.causes if one is not None])
-            for name, one in zip(self.names, self.causes, strict=True):
-                known["views"][name]["causes"] = None if one is None else json_of(one)
+        known["causes"] = shares([one for one in self.causes if one is not None])
+        for name, one in zip(self.names, self.causes, strict=True):
+            known["views"][name]["causes"] = None if one is None else json_of(one)
         return known
 
 
@@ -87,7 +86,6 @@ def judge(
     views: Sequence[View],
     background: Background = BACKGROUND,
     fit: bool = False,
-    look: bool = True,
     on_stage: OnStage = silent,
 ) -> Judged:
     """Measure Gaussians, held in the frame of the scene's cameras, on some of its photos.
@@ -99,7 +97,6 @@ def judge(
         views: the photos to measure on.
         background: behind everything, R, G, B.
         fit: also with each camera fitted to the scene.
-        look: also where the errors are, what they come from, and the time of a render.
 
     Raises:
         ValueError: no Gaussian shows from any of the cameras; or a photo and its mask do not fit.
@@ -127,12 +124,11 @@ def judge(
         replace(scene, test=[one.view for one in fits]), gaussians, background=background
     )
     found, seconds = list[Causes | None](), list[float]()
-    if look:
-        shown = shown_by(gaussians, [view.camera for view in scene.train])
-        for k, view in enumerate(views):
-            seconds.append(_seconds(gaussians, view, background))
-            found.append(_causes(renders, fitted, k, gaussians, view, shown))
-            on_stage(Stage("errors sorted by their causes", k + 1, len(views)))
+    shown = shown_by(gaussians, [view.camera for view in scene.train])
+    for k, view in enumerate(views):
+        seconds.append(_seconds(gaussians, view, background))
+        found.append(_causes(renders, fitted, k, gaussians, view, shown))
+        on_stage(Stage("errors sorted by their causes", k + 1, len(views)))
     return Judged(
         name=name,
         bytes=size,
@@ -144,7 +140,7 @@ def judge(
         fits=fits,
         again=measured(fitted),
         causes=found,
-        render_seconds=median(seconds) if seconds else None,
+        render_seconds=median(seconds),
         worse_than_flat=sum(_flat(view) > (one.psnr or 0.0) for view, one in zip(views, each, strict=True)),
     )
 

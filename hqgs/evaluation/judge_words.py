@@ -48,8 +48,18 @@ def told(found: dict[str, Any]) -> str:
     lines += [*not_measured(one), *wrong_frame(one)]
     lines.append(scene_words(one) + ("" if against is None else f"; against {scene_words(against)}"))
     lines += [f"the error comes from: {cause_words(one['causes'])}", *worst(one)]
-    word, why = verdict(one["mean"]["psnr"])
-    return "\n".join([*lines, f"quality: {word} ({why})"])
+    if "fitted" in one:
+        moved = sorted(view["moved_px"] for view in one["fitted"]["views"].values())
+        lines.append(f"cameras moved by {moved[len(moved) // 2]:.2f} px (median), at most {moved[-1]:.2f} px")
+    return "\n".join([*lines, f"quality: {quality(found)}"])
+
+
+def quality(found: dict[str, Any]) -> str:
+    """The verdict, by the report of the run where there is one."""
+    psnr, name = found["judged_by"]["psnr"], found["judged_by"]["name"]
+    word, why = verdict(psnr)
+    plain = psnr == found["scene"]["mean"]["psnr"]
+    return f"{word} ({why})" + ("" if plain else f"; {psnr:.2f} dB {name}")
 
 
 def table_rows(found: dict[str, Any], shown: Sequence[str]) -> list[list[str]]:
@@ -87,18 +97,6 @@ def wrong_frame(one: dict[str, Any]) -> list[str]:
 def not_measured(one: dict[str, Any]) -> list[str]:
     """Which metrics there are not, and why."""
     return [f"no {LABELS[metric]}: {why}" for metric, why in one["reasons"].items()]
-
-
-def photo_table(title: str, of: dict[str, Any]) -> str:
-    """The metrics of each photo, and at last their means."""
-    shown = [name for name in LABELS if of["mean"][name] is not None]
-    rows = [
-        [name, *("-" if view[metric] is None else format(view[metric], FORMS[metric]) for metric in shown)]
-        for name, view in of["views"].items()
-    ]
-    return markdown_table(
-        title, ["photo", *(LABELS[name] for name in shown)], [*rows, ["mean", *_cells(of, shown)]]
-    )
 
 
 def difference_row(found: dict[str, Any], shown: Sequence[str]) -> list[str]:

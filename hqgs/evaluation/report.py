@@ -1,4 +1,4 @@
-"""The report of a training run: report.json, side-by-side pictures and the error-over-time chart."""
+"""The report of a training run: report.json and side-by-side pictures."""
 
 from __future__ import annotations
 
@@ -10,27 +10,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import cast
 
 import numpy as np
 from PIL import Image
 
-from hqgs.base.files import atomic_path, read_json, write_json
+from hqgs.base.files import read_json, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED, PNG_LEVEL
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
 from hqgs.evaluation.intervals import half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
-from hqgs.evaluation.records import HistoryEntry, MetricsRecord, MetricValues, Report, RunRecord, alike
+from hqgs.evaluation.records import MetricsRecord, MetricValues, Report, RunRecord
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.sheet import printable, sheet
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-REPORT, CHART, PICTURES = "report.json", "error_vs_time.png", "comparison"
+REPORT, PICTURES = "report.json", "comparison"
 
 
 @dataclass(frozen=True)
@@ -53,10 +49,10 @@ def measure(result: RunResult) -> Report:
 def write_report(out_dir: str | Path, result: RunResult) -> Report:
     """Measure the held-out views and write the report into `out_dir`; return what report.json holds.
 
-    Files: `comparison/<view>.png` (photo | render | amplified difference), `error_vs_time.png` and
-    `report.json`, which names the pictures. They are made beside their places and then moved there;
-    report.json is moved last, so where it exists everything else does. A run that fails before the move
-    leaves an older report as it was. Pictures of other view names are not removed.
+    Files: `comparison/<view>.png` (photo | render | amplified difference) and `report.json`, which names
+    them. They are made beside their places and then moved there; report.json is moved last, so where it
+    exists everything else does. A run that fails before the move leaves an older report as it was. Pictures
+    of other view names are not removed.
 
     Raises ValueError as `measure` does, OSError where a file cannot be written.
     """
@@ -86,13 +82,11 @@ def _written(out_dir: Path, result: RunResult) -> Report:
             comparison_picture(view, metrics).save(stage / PICTURES / files[number], compress_level=PNG_LEVEL)
 
         report = _report(result, measured(result.views, draw), files)
-        with atomic_path(stage / CHART) as tmp:
-            error_chart(result).savefig(tmp)
         write_json(stage / REPORT, report)
 
         (out_dir / PICTURES).mkdir(exist_ok=True)
         (out_dir / REPORT).unlink(missing_ok=True)  # from here on the old report has lost its pictures
-        for file in (*(f"{PICTURES}/{file}" for file in files), CHART, REPORT):
+        for file in (*(f"{PICTURES}/{file}" for file in files), REPORT):
             (stage / file).replace(out_dir / file)
     return report
 
@@ -126,52 +120,6 @@ def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
 
     panels = [upright(panel, view.quarter_turns) for panel in panels]
     return sheet([list(zip(captions, panels, strict=True))])
-
-
-def error_chart(result: RunResult) -> Figure:
-    """Held-out PSNR and SSIM against training time, one panel each."""
-    from matplotlib.figure import Figure  # here: only what draws a chart waits for it
-
-    figure = Figure(figsize=(7, 5.2), dpi=150, layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True)
-    run, history = result.record, result.record["history"]
-    some = {entry["views"] for entry in history if "views" in entry}
-    views = f"{max(some)} of {len(result.views)} held-out views" if some else "held-out views"
-    title = f"{run['scene']}, {run['method']}, seed {run['seed']}: {views} while training"
-    top.set_title(printable(title, 90), fontsize=11, loc="left", parse_math=False)
-    _curve(top, history, "psnr", "PSNR (dB)", "{:.2f} dB", "#1f6fb2")
-    _curve(bottom, history, "ssim", "SSIM", "{:.3f}", "#c2571a")
-    bottom.set_xlabel("training time (s)")
-    figure.align_ylabels()
-    return figure
-
-
-def _curve(
-    axes: Axes, history: list[HistoryEntry], key: Literal["psnr", "ssim"], label: str, last: str, color: str
-) -> None:
-    points = [(h["seconds"], value) for h in history if (value := h[key]) is not None]
-    axes.set_ylabel(label)
-    axes.grid(color="#dddddd", linewidth=0.7)
-    axes.spines[["top", "right"]].set_visible(False)
-    if not points:
-        axes.text(0.5, 0.5, "not measured while training", transform=axes.transAxes, ha="center", va="center")
-        axes.set_yticks([])
-        return
-    seconds, values = zip(*points, strict=True)
-    for part in alike(history):
-        line = [(h["seconds"], h[key]) for h in part if h[key] is not None]
-        axes.plot(*zip(*line, strict=True), color=color, marker="o", markersize=3.5, linewidth=1.6)
-    axes.margins(x=0.02, y=0.18)
-    axes.set_xlim(left=0, right=max(seconds) * 1.12 or 1)  # room for the last value's label
-    axes.annotate(
-        last.format(values[-1]),
-        (seconds[-1], values[-1]),
-        xytext=(6, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=9,
-        color=color,
-    )
 
 
 def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | None) -> Report:

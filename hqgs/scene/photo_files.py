@@ -20,17 +20,7 @@ from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.names import FILM_SUFFIXES, KEPT, is_room
 
 MASKS = "masks"
-_FILES = (
-    CHECKPOINT,
-    CONFIG,
-    PAGE,
-    PLAN,
-    PLY,
-    "report.json",
-    "cameras.json",
-    "error_vs_time.png",
-    "learned.png",
-)
+_FILES = (CHECKPOINT, CONFIG, PAGE, PLAN, PLY, "report.json", "cameras.json", "learned.png")
 _FOLDERS = ("photos", "comparison")  # a run writes pictures into them
 _Key = tuple[str, ...]
 

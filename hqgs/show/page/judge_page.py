@@ -20,11 +20,11 @@ from hqgs.evaluation.judge_words import (
     cause_words,
     interval_words,
     not_measured,
+    quality,
     scene_words,
     table_rows,
     wrong_frame,
 )
-from hqgs.evaluation.verdict import verdict
 from hqgs.photos.pixels import png, upright
 from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_SHOWN
 from hqgs.show.page.page import pair, rendered
@@ -41,14 +41,12 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
     """The page as HTML. Names from files are escaped; nothing in it is loaded from elsewhere."""
     one, against, protocol = found["scene"], found.get("against"), found["protocol"]
     shown = [name for name in LABELS if one["mean"][name] is not None]
-    psnr = one["mean"]["psnr"]
-    word, why = verdict(psnr)
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
     chosen = [judged[0].names.index(name) for name in order[:SHEET_PHOTOS]]
     return rendered(
         "judge.html.j2",
         title=f"{Path(one['name']).name} on {protocol['photos']} photos",
-        verdict=f"Quality: {word}. {why[0].upper()}{why[1:]}.",
+        verdict=f"Quality: {quality(found)}.",
         heads=["", *(LABELS[name] for name in shown)],
         rows=table_rows(found, shown),
         sure=interval_words(one),
