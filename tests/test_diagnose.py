@@ -148,18 +148,16 @@ def test_jpeg_quality_and_table(quality: int, tmp_path: Path) -> None:
 
 
 def test_jpeg_table_that_libjpeg_does_not_make(tmp_path: Path) -> None:
-    """Its low steps show in the pixels; the file itself gives the whole table, unless the pixels deny it."""
+    """Its low steps show in the pixels."""
     path = tmp_path / "photo.jpg"
     table = np.add.outer(np.arange(8), np.arange(8)) * 3 + 17
     qtables = [table.ravel().tolist(), table.ravel().tolist()]
     Image.fromarray(clean_photo(1)).save(path, qtables=qtables, subsampling="4:2:0")
     with Image.open(path) as photo:
         pixels = np.asarray(photo)
-    blind, filed = diagnose_photo(pixels).jpeg, diagnose_photo(pixels, path=path).jpeg
-    assert blind.table is not None
-    np.testing.assert_array_equal(np.array(blind.table)[:3, 1:3], table[:3, 1:3])
-    np.testing.assert_array_equal(filed.table, table)
-    assert diagnose_photo(clean_photo(2), path=path).jpeg.quality is None
+    found = diagnose_photo(pixels).jpeg.table
+    assert found is not None
+    np.testing.assert_array_equal(np.array(found)[:3, 1:3], table[:3, 1:3])
 
 
 def test_cropped_jpeg_is_seen_and_left_out() -> None:
@@ -301,8 +299,6 @@ def test_bad_input_is_named() -> None:
         diagnose_photo(photo[::2, ::2], low=photo)
     with pytest.raises(ValueError, match="max_photos is 0"):
         diagnose_scene(degraded_scene("none", photos=1), max_photos=0)
-    with pytest.raises(FileNotFoundError):
-        diagnose_photo(photo, path=Path("missing.jpg"))
 
 
 def blurred_noise(sigma: float, level: float) -> Scene:

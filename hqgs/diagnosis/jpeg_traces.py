@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +18,13 @@ from hqgs.diagnosis.constants import (
     STEPS,
 )
 from hqgs.photos.blocks import block_coefficients
-from hqgs.photos.jpeg import read_table, standard_tables
+from hqgs.photos.jpeg import standard_tables
 from hqgs.photos.pixels import Floats, luma
 
 _ROWS, _COLUMNS = np.mgrid[:6, :6]
 _WAVES = _ROWS + _COLUMNS
 # Rows and columns of the 20 low frequencies. Not the mean: in a flat photo it is the same in all blocks.
 LOW = (_ROWS[(_WAVES > 0) & (_WAVES < 6)], _COLUMNS[(_WAVES > 0) & (_WAVES < 6)])
-Index = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @dataclass(frozen=True)
@@ -42,24 +40,23 @@ class Jpeg:
     table: tuple[tuple[int, ...], ...] | None
 
 
-def find_jpeg(levels: Floats, path: Path | None = None) -> Jpeg:
+def find_jpeg(levels: Floats) -> Jpeg:
     """JPEG traces in a photo [H, W, 3] (levels 0..255) that was not resized after decoding.
 
     In a decoded photo each coefficient of an 8 x 8 block lies near a multiple of its step (Fan & de Queiroz
     2003). A step's comb is scored by its log-likelihood over the smooth density that the coefficients come
-    from, summed over the low frequencies. Candidates are the table of the JPEG file at `path`, libjpeg's 100
-    tables, and the best step of each frequency by itself, which pays for its freedom.
+    from, summed over the low frequencies. Candidates are libjpeg's 100 tables, and the best step of each
+    frequency by itself, which pays for its freedom.
     """
     grey = luma(levels)
     blocking, phase = measure_blocking(grey)
     if min(grey.shape) < 3 * 8:  # too few blocks
         return Jpeg(None, 0.0, blocking, phase, None)
-    filed = read_table(path) if path is not None else None
     in_range = np.all((levels > 0) & (levels < 255), axis=2)
     unproven = []
     for row, column in dict.fromkeys([(0, 0), phase] if blocking > BLOCKING_SEEN else [(0, 0)]):
         coefficients = block_coefficients(grey[row:, column:], COMB_MAX_BLOCKS, in_range[row:, column:])
-        quality, evidence, table = _best_table(coefficients, filed)
+        quality, evidence, table = _best_table(coefficients)
         if quality is not None:
             steps = tuple(tuple(int(step) for step in line) for line in table)
             return Jpeg(quality, evidence, blocking, (row, column), steps)
@@ -83,15 +80,7 @@ def measure_blocking(grey: Floats) -> tuple[float, tuple[int, int]]:
     return min(strengths), (phases[0], phases[1])
 
 
-def nearest_quality(steps: NDArray[np.int64], at: Index) -> int:
-    """The quality 1..100 of libjpeg whose luma steps at (rows, columns) come nearest to `steps`, by ratio."""
-    off = np.abs(np.log(standard_tables()[:, at[0], at[1]] / steps))
-    return int(off.mean(axis=1).argmin()) + 1
-
-
-def _best_table(
-    coefficients: Floats, filed: NDArray[np.int64] | None
-) -> tuple[int | None, float, NDArray[np.int64]]:
+def _best_table(coefficients: Floats) -> tuple[int | None, float, NDArray[np.int64]]:
     """Quality (None: not proven), its evidence and table [8, 8] that best explain coefficients [n, 8, 8]."""
     scores, count = _comb_scores(coefficients)
     tables = standard_tables()
@@ -102,12 +91,12 @@ def _best_table(
     if told.any():
         at = (LOW[0][told], LOW[1][told])
         steps = scores[told].argmax(axis=1) + 1
-        quality = nearest_quality(steps, at)
+        quality = (
+            int(np.abs(np.log(tables[:, at[0], at[1]] / steps)).mean(1).argmin()) + 1
+        )  # nearest by ratio
         free = tables[quality - 1].copy()
         free[at] = steps
         candidates.append((quality, free, _total(scores, free[None])[0] - len(steps) * np.log(STEPS)))
-    if filed is not None:
-        candidates.insert(0, (nearest_quality(filed[LOW], LOW), filed, _total(scores, filed[None])[0]))
     quality, table, total = max(candidates, key=lambda candidate: candidate[2])  # the first of equals
     evidence = float(total / max(count, 1))
     many = count >= MIN_COEFFICIENTS and (scores != 0).any(axis=1).sum() >= MIN_FREQUENCIES

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,21 +77,19 @@ class Inspected:
         return found if found is not None and self.diagnosis.hiding else ROUNDING_ONLY
 
 
-def diagnose_photo(image: Photo, low: Photo | None = None, path: Path | None = None) -> PhotoDiagnosis:
+def diagnose_photo(image: Photo, low: Photo | None = None) -> PhotoDiagnosis:
     """What degraded a photo [H, W, 3]: enlargement, then of the small photo JPEG, noise and blur.
 
-    `low` is the small photo [h, w, 3] where it is at hand; `path` the photo's file, whose quantisation table
-    is taken if it is a JPEG and the pixels bear it out. ValueError for another shape or type, values that are
-    not finite, or a `low` larger than the photo; FileNotFoundError for a missing file.
+    `low` is the small photo [h, w, 3] where it is at hand. ValueError for another shape or type, values that
+    are not finite, or a `low` larger than the photo.
     """
-    return conclude([inspect_photo("photo", image, low, path)])[0]
+    return conclude([inspect_photo("photo", image, low)])[0]
 
 
 def inspect_photo(
     name: str,
     image: Photo,
     low: Photo | None = None,
-    path: Path | None = None,
     enlargement: Enlargement | None = None,
     film: float | None = None,
 ) -> Inspected:
@@ -112,7 +109,7 @@ def inspect_photo(
         if enlargement.factor > 1:
             levels = undo_enlargement(levels, enlargement.height, enlargement.width)
     levels = _middle(levels)
-    jpeg = find_jpeg(levels, path)
+    jpeg = find_jpeg(levels)
     limit = _least_blur(LEAST_BLUR, enlargement) * width / enlargement.width
     found = PhotoDiagnosis(name, height, width, enlargement, jpeg, None, 0.0, None, limit)
     film = film_detail(levels) if film is None else film

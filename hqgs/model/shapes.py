@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs.model.constants import NEAREST_OF_DISCS, THINNEST
+from hqgs.model.formats.turned import quaternions
 from hqgs.model.gaussians import Gaussians
 
 
@@ -33,7 +33,7 @@ def as_discs(gaussians: Gaussians) -> Gaussians:
     longest = np.maximum(squares[:, :1], np.finfo(float).tiny)
     shape = np.maximum(np.sqrt(np.maximum(squares, 0.0) / longest), THINNEST)
     shape /= np.sqrt(shape[:, :1] * shape[:, 1:2])
-    quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)  # w first
+    quats = quaternions(axes)
     return replace(
         gaussians,
         scales=gaussians.scales + torch.from_numpy(np.log(shape)).float(),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,31 +30,17 @@ def decode_jpeg(data: bytes) -> Float32:
         return as_floats(np.asarray(photo.convert("RGB")))
 
 
-def read_table(path: Path) -> NDArray[np.int64] | None:
-    """The luma quantisation table [8, 8] of a JPEG file; None for a file of another format."""
-    with Image.open(path) as photo:
-        tables = getattr(photo, "quantization", None)
-        return np.array(tables[0], np.int64).reshape(8, 8) if tables else None
-
-
-@lru_cache(maxsize=1)
-def standard_tables() -> NDArray[np.int64]:
-    """libjpeg's luma tables for qualities 1..100, [100, 8, 8], as the codec itself writes them."""
-    tables = []
-    for quality in range(1, 101):
-        file = io.BytesIO()
-        Image.new("L", (8, 8)).save(file, "JPEG", quality=quality)
-        file.seek(0)
-        with Image.open(file) as photo:
-            tables.append(np.array(photo.quantization[0]).reshape(8, 8))  # type: ignore[attr-defined]
-    return np.stack(tables).astype(np.int64)
-
-
 @lru_cache
 def tables_of_quality(quality: int) -> Tables:
-    """The steps that libjpeg uses at this quality, 1..95: taken from a file that it writes."""
+    """The steps that libjpeg uses at this quality, 1..100: taken from a file that it writes."""
     file = io.BytesIO()
     Image.new("RGB", (16, 16)).save(file, "JPEG", quality=quality)
     with Image.open(file) as photo:
         tables: dict[int, list[int]] = photo.quantization  # pyright: ignore[reportAttributeAccessIssue]
     return tuple(tables[0]), tuple(tables[1])
+
+
+@lru_cache(maxsize=1)
+def standard_tables() -> NDArray[np.int64]:
+    """libjpeg's luma tables for qualities 1..100, [100, 8, 8]."""
+    return np.array([tables_of_quality(quality)[0] for quality in range(1, 101)]).reshape(-1, 8, 8)

@@ -21,6 +21,7 @@ from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import BACKGROUND
 from hqgs.model.formats.rows import curve_order
+from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
 from hqgs.photos.files import PHOTO_SUFFIXES
@@ -133,7 +134,7 @@ def frames(
             raise ValueError("show is 'trust', which needs what the photos say of the Gaussians")
         yield from (trust_picture(trust.bound(camera)) for camera in cameras)
     elif show == "alpha":
-        yield from (_grey(prepared.depth(camera)[1]) for camera in cameras)
+        yield from (grey(prepared.depth(camera)[1]) for camera in cameras)
     else:
         places = evenly(len(cameras), DEPTH_SAMPLES)
         low_high = depth_range([prepared.depth(cameras[k]) for k in places])
@@ -198,15 +199,11 @@ class Activated:
     @torch.no_grad()
     def thickness(self, at: NDArray[np.float64], ahead: NDArray[np.float64]) -> float:
         """Standard deviation along a direction, unit [3], of the Gaussians around a point [3]: the median."""
-        from scipy.spatial.transform import Rotation  # here: only clicks need it
-
         means, quats, scales, _ = self._tensors
         apart = (means - torch.from_numpy(at).to(means)).square().sum(1)
         rows = apart.topk(min(THICKNESS_OF, len(means)), largest=False).indices
-        turns = Rotation.from_quat(np.roll(quats[rows].double().numpy(), -1, axis=1))
-        return float(
-            np.median(np.linalg.norm(turns.apply(ahead, inverse=True) * scales[rows].numpy(), axis=1))
-        )
+        own = ahead @ matrices(quats[rows].double().numpy())  # along the Gaussians' axes
+        return float(np.median(np.linalg.norm(own * scales[rows].numpy(), axis=1)))
 
 
 def depth_range(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> tuple[float, float]:
@@ -241,7 +238,7 @@ def _colored(share: NDArray[np.floating], light: NDArray[np.float32] | float) ->
     return np.rint(255 * table[np.rint(share.clip(0, 1) * 255).astype(np.intp)] * light).astype(np.uint8)
 
 
-def _grey(alpha: NDArray[np.float32]) -> Picture:
+def grey(alpha: NDArray[np.float32]) -> Picture:
     level = np.rint(255 * alpha.clip(0, 1)).astype(np.uint8)
     return np.repeat(level[..., None], 3, axis=2)
 

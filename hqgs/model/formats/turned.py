@@ -27,12 +27,12 @@ def mapped(arrays: Arrays, linear: Array, shift: Array) -> Arrays:
     rotation = u @ vt
     quats, logs = arrays["quats"].astype(np.float64), arrays["scales"].astype(np.float64)
     if np.ptp(stretch) < ROUNDING * stretch[0] and np.linalg.det(rotation) > 0:
-        quats, logs = _times(_quat(rotation[None]), quats), logs + np.log(stretch[0])
+        quats, logs = _times(quaternions(rotation[None]), quats), logs + np.log(stretch[0])
     else:
         factor = linear @ matrices(quats) * np.exp(logs)[:, None, :]
         axes, lengths, _ = np.linalg.svd(factor)
         axes[..., 0] *= np.sign(np.linalg.det(axes))[:, None]
-        quats, logs = _quat(axes), np.log(np.maximum(lengths, LEAST_SCALE))
+        quats, logs = quaternions(axes), np.log(np.maximum(lengths, LEAST_SCALE))
     return {
         **arrays,
         "means": means,
@@ -96,7 +96,7 @@ def matrices(quats: Array) -> Array:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def _quat(matrices: Array) -> Array:
+def quaternions(matrices: Array) -> Array:
     """w x y z of rotations [N, 3, 3]."""
     from scipy.spatial.transform import Rotation  # here: only maps need scipy
 

@@ -14,7 +14,7 @@ from hqgs.model.formats.turned import matrices
 from hqgs.scene.paths import view_matrix
 from hqgs.scene.scene import Camera
 from hqgs.show.constants import MOVED, STREAMED_SIDE
-from hqgs.show.frames import Activated, depth_picture, depth_range, trust_picture
+from hqgs.show.frames import Activated, depth_picture, depth_range, grey, trust_picture
 from hqgs.show.trust import LazyTrust
 
 Picture = NDArray[np.uint8]
@@ -59,7 +59,7 @@ def shown(scene: Activated, camera: Camera, show: str, trust: LazyTrust) -> Pict
     depth, alpha = scene.depth(camera)
     if show == "depth":
         return depth_picture(depth, alpha, depth_range([(depth, alpha)]))
-    return np.repeat(np.rint(255 * alpha.clip(0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+    return grey(alpha)
 
 
 def same_view(camera: Camera, photo: Camera, reach: float) -> bool:

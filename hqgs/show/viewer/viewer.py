@@ -17,6 +17,7 @@ from PIL import Image
 from hqgs.base.evenly import evenly
 from hqgs.evaluation.constants import MOST_CAMERAS
 from hqgs.model.content import content
+from hqgs.model.formats.turned import quaternions
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
 from hqgs.scene.camera_files import KnownCamera, RunCameras, save_path
@@ -237,7 +238,7 @@ class Viewer:
                 thickness_units="screen",
                 color=(220, 120, 40) if view.held_out else (60, 140, 220),
                 image=image,
-                wxyz=_quaternion(camera.viewmat[:3, :3].T),
+                wxyz=quaternions(camera.viewmat[None, :3, :3].swapaxes(1, 2))[0],
                 position=camera.center,
                 visible=False,
             )
@@ -338,10 +339,3 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
     """Markdown; names of files may hold what its tables mean otherwise."""
     lines = (f"| {name} | {value} |".replace("\n", " ") for name, value in rows)
     return "\n".join(["| | |", "|---|---|", *lines])
-
-
-def _quaternion(R: Any) -> Any:
-    """w x y z of a rotation [3, 3]."""
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(R).as_quat(), 1)
