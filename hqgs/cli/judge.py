@@ -74,6 +74,7 @@ def run(options: Judge) -> int:
         source, other, known = check_source(options.source, options.photos), None, None
         from hqgs.evaluation.judge import compared
         from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
+        from hqgs.evaluation.report import report_in
 
         if (
             options.against is not None
@@ -99,7 +100,7 @@ def run(options: Judge) -> int:
         if known is not None or other is not None:
             found["against"] = known["scene"] if known is not None else judged[1].json()
             found["difference"] = compared(found["scene"], found["against"])
-        report = report_of(options.source)
+        report = report_in(options.source) or {}
         psnr, name = judged_by({**report, "metrics": {"mean": found["scene"]["mean"]}})
         found["judged_by"] = {"psnr": psnr, "name": name}
         if options.out is not None:
@@ -193,12 +194,6 @@ def read_photos(
         cache=run,
         on_stage=screen.stage,
     )
-
-
-def report_of(source: Path) -> dict[str, Any]:
-    """Of the run in a folder; empty for a file, or where there is none."""
-    path = source / "report.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def background_of(source: Path) -> tuple[float, float, float]:

@@ -18,7 +18,6 @@ from hqgs.model.formats.files import scene_file
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
     from hqgs.photos.look import Look
-    from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Camera
     from hqgs.show.trust import Trust
     from hqgs.show.trust_measured import Predicted
@@ -113,7 +112,7 @@ def run(options: Render) -> int:
 def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
     from hqgs.model.orbit import orbit
-    from hqgs.scene.camera_files import load_path, moved
+    from hqgs.scene.camera_files import load_path, moved, picked
     from hqgs.scene.paths import UP, camera_path
     from hqgs.show.constants import FPS
 
@@ -123,8 +122,9 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     if views is not None:
         if known is None:
             raise ValueError(f"{source} has no cameras.json, which says what its views are; use --path orbit")
-        chosen = _chosen(known, views)
-        return [_file_name(k, name) for k, (name, _) in enumerate(chosen)], [c for _, c in chosen], FPS
+        held = {kind: [view for view in known.views if view.held_out == kind] for kind in (False, True)}
+        chosen = picked(held[False], held[True], views, "the run")
+        return [_file_name(k, v.name) for k, v in enumerate(chosen)], [v.camera for v in chosen], FPS
     if path not in PATHS:
         if frames is not None:
             raise ValueError("--frames is for paths that are made here; a path file has its own")
@@ -180,24 +180,6 @@ def _predicted(
     if len(set(kept)) < 2 or len(kept) < len(known.views):
         return None
     return predict_psnr(trust_of(gaussians, known) if trust is None else trust, cameras, known.train)
-
-
-def _chosen(known: RunCameras, views: str) -> list[tuple[str, Camera]]:
-    kinds = {"train": (False,), "test": (True,), "all": (False, True)}
-    if views in kinds:
-        found = [(v.name, v.camera) for v in known.views if v.held_out in kinds[views]]
-        if not found:
-            raise ValueError(f"--views {views}: the run has no such view")
-        return found
-    by_name = {v.name: v.camera for v in known.views}
-    by_name |= {Path(v.name).stem: v.camera for v in known.views if Path(v.name).stem not in by_name}
-    missing = [name for name in views.split(",") if name not in by_name]
-    if missing:
-        some = ", ".join(v.name for v in known.views[:3])
-        raise ValueError(
-            f"--views: the run has no view {missing[0]!r}; there are: train, test, all, {some}, ..."
-        )
-    return [(name, by_name[name]) for name in views.split(",")]
 
 
 def _file_name(number: int, view: str) -> str:

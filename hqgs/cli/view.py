@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import tell_read
+from hqgs.cli.scenes import cameras_beside, tell_read
 from hqgs.model.formats.files import scene_file
 from hqgs.show.constants import PORT
 from hqgs.show.viewer.guard import ELSEWHERE, check
@@ -49,15 +49,14 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         file = scene_file(options.source)
         check(options.port)
         from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
+        from hqgs.evaluation.report import report_in
         from hqgs.model.gaussians import Gaussians
-        from hqgs.scene.camera_files import CAMERAS, load_cameras
         from hqgs.show.viewer.viewer import Viewer
 
         gaussians = Gaussians.load(file)
         folder = file.parent
-        known = load_cameras(folder) if (folder / CAMERAS).is_file() else None
-        report = _report(folder)
-        viewer = Viewer(known, folder, port=options.port, title=folder.resolve().name)
+        report = report_in(folder)
+        viewer = Viewer(cameras_beside(file), folder, port=options.port, title=folder.resolve().name)
     except BAD_INPUT as error:
         return fail(2, error)
     try:
@@ -87,11 +86,9 @@ class LiveView:
 
         ValueError without viser, the extra `view`.
         """
-        from hqgs.scene.camera_files import CAMERAS, load_cameras
         from hqgs.show.viewer.viewer import Viewer
 
-        known = load_cameras(self._out) if (self._out / CAMERAS).is_file() else None
-        viewer = Viewer(known, self._out, port=self._port, title=self._scene.name)
+        viewer = Viewer(cameras_beside(self._out), self._out, port=self._port, title=self._scene.name)
         _tell(viewer.url, self._open)
         return viewer
 
@@ -114,8 +111,9 @@ class LiveView:
     def stay(self) -> None:
         """Go on showing the trained scene, and what the report says of its photos, until Ctrl-C."""
         from hqgs.evaluation.photo_facts import facts_of_photos
+        from hqgs.evaluation.report import report_in
 
-        if (report := _report(self._out)) is not None:
+        if (report := report_in(self._out)) is not None:
             self.viewer.set_facts(facts_of_photos(report))
         _tell(self.viewer.url, open_browser=False)
         try:
@@ -144,13 +142,6 @@ def elsewhere() -> bool:
     marks = ("SSH_CONNECTION", "SSH_TTY", "VSCODE_IPC_HOOK_CLI", "REMOTE_CONTAINERS", "CODESPACES")
     marks += ("JUPYTERHUB_USER", "COLAB_RELEASE_TAG", "KUBERNETES_SERVICE_HOST")
     return any(os.environ.get(mark) for mark in marks) or Path("/.dockerenv").exists()
-
-
-def _report(folder: Path) -> Any:
-    """report.json of a folder; None where there is none. ValueError where it is damaged."""
-    from hqgs.evaluation.report import REPORT, read_report
-
-    return read_report(folder / REPORT) if (folder / REPORT).is_file() else None
 
 
 def _numbers(report: Any, gaussians: int) -> list[tuple[str, str]]:

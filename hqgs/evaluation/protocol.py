@@ -12,6 +12,7 @@ import numpy as np
 
 from hqgs._rust import EPS2D
 from hqgs.evaluation.constants import CONFIDENCE
+from hqgs.scene.camera_files import picked
 from hqgs.scene.scene import Scene, View
 
 HELD_OUT, TRAINED, ALL = "test", "train", "all"
@@ -68,26 +69,12 @@ def told_which(scene: Scene, which: str) -> str:
 
 
 def chosen_views(scene: Scene, which: str) -> list[View]:
-    """The scene's views that `which` means: test, train, all, or names of photos with commas.
-
-    ValueError where there is none, or none of a name.
-    """
-    kinds = {HELD_OUT: scene.test, TRAINED: scene.train, ALL: [*scene.train, *scene.test]}
-    if which in kinds:
-        if not kinds[which]:
-            raise ValueError(
-                f"{scene.name} has no held-out photo to measure with; --views all measures on all of them"
-            )
-        return sorted(kinds[which], key=lambda view: view.name) if which == ALL else kinds[which]
-    named = {view.name: view for view in kinds[ALL]}
-    named |= {Path(name).stem: view for name, view in named.items() if Path(name).stem not in named}
-    missing = [name for name in which.split(",") if name not in named]
-    if missing:
-        some = ", ".join(view.name for view in kinds[ALL][:3])
+    """The scene's views that `which` means, as `picked`; ValueError where there is none."""
+    if which == HELD_OUT and not scene.test:
         raise ValueError(
-            f"--views: {scene.name} has no photo {missing[0]!r}; there are: test, train, all, {some}, ..."
+            f"{scene.name} has no held-out photo to measure with; --views all measures on all of them"
         )
-    return [named[name] for name in which.split(",")]
+    return picked(scene.train, scene.test, which, scene.name)
 
 
 def digest_of(views: Sequence[View]) -> str:

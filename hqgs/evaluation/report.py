@@ -103,6 +103,11 @@ def read_report(path: str | Path) -> Report:
     return cast(Report, report)
 
 
+def report_in(folder: Path) -> Report | None:
+    """Of the run in a folder; None where there is none. ValueError where it is damaged."""
+    return read_report(folder / REPORT) if (folder / REPORT).is_file() else None
+
+
 def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:
     """Photo, render and absolute difference (times 4, cut at white) side by side, a caption above each.
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,6 +106,32 @@ def load_cameras(folder: str | Path) -> RunCameras:
     if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
         raise ValueError(f"{path}: up is no direction: {value['up']!r:.60}")
     return RunCameras(up / np.linalg.norm(up), views)
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+N = TypeVar("N", bound=_Named)
+
+
+def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> list[N]:
+    """Those that `which` means: train, test, all, or names with commas, with suffix or without.
+
+    ValueError, which says `whose` they are, where there is none.
+    """
+    kinds = {"train": train, "test": test, "all": sorted([*train, *test], key=lambda one: one.name)}
+    if which in kinds:
+        if not kinds[which]:
+            raise ValueError(f"--views {which}: {whose} has none of them")
+        return [*kinds[which]]
+    named = {one.name: one for one in kinds["all"]}
+    named |= {Path(name).stem: one for name, one in named.items() if Path(name).stem not in named}
+    if missing := [name for name in which.split(",") if name not in named]:
+        known = ", ".join(["train", "test", "all", *[*named][:3]])
+        raise ValueError(f"--views: {whose} has no photo {missing[0]!r}; there are: {known}, ...")
+    return [named[name] for name in which.split(",")]
 
 
 def first_camera(folder: Path) -> Camera | None:
