@@ -108,12 +108,12 @@ def load_cameras(folder: str | Path) -> RunCameras:
     return RunCameras(up / np.linalg.norm(up), views)
 
 
-class _Named(Protocol):
+class _HasName(Protocol):
     @property
     def name(self) -> str: ...
 
 
-N = TypeVar("N", bound=_Named)
+N = TypeVar("N", bound=_HasName)
 
 
 def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> list[N]:
