@@ -81,7 +81,6 @@ FOCUS_LEAST = 0.25  # added to the sum of squares of a photo's nearness: few poi
 GAINS_WINDOW = 5  # px around a point, whose mean is its colour there
 # of white in linear light: beyond them noise and the sensor's white tell nothing
 GAINS_DARK, BRIGHT = 0.02, 0.9
-GAINS_FEWEST = 20  # points that a photo must share with others
 MOST_VALUES = 8_000_000  # photos times points that are looked at: 200 MB a table
 GAINS_LENGTHS = (0.1, 0.2, 0.4, 0.8, 1.6)  # over which gains may go together, see `_apart`
 SHARES = (0.25, 0.5, 0.75, 0.9, 0.97, 0.99)  # of their variance that does
@@ -90,7 +89,6 @@ OPPONENTS = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [
 
 # jpeg_traces.py: traces of JPEG: the blocks, and the quantisation table that the coefficients still show
 COMB_MAX_BLOCKS = 200  # looked at; they are spread over the photo
-MIN_COEFFICIENTS = 40  # fewer that are not zero prove nothing
 MIN_FREQUENCIES = 4  # in which coefficients must show: few repeat in a drawing
 COMB_MIN_EVIDENCE = 0.5  # nats per coefficient; photos that were never JPEG have -0.25, quality 90 has 0.8
 SPREAD = 0.4  # levels: standard deviation of a decoded coefficient, as pixels were rounded twice

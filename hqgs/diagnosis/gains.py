@@ -16,7 +16,6 @@ from hqgs.diagnosis.constants import (
     BRIGHT,
     GAINS_DARK,
     GAINS_DOUBT,
-    GAINS_FEWEST,
     GAINS_LENGTHS,
     GAINS_WINDOW,
     MOST_VALUES,
@@ -28,6 +27,7 @@ from hqgs.photos.light import to_linear
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import most_shown, project
 from hqgs.scene.scene import Scene, View
+from hqgs.scene.sfm.constants import JOINT
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class SharedColors:
 
 def shared_colors(scene: Scene) -> SharedColors | None:
     """None where the scene does not tell which photos show which points, or a photo shares fewer than
-    GAINS_FEWEST with others (dark and saturated ones do not count)."""
+    JOINT with others (dark and saturated ones do not count)."""
     if scene.seen is None or len(scene.train) < 3:
         return None
     chosen = _chosen_points(scene, scene.seen)
@@ -55,7 +55,7 @@ def shared_colors(scene: Scene) -> SharedColors | None:
             _note_colors(view, points, rows, colors[k], squares[k])
     told = np.isfinite(colors).all(2)
     told &= told.sum(0) >= 2
-    if told.sum(1).min() < GAINS_FEWEST:
+    if told.sum(1).min() < JOINT:
         return None
     with np.errstate(invalid="ignore"):
         logs = np.log(np.where(told[..., None], colors, np.nan))

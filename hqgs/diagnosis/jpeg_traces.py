@@ -11,13 +11,13 @@ from hqgs.diagnosis.constants import (
     BLOCKING_SEEN,
     COMB_MAX_BLOCKS,
     COMB_MIN_EVIDENCE,
-    MIN_COEFFICIENTS,
     MIN_FREQUENCIES,
     OUTLIERS,
     SPREAD,
     STEPS,
 )
 from hqgs.photos.blocks import block_coefficients
+from hqgs.photos.constants import ENOUGH_BLOCKS
 from hqgs.photos.jpeg import standard_tables
 from hqgs.photos.pixels import Floats, luma
 
@@ -99,7 +99,7 @@ def _best_table(coefficients: Floats) -> tuple[int | None, float, NDArray[np.int
         candidates.append((quality, free, _total(scores, free[None])[0] - len(steps) * np.log(STEPS)))
     quality, table, total = max(candidates, key=lambda candidate: candidate[2])  # the first of equals
     evidence = float(total / max(count, 1))
-    many = count >= MIN_COEFFICIENTS and (scores != 0).any(axis=1).sum() >= MIN_FREQUENCIES
+    many = count >= ENOUGH_BLOCKS and (scores != 0).any(axis=1).sum() >= MIN_FREQUENCIES
     proven = many and evidence >= COMB_MIN_EVIDENCE
     return (quality if proven else None), evidence, table
 

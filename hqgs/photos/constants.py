@@ -6,7 +6,9 @@ Those of a phone and of shaken hands are typical values, chosen by hand; no one 
 from __future__ import annotations
 
 # blocks.py: the 8 x 8 blocks in which JPEG and films store pictures
-ENOUGH_BLOCKS = 40  # with fewer no estimate is made; fewer without clipped pixels, and all blocks are taken
+# Of blocks, or coefficients that are not zero: with fewer no estimate is made; fewer without clipped pixels,
+# and all blocks are taken.
+ENOUGH_BLOCKS = 40
 MAX_BLOCKS = 4_000  # whose details are looked at
 
 # camera.py: what a camera chooses anew for each photo: exposure and white balance

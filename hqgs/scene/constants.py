@@ -74,7 +74,6 @@ ROUNDING = 1e-9  # residuals and shares below it are none
 
 # GPS: what is asked of it before it tells a scale.
 GPS_LEAST = 4  # photos with a place
-GPS_ROBUST_FROM = 12  # photos; of fewer every one counts
 
 # Printed tags.
 TAG_FITS = 2.0  # px: what the corners of a tag may be off a square, median; more, and two tags look the same

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import GPS_LEAST, GPS_ROBUST_FROM, OUTLIER
+from hqgs.scene.constants import GPS_LEAST, OUTLIER
 from hqgs.scene.similarity import robust, similarity
 
 _A, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: semi-major axis, m, and squared eccentricity
@@ -75,7 +75,7 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
         return None
     start = np.median(gps, axis=0)
     target = _enu(gps, start)
-    if len(target) < GPS_ROBUST_FROM:
+    if len(target) < 3 * GPS_LEAST:  # so few that every one counts
         found = similarity(centers, target), np.ones(len(target), bool)
     else:
         found = robust(

@@ -27,7 +27,6 @@ FEW_FEATURES = 150  # a photo with fewer is blurred, or shows nothing that can b
 POOR = 0.25  # of the features of the others: the same
 ENOUGH_INLIERS = 30  # a pair with so many matches that one geometry bears out shows the same thing
 BORNE_OUT = 0.85  # of matches between panoramas: 0.91 and 0.93 at right places, 0.68 and 0.79 at wrong ones
-DOUBT_POINTS = 20  # that a photo should show; fewer tell nothing
 MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them by so many px on average
 PROBED = 8  # photos that tell of all what files do not: how rich they are, whether they are panoramas
 LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
@@ -65,7 +64,9 @@ GATES = ((15, 0.15), (12, 0.1))  # matches with points that agree on a place, an
 ALWAYS_CHECKED = 16  # photos, whose places are always checked
 SEARCHED = 60  # points of each photo that the others are searched for, those that most photos see
 DEVIATIONS, TIMES = 3.0, 1.5  # by which more must agree at the place than beside it; the same, as a ratio
-JOINT = 20  # points that a part shares with the rest: wrong ones 12 and 15, right ones 36 and more
+# Points that a photo must show, or share with others, to be told by them; parts share 12 and 15 with the rest
+# where they are wrong, 36 and more where right.
+JOINT = 20
 
 # What is left out, and adjusted.
 ROUNDS = 3  # of patches, or of leaving out what lies far off, and adjustment
@@ -105,7 +106,6 @@ SETTLED, TINY = (
 # Frames laid onto each other.
 HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more
 
-# Points for known poses: photos, of fewer each is matched with each; cosine of the angle between the
-# directions in which two of more must look, at least; points and px of the photos, below which there is no
+# Points for known poses: cosine of the angle between the directions in which two of more must look, at least; points and px of the photos, below which there is no
 # basis; s for a COLMAP that hangs.
-ALL_PAIRS, ALIKE, POINTS_WANTED, TOO_SMALL, TRIANGULATION = 60, 0.5, 200, 100, 1800.0
+ALIKE, POINTS_WANTED, TOO_SMALL, TRIANGULATION = 0.5, 200, 100, 1800.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from hqgs.base.text import some
 from hqgs.scene.sfm.agree import confirmed
-from hqgs.scene.sfm.constants import BORNE_OUT, DOUBT_POINTS, ENOUGH_INLIERS, FEW_FEATURES, MATCHES, POOR
+from hqgs.scene.sfm.constants import BORNE_OUT, ENOUGH_INLIERS, FEW_FEATURES, JOINT, MATCHES, POOR
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def doubtful(one: Pass) -> list[str]:
     return sorted(
         name
         for name, (looked, *found) in one.agree.items()
-        if looked >= DOUBT_POINTS and not confirmed(looked, *found)
+        if looked >= JOINT and not confirmed(looked, *found)
     )
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.scene import View
-from hqgs.scene.sfm.constants import ALIKE, ALL_PAIRS, PARTNERS, POINTS_WANTED, TRIANGULATION
+from hqgs.scene.sfm.constants import ALIKE, MATCHED_ALL, PARTNERS, POINTS_WANTED, TRIANGULATION
 from hqgs.scene.sfm.run import PROGRAM, surroundings
 
 
@@ -56,7 +56,7 @@ def triangulated(views: Sequence[View], time_limit: float = TRIANGULATION) -> Sp
             "Ks": np.stack([camera.K for camera in cameras]),
             "viewmats": np.stack([camera.viewmat for camera in cameras]),
         }
-        if len(views) > ALL_PAIRS:
+        if len(views) > MATCHED_ALL:
             given["pairs"] = pairs_of(views)
         np.savez(directory / "input.npz", allow_pickle=False, **given)
         try:
