@@ -98,14 +98,12 @@ ADJUST_STEPS, LEVENBERG = 10, 1e-6  # at most; damping, of the diagonal
 ROBUST = 2.0  # medians of the errors, scale of Cauchy's function
 ALONG = 0.1  # of the usual precision; an observation that is less precise some way follows its point there
 NUDGE = 1e-6  # of a depth or parameter, by which slopes are taken
-SETTLED, TINY = (
-    1e-5,
-    1e-12,
-)  # of the cost: a step that gains less is the last; of the diagonal: what stays free
+# Of the cost: a step that gains less is the last; of the diagonal: what stays free.
+SETTLED, TINY = 1e-5, 1e-12
 
 # Frames laid onto each other.
 HUBER, FARTHEST = 1.0, 1e3  # px from where on a distance counts linearly, and no more
 
-# Points for known poses: cosine of the angle between the directions in which two of more must look, at least; points and px of the photos, below which there is no
-# basis; s for a COLMAP that hangs.
+# Points for known poses: cosine of the angle between the directions in which two of more must look, at least;
+# points and px of the photos, below which there is no basis; s for a COLMAP that hangs.
 ALIKE, POINTS_WANTED, TOO_SMALL, TRIANGULATION = 0.5, 200, 100, 1800.0
