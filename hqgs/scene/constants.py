@@ -49,10 +49,8 @@ EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 RANDOM_POINTS = 20_000  # to start from where a scene has none
 
 # Camera paths.
-PATH_SIZE, PATH_FOV = (
-    (504, 378),
-    60.0,
-)  # px (of photos of built-in rooms too), degrees, where nothing else is said
+# px (of photos of built-in rooms too), degrees, where nothing else is said.
+PATH_SIZE, PATH_FOV = (504, 378), 60.0
 MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
 TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 

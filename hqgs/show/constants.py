@@ -39,11 +39,8 @@ CHANGE_VIEWS = 4  # renders that tell what a file changes, as large as photos be
 
 # report.html, and judge.html.
 PAGE_GAUSSIANS = 400_000  # in a page, at most
-GAUSSIANS_A_SET, LEAST_SETS, MOST_SETS = (
-    8,
-    1 << 11,
-    1 << 13,
-)  # of harmonics: 50,000 Gaussians of degree 3 take less than 3 MB
+# Sets of harmonics: 50,000 Gaussians of degree 3 take less than 3 MB.
+GAUSSIANS_A_SET, LEAST_SETS, MOST_SETS = 8, 1 << 11, 1 << 13
 BAND_COVERED = 0.999  # of a band's coefficients that its largest stored value covers
 DIFFERENCE_SHOWN = 16.0  # levels between two scenes: the deepest blue and red
 PAIRS, PAIR_SIDE, SHEET_SIDE = 8, 720, 1080  # pictures of photo and render, best, worst and between; px

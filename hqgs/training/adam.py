@@ -16,12 +16,8 @@ from torch.optim.optimizer import ParamsT
 from hqgs import _rust
 from hqgs.model.gaussians import Gaussians
 
-UNSUPPORTED = (
-    "weight_decay",
-    "amsgrad",
-    "maximize",
-    "differentiable",
-)  # a loaded state dict may ask for these
+# A loaded state dict may ask for these.
+UNSUPPORTED = ("weight_decay", "amsgrad", "maximize", "differentiable")
 
 
 class Adam(torch.optim.Optimizer):
