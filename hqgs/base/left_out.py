@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TypedDict, cast
+from typing import TYPE_CHECKING, TypedDict, cast
+
+if TYPE_CHECKING:
+    from typing_extensions import NotRequired  # typing has it from Python 3.11 on
 
 CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not show
 
 
-class _Named(TypedDict):
-    what: str
-    why: str
-
-
-class LeftOutRecord(_Named, total=False):
+class LeftOutRecord(TypedDict):
     """`LeftOut` as JSON: what is not known is not there."""
 
-    evidence: str
-    bytes: int
-    cost_db: float
+    what: str
+    why: str
+    evidence: NotRequired[str]
+    bytes: NotRequired[int]
+    cost_db: NotRequired[float]
 
 
 @dataclass(frozen=True)

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
-from typing import Any, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
 
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import MachineFacts
 
+if TYPE_CHECKING:
+    from typing_extensions import NotRequired  # typing has it from Python 3.11 on
+
 Json: TypeAlias = "bool | int | float | str | list[Json] | dict[str, Json] | None"
 
 
-class _More(TypedDict, total=False):
-    gaussians: int  # older runs do not tell
-    memory_mb: float | None  # the most that the process has held so far
-    views: int  # held-out views that were measured, where that is not all of them
-
-
-class HistoryEntry(_More):
+class HistoryEntry(TypedDict):
     """Means over the held-out views, or some of them, at one moment of a run. None: no such value."""
 
     iteration: int
     seconds: float  # of training until then
     psnr: float | None  # dB
     ssim: float | None
+    gaussians: NotRequired[int]  # older runs do not tell
+    memory_mb: NotRequired[float | None]  # the most that the process has held so far
+    views: NotRequired[int]  # held-out views that were measured, where that is not all of them
 
 
 def alike(history: Sequence[HistoryEntry]) -> list[list[HistoryEntry]]:
@@ -96,22 +96,17 @@ class PhotoRecord(TypedDict):
     enlarged: int  # 1: it was not
 
 
-class _LookOfCamera(TypedDict, total=False):
-    vignetting: list[float]  # [2], as `hqgs.photos.look` has it; older runs do not tell
-    response: list[list[float]]  # [2, 3]
-
-
-class LearnedRecord(_LookOfCamera):
+class LearnedRecord(TypedDict):
     """What was learned of a training photo's camera."""
 
     name: str
     shake_px: float  # how far the picture's middle went during the exposure
     trajectory_px: list[list[float]]  # its trajectory, [9, 2], x to the right and y down; of mean 0
     defocus_px: float  # radius of the largest disc that a point becomes
-    focus: (
-        float | None
-    )  # where it was focused, 1 at the photo's median depth; None: sharp, or out of focus as a whole
+    focus: float | None  # where, 1 at the photo's median depth; None: sharp, or out of focus as a whole
     gains: list[float]  # of red, green and blue in linear light; their logarithms' mean over photos is 0
+    vignetting: NotRequired[list[float]]  # [2], as `hqgs.photos.look` has it; older runs do not tell
+    response: NotRequired[list[list[float]]]  # [2, 3]
 
 
 class RankRecord(TypedDict):
@@ -123,31 +118,25 @@ class RankRecord(TypedDict):
     sent_bytes: int
 
 
-class _Decided(TypedDict):
+class PlanRowRecord(TypedDict):
+    """One decision of a run; what is not there does not apply."""
+
     what: str
     value: str
     why: str
+    evidence: NotRequired[str]  # what was measured
+    rule: NotRequired[str]  # the rule's name and its source
+    iteration: NotRequired[int]  # after which it was decided; none: before the first step
 
 
-class PlanRowRecord(_Decided, total=False):
-    """One decision of a run; what is not there does not apply."""
-
-    evidence: str  # what was measured
-    rule: str  # the rule's name and its source
-    iteration: int  # after which it was decided; none: before the first step
-
-
-class _WorldTold(TypedDict, total=False):
-    error: float  # of metres, half of the 95 % interval, as a share
-    up: list[float]
-
-
-class WorldRecord(_WorldTold):
+class WorldRecord(TypedDict):
     """The frame of what the run wrote: `World`, but for its place."""
 
     unit: float  # of coordinates in memory, in those that were written
     shift: list[float]
     metres: float | None  # a written unit is a metre, and one of the files that were read this many
+    error: NotRequired[float]  # of metres, half of the 95 % interval, as a share
+    up: NotRequired[list[float]]
 
 
 class RunRecord(TypedDict):
