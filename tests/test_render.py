@@ -122,7 +122,7 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--views", "nobody"], "--views: the run has no photo 'nobody'; there are: train, test, all, view1"),
+        (["--views", "nobody"], "--views: the run has no photo 'nobody'; there are: train, test, all, view0"),
         (["--path", "no.json"], "--path is 'no.json': no such file, and none of: cameras, orbit"),
         (["--frames", "0"], "frames is 0, wanted at least 1"),
         (["--fps", "fast"], "--fps is fast, wanted a number"),
