@@ -24,7 +24,7 @@ from hqgs.evaluation.metrics import color_factors
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_levels
 from hqgs.scene.constants import ENOUGH_SHOW
-from hqgs.scene.geometry import in_frame, project
+from hqgs.scene.geometry import in_frame, project, within
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ def pixel_maps(gaussians: Gaussians, camera: Camera, shown: torch.Tensor) -> Map
     """`shown` [N]: of `shown_by`."""
     depths, alphas, _ = gaussians.rasterize(camera, gaussians.sh0[:, 0], render_mode="ED")
     pixels, z = project(camera, gaussians.means.double().numpy())
-    inside = (z > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
+    inside = within(camera, pixels, z)
     column, row = pixels[inside].astype(int).T
     before = torch.zeros(len(gaussians))
     before[torch.from_numpy(inside)] = torch.from_numpy(z[inside]).float() / depths[0, row, column, 0]

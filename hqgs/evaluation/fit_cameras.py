@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from hqgs._rust import NEAR_PLANE
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.constants import DAMPING, DIFFERENCE, FIT_STEPS, GIVEN_UP, SETTLED, SMOOTHED
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.geometry import project
+from hqgs.scene.geometry import project, within
 from hqgs.scene.scene import Camera, View
 
 Floats = NDArray[np.float64]
@@ -79,20 +78,15 @@ def fit_camera(
     turn = Rotation.from_matrix(now[:3, :3] @ own[:3, :3].T).magnitude()
     means = gaussians.means.detach().numpy().astype(np.float64)
     (at, depths), (there, _) = project(view.camera, means), project(camera, means)
-    shown = _shown(view.camera, at, depths)
+    shown = within(view.camera, at, depths)
     moved = float(np.median(np.linalg.norm(there - at, axis=1)[shown])) if shown.any() else 0.0
     return Fitted(replace(view, camera=camera), float(np.rad2deg(turn)), moved)
-
-
-def _shown(camera: Camera, pixels: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """Which of projected points lie in the picture."""
-    return (depths > NEAR_PLANE) & ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
 
 
 def _units(camera: Camera, gaussians: Gaussians) -> Floats:
     """Turns and shifts [6] that move a picture about one pixel: 1 / f, and the middle depth / f."""
     pixels, depths = project(camera, gaussians.means.detach().numpy().astype(np.float64))
-    inside = _shown(camera, pixels, depths)
+    inside = within(camera, pixels, depths)
     depth = float(np.median(depths[inside])) if inside.any() else 1.0
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     return np.array([1.0, 1, 1, depth, depth, depth]) / focal

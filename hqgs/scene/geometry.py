@@ -40,7 +40,11 @@ def project(camera: Camera, points: NDArray[np.float64]) -> tuple[NDArray[np.flo
 
 def in_frame(camera: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """[M]: which of `points` [M, 3], world, lie before the camera and project into its picture."""
-    pixels, depths = project(camera, points)
+    return within(camera, *project(camera, points))
+
+
+def within(camera: Camera, pixels: NDArray[np.float64], depths: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[M]: which of projected points lie before the camera and in its picture."""
     return (depths > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
-from hqgs.photos.exif import Exif, read_exif
+from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
 from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.constants import FAR_OFF, GPS_LEAST, LOOKED_AT, ONE_PLACE, SHOWN
@@ -126,7 +126,11 @@ def placed(capture: Capture, notes: list[str]) -> Capture:
 
 def located(capture: Capture) -> Georeference | None:
     """Where on Earth the frame of the capture's files is, by the GPS of its photos; None: nothing tells."""
-    found = [(k, tags.gps, tags.above) for k, tags in enumerate(map(_tags, capture.photos)) if tags.gps]
+    found = [
+        (k, tags.gps, tags.above)
+        for k, tags in enumerate(read_exif(photo.path) for photo in capture.photos)
+        if tags.gps
+    ]
     if len(found) < GPS_LEAST:
         return None
     rows, gps, above = zip(*found, strict=True)
@@ -135,10 +139,6 @@ def located(capture: Capture) -> Georeference | None:
     if np.isfinite(above).all():  # a barometer tells heights better than GPS, but for where they begin
         places[:, 2] = np.array(above) + np.median(places[:, 2] - above)
     return georeference(centers, [(north, east, up) for north, east, up in places.tolist()])
-
-
-def _tags(photo: Photo) -> Exif:
-    return read_exif(photo.path)
 
 
 def _without(capture: Capture, gone: set[str]) -> Capture:

@@ -19,8 +19,8 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.evaluation.held_out import HeldOutViews
 from hqgs.evaluation.metrics import haarpsi, psnr_aligned, ssim
 from hqgs.photos.formula import NONE, parse_formation
-from hqgs.scene.geometry import resized
-from hqgs.scene.scene import Scene, View
+from hqgs.scene.geometry import shrunk
+from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.constants import (
     TRIAL_EACH,
@@ -81,7 +81,7 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
     """
     on_stage(Stage("growth", 0, 0, "trying on photos held back whether growth pays"))
     side = _side(scene, plan.settings.iterations)
-    config, views = _settings(plan.settings), [_small(view, side) for view in scene.train]
+    config, views = _settings(plan.settings), [shrunk(view, side) for view in scene.train]
     found = list[NDArray[np.float64]]()
     for offset in TRIAL_OFFSETS:
         held = range(offset, len(views), TRIAL_EACH)
@@ -129,9 +129,3 @@ def _settings(settings: TrainConfig) -> TrainConfig:
         opacity_decay=settings.opacity_decay or 0.0,
         dropout=settings.dropout or 0.0,
     )
-
-
-def _small(view: View, side: int) -> View:
-    camera = view.camera
-    factor = max(1.0, max(camera.width, camera.height) / side)
-    return resized(view, *(max(1, round(side / factor)) for side in (camera.width, camera.height)))
