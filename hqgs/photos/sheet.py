@@ -50,7 +50,7 @@ def tiled(tiles: Sequence[Image.Image]) -> Image.Image:
     return made
 
 
-def printable(text: str, longest: int = 60) -> str:
-    """The text with everything but printable ASCII replaced (fonts lack the rest), cut to `longest`."""
+def printable(text: str) -> str:
+    """The text with everything but printable ASCII replaced (fonts lack the rest), cut to 60."""
     text = re.sub(r"[^ -~]", "?", text)
-    return text if len(text) <= longest else text[: longest - 3] + "..."
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,10 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, read_json, write_json
 from hqgs.photos.constants import LARGEST
-from hqgs.photos.pixels import to_uint8
+from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES
 from hqgs.scene.paths import scene_up, view_matrix
-from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.scene import Camera, Scene
 from hqgs.scene.world import World
 
 CAMERAS, PHOTOS = "cameras.json", "photos"
@@ -60,7 +60,8 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
     ):
         photo = f"{PHOTOS}/{number:05}.jpg"
         with atomic_path(folder / photo) as tmp:
-            picture = small_photo(view)
+            picture = Image.fromarray(to_uint8(as_floats(view.image)))
+            picture.thumbnail((KEPT_SIDE, KEPT_SIDE), Image.Resampling.LANCZOS)
             picture.save(tmp, quality=88)
         entries.append(
             {
@@ -77,14 +78,6 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
     frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
     content = {"frame": frame, "up": up.tolist(), "views": entries}
     write_json(folder / CAMERAS, content | ({} if scene.world == World() else {"world": scene.world.json()}))
-
-
-def small_photo(view: View, most: int = KEPT_SIDE) -> Image.Image:
-    """The photo of a view with 8 bits, at most `most` px wide and high."""
-    pixels = view.image if view.image.dtype == np.uint8 else to_uint8(cast(NDArray[np.float32], view.image))
-    picture = Image.fromarray(pixels)
-    picture.thumbnail((most, most), Image.Resampling.LANCZOS)
-    return picture
 
 
 def load_cameras(folder: str | Path) -> RunCameras:

@@ -11,7 +11,7 @@ the photos that it held out (`calibrated`): scenes learn their training photos b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +44,6 @@ from hqgs.show.constants import (
 )
 
 Array = NDArray[np.float32]
-OnPass = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -152,27 +151,18 @@ def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
     return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
 
 
-def learn_trust(
-    gaussians: Gaussians, known: RunCameras, progress: OnPass | None = None, photos: int = TRUST_PHOTOS
-) -> Trust:
+def learn_trust(gaussians: Gaussians, known: RunCameras, photos: int = TRUST_PHOTOS) -> Trust:
     """What the photos of a run, in its folder, say of its Gaussians.
 
     The errors are those of at most `photos` training photos, the factor is that of the held-out ones.
-    `progress` hears how many passes over a photo are done, and how many there are. ValueError where the run
-    has no training photo.
+    ValueError where the run has no training photo.
     """
     views = [view for view in known.views if not view.held_out and view.photo is not None]
     if not views:
         raise ValueError("trust needs the photos of a run: give its folder, with cameras.json and photos/")
     chosen, n = [views[k] for k in evenly(len(views), photos)], len(gaussians)
-    looks, done = list[tuple[Camera, Tensor]](), 0
+    looks = list[tuple[Camera, Tensor]]()
     sums, seen = torch.zeros(n, 2), torch.zeros(n)  # sums of weights, and of weights times errors
-
-    def tell() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, len(chosen) * (TRUST_ROUNDS + 1))
 
     with one_torch_thread():
         for view in chosen:
@@ -183,14 +173,12 @@ def learn_trust(
             )
             sums += both
             seen += both[:, 0] > SEEN
-            tell()
         weights = sums[:, 0] + 1
         errors = (sums[:, 1] + PRIOR) / weights
         for _ in range(TRUST_ROUNDS):
             found = torch.zeros(n)
             for camera, error in looks:
                 found += _back(gaussians, camera, errors[:, None], error[..., None], ratio=True)[:, 0]
-                tell()
             errors = (errors * found + PRIOR) / weights
     carried = Trust(gaussians, errors, seen)
 

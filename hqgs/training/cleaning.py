@@ -57,11 +57,11 @@ class Cleaned:
 
 
 def clean(
-    gaussians: Gaussians, scene: Scene, steps: int = CLEANING_STEPS, seed: int = 0, on_stage: OnStage = silent
+    gaussians: Gaussians, scene: Scene, steps: int = CLEANING_STEPS, on_stage: OnStage = silent
 ) -> Cleaned:
     """The Gaussians fitted on to the scene's training photos for so many steps.
 
-    Same seed, same bits, for any number of threads. ValueError where the scene has fewer than 2 held-out
+    Same bits for any number of threads. ValueError where the scene has fewer than 2 held-out
     photos, or `steps` is below 1.
     """
     if len(scene.test) < 2:
@@ -72,7 +72,7 @@ def clean(
     if steps < 1:
         raise ValueError(f"steps is {steps}, wanted at least 1")
     before = _held_out(gaussians, scene)
-    config, method, rng = TrainConfig(), ThreeDGS(), np.random.default_rng(seed)
+    config, method, rng = TrainConfig(), ThreeDGS(), np.random.default_rng(0)
     rates = {
         name: getattr(config, f"lr_{name}") for name in ("scales", "quats", "opacities", "sh0", "shN")
     } | {"means": 0.0}
@@ -88,7 +88,7 @@ def clean(
     with one_torch_thread():
         targets = [method.prepare(view) for view in scene.train]
         for k, number in enumerate(order.tolist()):
-            some = with_dropout(fitted, DROPOUT, seed, k + 1)
+            some = with_dropout(fitted, DROPOUT, 0, k + 1)
             camera = scene.train[number].camera
             render, _ = render_view(some, camera, fitted.sh_degree, config.background)
             of_render = coming_gradient(render)

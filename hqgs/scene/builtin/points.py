@@ -14,7 +14,7 @@ from hqgs.scene.sfm.triangulated import SparsePoints, in_order, triangulated
 TIME_LIMIT = 300.0  # s: for a COLMAP that hangs; a slow or busy machine is to get the same points as others
 
 
-def sfm_points(views: Sequence[View], time_limit: float = TIME_LIMIT, seed: int = 0) -> SparsePoints:
+def sfm_points(views: Sequence[View], time_limit: float = TIME_LIMIT) -> SparsePoints:
     """Points of the views by COLMAP.
 
     COLMAP (SIFT, exhaustive matching, triangulation with the known cameras) runs in its own process and is
@@ -26,7 +26,7 @@ def sfm_points(views: Sequence[View], time_limit: float = TIME_LIMIT, seed: int 
     found = triangulated(views, time_limit)
     if isinstance(found, SparsePoints):
         return found
-    cast = surface_points(views, seed=seed)
+    cast = surface_points(views)
     return cast._replace(note=f"{cast.note}, as COLMAP gave none: {found}")
 
 

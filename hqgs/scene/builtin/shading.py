@@ -68,7 +68,7 @@ def render_exposure(
     return image
 
 
-def render_depth(camera: Camera, threads: int | None = None) -> NDArray[np.float64]:
+def render_depth(camera: Camera) -> NDArray[np.float64]:
     """View-space z of the first surface at each pixel centre, [H, W]; inf where a ray leaves the scene.
 
     Raises ValueError as `render_view` does.
@@ -79,7 +79,7 @@ def render_depth(camera: Camera, threads: int | None = None) -> NDArray[np.float
         t, _ = nearest(tile.seen, tile.blocks, tile.eye, tile.d)
         depth[tile.rows, tile.cols] = tile.picture(t[:, 0])
 
-    _each_tile(still(camera, np.full((1, 2), 0.5)), np.float64, work, threads)
+    _each_tile(still(camera, np.full((1, 2), 0.5)), np.float64, work, None)
     return depth
 
 
