@@ -29,6 +29,7 @@ from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.scene.sfm.run import SIFT, check_features
 from hqgs.scene.tags import by_tags, check_tag_size
+from hqgs.scene.upright import with_up
 
 
 def load(
@@ -149,6 +150,7 @@ def load(
         scene = sfm_scene(scene, models, on_stage, features)
     scene = scene if restore is None else restore_scene(scene, restore)
     scene = with_points(scene, models, on_stage) if points else scene
+    scene = scene if is_room(path) else with_up(scene)
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if tag_size is None else by_tags(scene, tag_size)
     return replace(scene, origin=origin)

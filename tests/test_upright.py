@@ -1,0 +1,80 @@
+"""Up in a scene, by edges of the built-in room, and by points of a level surface."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hqgs.scene.builtin import render_view
+from hqgs.scene.builtin.scene import embedded_cameras
+from hqgs.scene.georeference import Georeference
+from hqgs.scene.paths import scene_up
+from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.upright import with_up
+
+TURN = Rotation.from_euler("xyz", [30, 50, 70], degrees=True).as_matrix()
+UP = TURN @ [0, -1, 0]
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    """The room in a turned frame, by somebody who leans by 7 degrees."""
+    lean = Rotation.from_euler("z", 7, degrees=True).as_matrix()
+    views = []
+    for k, camera in enumerate(embedded_cameras(160, 120, 6)):
+        held = camera.viewmat.copy()
+        held[:3] = lean @ held[:3]
+        image = render_view(Camera(160, 120, camera.K, held))
+        held[:3, :3] = held[:3, :3] @ TURN.T
+        views.append(View(f"{k}.png", Camera(160, 120, camera.K, held), image))
+    return Scene("room", views[1:], views[:1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "colmap")
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> float:
+    return math.degrees(math.acos(min(float(a @ b), 1.0)))
+
+
+def noise(room: Scene) -> list[View]:
+    rng = np.random.default_rng(0)
+    return [replace(v, image=rng.integers(0, 256, v.image.shape, dtype=np.uint8)) for v in room.train[:3]]
+
+
+def test_upright_edges_tell_up_better_than_how_photos_were_held(room: Scene) -> None:
+    assert degrees(scene_up(room), UP) > 5
+    found = with_up(room)
+    assert degrees(scene_up(found), UP) < 1
+    (note,) = found.notes
+    stated = float(note.split("within ")[1].split()[0])
+    assert degrees(scene_up(found), UP) < stated
+    assert "upright edges in" in note
+
+
+def test_a_floor_tells_up_where_photos_do_not(room: Scene) -> None:
+    rng = np.random.default_rng(1)
+    flat = np.column_stack([rng.uniform(-3, 3, 400), rng.normal(0, 0.01, 400), rng.uniform(-3, 3, 400)])
+    points = np.concatenate([flat, rng.uniform(-3, 3, (400, 3))]) @ TURN.T
+    bare = replace(room, train=noise(room), test=[])
+    found = with_up(replace(bare, points=points, point_colors=np.zeros((800, 3), np.uint8)))
+    assert degrees(scene_up(found), UP) < 0.3
+    assert "level surface" in found.notes[0]
+    steep = Rotation.from_euler("x", 40, degrees=True).as_matrix()
+    for other in (points @ steep, points[400:]):
+        kept = with_up(replace(bare, points=other, point_colors=np.zeros((len(other), 3), np.uint8)))
+        assert kept.world.up is None
+        assert "as the photos were held" in kept.notes[0]
+    guessed = with_up(replace(bare, points=points, guessed=True))
+    assert guessed.world.up is None
+
+
+def test_gps_tells_up_where_it_is_sure(room: Scene) -> None:
+    bare = replace(room, train=noise(room), test=[])
+    place = Georeference(1, [0.9, 1.1], np.eye(3).tolist(), UP.tolist(), [1, 2], 40, 38, 1, 500, 0.4)
+    told = with_up(replace(bare, world=replace(bare.world, place=place)))
+    np.testing.assert_allclose(scene_up(told), UP)
+    assert "GPS of 38 photos" in told.notes[0]
+    loose = replace(place, tilt=5.0)
+    assert with_up(replace(bare, world=replace(bare.world, place=loose))).world.up is None
