@@ -180,6 +180,18 @@ def test_model_without_photos(tmp_path: Path) -> None:
         load_scene(write_colmap(make_truth(), tmp_path, images=None), downscale=2)
 
 
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("gone", ["rigs", "frames"])
+def test_frames_without_rigs_leave_the_photos_their_poses(tmp_path: Path, gone: str, binary: bool) -> None:
+    truth = make_truth()
+    write_colmap(truth, tmp_path, binary=binary)
+    (tmp_path / "sparse/0" / f"{gone}.{'bin' if binary else 'txt'}").unlink()
+    scene = load_scene(tmp_path, test_every=0)
+    assert "the photos' own poses are used" in scene.notes[0]
+    for view, viewmat in zip(scene.train, truth.viewmats, strict=True):
+        np.testing.assert_allclose(view.camera.viewmat, viewmat, atol=1e-12)
+
+
 def left_out(root: Path) -> str:
     notes = load_scene(root).notes
     return next(note for note in notes if note.startswith("1 of 9 photos have no pose"))

@@ -80,6 +80,47 @@ def test_frame_overrides_and_other_size(tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.train[1].camera.K[1], truth.K[1])
 
 
+K = [[FX, 0, 25.0], [0, FY, 17.5], [0, 0, 1]]
+MATRICES: dict[str, dict[str, Any]] = {
+    "K": {"K": K},
+    "flat": {"camera_intrinsics": np.ravel(K).tolist()},
+    "columns": {"intrinsic_matrix": np.transpose(K).ravel().tolist()},
+    "four": {"intrinsics": [FX, FY, 25.0, 17.5]},
+    "4x4": {"camera_matrix": np.block([[np.array(K), np.zeros((3, 1))], [np.eye(4)[3:]]]).tolist()},
+    "names": {"intrinsics": {"fx": FX, "fy": FY, "cx": 25.0, "cy": 17.5, "width": WIDTH, "height": HEIGHT}},
+    "fx": {"fx": FX, "fy": FY, "cx": 25.0, "cy": 17.5},
+}
+
+
+@pytest.mark.parametrize("of_frame", [False, True])
+@pytest.mark.parametrize("form", MATRICES)
+def test_intrinsics_by_other_names_and_as_matrices(tmp_path: Path, form: str, of_frame: bool) -> None:
+    """A frame's own wins over the file's, whatever either calls it."""
+    truth = make_truth(2)
+    none: dict[str, Any] = dict.fromkeys(["fl_x", "fl_y", "cx", "cy", "w", "h"])
+    if of_frame:
+        entries = [frame | MATRICES[form] for frame in frames(truth)]
+        write_transforms(truth, tmp_path, **none | {"fl_x": 77.0, "cx": 3.0}, frames=entries)
+    else:
+        write_transforms(truth, tmp_path, **none | MATRICES[form])
+    for view in load_scene(tmp_path, test_every=0).train:
+        np.testing.assert_allclose(view.camera.K, K)
+
+
+def test_distortion_as_opencv_lists_it(tmp_path: Path) -> None:
+    truth = make_truth(2)
+    plain = write_transforms(truth, tmp_path / "a", k1=0.1, k2=0.02, p1=1e-3, p2=2e-3)
+    listed = write_transforms(truth, tmp_path / "b", dist_coeffs=[[0.1, 0.02, 1e-3, 2e-3, 0.0]])
+    for a, b in zip(load_scene(plain).train, load_scene(listed).train, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+    for wrong in ({"K": [[1, 2], [3, 4]]}, {"K": "x"}, {"K": [[FX, 9, 1], [0, FY, 1], [0, 0, 1]]}):
+        with pytest.raises(ValueError, match="K"):
+            load_scene(write_transforms(truth, tmp_path / "c", fl_x=None, **wrong))
+    with pytest.raises(ValueError, match="distortion must be"):
+        load_scene(write_transforms(truth, tmp_path / "c", distortion=[0, 0, 0, 0, 0, 1]))
+
+
 @pytest.mark.parametrize("entry", ["images/a", "./images/a", "sub/../images/a.png", "{root}/images/a.png"])
 def test_file_path_forms(tmp_path: Path, entry: str) -> None:
     truth = make_truth(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
 from hqgs.scene.sfm.folder import write_colmap_folder
-from hqgs.scene.sfm.front_door import strays
+from hqgs.scene.sfm.front_door import maybe_two, strays, understood
 from hqgs.scene.source import load, pictures
 
 
@@ -110,6 +111,43 @@ def test_bursts_and_places_are_counted(tmp_path: Path) -> None:
             tags.get_ifd(0x8825).update({1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0)})
         picture(k).save(tmp_path / name, exif=tags)
     assert looked_at(tmp_path).notes == ["5 photos of 2 cameras, GPS in 2, 4 in 2 bursts"]
+
+
+def taken(name: str, *times: str) -> list[Exif]:
+    found = [datetime.strptime(f"2024:05:{time}", "%Y:%m:%d %H:%M:%S") for time in times]
+    return [Exif(camera=("a", name, "28 28"), taken=time) for time in found]
+
+
+def test_bursts_by_the_second_are_counted() -> None:
+    same = [*taken("x", *["01 10:00:00"] * 4), *taken("y", *["01 10:00:00"] * 2), *taken("x", "01 10:00:01")]
+    text = understood(same, [f"{k}.jpg" for k in range(7)], 0, False)
+    assert text == "7 photos of 2 cameras, 4 in 1 burst"
+
+
+def test_two_captures_in_one_folder_are_told_and_not_refused() -> None:
+    plain, names = [Exif()] * 6, [f"IMG_{k}.jpg" for k in range(6)]
+    assert maybe_two(plain, names) == []
+    times = [f"0{day} 10:0{k}:00" for day in (1, 2) for k in range(3)]
+    assert maybe_two(taken("x", *times), names) == [
+        "perhaps 2 scenes, as photos were taken more than 1 hour apart: 3 from IMG_0.jpg to IMG_2.jpg; "
+        "3 from IMG_3.jpg to IMG_5.jpg. If so, give each its own folder"
+    ]
+    assert maybe_two(taken("x", *[f"01 10:{k}0:00" for k in range(6)]), names) == []
+    assert maybe_two(taken("x", *[f"0{k + 1} 10:00:00" for k in range(6)]), names) == []  # a tourist each
+    assert "several folders" in maybe_two(plain, [f"{'ab'[k // 3]}/{k}.jpg" for k in range(6)])[0]
+    assert (
+        "3 from garden1.jpg"
+        in maybe_two(plain, [f"{w}{k}.jpg" for w in ("room", "garden") for k in (1, 2, 3)])[0]
+    )
+    assert maybe_two(plain, [f"{letter}.jpg" for letter in "abcdef"]) == []
+
+
+def test_the_time_of_a_photo_is_read(tmp_path: Path) -> None:
+    for written, wanted in (("2024:05:01 10:11:12", datetime(2024, 5, 1, 10, 11, 12)), ("0000:00:00", None)):
+        tags = exif(1, 28, "Phone")
+        tags.get_ifd(0x8769)[36867] = written
+        picture(0).save(tmp_path / "a.jpg", exif=tags)
+        assert read_exif(tmp_path / "a.jpg").taken == wanted
 
 
 @pytest.mark.parametrize(

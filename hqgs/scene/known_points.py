@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
+import inspect
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.random_points import NO_POINTS
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.constants import TOO_SMALL
+from hqgs.scene.sfm.run import key_of
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
 
 
@@ -27,7 +29,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
     if not scene.guessed or len(views) < 2 or min(sides) < TOO_SMALL:
         return scene
     on_stage(Stage("COLMAP: points for the cameras that are there", 0, 0))
-    file = None if keep is None else keep / f"points-{_digest(scene)}.npz"
+    file = None if keep is None else keep / f"points-{key_of('points', _pieces(scene))}.npz"
     if file is not None and file.is_file():
         with np.load(file, allow_pickle=False) as data:
             found = SparsePoints(
@@ -54,11 +56,9 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
     )
 
 
-def _digest(scene: Scene) -> str:
-    """Of the photos and cameras."""
-    sha = hashlib.sha256()
+def _pieces(scene: Scene) -> Iterator[bytes]:
+    """The photos and cameras, and how points are found."""
+    yield Path(inspect.getfile(triangulated)).read_bytes()
     for view in scene.train:
-        arrays = (view.image, view.mask, view.camera.K, view.camera.viewmat)
-        for array in arrays:
-            sha.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
-    return sha.hexdigest()[:16]
+        for array in (view.image, view.mask, view.camera.K, view.camera.viewmat):
+            yield b"-" if array is None else np.ascontiguousarray(array).tobytes()

@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from hqgs.base.text import some
 
 NEEDED, POINTS = ("cameras", "images"), "points3D"
+_RIGGED = ("frames", "rigs")  # from COLMAP 3.12 on, of no use without each other
 HEAD = 9  # id, rotation, translation and camera of a photo in images.txt, before its name
 _COMMA = re.compile(rb"(?<!\S)(-?\d+),(\d+(?:[eE][-+]?\d+)?)(?!\S)")  # a number as some languages write it
 _BOM = b"\xef\xbb\xbf"  # that Windows puts before a text
@@ -48,7 +49,13 @@ def mended(folder: Path, notes: list[str]) -> Iterator[Path]:
         plain["images.txt"] = _photo_lines(plain["images.txt"], notes)
     points = f"{POINTS}.{kind}"
     bare = not (folder / points).is_file()
-    if plain == texts and not bare:
+    pair = {f"{name}.{kind}" for name in _RIGGED}
+    lone = {name for name in pair if (folder / name).is_file()}
+    if len(lone) == 1:
+        notes.append(
+            f"the model has {some([*lone])} but no {some([*(pair - lone)])}: the photos' own poses are used"
+        )
+    elif plain == texts and not bare:
         yield folder
         return
     with TemporaryDirectory(prefix="hqgs-colmap-") as name:
@@ -59,6 +66,8 @@ def mended(folder: Path, notes: list[str]) -> Iterator[Path]:
         else:
             for path in folder.glob("*.bin"):
                 shutil.copyfile(path, copy / path.name)
+        if len(lone) == 1:
+            (copy / lone.pop()).unlink()
         if bare:
             (copy / points).write_bytes(bytes(8) if kind == "bin" else b"")
         try:

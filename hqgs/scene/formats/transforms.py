@@ -26,6 +26,7 @@ from hqgs.scene.capture import (
 )
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around
+from hqgs.scene.formats.intrinsics import MATRICES, with_matrix
 from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named, below
@@ -45,10 +46,11 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     """Read `transforms.json`, or the Blender files, of which each names the views of a part of the split.
 
     Poses are camera to world in the OpenGL frame (x right, y up, z back). Intrinsics stand in the file or in
-    a frame, which wins. Distortion follows OpenCV: k1, k2, p1, p2, k3, or k1..k4 for a fisheye. Photos are
-    found by what their paths say, whatever machine wrote them, but never outside of `root`; one that is not
-    there keeps its path, for `load_scene` to name. Test views are those of the test file, of the validation
-    file where there is none, or what the lists `train_filenames`, `test_filenames` and `val_filenames` say.
+    a frame, which wins, as numbers or as a matrix (`with_matrix`). Distortion follows OpenCV: k1, k2, p1, p2,
+    k3, or k1..k4 for a fisheye. Photos are found by what their paths say, whatever machine wrote them, but
+    never outside of `root`; one that is not there keeps its path, for `load_scene` to name. Test views are
+    those of the test file, of the validation file where there is none, or what the lists `train_filenames`,
+    `test_filenames` and `val_filenames` say.
 
     A photo that appears twice with one pose is one, and points that are not there are none.
 
@@ -125,11 +127,18 @@ def _read_frames(
             if mask_path is None:
                 raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
         try:
-            camera = _camera({**meta, **frame}, path, where)
+            camera = _camera(_by_our_names(meta, frame, where), path, where)
         except UnreadableError:
             camera = UNKNOWN_CAMERA
         photos.append(Photo(name, path, camera, viewmat, mask_path))
     return photos, called
+
+
+def _by_our_names(meta: dict[str, Any], frame: dict[str, Any], where: str) -> dict[str, Any]:
+    """What a file and a frame say of the camera; the frame wins, by whatever names."""
+    told = meta | frame
+    fisheye = bool(told.get("is_fisheye")) or str(told.get("camera_model")).upper() in _FISHEYE
+    return with_matrix(meta, fisheye, where) | with_matrix(frame, fisheye, where)
 
 
 def _once(root: Path, photos: list[Photo]) -> list[Photo]:
@@ -205,7 +214,10 @@ def _camera(values: dict[str, Any], path: Path, where: str) -> pycolmap.Camera:
     fx = _focal(number("fl_x"), number("camera_angle_x"), width, where)
     fy = _focal(number("fl_y"), number("camera_angle_y"), height, where)
     if fx is None and fy is None:
-        raise ValueError(f"{where}: no focal length: looked for fl_x, fl_y, camera_angle_x, camera_angle_y")
+        raise ValueError(
+            f"{where}: no focal length: looked for fl_x, fl_y, camera_angle_x, camera_angle_y and a matrix "
+            f"{', '.join(MATRICES)}"
+        )
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     pinhole = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
     if (

@@ -27,6 +27,7 @@ from hqgs.scene.sfm.front_door import (
     cameras_beside,
     copies,
     films_beside,
+    maybe_two,
     not_here,
     photos_and_maps,
     photos_below,
@@ -195,7 +196,10 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     sphere = all_around(photos.folder, looked, tags)
     if not film or sphere:
         notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
-        on_stage(Stage("photos looked at", len(photos.names), len(photos.names), notes[0]))
+        told = maybe_two([*tags.values()], names)
+        for note in (notes[0], *told):
+            on_stage(Stage("photos looked at", len(photos.names), len(photos.names), note))
+        notes += told
     return replace(
         photos,
         names=names,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from datetime import timedelta
 from hashlib import sha256
 from pathlib import Path
 
@@ -40,6 +42,8 @@ _NOT_HERE = (".icloud", ".crdownload", ".part", ".partial", ".download")
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
 _OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
 _LEAST = 3  # photos of that camera
+_PAUSE, _SCENES, _NEARLY = timedelta(hours=1), 4, 0.9  # between captures; of them; of the photos in one
+_WORDS = re.compile(r"[\W\d_]+")
 _SCREEN = re.compile(r"screen.?shot|bildschirmfoto|capture d.{1,2}cran|captura de pantalla", re.IGNORECASE)
 _DRAWN = ("PNG", "WEBP", "GIF", "BMP")  # what screens are stored as
 
@@ -121,10 +125,49 @@ def understood(exif: Sequence[Exif], names: Sequence[str], left_out: int, around
         text += f", {_count(left_out, 'duplicate')} left out"
     if located := sum(tags.gps is not None for tags in exif):
         text += f", GPS in {located}"
-    bursts = [match.group(2) or match.group(1) for name in names if (match := _BURST.match(name))]
+    bursts = _bursts(exif, names)
     if bursts:
         text += f", {len(bursts)} in {_count(len(set(bursts)), 'burst')}"
     return text
+
+
+def _bursts(exif: Sequence[Exif], names: Sequence[str]) -> list[object]:
+    """Of each photo of a burst, which: by its name, else by camera and second, if _LEAST have those."""
+    seconds = Counter((tags.camera, tags.taken) for tags in exif)
+    found = list[object]()
+    for tags, name in zip(exif, names, strict=True):
+        if (match := _BURST.match(name)) is not None:
+            found.append(match.group(2) or match.group(1))
+        elif tags.taken is not None and seconds[tags.camera, tags.taken] >= _LEAST:
+            found.append((tags.camera, tags.taken))
+    return found
+
+
+def maybe_two(exif: Sequence[Exif], names: Sequence[str]) -> list[str]:
+    """That the photos may be of several scenes, in a sentence, by their times, folders or names; or nothing.
+
+    Of each group _LEAST photos and more are wanted, and of all photos nearly all in groups.
+    """
+    times = sorted((tags.taken, name) for tags, name in zip(exif, names, strict=True) if tags.taken)
+    sittings = list[list[str]]()
+    for k, (taken, name) in enumerate(times):
+        if not k or taken - times[k - 1][0] > _PAUSE:
+            sittings.append([])
+        sittings[-1].append(name)
+    by_folder, by_name = dict[str, list[str]](), dict[str, list[str]]()
+    for name in names:
+        by_folder.setdefault(name.rpartition("/")[0], []).append(name)
+        by_name.setdefault(_WORDS.sub("", name.rpartition("/")[2].rpartition(".")[0]), []).append(name)
+    for groups, what in (
+        (sittings, f"were taken more than {_PAUSE.seconds // 3600} hour apart"),
+        ([*by_folder.values()], "lie in several folders"),
+        ([*by_name.values()], "have names of several kinds"),
+    ):
+        large = [sorted(group) for group in groups if len(group) >= _LEAST]
+        if 2 <= len(large) <= _SCENES and sum(map(len, large)) >= _NEARLY * len(names):
+            told = "; ".join(f"{len(group)} from {group[0]} to {group[-1]}" for group in large)
+            return [f"perhaps {len(large)} scenes, as photos {what}: {told}. If so, give each its own folder"]
+    return []
 
 
 def films_beside(folder: Path, names: Sequence[str]) -> list[str]:

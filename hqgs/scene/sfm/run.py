@@ -219,7 +219,7 @@ def run_colmap(
     check_features(features)
     if features == LEARNED and "rotations" not in given:
         given["learned"] = np.array(True)
-    kept = None if keep is None else keep / _key(names, contents, given)
+    kept = None if keep is None else keep / key_of(str(sorted(given)), _pieces(names, contents, given))
     if kept is not None and kept.is_dir():
         return _read(kept, called or {})
     sizes = given["sizes"][given["camera_of"]] if "camera_of" in given else given["sizes"]
@@ -326,14 +326,20 @@ def _passes(facts: Path) -> list[Pass]:
     return [Pass(**one) for one in json.loads(facts.read_text(encoding="utf-8"))["passes"]]
 
 
-def _key(names: Sequence[str], contents: Iterable[bytes], given: dict[str, NDArray[np.generic]]) -> str:
-    """A name for everything that the model depends on; where the photos lie is not part of it."""
-    digest = hashlib.sha256(f"{pycolmap.__version__} {sorted(given)}".encode())
+def key_of(what: str, pieces: Iterable[bytes]) -> str:
+    """A name for what COLMAP makes of the pieces: another for another version of it, or of PARTS."""
+    digest = hashlib.sha256(f"{pycolmap.__version__} {what}".encode())
     for part in PARTS:
         digest.update(part.read_bytes())
+    for piece in pieces:
+        digest.update(piece)
+    return digest.hexdigest()[:16]
+
+
+def _pieces(names: Sequence[str], contents: Iterable[bytes], given: dict[str, Any]) -> Iterator[bytes]:
+    """Everything that the model depends on; where the photos lie is not part of it."""
     for name, content in zip(names, contents, strict=True):
-        digest.update(f"{name} {len(content)} ".encode() + content)
+        yield f"{name} {len(content)} ".encode() + content
     for part in ("sizes", "Ks", "focals", "camera_of", "pairs", "rotations"):
         if part in given:
-            digest.update(given[part].tobytes())
-    return digest.hexdigest()[:16]
+            yield given[part].tobytes()
