@@ -15,7 +15,6 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import FORMATS, has_format, scene_file
-from hqgs.scene.names import existing_folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,10 +81,10 @@ def _run(path: Path) -> list[str]:
 
 
 def _photos(path: Path) -> list[str]:
-    root = existing_folder(path)
-    from hqgs.scene.load import formats_of  # here: it loads torch
+    from hqgs.scene.load import formats_of, scene_folder  # here: they load torch
     from hqgs.scene.sfm.bare_photos import bare_photos, readable
 
+    root, inside = scene_folder(path)
     formats = formats_of(root, 1.0)
     found = bare_photos(root, 1.0)
     if found is None:
@@ -102,6 +101,6 @@ def _photos(path: Path) -> list[str]:
         f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} lie on their side",
         f"poses: {poses}",
     ]
-    lines += photos.notes
+    lines += [*inside, *photos.notes]
     lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
     return lines

@@ -165,7 +165,7 @@ def read_photos(
     source: Path, photos: str | None, downscale: float | None, test_every: int | None, screen: LoadingScreen
 ) -> Scene:
     """The photos with their cameras: those of --photos, or those that the run was trained on."""
-    from hqgs.scene.load import formats_of  # here: they load torch
+    from hqgs.scene.load import formats_of, scene_folder  # here: they load torch
     from hqgs.scene.source import load, load_again
 
     if photos is None:
@@ -177,7 +177,7 @@ def read_photos(
     run = source if source.is_dir() else source.parent
     run = run if (run / CONFIG).is_file() else None
     bare = film_at(photos) is not None or not (
-        is_room(photos) or formats_of(Path(photos).resolve(), downscale or 1.0)
+        is_room(photos) or formats_of(scene_folder(photos)[0], downscale or 1.0)
     )
     if bare and run is None:
         raise ValueError(

@@ -156,7 +156,8 @@ def photo_folder(root: Path, downscale: float) -> tuple[Path, float, list[str]] 
             1.0,
             [f"photos were read from {ready.name}, which holds them at downscale {downscale:g}"],
         )
-    for folder in (root / "images", root / "images_1"):
+    spelt = [p for p in (sorted(root.iterdir()) if root.is_dir() else []) if p.name.lower() == "images"]
+    for folder in (root / "images", root / "images_1", *spelt):
         if folder.is_dir():
             return folder, downscale, []
     return None

@@ -36,7 +36,7 @@ from hqgs.scene.place import (
     without_strays,
 )
 from hqgs.scene.random_points import random_points
-from hqgs.scene.refused import above, broken, nothing
+from hqgs.scene.refused import above, beside, broken, nothing
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, read_photos
@@ -86,7 +86,7 @@ def load_scene(
 
     Raises FileNotFoundError for a missing folder or photo, ValueError for anything else that is wrong.
     """
-    root = existing_folder(path)
+    root, inside = scene_folder(path)
     if not (math.isfinite(downscale) and downscale >= 1):
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
@@ -98,7 +98,7 @@ def load_scene(
     degraded = read_degraded_folder(root)
     if degraded is not None:
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
-    notes = [*capture.notes, *masks_told(root, capture), *odd_lenses(capture)]
+    notes = [*inside, *capture.notes, *masks_told(root, capture), *odd_lenses(capture)]
     test_names = held_out_names(root, capture, test_every, notes, degraded)
     capture = without_poseless(root, without_missing(root, capture, notes), notes)
     capture = placed(without_strays(capture, notes), notes)
@@ -163,7 +163,7 @@ def load_pictures(
     Each camera is a placeholder: a plausible one at the origin. None where the folder has cameras of its own.
     `longest` bounds all photos of the folder as `load_scene` does. ValueError where it holds neither.
     """
-    root = existing_folder(path)
+    root, _ = scene_folder(path)
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
@@ -191,9 +191,27 @@ def load_pictures(
 
 def check_names(path: str | Path, downscale: float, distance: Distance) -> None:
     """ValueError where photos alone lack one of the two that a distance names: before COLMAP works."""
-    root = existing_folder(path)
+    root, _ = scene_folder(path)
     if not formats_of(root, downscale) and (found := bare_photos(root, downscale)) is not None:
         named_photos(found.names, distance)
+
+
+def scene_folder(path: str | Path) -> tuple[Path, list[str]]:
+    """The folder of a scene: `path`, or the one in it that has cameras, where itself has none; and a note.
+
+    ValueError where several have cameras.
+    """
+    root = existing_folder(path)
+    if formats_of(root, 1.0) or photo_folder(root, 1.0) is not None or list_photos(root):
+        return root, []
+    found = sorted({file.parent for name in (SINGLE, TRAIN, POSES) for file in root.glob(f"*/{name}")})
+    found = found or sorted(
+        {file.parent for name in (SINGLE, TRAIN, POSES) for file in root.glob(f"*/*/{name}")}
+    )
+    if len(found) > 1:
+        inner = some([folder.relative_to(root).as_posix() for folder in found])
+        raise ValueError(f"{root} holds several scenes: give one of {inner}")
+    return (found[0], [f"the scene is the one in {found[0].relative_to(root)}"]) if found else (root, [])
 
 
 def formats_of(root: Path, downscale: float) -> list[str]:
@@ -223,7 +241,7 @@ def _read(root: Path, downscale: float, sfm: bool, search: Search) -> Capture:
     if not sfm and (half := broken(root)) is not None:
         raise ValueError(f"{half}; `--sfm` takes cameras and points from the photos alone")
     if (photos := bare_photos(root, downscale)) is not None:
-        told = [] if sfm else above(root)
+        told = [] if sfm else [*above(root), *beside(root)]
         if told:
             search.on_stage(Stage("COLMAP", 0, len(photos.names), told[0]))
         capture = read_photos(root, photos, search)

@@ -23,6 +23,13 @@ def above(root: Path) -> list[str]:
     return [f"{which}, which are not read: give that folder to train with them"] if found else []
 
 
+def beside(root: Path) -> list[str]:
+    """That folders beside the photos hold cameras, which are not read; or nothing."""
+    found = sorted(path for name in (SINGLE, TRAIN, POSES) for path in root.glob(f"*/{name}"))
+    which = f"{some([path.relative_to(root).as_posix() for path in found])} hold cameras, which are not read"
+    return [f"{which}: put such a file into {root} to train with them"] if found else []
+
+
 def broken(root: Path) -> str | None:
     """What is there of a scene that is not whole; None: nothing."""
     if (folder := half_model(root)) is not None:

@@ -38,9 +38,17 @@ DEEP = 3  # folders below the one named in which a model is looked for
 
 def find_models(root: Path) -> list[Path]:
     """Folders with a complete COLMAP model: those below `sparse/`, else `sparse` itself, else `root`."""
-    sparse = root / "sparse"
-    fragments = sorted(p for p in sparse.iterdir() if kind_of(p)) if sparse.is_dir() else []
+    sparse = _sparse(root)
+    below = [sorted(sparse.glob(depth)) if sparse.is_dir() else [] for depth in ("*", "*/*")]
+    fragments = next((models for paths in below if (models := [*filter(kind_of, paths)])), [])
     return fragments or [p for p in (sparse, root) if kind_of(p)][:1]
+
+
+def _sparse(root: Path) -> Path:
+    """`sparse` in a folder, however it is spelt."""
+    named = root / "sparse"
+    others = (p for p in sorted(root.iterdir()) if p.name.lower() == "sparse" and p.is_dir())
+    return named if named.is_dir() else next(others, named)
 
 
 def find_models_below(root: Path) -> list[Path]:
@@ -54,20 +62,26 @@ def find_models_below(root: Path) -> list[Path]:
         inner = [p for folder in inner for p in _folders(folder)]
         for folder in inner:
             models = find_models(folder)
-            if models and (models != [folder] or folder.name.lower() in CALLED or list_photos(folder)):
+            if models and (models != [folder] or _called_model(folder) or list_photos(folder)):
                 return models
     return []
 
 
+def _called_model(folder: Path) -> bool:
+    """Whether it has the name of a model, or a number in such a folder (`colmap_output/0`)."""
+    name = (folder.parent if folder.name.isdigit() else folder).name.lower()
+    return any(word in name for word in CALLED)
+
+
 def _folders(folder: Path) -> list[Path]:
     """Those in which a scene may lie."""
-    inner = (p for p in folder.iterdir() if p.is_dir() and p.name[0] != "." and p.name != KEPT)
-    return sorted(p for p in inner if not is_run(p))
+    inner = (p for p in folder.iterdir() if p.is_dir() and p.name[0] != ".")
+    return sorted(p for p in inner if not is_run(p) and (p.name != KEPT or _sparse(p).is_dir()))
 
 
 def half_model(root: Path) -> Path | None:
     """A folder that holds some files of a COLMAP model, but not all."""
-    sparse = root / "sparse"
+    sparse = _sparse(root)
     folders = [*(sorted(p for p in sparse.iterdir() if p.is_dir()) if sparse.is_dir() else []), sparse, root]
     for folder in folders:
         for kind in ("bin", "txt"):

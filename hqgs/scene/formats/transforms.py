@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,10 @@ UNKNOWN_CAMERA = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, para
 
 _PERSPECTIVE = {"PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+# What frames call their photo and their pose: nerfstudio, and others.
+_FILE = ("file_path", "image_path", "img_path", "path", "filename", "file_name", "image")
+_POSE = ("transform_matrix", "transformation_matrix", "c2w", "cam2world", "camera_to_world", "pose")
+_WORLD_TO_CAMERA = ("w2c", "world2cam", "world_to_camera")
 _OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])  # y up and z back become y down and z forward
 
 
@@ -98,9 +103,32 @@ def read_transforms(root: Path, downscale: float) -> Capture:
 
 def _read(path: Path) -> dict[str, Any]:
     meta = read_json(path)
-    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+    if isinstance(meta, list):
+        meta = {"frames": meta}
+    if not isinstance(meta, dict):
+        meta = {}
+    listed = meta.get("frames", meta.get("images"))
+    if isinstance(listed, dict):  # by name
+        listed = [{_FILE[0]: k} | v if isinstance(v, dict) else v for k, v in listed.items()]
+    if not isinstance(listed, list) or not listed:
         raise ValueError(f"{path}: expected an object with a list 'frames' that is not empty")
-    return meta
+    return meta | {"frames": listed}
+
+
+def _told(frame: dict[str, Any], keys: Sequence[str]) -> Any:
+    """What a frame has under the first of the keys; None: under none."""
+    return next((frame[key] for key in keys if frame.get(key) is not None), None)
+
+
+def _pose(frame: dict[str, Any], where: str) -> NDArray[np.float64]:
+    """Camera to world, [3, 4], in the file's axes; nan: there is none."""
+    value, inverse = _told(frame, _POSE), _told(frame, _WORLD_TO_CAMERA)
+    if value is not None or inverse is None:
+        return _matrix(value, where)
+    viewmat = np.vstack([_matrix(inverse, where), [0, 0, 0, 1]])
+    if np.isfinite(viewmat).all() and np.linalg.matrix_rank(viewmat) < 4:
+        raise ValueError(f"{where}: {viewmat.tolist()} is no matrix of a pose")
+    return np.linalg.inv(viewmat)[:3]
 
 
 def _read_frames(
@@ -112,12 +140,12 @@ def _read_frames(
         where = f"{root / file}, frame {i}"
         if not isinstance(frame, dict):
             raise ValueError(f"{where}: expected an object, got {frame!r:.80}")
-        written = _text(frame.get("file_path"), "file_path", where)
+        written = _text(_told(frame, _FILE), "file_path", where)
         path = _photo_path(root, written, files)
         name = path.relative_to(root).as_posix()
         called[written] = name
         where = f"{where} ({name})"
-        c2w = _matrix(frame.get("transform_matrix"), where)
+        c2w = _pose(frame, where)
         c2w[:, :3] *= _OPENGL_TO_OPENCV
         viewmat = viewmat_from_pose(c2w, name, camera_to_world=True)
         mask = frame.get("mask_path")

@@ -27,6 +27,7 @@ _CAMERAS = {  # files of other programs, by what they are called
     "OpenMVG or Meshroom": re.compile(r"^(sfm(_data.*)?\.(json|bin)|cameras\.sfm|.*\.mg)$", re.IGNORECASE),
     "OpenSfM": re.compile(r"^(opensfm|reconstruction\.(json|meshed\.json))$"),
     "Polycam": re.compile(r"^(corrected_)?cameras$|^mesh_info\.json$"),
+    "nerfstudio's are called transforms.json": re.compile(r"^transforms\b.*\.json$", re.IGNORECASE),
     "3DGS": re.compile(r"^cameras\.json$"),
     "poses": re.compile(
         r"^(poses?|trajectory|traj|groundtruth|camera_poses)\.(txt|csv|json|log|np[yz])$"
