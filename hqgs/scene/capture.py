@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.constants import LARGEST
 from hqgs.scene.faces import Face
-from hqgs.scene.photo_files import MASKS, Named, below
+from hqgs.scene.photo_files import MASK_FOLDERS, Named, below
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.world import World
 
@@ -169,12 +169,27 @@ def perhaps(root: Path) -> str:
     return "" if meant is None else f"; perhaps {meant} is meant"
 
 
+def mask_folder(root: Path) -> Path | None:
+    """The folder of a scene's masks, `masks` or `mask` however they are spelt; None: there is none."""
+    named = (root / name for name in MASK_FOLDERS)
+    return next((folder for folder in named if folder.is_dir()), None)
+
+
 def find_mask(root: Path, name: str) -> Path | None:
-    """The mask of photo `name` in `masks/`: the same name, with a suffix added, or with another suffix."""
-    masks = root / MASKS
-    if not masks.is_dir():
+    """The mask of photo `name` in `masks/`: the same name, with a suffix added, or with another suffix.
+
+    The name may also have "_mask" after it, or "mask_" before it.
+    """
+    masks = mask_folder(root)
+    if masks is None:
         return None
     plain = (masks / name).with_suffix("")
     suffixes = [suffix for own in PHOTO_SUFFIXES for suffix in (own, own.upper())]
-    added, instead = ([path.with_name(path.name + s) for s in suffixes] for path in (masks / name, plain))
-    return next((p for p in (masks / name, *added, *instead) if p.is_file()), None)
+    stems = (
+        masks / name,
+        plain,
+        plain.with_name(f"{plain.name}_mask"),
+        plain.with_name(f"mask_{plain.name}"),
+    )
+    options = (path.with_name(path.name + suffix) for path in stems for suffix in suffixes)
+    return next((path for path in (masks / name, *options) if path.is_file()), None)

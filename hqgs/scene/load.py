@@ -12,7 +12,7 @@ import pycolmap
 from hqgs.base.evenly import evenly
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import some
-from hqgs.photos.files import UnreadableError, stored_size
+from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
 from hqgs.scene.constants import COPY_SIDE, MOST_BYTES
@@ -202,7 +202,10 @@ def scene_folder(path: str | Path) -> tuple[Path, list[str]]:
     ValueError where several have cameras.
     """
     root = existing_folder(path)
-    if formats_of(root, 1.0) or photo_folder(root, 1.0) is not None or list_photos(root):
+    bare = photo_folder(root, 1.0) is not None or any(
+        path.suffix.lower() in PHOTO_SUFFIXES for path in root.iterdir()
+    )
+    if bare or formats_of(root, 1.0):
         return root, []
     found = sorted({file.parent for name in (SINGLE, TRAIN, POSES) for file in root.glob(f"*/{name}")})
     found = found or sorted(

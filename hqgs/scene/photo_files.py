@@ -20,6 +20,7 @@ from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.names import FILM_SUFFIXES, KEPT, is_room
 
 MASKS = "masks"
+MASK_FOLDERS = (MASKS, "mask", "Masks", "Mask", "MASKS")  # as people spell it
 _FILES = (CHECKPOINT, CONFIG, PAGE, PLAN, PLY, "report.json", "cameras.json", "learned.png")
 _FOLDERS = ("photos", "comparison")  # a run writes pictures into them
 _Key = tuple[str, ...]

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from hqgs.base.text import some
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
-from hqgs.scene.capture import Capture, Photo
+from hqgs.scene.capture import Capture, Photo, mask_folder
 from hqgs.scene.constants import FAR_OFF, GPS_LEAST, LOOKED_AT, ONE_PLACE, SHOWN
 from hqgs.scene.georeference import Georeference, georeference
-from hqgs.scene.photo_files import MASKS
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
 
@@ -94,12 +93,12 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
 def masks_told(root: Path, capture: Capture) -> list[str]:
     """Which photos have no mask, in a sentence, where a folder of masks is there; else nothing."""
     bare = [photo.name for photo in capture.photos if photo.mask_path is None]
-    if not bare or not (root / MASKS).is_dir():
+    if not bare or (folder := mask_folder(root)) is None:
         return []
     which = "none of them has the name of a photo, and none is used"
     if len(bare) < len(capture.photos):
         which = f"{len(bare)} of {len(capture.photos)} photos have none, and count everywhere: {some(bare)}"
-    return [f"masks are in {MASKS}, but {which}"]
+    return [f"masks are in {folder.name}, but {which}"]
 
 
 def cut_outs(capture: Capture) -> bool:

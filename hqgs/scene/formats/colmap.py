@@ -32,7 +32,7 @@ from hqgs.scene.photo_files import is_run
 from hqgs.scene.scene import Camera, TrackStatistics
 
 _POINT_FILES = (f"{POINTS}.ply", "points.ply", "input.ply")  # in place of COLMAP's own
-CALLED = ("colmap", "distorted", "model", "reconstruction")  # folders of a model
+CALLED = ("colmap", "distorted", "model", "reconstruction", "sparse")  # in the names of folders of a model
 DEEP = 3  # folders below the one named in which a model is looked for
 
 

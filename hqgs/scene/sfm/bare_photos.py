@@ -21,7 +21,7 @@ from hqgs.scene.constants import JPEG_QUALITY
 from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
-from hqgs.scene.photo_files import MASKS, is_run
+from hqgs.scene.photo_files import MASK_FOLDERS, MASKS, is_run
 from hqgs.scene.sfm.constants import DECODERS, FOLDERS_DEEP
 from hqgs.scene.sfm.front_door import (
     cameras_beside,
@@ -38,6 +38,7 @@ from hqgs.scene.sfm.panoramas import all_around, colmap_faces, write_faces
 from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
+_MASK = "_mask"  # at the end of a name
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
 
 
@@ -140,6 +141,13 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
             notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
         if others:
             notes.append(f"not taken for photos, by the names of their folders: {some([*others])}")
+    stems = {Path(name).stem for name in names}
+    masks = [
+        name for name in names if (stem := Path(name).stem).endswith(_MASK) and stem[: -len(_MASK)] in stems
+    ]
+    if masks:
+        names = [name for name in names if name not in masks]
+        notes.append(f"{len(masks)} masks among the photos are not read: move them to {MASKS}: {some(masks)}")
     if not names:
         return None
     notes += [*films_beside(folder, names), *cameras_beside(root, folder), *not_here(folder)]
@@ -229,7 +237,9 @@ def _photos_below(folder: Path) -> dict[str, list[str]]:
     level = [folder]
     for _ in range(FOLDERS_DEEP):
         inner = (p for place in level for p in place.iterdir() if p.is_dir())
-        level = sorted(p for p in inner if p.name not in (MASKS, KEPT) and p.name[0] != "." and not is_run(p))
+        level = sorted(
+            p for p in inner if p.name not in (*MASK_FOLDERS, KEPT) and p.name[0] != "." and not is_run(p)
+        )
         if found := {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}:
             return found
     return {}
