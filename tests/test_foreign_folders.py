@@ -112,6 +112,10 @@ LAYOUTS = {  # where the model lies, and where the photos
     "a folder around it": ("scene/sparse/0", "scene/images"),
     "deep": ("a/b/sparse/0", "a/b/images"),
     "scaled photos alone": ("sparse/0", "images_2"),
+    "capitals": ("Sparse/0", "Images"),
+    "a number in a folder of models": ("colmap_output/0", "frames"),
+    "one folder more": ("sparse/final/0", "images"),
+    "sfm": ("sfm/sparse/0", "images"),
 }
 
 
@@ -124,6 +128,17 @@ def test_layouts(tmp_path: Path, layout: str, binary: bool) -> None:
     scene = load_scene(tmp_path, test_every=0)
     assert scene.source == "colmap"
     same_views(scene, truth)
+
+
+def test_a_scene_one_folder_further_down(tmp_path: Path) -> None:
+    truth = make_truth(4)
+    write_transforms(truth, tmp_path / "outer/inner")
+    scene = load_scene(tmp_path / "outer", test_every=0)
+    assert scene.source == "transforms"
+    assert scene.notes[0] == "the scene is the one in inner"
+    write_transforms(truth, tmp_path / "outer/other")
+    with pytest.raises(ValueError, match="several scenes: give one of inner, other"):
+        load_scene(tmp_path / "outer")
 
 
 def test_a_model_further_down_gives_way_to_transforms(tmp_path: Path) -> None:

@@ -54,6 +54,28 @@ def test_of_copies_one_is_used_and_the_others_are_named(tmp_path: Path) -> None:
     assert stages[-1].note == photos.notes[0]
 
 
+def test_of_versions_of_a_photo_one_is_used_and_other_photos_by_such_names_stay(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    coarse = [Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)) for _ in range(3)]
+    first, second, third = (small.resize((400, 300), Image.Resampling.BICUBIC) for small in coarse)
+    first.save(tmp_path / "IMG_0001.jpg")
+    first.save(tmp_path / "IMG_0001.webp", quality=60)
+    first.point(lambda value: value * 0.8).save(tmp_path / "IMG_E0001.jpg")
+    first.resize((200, 150)).save(tmp_path / "IMG_0001_small.png")
+    second.save(tmp_path / "IMG_0002.jpg")
+    third.save(tmp_path / "IMG_0002 (1).jpg")
+    assert looked_at(tmp_path).names == ["IMG_0001.jpg", "IMG_0002 (1).jpg", "IMG_0002.jpg"]
+
+
+def test_photos_deeper_than_those_that_are_used_are_told(tmp_path: Path) -> None:
+    for k, folder in enumerate(("one", "one", "two/inner")):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        picture(k).save(tmp_path / folder / f"{k}.png")
+    photos = looked_at(tmp_path)
+    assert photos.names == ["0.png", "1.png"]
+    assert any(note.startswith("1 photo in the folder two/inner: not used") for note in photos.notes)
+
+
 def test_frames_of_a_film_that_stands_still_all_stay(tmp_path: Path) -> None:
     for k in range(3):
         picture(0).save(tmp_path / f"{k}.png")

@@ -21,7 +21,7 @@ MISTAKES = {
     "train https://a.b/photos.zip --out run": "is an address: download what it names",
     "train photos/view_00.png photos/view_01.png --out run": "photos/view_01.png; give their folder",
     "train scene/transforms.json --out run": "is a folder with photos, or a film: perhaps {root}/scene is",
-    "train colmap/sparse --out run": "; it holds 0; perhaps {root}/colmap is meant",
+    "train colmap/sparse --out run": "has a COLMAP model but no photos",
     "train colmap/sparse/0 --out run": "has a COLMAP model but no photos: looked for ",
     "train a.ply --out run": "is a scene file, trained already: hqgs view shows it",
     "train raws --out run": "holds no photos, but a.CR2: raw data of a camera: develop them to JPEG",

@@ -52,7 +52,31 @@ def utf16(root: Path) -> None:
     (root / "transforms.json").write_bytes(text.encode("utf-16"))
 
 
+def frames(change: Callable[[list[dict[str, Any]]], Any]) -> Change:
+    """The list of frames, changed."""
+
+    def made(root: Path) -> None:
+        meta = json.loads((root / "transforms.json").read_text())
+        (root / "transforms.json").write_text(json.dumps(meta | {"frames": change(meta["frames"])}))
+
+    return made
+
+
+def inverse(matrix: list[list[float]]) -> list[list[float]]:
+    return np.linalg.inv(matrix).tolist()
+
+
 TRANSFORMS: dict[str, Change] = {
+    "frames by number": frames(lambda fs: {str(k): frame for k, frame in enumerate(fs)}),
+    "frames by photo": frames(
+        lambda fs: {f["file_path"]: {"transform_matrix": f["transform_matrix"]} for f in fs}
+    ),
+    "other keys": frames(
+        lambda fs: [{"image_path": f["file_path"], "c2w": f["transform_matrix"]} for f in fs]
+    ),
+    "world to camera": frames(
+        lambda fs: [{"file_path": f["file_path"], "w2c": inverse(f["transform_matrix"])} for f in fs]
+    ),
     "cameras that were scaled with the scene": poses(lambda m: (m @ np.diag([0.3, 0.3, 0.3, 1])).tolist()),
     "sixteen numbers in a list": poses(lambda m: m.ravel().tolist()),
     "column by column": poses(lambda m: m.T.tolist()),

@@ -36,6 +36,8 @@ def run(options: Info) -> int:
             lines = _file(path)
         elif (path / "report.json").is_file():
             lines = _run(path)
+        elif (path / "meta.json").is_file():
+            lines = _file(scene_file(path))
         else:
             lines = _photos(path)
     except BAD_INPUT as error:

@@ -139,6 +139,8 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
             folder, names = folder / inner[0], found[inner[0]]
         if inner:
             notes = [*notes, f"the photos are those in {some(inner)}, below {root.name}"]
+        rest = {k: v for k, v in _photos_below(root, deepest=True).items() if k not in (*found, *others)}
+        notes += photos_below(root, [f"{k}/{name}" for k, v in found.items() for name in v], rest)
         if others:
             notes.append(f"not taken for photos, by the names of their folders: {some([*others])}")
     stems = {Path(name).stem for name in names}
@@ -232,17 +234,18 @@ def ups(exif: Sequence[Exif]) -> np.ndarray:
     return found
 
 
-def _photos_below(folder: Path) -> dict[str, list[str]]:
-    """The photos in the folders below, by their paths: those of the first level that has any."""
-    level = [folder]
+def _photos_below(folder: Path, deepest: bool = False) -> dict[str, list[str]]:
+    """The photos in the folders below, by their paths: those of the first level that has any; or of all."""
+    level, found = [folder], dict[str, list[str]]()
     for _ in range(FOLDERS_DEEP):
         inner = (p for place in level for p in place.iterdir() if p.is_dir())
         level = sorted(
             p for p in inner if p.name not in (*MASK_FOLDERS, KEPT) and p.name[0] != "." and not is_run(p)
         )
-        if found := {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}:
-            return found
-    return {}
+        found |= {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}
+        if found and not deepest:
+            break
+    return found
 
 
 def _photos_in(folder: Path) -> list[str]:

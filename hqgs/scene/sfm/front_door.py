@@ -10,10 +10,11 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from hqgs.base.text import some
 from hqgs.photos.exif import Exif
-from hqgs.photos.files import Glance, UnreadableError, decode
+from hqgs.photos.files import Glance, UnreadableError, decode, open_photo
 from hqgs.scene.names import FILM_SUFFIXES
 
 _BURST = re.compile(r"(.*?)BURST(\d{8,})?", re.IGNORECASE)  # with the time of a burst, or its photos' numbers
@@ -41,6 +42,11 @@ _NO_PHOTOS = re.compile(
 )
 _NOT_HERE = (".icloud", ".crdownload", ".part", ".partial", ".download")
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
+_VERSIONS, _SIDE = 0.98, 32  # correlation of versions of one photo, at so many px
+_VERSION = re.compile(
+    r"(?<=IMG_)E(?=\d{4})|[ _-]*(\(\d+\)|copy|kopie|small|resized|thumb|edited|edit|bearbeitet|\d+x\d+)$",
+    re.IGNORECASE,
+)
 _OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
 _LEAST = 3  # photos of that camera
 _PAUSE, _SCENES, _NEARLY = timedelta(hours=1), 4, 0.9  # between captures; of them; of the photos in one
@@ -52,8 +58,9 @@ _DRAWN = ("PNG", "WEBP", "GIF", "BMP")  # what screens are stored as
 def copies(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> dict[str, str]:
     """Photos that hold the same pixels as another, and which other one is used in their place.
 
-    That is the one with EXIF data, highest up, with the shortest name: IMG_1.jpg, not "IMG_1 (1).jpg". Only
-    files that a glance could not tell apart are decoded.
+    That is the largest, with EXIF data, highest up, with the shortest name: IMG_1.jpg, not "IMG_1 (1).jpg".
+    Only files that a glance could not tell apart are decoded. Versions of a photo by their names (in another
+    format, edited, smaller) are copies too, where they look alike.
     """
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, seen in looked.items():
@@ -64,11 +71,31 @@ def copies(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> di
         for name, row in zip(names, small, strict=True):
             if (np.abs(small - row).max(1) <= _ALIKE).sum() > 1:
                 alike.setdefault(_digest(folder / name), []).append(name)
+    versions: dict[str, list[str]] = {}
+    for name in looked:
+        folder_of, _, file = name.rpartition("/")
+        versions.setdefault(f"{folder_of}/{_VERSION.sub('', file.rpartition('.')[0])}", []).append(name)
+    sets = [*alike.values(), *(names for names in versions.values() if _look_alike(folder, names))]
     found: dict[str, str] = {}
-    for names in alike.values():
-        best = min(names, key=lambda n: (not exif[n].camera, n.count("/"), len(n), n))
+    for names in sets:
+        largest = {n: -looked[n].size[0] * looked[n].size[1] for n in names}
+        best = min(names, key=lambda n: (largest[n], not exif[n].camera, n.count("/"), len(n), n))
         found |= {name: best for name in names if name != best}
     return dict(sorted(found.items()))
+
+
+def _look_alike(folder: Path, names: list[str]) -> bool:
+    """Whether pictures of several files are one but for size, format and brightness."""
+    small, shapes = list[np.ndarray](), list[float]()
+    for name in names if len(names) > 1 else ():
+        with open_photo(folder / name) as photo:
+            shapes.append(photo.width / photo.height)
+            photo.draft("L", (4 * _SIDE, 4 * _SIDE))
+            grey = photo.convert("L").resize((_SIDE, _SIDE), Image.Resampling.BOX)
+        small.append(np.asarray(grey, float).ravel())
+    if not small or min(map(np.ptp, small)) < _ALIKE or max(shapes) > 1.02 * min(shapes):
+        return False
+    return float(np.corrcoef(small).min()) > _VERSIONS
 
 
 def _digest(path: Path) -> bytes:
