@@ -14,7 +14,7 @@ use crate::{
     error::{Error, check_len},
     scene::{Camera, CameraGrad, Gaussians},
     simd::{
-        Real, Wide,
+        Lanes, Real, Wide,
         groups::{self, Column, GROUP, wide3},
         lanes, splat as splat_lanes,
         sums::{self, MAX_PARTS},
@@ -22,7 +22,7 @@ use crate::{
     },
     uninit::{PieceWriter, UninitPiece, UninitVec, prefetch_rows},
 };
-use fearless_simd::{Select, Simd, dispatch};
+use fearless_simd::{Select, Simd, SimdBase, SimdMask, dispatch};
 use rayon::prelude::*;
 use std::slice::from_ref;
 
@@ -156,25 +156,24 @@ impl<T: Real> Cotangents<T> {
 
     /// Gaussians of the group with a cotangent that is not 0.
     #[inline(always)]
-    fn nonzero(&self) -> u16 {
-        let mut any = [false; GROUP];
-        for columns in [
-            &self.means2d[..],
-            &self.whitened,
-            from_ref(&self.opacities),
-            from_ref(&self.depths),
-            &self.conics,
-            &self.colors,
-        ] {
-            for column in columns {
-                for (any, v) in any.iter_mut().zip(&column.0) {
-                    *any |= *v != T::ZERO;
+    fn nonzero<S: Simd>(&self, simd: S) -> u16 {
+        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+        let mut set = 0;
+        for at in (0..GROUP).step_by(Lanes::<T, S>::LEN) {
+            let mut none = zero.simd_eq(zero);
+            for columns in [
+                &self.means2d[..],
+                &self.whitened,
+                from_ref(&self.opacities),
+                from_ref(&self.depths),
+                &self.conics,
+                &self.colors,
+            ] {
+                for column in columns {
+                    none &= column.get(simd, at).simd_eq(zero);
                 }
             }
-        }
-        let mut set = 0;
-        for (lane, any) in any.iter().enumerate() {
-            set |= u16::from(*any) << lane;
+            set |= ((!none).to_bitmask() as u16) << at;
         }
         set
     }
@@ -377,7 +376,7 @@ fn backward_chunk<S: Simd, T: Real>(
             continue;
         }
         cotangents.read(simd, v, first);
-        if visible & cotangents.nonzero() == 0 {
+        if visible & cotangents.nonzero(simd) == 0 {
             chunk.put(&zeros, rows);
             continue;
         }
