@@ -149,7 +149,7 @@ fn chunks(n: usize, chunk: usize) -> impl Iterator<Item = usize> + Clone {
 }
 
 /// The lanes of a mask of f64.
-type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
+pub(crate) type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
 
 /// The geometry of a group of Gaussians, or the gradients of it, one column per number.
 struct Columns<T> {
@@ -208,7 +208,7 @@ impl<T: Real> Columns<T> {
 
 /// The lanes of a group in a bit set, as 1 or 0.
 #[inline(always)]
-fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> Mask<S> {
+pub(crate) fn lanes_in<S: Simd>(simd: S, set: u16, at: usize) -> Mask<S> {
     let mut ones = [0.0; GROUP];
     for (lane, one) in ones.iter_mut().enumerate() {
         *one = f64::from(set >> lane & 1);

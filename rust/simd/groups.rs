@@ -133,7 +133,7 @@ pub fn turned<S: Simd, T: Real>(simd: S, data: &[T]) -> [Lanes<T, S>; GROUP] {
 /// Columns `begin..` of the rows `first..` of an array with `row` numbers per row: as many as the vector is
 /// long or `out` has. Rows beyond the end are 0.
 #[inline(always)]
-fn read_block<S: Simd, T: Real>(
+pub fn read_block<S: Simd, T: Real>(
     simd: S,
     data: &[T],
     row: usize,

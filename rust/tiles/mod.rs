@@ -2,7 +2,7 @@
 //!
 //! Everything runs in the order of the Gaussians' indices, so that memory is read and written as streams: a
 //! tile's records lie in index order, and a small sort per tile, in cache, gives their depth order. The
-//! backward pass walks the same spans with one cursor per tile to sum each Gaussian's gradients, without an
+//! backward pass walks the same pairs with one cursor per tile to sum each Gaussian's gradients, without an
 //! inverse index and in a fixed order.
 
 mod block_masks;
@@ -12,7 +12,7 @@ mod spans;
 
 pub(crate) use lists::{List, Scratch};
 pub(crate) use pairs::{Chunk, Record, UNIT};
-pub(crate) use spans::Span;
+pub(crate) use spans::Reach;
 
 use crate::{
     constants::{MAX_PAIR_BYTES, MAX_PAIRS, TILE},
@@ -250,7 +250,7 @@ mod tests {
             let source = source(limit);
             let (chunk, pairs) = dispatch!(level, simd => source.chunk(simd, 0..1000)).unwrap();
             (
-                chunk.spans.len(),
+                chunk.reaches.len(),
                 pairs.records.len(),
                 source.total.into_inner(),
             )
@@ -258,7 +258,7 @@ mod tests {
         let (all, records, total) = spans(u64::MAX);
         assert_eq!(records as u64, total);
         let (some, none, counted) = spans(total / 10);
-        assert!(some < all / 4 && none == 0, "{some} of {all} spans");
+        assert!(some < all / 4 && none == 0, "{some} of {all} tiles");
         assert!(
             total / 10 < counted && counted < total / 2,
             "{counted} of {total} pairs"

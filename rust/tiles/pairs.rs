@@ -2,7 +2,7 @@
 
 use super::{
     NAME,
-    spans::{Span, tile_spans},
+    spans::{Reach, tile_spans},
 };
 use crate::{
     accuracy_knobs::Spans,
@@ -40,14 +40,15 @@ pub(crate) struct Record<T> {
 pub(crate) const UNIT: f64 = 0.849_321_800_288_019_1;
 
 impl<T: Real> Record<T> {
-    /// All of it that is the same in each tile.
+    /// In the tile around `center`.
     #[inline(always)]
-    fn new(splat: &Splat, gaussian: u32) -> Self {
+    fn new(splat: &Splat, gaussian: u32, center: [f64; 2]) -> Self {
         let [s, m, t] = splat.factors;
         let (s, t) = (UNIT * s, UNIT * t);
+        let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
         Self {
-            u0: T::ZERO,
-            v0: T::ZERO,
+            u0: T::from_f64(s * (m * y - x)),
+            v0: T::from_f64(-t * y),
             s: T::from_f64(s),
             n: T::from_f64(-s * m),
             t: T::from_f64(t),
@@ -56,28 +57,16 @@ impl<T: Real> Record<T> {
             gaussian,
         }
     }
-
-    /// The same in the tile around `center`.
-    #[inline(always)]
-    fn at(self, splat: &Splat, center: [f64; 2]) -> Self {
-        let [s, m, t] = splat.factors;
-        let (x, y) = (splat.mean[0] - center[0], splat.mean[1] - center[1]);
-        Self {
-            u0: T::from_f64(UNIT * s * (m * y - x)),
-            v0: T::from_f64(-(UNIT * t) * y),
-            ..self
-        }
-    }
 }
 
-/// The spans of a range of consecutive Gaussians, in their order.
+/// The tiles that a range of consecutive Gaussians reach, in their order.
 #[derive(Debug)]
 pub(crate) struct Chunk {
     /// First Gaussian.
     pub begin: usize,
     /// End of the range.
     pub end: usize,
-    pub spans: Vec<Span>,
+    pub reaches: Vec<Reach>,
     /// For each tile the place, by index among the tile's records, of this chunk's first one.
     pub starts: Vec<u32>,
 }
@@ -123,54 +112,68 @@ const REPORT: u64 = 1 << 14;
 /// index for each block.
 pub(super) const fn pair_bytes<T>(channels: usize) -> u64 {
     let both = size_of::<Record<T>>() + channels * size_of::<T>();
-    let of_chunk = size_of::<Span>() + size_of::<u32>();
+    let of_chunk = size_of::<Reach>() + size_of::<u32>();
     let of_list = size_of::<u32>() + size_of::<u16>() + TILE_BLOCKS * size_of::<u32>();
     (2 * both + of_chunk + of_list) as u64
 }
 
 impl<T: Real> Source<'_, T> {
-    /// The spans of the Gaussians `range`, and their pairs; not all of the spans and none of the pairs if those of
-    /// all chunks so far are too many. The chunk's `starts` are counts.
+    /// The tiles that the Gaussians `range` reach, and their pairs; not all of the tiles and none of the pairs if those
+    /// of all chunks so far are too many. The chunk's `starts` are counts.
     #[inline(always)]
-    pub fn chunk<S: Simd>(&self, _: S, range: Range<usize>) -> Result<(Chunk, Pairs<T>), Error> {
-        let mut spans = memory::with_capacity(range.len(), NAME)?;
-        let mut counts = memory::filled(0u32, self.tiles_x * self.tiles_y, NAME)?;
+    pub fn chunk<S: Simd>(&self, simd: S, range: Range<usize>) -> Result<(Chunk, Pairs<T>), Error> {
+        let mut reaches = memory::with_capacity(range.len(), NAME)?;
         let exact = self.projection.knobs.spans == Spans::Ellipse;
         let mut fresh = 0;
         let mut too_many = self.add(0);
         for i in range.clone() {
             let splat = &self.projection.splats[i];
-            if too_many || !splat.visible() {
-                continue;
+            let [x0, x1, y0, y1] = splat.tiles;
+            let count = usize::from(x1 - x0) * usize::from(y1 - y0);
+            let reach = |x, y| Reach {
+                gaussian: i as u32,
+                x,
+                y,
+            };
+            if count <= 2 {
+                // As most have, and those without any that are culled: two are written, and as many kept. No processor
+                // foresees a branch for their number.
+                memory::reserve(&mut reaches, 2, NAME)?;
+                let (len, right) = (reaches.len() + count, u16::from(x1 - x0 > 1));
+                reaches.push(reach(x0, y0));
+                reaches.push(reach(x0 + right, y0 + (1 - right)));
+                reaches.truncate(len);
+                fresh += count as u64;
+            } else {
+                tile_spans(simd, splat, exact, |y, x0, x1| {
+                    fresh += u64::from(x1 - x0);
+                    if fresh >= REPORT {
+                        too_many |= self.add(std::mem::take(&mut fresh));
+                    }
+                    if !too_many {
+                        reaches.extend((x0..x1).map(|x| reach(x, y)));
+                    }
+                });
             }
-            let [_, _, first, last] = splat.tiles.map(usize::from);
-            memory::reserve(&mut spans, last - first, NAME)?;
-            tile_spans(splat, exact, |row, x0, x1| {
-                let span = Span {
-                    gaussian: i as u32,
-                    row: row as u16,
-                    begin: x0 as u16,
-                    end: x1 as u16,
-                };
-                for count in &mut counts[span.tiles(self.tiles_x)] {
-                    *count += 1;
-                }
-                spans.push(span);
-                fresh += (x1 - x0) as u64;
-            });
             if fresh >= REPORT {
-                too_many = self.add(std::mem::take(&mut fresh));
+                too_many |= self.add(std::mem::take(&mut fresh));
+            }
+            if too_many {
+                break;
             }
         }
-        too_many = self.add(fresh);
+        too_many |= self.add(fresh);
+        let mut starts = memory::filled(0u32, self.tiles_x * self.tiles_y, NAME)?;
+        for reach in &reaches {
+            starts[reach.tile(self.tiles_x)] += 1;
+        }
+        let pairs = self.pairs(if too_many { &[] } else { &reaches }, &starts)?;
         let chunk = Chunk {
             begin: range.start,
             end: range.end,
-            spans,
-            starts: counts,
+            reaches,
+            starts,
         };
-        let spans = if too_many { &[] } else { &chunk.spans[..] };
-        let pairs = self.pairs(spans, &chunk.starts)?;
         Ok((chunk, pairs))
     }
 
@@ -180,7 +183,7 @@ impl<T: Real> Source<'_, T> {
     }
 
     #[inline(always)]
-    fn pairs(&self, spans: &[Span], counts: &[u32]) -> Result<Pairs<T>, Error> {
+    fn pairs(&self, reaches: &[Reach], counts: &[u32]) -> Result<Pairs<T>, Error> {
         let d = self.channels;
         let mut begins = memory::with_capacity(counts.len() + 1, NAME)?;
         let mut sum = 0usize;
@@ -189,7 +192,7 @@ impl<T: Real> Source<'_, T> {
             sum += *count as usize;
         }
         begins.push(sum as u32);
-        if spans.is_empty() {
+        if reaches.is_empty() {
             sum = 0;
         }
         let mut next = memory::with_capacity(begins.len(), NAME)?;
@@ -198,24 +201,19 @@ impl<T: Real> Source<'_, T> {
         let mut depths = memory::filled(0, sum, NAME)?;
         let mut records = memory::filled(Record::default(), sum, NAME)?;
         let mut colors = memory::filled(T::ZERO, sum * d, NAME)?;
-        let middle = |k: usize| (k * TILE + TILE / 2) as f64;
-        for of_one in spans.chunk_by(|a, b| a.gaussian == b.gaussian) {
-            let i = of_one[0].gaussian as usize;
+        let middle = |k: u16| (usize::from(k) * TILE + TILE / 2) as f64;
+        for reach in reaches {
+            let i = reach.gaussian as usize;
             let splat = &self.projection.splats[i];
-            let depth = (self.projection.depths[i] as f32).to_bits();
-            let color = &self.colors[i * d..(i + 1) * d];
-            let record = Record::new(splat, i as u32);
-            for span in of_one {
-                let row = usize::from(span.row);
-                for x in span.begin..span.end {
-                    let slot = &mut next[row * self.tiles_x + usize::from(x)];
-                    let at = *slot as usize;
-                    *slot += 1;
-                    depths[at] = depth;
-                    records[at] = record.at(splat, [middle(usize::from(x)), middle(row)]);
-                    copy_color(&mut colors[at * d..(at + 1) * d], color);
-                }
-            }
+            let slot = &mut next[reach.tile(self.tiles_x)];
+            let at = *slot as usize;
+            *slot += 1;
+            depths[at] = (self.projection.depths[i] as f32).to_bits();
+            records[at] = Record::new(splat, i as u32, [middle(reach.x), middle(reach.y)]);
+            copy_color(
+                &mut colors[at * d..(at + 1) * d],
+                &self.colors[i * d..(i + 1) * d],
+            );
         }
         Ok(Pairs {
             begins,
