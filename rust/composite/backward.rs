@@ -3,14 +3,15 @@
 use super::{
     CompositeInput, Composited, for_channels, for_parts, for_vectors,
     gather::{PairLayout, gather},
-    kernel::{self, Adjoint, Grid, LAYER, Sums},
+    kernel::{self, Adjoint, Grid, Layer, Pixels, Sums},
 };
 use crate::{
-    constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
+    constants::{BLOCK, BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::{Error, check_len},
     memory,
-    simd::Real,
+    simd::{Real, groups::Column},
+    uninit::prefetch_all,
 };
 use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
@@ -93,7 +94,6 @@ pub fn backward<T: Real>(
         });
     }
     let grid = Grid::new();
-    let level = input.projection.level.token;
     let count = tiles.lists.len();
     let mut pair_grads = memory::filled(Vec::new(), count, NAME)?;
     let mut counts = memory::filled(Counts::default(), count, NAME)?;
@@ -104,9 +104,8 @@ pub fn backward<T: Real>(
         .try_for_each_init(
             Scratch::default,
             |scratch, (tile, (grads, counts))| -> Result<(), Error> {
-                (*grads, *counts) = dispatch!(level, simd => for_channels!(
-                    channels, backward_tile, simd, T, (input, composited, v, &grid, tile, layout, scratch)
-                ))?;
+                (*grads, *counts) =
+                    backward_tile(input, composited, v, &grid, tile, layout, scratch)?;
                 Ok(())
             },
         )?;
@@ -124,13 +123,12 @@ pub fn backward<T: Real>(
 struct Scratch<T: Real> {
     adjoint: Adjoint<T>,
     /// What `kernel::replay` stores.
-    layers: Vec<T>,
+    layers: Vec<Layer<T>>,
 }
 
-/// Gradients of a tile's pairs, by index, and the work that they took; empty if all are zero.
-#[inline(always)]
-fn backward_tile<S: Simd, T: Real, const D: usize>(
-    simd: S,
+/// Gradients of a tile's pairs, by index, and the work that they took; empty if all are zero. Each of the three steps
+/// is compiled by itself: together they are too much for what the compiler keeps in registers.
+fn backward_tile<T: Real>(
     input: &CompositeInput<T>,
     composited: &Composited<T>,
     v: &CompositeCotangents<T>,
@@ -144,9 +142,12 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     if list.records.is_empty() {
         return Ok((Vec::new(), counts));
     }
+    let (channels, level) = (layout.channels, input.projection.level.token);
     let Scratch { adjoint, layers } = scratch;
-    adjoint.make_room(layout.channels)?;
-    let wanted = read_cotangents::<T, D>(input, v, tile, adjoint, &mut counts);
+    adjoint.make_room(channels)?;
+    let wanted = dispatch!(level, simd => for_channels!(
+        channels, read_cotangents, simd, T, (input, v, tile, adjoint, &mut counts)
+    ));
     // What the layers of a block without a cotangent contribute is 0.
     let mut depths = composited.depths[tile];
     for (block, depth) in depths.iter_mut().enumerate() {
@@ -162,15 +163,23 @@ fn backward_tile<S: Simd, T: Real, const D: usize>(
     counts.backward_tiles = 1;
     if let Some(next) = input.tiles.lists.get(tile + 1) {
         next.prefetch();
+        for (_, pixel, n) in input.runs(tile + 1) {
+            prefetch_all(&v.image[pixel * channels..(pixel + n) * channels]);
+        }
     }
-    let begins = replay_blocks::<S, T>(simd, input, grid, tile, &depths, adjoint, layers)?;
-    let out = for_parts!(S, T, P => unblend::<S, T, D, P>(simd, input, grid, tile, &begins, layout, adjoint, layers))?;
+    let begins = dispatch!(level, simd => replay_blocks::<_, T>(
+        simd, input, grid, tile, &depths, adjoint, layers
+    ))?;
+    let out = dispatch!(level, simd => for_channels!(
+        channels, unblend_tile, simd, T, (input, grid, tile, &begins, layout, adjoint, layers)
+    ))?;
     Ok((out, counts))
 }
 
 /// Fill `adjoint` with the cotangents of a tile. Returns the blocks with one that is not 0: bit b for block b.
 #[inline(always)]
-fn read_cotangents<T: Real, const D: usize>(
+fn read_cotangents<S: Simd, T: Real, const D: usize>(
+    simd: S,
     input: &CompositeInput<T>,
     v: &CompositeCotangents<T>,
     tile: usize,
@@ -182,30 +191,51 @@ fn read_cotangents<T: Real, const D: usize>(
     let mut wanted = 0u16;
     for (p, pixel, n) in input.runs(tile) {
         adjoint.transmittance[p..p + n].fill(T::ONE);
-        let mut any = false;
         let image = &v.image[pixel * channels..(pixel + n) * channels];
-        for (c, v_color) in adjoint.v_colors[..channels].iter_mut().enumerate() {
-            for (k, v_color) in v_color[p..p + n].iter_mut().enumerate() {
-                *v_color = image[k * channels + c];
-                any |= *v_color != T::ZERO;
-            }
+        let v_colors = &mut adjoint.v_colors[..channels];
+        if n == BLOCK {
+            // Most are whole: all of their pixels at once.
+            read_run::<T, D>(p, &image[..BLOCK * channels], v_colors);
+        } else {
+            read_run::<T, D>(p, image, v_colors);
         }
         if input.background.is_some() || v.alphas.is_some() {
             // Behind the last layer: the background, and the alpha, which is 1 - T.
-            for k in 0..n {
-                let v_alpha = v.alphas.map_or(0.0, |a| a[pixel + k].to_f64());
-                any |= v_alpha != 0.0;
-                let mut sum = -v_alpha;
-                for (v_color, b) in adjoint.v_colors.iter().zip(input.background.unwrap_or(&[])) {
-                    sum += v_color[p + k].to_f64() * b.to_f64();
+            let mut sums = [-0.0; BLOCK]; // adds nothing to any number
+            if let Some(alphas) = v.alphas {
+                for (sum, v_alpha) in sums.iter_mut().zip(&alphas[pixel..pixel + n]) {
+                    *sum = -v_alpha.to_f64();
+                    wanted |= u16::from(*v_alpha != T::ZERO) << (p / BLOCK_PIXELS);
                 }
-                adjoint.behind[p + k] = T::from_f64(sum);
+                counts.alpha_cotangents += n as u64;
+            }
+            for (v_color, b) in v_colors.iter().zip(input.background.unwrap_or(&[])) {
+                for (sum, v) in sums.iter_mut().zip(&v_color[p..p + BLOCK]) {
+                    *sum += v.to_f64() * b.to_f64();
+                }
+            }
+            for (behind, sum) in adjoint.behind[p..p + n].iter_mut().zip(sums) {
+                *behind = T::from_f64(sum);
             }
         }
-        wanted |= u16::from(any) << (p / BLOCK_PIXELS);
-        counts.alpha_cotangents += if v.alphas.is_some() { n as u64 } else { 0 };
+    }
+    for block in 0..TILE_BLOCKS {
+        let any = for_vectors!(S, T, V => kernel::any_nonzero::<S, T, V>(simd, block, &adjoint.v_colors[..channels]));
+        wanted |= u16::from(any) << block;
     }
     wanted
+}
+
+/// Cotangents of neighbouring pixels, from `p` on in block order.
+#[inline(always)]
+fn read_run<T: Real, const D: usize>(p: usize, image: &[T], v_colors: &mut [Pixels<T>]) {
+    let channels = if D > 0 { D } else { v_colors.len() };
+    let n = image.len() / channels.max(1);
+    for (c, v_color) in v_colors[..channels].iter_mut().enumerate() {
+        for (k, v_color) in v_color[p..p + n].iter_mut().enumerate() {
+            *v_color = image[k * channels + c];
+        }
+    }
 }
 
 /// Block by block its first `depths` layers once more, one after the other in `layers`. Returns the begin of each
@@ -218,12 +248,11 @@ fn replay_blocks<S: Simd, T: Real>(
     tile: usize,
     depths: &[u32; TILE_BLOCKS],
     adjoint: &Adjoint<T>,
-    layers: &mut Vec<T>,
+    layers: &mut Vec<Layer<T>>,
 ) -> Result<[usize; TILE_BLOCKS + 1], Error> {
     let total = depths.iter().sum::<u32>() as usize;
-    if layers.len() < total * LAYER {
-        memory::reserve(layers, total * LAYER - layers.len(), NAME)?;
-        layers.resize(total * LAYER, T::ZERO);
+    if layers.len() < total {
+        memory::resize(layers, total, [Column::ZERO; 2], NAME)?;
     }
     let list = &input.tiles.lists[tile];
     let mut begins = [0; TILE_BLOCKS + 1];
@@ -232,11 +261,29 @@ fn replay_blocks<S: Simd, T: Real>(
         let end = begin + depth;
         let mut seen = input.layers(list, block);
         seen.list = &seen.list[..depth];
-        let out = &mut layers[begin * LAYER..end * LAYER];
+        let out = &mut layers[begin..end];
         for_vectors!(S, T, V => kernel::replay::<S, T, V>(simd, grid, block, seen, adjoint, out));
         begins[block + 1] = end;
     }
     Ok(begins)
+}
+
+/// In whole cache lines: no vector lies in two.
+#[repr(C, align(64))]
+struct Lines<A>(A);
+
+#[inline(always)]
+fn unblend_tile<S: Simd, T: Real, const D: usize>(
+    simd: S,
+    input: &CompositeInput<T>,
+    grid: &Grid<T>,
+    tile: usize,
+    begins: &[usize; TILE_BLOCKS + 1],
+    layout: PairLayout,
+    adjoint: &Adjoint<T>,
+    layers: &[Layer<T>],
+) -> Result<Vec<T>, Error> {
+    for_parts!(S, T, P => unblend::<S, T, D, P>(simd, input, grid, tile, begins, layout, adjoint, layers))
 }
 
 /// Gaussian by Gaussian, back to front, the sums over its blocks.
@@ -249,13 +296,14 @@ fn unblend<S: Simd, T: Real, const D: usize, const P: usize>(
     begins: &[usize; TILE_BLOCKS + 1],
     layout: PairLayout,
     adjoint: &Adjoint<T>,
-    layers: &[T],
+    layers: &[Layer<T>],
 ) -> Result<Vec<T>, Error> {
     let list = &input.tiles.lists[tile];
     let channels = if D > 0 { D } else { layout.channels };
     // Copies, which the compiler knows to lie apart from everything else.
-    let (mut behind, mut v_colors) = (adjoint.behind, [[T::ZERO; TILE_PIXELS]; D]);
-    for (v_color, from) in v_colors.iter_mut().zip(&adjoint.v_colors) {
+    let mut behind = Lines(adjoint.behind);
+    let mut v_colors = Lines([[T::ZERO; TILE_PIXELS]; D]);
+    for (v_color, from) in v_colors.0.iter_mut().zip(&adjoint.v_colors) {
         *v_color = *from;
     }
     // Of each block the layers in front, of which the last ones may not have been reached.
@@ -277,15 +325,15 @@ fn unblend<S: Simd, T: Real, const D: usize, const P: usize>(
             left[block] -= 1;
             let k = begins[block] + left[block];
             if k < begins[block + 1] {
-                let layer = &layers[k * LAYER..(k + 1) * LAYER];
+                let layer = &layers[k];
                 let many = (color, &adjoint.v_colors[..]);
                 sums.add::<D>(
                     simd,
                     grid,
                     block,
                     layer,
-                    &mut behind,
-                    &v_colors,
+                    &mut behind.0,
+                    &v_colors.0,
                     many,
                     layout.absolute,
                     out,

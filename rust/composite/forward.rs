@@ -5,7 +5,7 @@ use super::{
     kernel::{self, Grid, Pixels},
 };
 use crate::{
-    constants::{BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
+    constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
     error::Error,
     memory,
@@ -87,32 +87,69 @@ fn image_from_tiles<T: Real>(
     let pixels = width * height;
     let [mut image, mut alphas] = UninitVec::several([pixels * channels, pixels], "image")?;
     let pixels = (0..tiles.tiles_y).map(|row| TILE.min(height - row * TILE) * width);
+    let level = input.projection.level.token;
     image
         .cut(pixels.clone().map(|n| n * channels))
         .into_par_iter()
         .zip(alphas.cut(pixels))
         .enumerate()
         .for_each(|(row, (image, alphas))| {
-            let (image, alphas) = (image.fill(T::ZERO), alphas.fill(T::ZERO));
-            let base = row * TILE * width;
-            for tile in row * tiles.tiles_x..(row + 1) * tiles.tiles_x {
-                let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
-                let colors = &colors[tile * channels..(tile + 1) * channels];
-                for (p, pixel, n) in input.runs(tile) {
-                    let pixel = pixel - base;
-                    for (alpha, t) in alphas[pixel..pixel + n].iter_mut().zip(&t[p..p + n]) {
-                        *alpha = T::from_f64(1.0 - t.to_f64());
-                    }
-                    let out = &mut image[pixel * channels..(pixel + n) * channels];
-                    for (c, color) in colors.iter().enumerate() {
-                        for (k, color) in color[p..p + n].iter().enumerate() {
-                            out[k * channels + c] = *color;
-                        }
-                    }
-                }
-            }
+            let out = (image.fill(T::ZERO), alphas.fill(T::ZERO));
+            dispatch!(level, simd => for_channels!(
+                channels, row_from_tiles, simd, T, (input, row, transmittance, colors, out)
+            ));
         });
     Ok((image.finish(), alphas.finish()))
+}
+
+/// One row of tiles of [`image_from_tiles`].
+#[inline(always)]
+fn row_from_tiles<S: Simd, T: Real, const D: usize>(
+    _: S,
+    input: &CompositeInput<T>,
+    row: usize,
+    transmittance: &[T],
+    colors: &[Pixels<T>],
+    (image, alphas): (&mut [T], &mut [T]),
+) {
+    let channels = if D > 0 { D } else { input.channels() };
+    let tiles_x = input.tiles.tiles_x;
+    let base = row * TILE * input.camera.width;
+    for tile in row * tiles_x..(row + 1) * tiles_x {
+        let t = &transmittance[tile * TILE_PIXELS..(tile + 1) * TILE_PIXELS];
+        let colors = &colors[tile * channels..(tile + 1) * channels];
+        for (p, pixel, n) in input.runs(tile) {
+            let pixel = pixel - base;
+            let alphas = &mut alphas[pixel..pixel + n];
+            let image = &mut image[pixel * channels..(pixel + n) * channels];
+            // Most are whole: all of their pixels at once.
+            if let Some(alphas) = alphas.first_chunk_mut::<BLOCK>() {
+                write_run::<T, D>(p, t, colors, &mut image[..BLOCK * channels], alphas);
+            } else {
+                write_run::<T, D>(p, t, colors, image, alphas);
+            }
+        }
+    }
+}
+
+/// Pixels `p..` of a tile, as many as there are alphas.
+#[inline(always)]
+fn write_run<T: Real, const D: usize>(
+    p: usize,
+    transmittance: &[T],
+    colors: &[Pixels<T>],
+    image: &mut [T],
+    alphas: &mut [T],
+) {
+    let (n, channels) = (alphas.len(), if D > 0 { D } else { colors.len() });
+    for (alpha, t) in alphas.iter_mut().zip(&transmittance[p..p + n]) {
+        *alpha = T::from_f64(1.0 - t.to_f64());
+    }
+    for (c, color) in colors[..channels].iter().enumerate() {
+        for (k, color) in color[p..p + n].iter().enumerate() {
+            image[k * channels + c] = *color;
+        }
+    }
 }
 
 /// Composite one tile.

@@ -5,7 +5,7 @@
 
 use super::{
     CompositeInput, for_vectors,
-    kernel::{Decision, Grid, Layers, RecordLanes, STRIDE, load, width},
+    kernel::{Decision, Grid, Layers, STRIDE, load, width},
 };
 use crate::{
     constants::{BLOCK_PIXELS, TILE_BLOCKS, TILE_PIXELS},
@@ -112,20 +112,19 @@ fn weigh<S: Simd, T: Real, const V: usize>(
     transmittance: &[T],
     largest: &mut [T],
 ) {
-    let [x, y] = grid.block::<S, V>(simd, block);
+    let pixels = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
     let zero = Lanes::<T, S>::splat(simd, T::ZERO);
     let mut open = load::<S, T, V>(simd, transmittance);
     for part in layers.list.chunks(STRIDE) {
         for &k in part {
+            let [alpha] = layers.alphas(simd, &[k], pixels);
             let k = k as usize;
-            let record = RecordLanes::<S, T>::new(simd, &layers.records[k]);
             let out = &mut largest[k * width::<S, T>()..(k + 1) * width::<S, T>()];
             let mut most = Lanes::<T, S>::from_slice(simd, out);
             for j in 0..V {
-                let alpha = record.alpha(simd, x[j], y[j]);
-                let met = decision.meet(alpha, open[j]);
-                most = most.max(met.blended.select(open[j] * alpha, zero));
+                let met = decision.meet(alpha[j], open[j]);
+                most = most.max(met.blended.select(open[j] * alpha[j], zero));
                 open[j] = met.open;
             }
             most.store_slice(out);

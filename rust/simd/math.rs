@@ -25,52 +25,56 @@ const EXP2_F64: [f64; 14] = {
     c
 };
 
-/// `2^x`: round to the nearest integer by adding `magic` (1.5 x 2^mantissa bits), whose low bits then hold
-/// that integer; evaluate the polynomial at the rest; add the integer to the exponent.
+/// `2^x` of N vectors: round to the nearest integer by adding `magic` (1.5 x 2^mantissa bits), whose low bits then
+/// hold that integer; evaluate the polynomial at the rest; add the integer to the exponent. Step by step for all of
+/// them, so that the processor need not wait for one.
 macro_rules! exp2 {
     ($T:ty, $simd:ident, $x:ident, $min:expr, $magic:expr, $bits:expr, $coefficients:expr) => {{
-        let x = $x.max(Lanes::<$T, S>::splat($simd, $min));
-        let magic = Lanes::<$T, S>::splat($simd, $magic);
-        let shifted = x + magic;
-        let f = x - (shifted - magic);
-        let mut p = Lanes::<$T, S>::splat($simd, $coefficients[$coefficients.len() - 1]);
-        let mut k = $coefficients.len() - 1;
+        let splat = |x: $T| Lanes::<$T, S>::splat($simd, x);
+        let magic = splat($magic);
+        let last = $coefficients.len() - 1;
+        let mut shifted = [magic; N];
+        let mut p = [splat($coefficients[last]); N];
+        for (x, shifted) in $x.iter_mut().zip(&mut shifted) {
+            *x = x.max(splat($min));
+            *shifted = *x + magic;
+            *x -= *shifted - magic;
+        }
+        let mut k = last;
         while k > 0 {
             k -= 1;
-            p = p.mul_add(f, Lanes::<$T, S>::splat($simd, $coefficients[k]));
+            for (p, f) in p.iter_mut().zip($x.iter()) {
+                *p = p.mul_add(*f, splat($coefficients[k]));
+            }
         }
-        Lanes::<$T, S>::from_bits(p.to_bits() + (shifted.to_bits() << $bits))
+        for ((x, p), shifted) in $x.iter_mut().zip(p).zip(shifted) {
+            *x = Lanes::<$T, S>::from_bits(p.to_bits() + (shifted.to_bits() << $bits));
+        }
     }};
 }
 
 /// [`Real::exp2`](super::Real::exp2) in f32.
 #[inline(always)]
-pub(super) fn exp2_f32<S: Simd>(simd: S, x: Lanes<f32, S>) -> Lanes<f32, S> {
-    exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32)
+pub(super) fn exp2_f32<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<f32, S>; N]) {
+    exp2!(f32, simd, x, -126.0, 12_582_912.0, 23u32, EXP2_F32);
 }
 
 /// [`Real::exp2`](super::Real::exp2) in f64.
 #[inline(always)]
-pub(super) fn exp2_f64<S: Simd>(simd: S, x: Lanes<f64, S>) -> Lanes<f64, S> {
-    exp2!(
-        f64,
-        simd,
-        x,
-        -1022.0,
-        6_755_399_441_055_744.0,
-        52u32,
-        EXP2_F64
-    )
+pub(super) fn exp2_f64<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<f64, S>; N]) {
+    const MAGIC: f64 = 6_755_399_441_055_744.0;
+    exp2!(f64, simd, x, -1022.0, MAGIC, 52u32, EXP2_F64);
 }
 
 /// `e^x` with a relative error below (1 + |x|) 2e-16, and never less than the smallest normal number; NaN stays.
 #[inline(always)]
 pub(crate) fn exp<S: Simd>(simd: S, x: Wide<S>) -> Wide<S> {
     const LN_MAX: f64 = 709.782_712_893_384; // of the largest number
-    let power = exp2_f64(simd, x.min(splat(simd, LN_MAX)) * std::f64::consts::LOG2_E);
+    let mut power = [x.min(splat(simd, LN_MAX)) * std::f64::consts::LOG2_E];
+    exp2_f64(simd, &mut power);
     let finite = x
         .simd_le(splat(simd, LN_MAX))
-        .select(power, splat(simd, f64::INFINITY));
+        .select(power[0], splat(simd, f64::INFINITY));
     x.simd_eq(x).select(finite, x)
 }
 
@@ -115,8 +119,9 @@ mod tests {
             (0..20_000)
                 .map(|i| {
                     let x = T::from_f64(-f64::from(i) * 0.0037);
-                    let y = T::exp2(simd, Lanes::<T, S>::splat(simd, x))[0].to_f64();
-                    (y / x.to_f64().exp2() - 1.0).abs()
+                    let mut y = [Lanes::<T, S>::splat(simd, x)];
+                    T::exp2(simd, &mut y);
+                    (y[0][0].to_f64() / x.to_f64().exp2() - 1.0).abs()
                 })
                 .fold(0.0, f64::max)
         }

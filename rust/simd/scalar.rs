@@ -28,10 +28,10 @@ pub trait Real: sealed::Scalar + Send + Sync + 'static {
     fn saturating(x: f64) -> Self;
     /// The value as f64, exactly.
     fn to_f64(self) -> f64;
-    /// `2^x` for `x <= 0`, lane by lane. Relative error at most 1.2e-7 (f32), 3e-16 (f64) down to the
+    /// `2^x` of some vectors for `x <= 0`, lane by lane, in their place. Relative error at most 1.2e-7 (f32), 3e-16 (f64) down to the
     /// smallest normal number; below it the result is that number, which every caller cuts off.
     #[doc(hidden)]
-    fn exp2<S: Simd>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S>;
+    fn exp2<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<Self, S>; N]);
 }
 
 impl Real for f32 {
@@ -55,8 +55,8 @@ impl Real for f32 {
     }
 
     #[inline(always)]
-    fn exp2<S: Simd>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S> {
-        exp2_f32(simd, x)
+    fn exp2<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<Self, S>; N]) {
+        exp2_f32(simd, x);
     }
 }
 
@@ -81,7 +81,7 @@ impl Real for f64 {
     }
 
     #[inline(always)]
-    fn exp2<S: Simd>(simd: S, x: Lanes<Self, S>) -> Lanes<Self, S> {
-        exp2_f64(simd, x)
+    fn exp2<S: Simd, const N: usize>(simd: S, x: &mut [Lanes<Self, S>; N]) {
+        exp2_f64(simd, x);
     }
 }

@@ -1,6 +1,6 @@
 //! A block in the forward pass.
 
-use super::{Decision, Grid, Layers, Pixels, RecordLanes, STRIDE, load, store, width};
+use super::{Decision, Grid, Layers, Pixels, STRIDE, load, store, width};
 use crate::{
     constants::BLOCK_PIXELS,
     simd::{Lanes, Real},
@@ -18,6 +18,57 @@ pub struct Blended {
     pub pixels: u64,
 }
 
+/// The pixels of a block (V vectors) on their way through its layers.
+struct Way<S: Simd, T: Real, const D: usize, const V: usize> {
+    /// What the last layer leaves, and the same with `least` where the pixel is finished.
+    after: [Lanes<T, S>; V],
+    open: [Lanes<T, S>; V],
+    /// Colours so far.
+    sums: [[Lanes<T, S>; V]; D],
+    /// How many layers each pixel blends: it is finished long before f32 cannot count them.
+    blended: [Lanes<T, S>; V],
+    /// Layers that changed a pixel.
+    changed: u64,
+}
+
+impl<S: Simd, T: Real, const D: usize, const V: usize> Way<S, T, D, V> {
+    /// Meet one layer. With D = 0 the colours lie in `colors`, from `at` on.
+    #[inline(always)]
+    fn meet(
+        &mut self,
+        simd: S,
+        decision: &Decision<S, T>,
+        alpha: [Lanes<T, S>; V],
+        rgb: &[T],
+        colors: &mut [Pixels<T>],
+        at: usize,
+    ) {
+        let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+        let mut changed = 0;
+        for j in 0..V {
+            let met = decision.meet(alpha[j], self.open[j]);
+            let weight = met.blended.select(self.open[j] * alpha[j], zero);
+            for (c, color) in rgb.iter().enumerate() {
+                let color = Lanes::<T, S>::splat(simd, *color);
+                if D > 0 {
+                    self.sums[c][j] = weight.mul_add(color, self.sums[c][j]);
+                } else {
+                    let out = &mut colors[c][at + j * width::<S, T>()..][..width::<S, T>()];
+                    weight
+                        .mul_add(color, Lanes::<T, S>::from_slice(simd, out))
+                        .store_slice(out);
+                }
+            }
+            self.after[j] = met.blended.select(met.behind, self.after[j]);
+            self.open[j] = met.open;
+            changed |= met.blended.to_bitmask();
+            let one_more = self.blended[j] + T::ONE;
+            self.blended[j] = met.blended.select(one_more, self.blended[j]);
+        }
+        self.changed += u64::from(changed != 0);
+    }
+}
+
 /// Blend the layers over one block (V vectors). `transmittance` is 1 inside the image and 0 outside before,
 /// and what the last layer leaves after. The colours go to `colors[channel]`, block by block.
 #[inline(always)]
@@ -29,60 +80,57 @@ pub fn blend<S: Simd, T: Real, const D: usize, const V: usize>(
     transmittance: &mut [T],
     colors: &mut [Pixels<T>],
 ) -> Blended {
-    let splat = |x: T| Lanes::<T, S>::splat(simd, x);
     let channels = if D > 0 { D } else { layers.channels };
     let at = block * BLOCK_PIXELS;
-    let [x, y] = grid.block::<S, V>(simd, block);
+    let pixels = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
-    let zero = splat(T::ZERO);
-    // What the last layer leaves, and the same with 0 where the pixel is finished.
-    let mut after = load::<S, T, V>(simd, transmittance);
-    let mut open = after;
-    let mut sums = [[zero; V]; D];
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+    let before = load::<S, T, V>(simd, transmittance);
+    let mut way = Way::<S, T, D, V> {
+        after: before,
+        open: before,
+        sums: [[zero; V]; D],
+        blended: [zero; V],
+        changed: 0,
+    };
     let mut counts = Blended::default();
+    let rgb = |k: u32| &layers.colors[k as usize * channels..(k as usize + 1) * channels];
     for part in layers.list.chunks(STRIDE) {
-        for &k in part {
-            let k = k as usize;
-            let record = RecordLanes::<S, T>::new(simd, &layers.records[k]);
-            let rgb = &layers.colors[k * channels..(k + 1) * channels];
-            let mut changed = 0;
-            for j in 0..V {
-                let alpha = record.alpha(simd, x[j], y[j]);
-                let met = decision.meet(alpha, open[j]);
-                let weight = met.blended.select(open[j] * alpha, zero);
-                for (c, color) in rgb.iter().enumerate() {
-                    if D > 0 {
-                        sums[c][j] = weight.mul_add(splat(*color), sums[c][j]);
-                    } else {
-                        let out = &mut colors[c][at + j * width::<S, T>()..][..width::<S, T>()];
-                        weight
-                            .mul_add(splat(*color), Lanes::<T, S>::from_slice(simd, out))
-                            .store_slice(out);
-                    }
-                }
-                after[j] = met.blended.select(met.behind, after[j]);
-                open[j] = met.open;
-                let bits = met.blended.to_bitmask().count_ones();
-                changed |= bits;
-                counts.pixels += u64::from(bits);
+        match <&[u32; STRIDE]>::try_from(part) {
+            Ok(part) if V == 1 => {
+                let [a, b, c, d] = layers.alphas(simd, part, pixels);
+                way.meet(simd, &decision, a, rgb(part[0]), colors, at);
+                way.meet(simd, &decision, b, rgb(part[1]), colors, at);
+                way.meet(simd, &decision, c, rgb(part[2]), colors, at);
+                way.meet(simd, &decision, d, rgb(part[3]), colors, at);
             }
-            counts.changed += u64::from(changed != 0);
+            _ => {
+                for &k in part {
+                    let [alpha] = layers.alphas(simd, &[k], pixels);
+                    way.meet(simd, &decision, alpha, rgb(k), colors, at);
+                }
+            }
         }
         counts.layers += part.len();
-        if decision.finished(&open) {
+        if decision.finished(&way.open) {
             break;
         }
     }
-    store::<S, T, V>(transmittance, after);
+    counts.changed = way.changed;
+    for blended in way.blended {
+        counts.pixels += blended.reduce_sum().to_f64() as u64;
+    }
+    store::<S, T, V>(transmittance, way.after);
     for (c, color) in colors[..channels].iter_mut().enumerate() {
         let mut sum = if D > 0 {
-            sums[c]
+            way.sums[c]
         } else {
             load::<S, T, V>(simd, &color[at..])
         };
         if let Some(background) = layers.background {
-            for j in 0..V {
-                sum[j] = after[j].mul_add(splat(background[c]), sum[j]);
+            let behind = Lanes::<T, S>::splat(simd, background[c]);
+            for (sum, after) in sum.iter_mut().zip(way.after) {
+                *sum = after.mul_add(behind, *sum);
             }
         }
         store::<S, T, V>(&mut color[at..], sum);

@@ -8,7 +8,7 @@ mod blend;
 mod unblend;
 
 pub(super) use blend::blend;
-pub(super) use unblend::{ABSOLUTE, Adjoint, LAYER, MOMENTS, Sums, replay};
+pub(super) use unblend::{ABSOLUTE, Adjoint, Layer, MOMENTS, Sums, any_nonzero, replay};
 
 use crate::{
     constants::{ALPHA_MAX, BLOCK, BLOCK_PIXELS, BLOCKS_PER_SIDE, TILE, TILE_PIXELS},
@@ -36,6 +36,7 @@ pub(super) const fn position(p: usize) -> (usize, usize) {
 }
 
 /// Coordinates that do not depend on the Gaussian, relative to the tile's centre.
+#[repr(C, align(64))]
 pub(super) struct Grid<T> {
     /// Pixel centres.
     x: Pixels<T>,
@@ -67,7 +68,6 @@ pub(super) struct RecordLanes<S: Simd, T: Real> {
     s: Lanes<T, S>,
     n: Lanes<T, S>,
     t: Lanes<T, S>,
-    opacity: Lanes<T, S>,
 }
 
 impl<S: Simd, T: Real> RecordLanes<S, T> {
@@ -80,7 +80,6 @@ impl<S: Simd, T: Real> RecordLanes<S, T> {
             s: splat(g.s),
             n: splat(g.n),
             t: splat(g.t),
-            opacity: splat(g.opacity),
         }
     }
 
@@ -91,15 +90,6 @@ impl<S: Simd, T: Real> RecordLanes<S, T> {
             self.s.mul_add(x, self.n.mul_add(y, self.u0)),
             self.t.mul_add(y, self.v0),
         )
-    }
-
-    /// alpha at the pixels (x, y): the one function that both passes use.
-    #[inline(always)]
-    pub fn alpha(&self, simd: S, x: Lanes<T, S>, y: Lanes<T, S>) -> Lanes<T, S> {
-        let (u, v) = self.position(x, y);
-        let power = u.mul_add(u, v * v);
-        let alpha = self.opacity * T::exp2(simd, -power);
-        alpha.min(Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX)))
     }
 }
 
@@ -137,6 +127,34 @@ pub(super) struct Layers<'a, T> {
     pub floor: T,
     /// Transmittance at which a pixel is finished.
     pub least: T,
+}
+
+impl<T: Real> Layers<'_, T> {
+    /// alpha of N layers at the pixels (x, y) of a block: the one function that all passes use. Step by step for all
+    /// of them, since a processor that computes one after the other mostly waits.
+    #[inline(always)]
+    pub fn alphas<S: Simd, const N: usize, const V: usize>(
+        &self,
+        simd: S,
+        layers: &[u32; N],
+        [x, y]: [[Lanes<T, S>; V]; 2],
+    ) -> [[Lanes<T, S>; V]; N] {
+        let cap = Lanes::<T, S>::splat(simd, T::from_f64(ALPHA_MAX));
+        let records = layers.map(|k| &self.records[k as usize]);
+        let mut out = [[cap; V]; N];
+        for j in 0..V {
+            let mut powers = [cap; N];
+            for (power, record) in powers.iter_mut().zip(records) {
+                let (u, v) = RecordLanes::<S, T>::new(simd, record).position(x[j], y[j]);
+                *power = -u.mul_add(u, v * v);
+            }
+            T::exp2(simd, &mut powers);
+            for ((out, power), record) in out.iter_mut().zip(powers).zip(records) {
+                out[j] = (Lanes::<T, S>::splat(simd, record.opacity) * power).min(cap);
+            }
+        }
+        out
+    }
 }
 
 /// Layers between two tests whether all pixels are finished.

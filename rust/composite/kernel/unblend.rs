@@ -1,14 +1,18 @@
 //! A block in the backward pass, and the sums over the blocks of a tile.
 
-use super::{Decision, Grid, Layers, Pixels, RecordLanes, load, store, width};
+use super::{Decision, Grid, Layers, Pixels, RecordLanes, STRIDE, load, store, width};
 use crate::{
     constants::{ALPHA_MAX, BLOCK_PIXELS, TILE_PIXELS},
     error::Error,
     memory,
-    simd::{Lanes, Real, sums::fold},
+    simd::{
+        Lanes, Real,
+        groups::{Column, GROUP},
+        sums::fold,
+    },
     tiles::Record,
 };
-use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
+use fearless_simd::{Select, Simd, SimdBase, SimdFloat, SimdMask};
 
 /// Sums over the pixels of a tile for one Gaussian; the order of the fields is the order in memory.
 /// With w the gradient of the loss with respect to sigma: w, w u, w v, w u^2, w u v, w v^2.
@@ -17,8 +21,9 @@ pub const MOMENTS: usize = 6;
 /// |d loss / d mean2d| summed pixel by pixel, x and y, where asked for.
 pub const ABSOLUTE: usize = 2;
 
-/// Numbers that `replay` stores per layer of a block.
-pub const LAYER: usize = 2 * BLOCK_PIXELS;
+/// What `replay` stores of a layer of a block, in whole cache lines: the transmittance in front of it, and its alpha.
+pub type Layer<T> = [Column<T>; 2];
+const _: () = assert!(GROUP == BLOCK_PIXELS);
 
 /// One tile in the backward pass.
 pub struct Adjoint<T> {
@@ -60,6 +65,23 @@ impl<T: Real> Adjoint<T> {
     }
 }
 
+/// Whether a pixel of a block (V vectors) has a value that is not 0 in one of `data`.
+#[inline(always)]
+pub fn any_nonzero<S: Simd, T: Real, const V: usize>(
+    simd: S,
+    block: usize,
+    data: &[Pixels<T>],
+) -> bool {
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+    let mut none = zero.simd_eq(zero);
+    for data in data {
+        for x in load::<S, T, V>(simd, &data[block * BLOCK_PIXELS..]) {
+            none &= x.simd_eq(zero);
+        }
+    }
+    !none.all_true()
+}
+
 /// The layers of one block (V vectors), front to back once more: for each layer `out` receives the transmittance in
 /// front of it and its alpha, 0 where it is not blended.
 #[inline(always)]
@@ -69,25 +91,49 @@ pub fn replay<S: Simd, T: Real, const V: usize>(
     block: usize,
     layers: Layers<T>,
     adjoint: &Adjoint<T>,
-    out: &mut [T],
+    out: &mut [Layer<T>],
 ) {
-    let [x, y] = grid.block::<S, V>(simd, block);
+    let pixels = grid.block::<S, V>(simd, block);
     let decision = Decision::new(simd, &layers);
-    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
     let mut open = load::<S, T, V>(simd, &adjoint.transmittance[block * BLOCK_PIXELS..]);
-    for (&k, out) in layers.list.iter().zip(out.chunks_exact_mut(LAYER)) {
-        let record = RecordLanes::<S, T>::new(simd, &layers.records[k as usize]);
-        let (mut before, mut alphas) = (open, [zero; V]);
-        for j in 0..V {
-            let alpha = record.alpha(simd, x[j], y[j]);
-            let met = decision.meet(alpha, open[j]);
-            before[j] = open[j];
-            alphas[j] = met.blended.select(alpha, zero);
-            open[j] = met.open;
+    let parts = layers.list.chunks(STRIDE).zip(out.chunks_mut(STRIDE));
+    for (part, out) in parts {
+        match (<&[u32; STRIDE]>::try_from(part), out) {
+            (Ok(part), [a, b, c, d]) if V == 1 => {
+                let alphas = layers.alphas(simd, part, pixels);
+                keep(simd, &decision, alphas[0], &mut open, a);
+                keep(simd, &decision, alphas[1], &mut open, b);
+                keep(simd, &decision, alphas[2], &mut open, c);
+                keep(simd, &decision, alphas[3], &mut open, d);
+            }
+            (_, out) => {
+                for (&k, out) in part.iter().zip(out) {
+                    let [alpha] = layers.alphas(simd, &[k], pixels);
+                    keep(simd, &decision, alpha, &mut open, out);
+                }
+            }
         }
-        store::<S, T, V>(out, before);
-        store::<S, T, V>(&mut out[BLOCK_PIXELS..], alphas);
     }
+}
+
+/// Store what pixels of transmittance `open` see of a layer, and what is left of it.
+#[inline(always)]
+fn keep<S: Simd, T: Real, const V: usize>(
+    simd: S,
+    decision: &Decision<S, T>,
+    alpha: [Lanes<T, S>; V],
+    open: &mut [Lanes<T, S>; V],
+    [front, layer]: &mut Layer<T>,
+) {
+    let zero = Lanes::<T, S>::splat(simd, T::ZERO);
+    let mut alphas = [zero; V];
+    store::<S, T, V>(&mut front.0, *open);
+    for j in 0..V {
+        let met = decision.meet(alpha[j], open[j]);
+        alphas[j] = met.blended.select(alpha[j], zero);
+        open[j] = met.open;
+    }
+    store::<S, T, V>(&mut layer.0, alphas);
 }
 
 /// Running sums of one Gaussian over its blocks, in P vectors each (`sums::parts`).
@@ -116,7 +162,7 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         }
     }
 
-    /// Step in front of the Gaussian in one block, of which `replay` stored `layer`, and add its gradients there. The
+    /// Step in front of the Gaussian in one block, of which `replay` stored these two, and add its gradients there. The
     /// cotangents of the channels are `few`; with D = 0 the colour and they are `many`, and the gradient of the colour
     /// goes straight to `out`.
     ///
@@ -128,7 +174,7 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         simd: S,
         grid: &Grid<T>,
         block: usize,
-        layer: &[T],
+        [before, alphas]: &Layer<T>,
         behind: &mut Pixels<T>,
         few: &[Pixels<T>; D],
         many: (&[T], &[Pixels<T>]),
@@ -138,7 +184,7 @@ impl<S: Simd, T: Real, const P: usize> Sums<S, T, P> {
         let n = width::<S, T>();
         let zero = Lanes::<T, S>::splat(simd, T::ZERO);
         let load = |from: &[T]| Lanes::<T, S>::from_slice(simd, &from[..n]);
-        let (before, alphas) = layer.split_at(BLOCK_PIXELS);
+        let (before, alphas) = (&before.0, &alphas.0);
         // Two loops, since all that one needs would not fit into the registers of AVX2.
         let (mut ws, mut weights) = ([T::ZERO; BLOCK_PIXELS], [T::ZERO; BLOCK_PIXELS]);
         for i in (0..BLOCK_PIXELS).step_by(n) {
