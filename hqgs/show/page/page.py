@@ -177,7 +177,8 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
 
 def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
     packed = pack_scene(gaussians)
-    views = [*scene.test, *scene.train][:MOST_CAMERAS]
+    views = [*scene.test, *scene.train]
+    views = [views[k] for k in evenly(len(views), MOST_CAMERAS)]
     cameras = [view.camera for view in views]
     middle = focus([view.camera for view in scene.train])
     note = (
