@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.random_points import NO_POINTS
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.constants import TOO_SMALL
-from hqgs.scene.sfm.run import key_of
+from hqgs.scene.sfm.run import PROGRAM, key_of
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
 
 
@@ -58,7 +57,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
 
 def _pieces(scene: Scene) -> Iterator[bytes]:
     """The photos and cameras, and how points are found."""
-    yield Path(inspect.getfile(triangulated)).read_bytes()
+    yield PROGRAM.with_name("triangulated.py").read_bytes()
     for view in scene.train:
         for array in (view.image, view.mask, view.camera.K, view.camera.viewmat):
             yield b"-" if array is None else np.ascontiguousarray(array).tobytes()
