@@ -133,6 +133,7 @@ def test_diagnose_prints_and_writes_what_it_found(
         "exposure",
         "vignetting",
         "response",
+        "rolling",
         "shake",
         "focus",
         "blur",
