@@ -36,12 +36,7 @@ def take_photo(
 
 
 def take_rows(
-    image: Tensor,
-    size: tuple[int, int],
-    nearness: Tensor | None,
-    warps: Tensor,
-    gains: Tensor,
-    rows: Tensor,
+    image: Tensor, size: tuple[int, int], nearness: Tensor | None, warps: Tensor, gains: Tensor, rows: Tensor
 ) -> Tensor:
     """The same where rows are taken one after another: to `warps` come those of equal bands of rows from top
     to bottom, [B, 3, 4], float64. A band sees no more of the render than its rows and the margin around."""
