@@ -51,27 +51,52 @@ class Agreement:
         self._shared: NDArray[np.intp] = (sees @ sees.T).toarray()
         np.fill_diagonal(self._shared, -1)
 
+    def asked(self, number: int, most: int = ASKED) -> list[int]:
+        """Numbers of the photos that share most points with a view, at most so many."""
+        order = np.argsort(-self._shared[number], kind="stable")
+        return [int(k) for k in order[: min(most, len(order) - 1)]]
+
     def depths(
-        self, number: int, pixels: Floats, ranges: Floats, grey: NDArray[np.float32] | None = None
+        self,
+        number: int,
+        pixels: Floats,
+        ranges: Floats,
+        others: Sequence[int] | None = None,
+        grey: NDArray[np.float32] | None = None,
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where others agree.
 
-        `grey`: what is compared with the other photos in place of the view's own, [h, w] of its small photo.
+        `others`: who is asked, None: `asked`. `grey`: what is compared with them in place of the view's own,
+        [h, w] of its small photo.
         """
-        order = np.argsort(-self._shared[number], kind="stable")
-        others = [int(k) for k in order[: min(ASKED, len(order) - 1)]]
+        others = self.asked(number) if others is None else others
         if len(others) < AGREEING:
             return ranges[:, 0], np.zeros(len(ranges), bool)
+        depths, scores = self._swept(number, pixels, ranges, others, AGREEING, grey)
+        return depths, scores >= AGREED
+
+    def depths_by(self, number: int, pixels: Floats, ranges: Floats, other: int) -> tuple[Floats, Floats]:
+        """Depths [M] as `depths` has them by one other photo alone, and the correlations [M]; -1: none."""
+        return self._swept(number, pixels, ranges, [other], 1, None)
+
+    def _swept(
+        self,
+        number: int,
+        pixels: Floats,
+        ranges: Floats,
+        others: Sequence[int],
+        agreeing: int,
+        grey: NDArray[np.float32] | None,
+    ) -> tuple[Floats, Floats]:
         look = self.looks[number]
-        depths, scores = _rust.agreed_depths(
+        return _rust.agreed_depths(
             look.grey if grey is None else grey,
             [self.looks[k].grey for k in others],
             np.stack([_map(look.camera, self.looks[k].camera) for k in others]),
             np.ascontiguousarray(pixels * look.scale),
             np.ascontiguousarray(ranges),
-            AGREEING,
+            agreeing,
         )
-        return depths, scores >= AGREED
 
 
 def _map(first: Camera, second: Camera) -> Floats:

@@ -19,6 +19,9 @@ FLAT = 0.2  # share of the points that all pixels alike get
 AROUND, WIDENED, LEAST_AROUND = 6, 1.6, 3
 AGREE_LONGEST, AGREE_SMOOTH = 800, 1.0  # px: of a smaller copy; of noise there is less then
 ASKED, AGREEING, AGREED = 4, 2, 0.6  # photos that are asked, that must agree, and the correlation of patches
+# Points that are found back: px of the small copies, within which; photos that are asked in the second look;
+# the correlation that one alone must have; and what widens a range between known depths.
+FOUND_BACK, ASKED_AGAIN, ALONE, AROUND_KNOWN = 1.0, 8, 0.8, 1.15
 
 # What there is to see of a scene: the share within the radius of `content`; how far from the middle, in such
 # radii, a camera sees it fill the picture, and how high above it; Gaussians that tell the size.

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
-from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement, SmallPhoto
 from hqgs.model.constants import AROUND, FLAT, LEAST_AROUND, WIDENED
 from hqgs.photos.pixels import as_floats, to_uint8
@@ -18,6 +17,7 @@ from hqgs.scene.scene import View
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 
 
 def points_along_edges(
@@ -27,7 +27,6 @@ def points_along_edges(
     count: int,
     seed: int,
     agreement: Agreement,
-    on_stage: OnStage = silent,
 ) -> tuple[Points, Colors]:
     """About `count` points [M, 3] (world) under pixels of the photos, and those pixels' colours [M, 3].
 
@@ -43,28 +42,58 @@ def points_along_edges(
         seed: of the draw. Each view has its own numbers, whatever the others are.
         agreement: of the same views: how they are looked at; it tells the depths, and points that it does
             not find are left out.
-        on_stage: hears of each view.
     """
-    found, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
-    for k, view in enumerate(views):
+    surfaces, found = Surfaces(views, points, seen), list[tuple[int, Floats, Floats]]()
+    for k in range(len(views)):
         share = count * (k + 1) // len(views) - count * k // len(views)
-        rows = seen.get(view.name)
-        on_stage(Stage("first points, from photos", k + 1, len(views)))
-        if rows is None or not share:
-            continue
-        pixels = _drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
-        ranges = _ranges(view, points[rows].astype(np.float64), pixels)
-        if ranges is None:
-            continue
-        depths, agreed = agreement.depths(k, pixels, ranges)
-        pixels, depths = pixels[agreed], depths[agreed]
-        found.append(unproject(view.camera, pixels, depths).astype(np.float32))
+        if share and surfaces.known(k):
+            pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
+            depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
+            found.append((k, pixels[agreed], depths[agreed]))
+    return gathered(views, found)
+
+
+class Surfaces:
+    """Where the surfaces are that each view shows, as far as that is known."""
+
+    def __init__(self, views: Sequence[View], points: Points, seen: Mapping[str, NDArray[np.intp]]) -> None:
+        """Of points [P, 3], world, of which `seen` tells by the view's name what rows it sees."""
+        self._pixels, self._depths = list[Floats](), list[Floats]()
+        for view in views:
+            rows = seen.get(view.name, np.zeros(0, np.intp))
+            pixels, depths = project(view.camera, points[rows].astype(np.float64))
+            self._pixels.append(pixels[depths > 0])
+            self._depths.append(depths[depths > 0])
+
+    def known(self, number: int) -> bool:
+        """Whether enough is known of a view to tell ranges."""
+        return len(self._depths[number]) >= LEAST_AROUND
+
+    def add(self, number: int, pixels: Floats, depths: Floats) -> None:
+        """More pixels [M, 2] of a view, and their depths [M]."""
+        self._pixels[number] = np.concatenate([self._pixels[number], pixels])
+        self._depths[number] = np.concatenate([self._depths[number], depths])
+
+    def ranges(self, number: int, pixels: Floats, widened: float = WIDENED) -> Floats:
+        """Between which depths [M, 2] the surface at `pixels` [M, 2] is sought: those of what is known
+        nearest in the picture, times and over `widened`."""
+        depths = self._depths[number]
+        _, nearest = KDTree(self._pixels[number]).query(pixels, min(AROUND, len(depths)))
+        around = depths[nearest]
+        return np.stack([around.min(1) / widened, around.max(1) * widened], axis=1)
+
+
+def gathered(views: Sequence[View], found: Sequence[tuple[int, Floats, Floats]]) -> tuple[Points, Colors]:
+    """Points [M, 3] (world) under pixels of views at their depths, and those pixels' colours [M, 3]."""
+    points, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
+    for number, pixels, depths in found:
+        points.append(unproject(views[number].camera, pixels, depths).astype(np.float32))
         columns, lines = pixels.astype(np.intp).T
-        colors.append(to_uint8(as_floats(view.image[lines, columns])))
-    return np.concatenate(found), np.concatenate(colors)
+        colors.append(to_uint8(as_floats(views[number].image[lines, columns])))
+    return np.concatenate(points), np.concatenate(colors)
 
 
-def _drawn(look: SmallPhoto, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def drawn(look: SmallPhoto, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Centres [M, 2] of pixels of the view as x, y; M is `count`, or fewer where so many do not count."""
     grey = look.grey
     mask = np.ones(grey.shape, bool) if look.mask is None else look.mask
@@ -79,17 +108,3 @@ def _drawn(look: SmallPhoto, count: int, rng: np.random.Generator) -> NDArray[np
     chosen = np.sort(np.argpartition(-keys, max(count - 1, 0))[:count])
     lines, columns = np.divmod(chosen, look.camera.width)
     return (np.stack([columns, lines], 1) + 0.5) / look.scale
-
-
-def _ranges(
-    view: View, points: NDArray[np.float64], pixels: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Between which depths [M, 2] the surface at `pixels` [M, 2] is sought, beside points [P, 3]; None where
-    there are too few."""
-    where, depths = project(view.camera, points)
-    where, depths = where[depths > 0], depths[depths > 0]
-    if len(depths) < LEAST_AROUND:
-        return None
-    _, nearest = KDTree(where).query(pixels, min(AROUND, len(depths)))
-    around = depths[nearest]
-    return np.stack([around.min(1) / WIDENED, around.max(1) * WIDENED], axis=1)

@@ -159,7 +159,7 @@ def _contradicted(
     ranges = 1 / np.maximum(near[lines, columns, None], np.finfo(float).tiny) * DEPTHS_ASKED
     grey = np.ascontiguousarray(ndimage.gaussian_filter(render.mean(2), AGREE_SMOOTH), np.float32)
     _, of_photo = agreement.depths(number, pixels, ranges)
-    _, of_scene = agreement.depths(number, pixels, ranges, grey)
+    _, of_scene = agreement.depths(number, pixels, ranges, grey=grey)
     numbers = np.arange(1, regions.max() + 1)
     scene, photo = (
         np.asarray(ndimage.mean(agreed, regions[lines, columns], numbers)) for agreed in (of_scene, of_photo)

@@ -1,0 +1,136 @@
+"""First points that photos find in each other: all over what at least two of them show.
+
+Between points of a reconstruction depths are sought twice. What is found at first, and found back by other
+photos, tells more closely where to look; so does it where no two others agree, and one alone must.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.model.consistency import Agreement
+from hqgs.model.constants import ALONE, AROUND_KNOWN, ASKED_AGAIN, FOUND_BACK, WIDENED
+from hqgs.model.first_points import Colors, Points, Surfaces, drawn, gathered
+from hqgs.scene.geometry import in_frame, project, unproject
+from hqgs.scene.scene import View
+
+Floats = NDArray[np.float64]
+STAGE = "first points, from photos"
+
+
+def points_found_back(
+    views: Sequence[View],
+    points: Points,
+    seen: Mapping[str, NDArray[np.intp]],
+    count: int,
+    seed: int,
+    agreement: Agreement,
+    on_stage: OnStage = silent,
+) -> tuple[Points, Colors, float]:
+    """At most `count` points, as `points_along_edges` has them, and the share of a first look at so many
+    pixels at which photos agree.
+
+    A pixel counts where two others agree and one of them finds it back, or where one alone agrees much and
+    finds it back: at the depth that it has there, within FOUND_BACK px.
+    """
+    surfaces = Surfaces(views, points, seen)
+    shares = [count * (k + 1) // len(views) - count * k // len(views) for k in range(len(views))]
+    asked = [k for k, share in enumerate(shares) if share and surfaces.known(k)]
+    sure, agreeing = list[tuple[int, Floats, Floats]](), 0
+    for done, k in enumerate(asked):
+        on_stage(Stage(STAGE, done + 1, 2 * len(asked)))
+        pixels = drawn(agreement.looks[k], shares[k], np.random.default_rng([seed, k]))
+        depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
+        agreeing += int(agreed.sum())
+        pixels, depths = pixels[agreed], depths[agreed]
+        by_two = _found_back(agreement, surfaces, k, pixels, depths, agreement.asked(k), 2)
+        sure.append((k, pixels[by_two], depths[by_two]))
+    for k, pixels, depths in sure:
+        surfaces.add(k, pixels, depths)
+    found = list[tuple[int, Floats, Floats]]()
+    for done, k in enumerate(asked):
+        on_stage(Stage(STAGE, len(asked) + done + 1, 2 * len(asked)))
+        pixels = drawn(agreement.looks[k], shares[k], np.random.default_rng([seed, k, 1]))
+        depths, kept = _borne_out(agreement, surfaces, k, pixels)
+        found.append((k, pixels[kept], depths[kept]))
+    return *gathered(views, found), agreeing / max(count, 1)
+
+
+def _borne_out(
+    agreement: Agreement, surfaces: Surfaces, number: int, pixels: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Depths [M] of a view's pixels [M, 2], and which of them others bear out."""
+    others = agreement.asked(number, ASKED_AGAIN)
+    depths, kept = agreement.depths(number, pixels, surfaces.ranges(number, pixels, AROUND_KNOWN), others)
+    kept[kept] = _found_back(agreement, surfaces, number, pixels[kept], depths[kept], others, 1)
+    best, ranges = np.full(len(pixels), ALONE), surfaces.ranges(number, pixels)
+    for other in others:
+        rows = np.flatnonzero(~kept)
+        there, scores = agreement.depths_by(number, pixels[rows], ranges[rows], other)
+        better = scores > best[rows]
+        rows, there, scores = rows[better], there[better], scores[better]
+        back = _seen_alike(agreement, number, other, pixels[rows], there)
+        rows = rows[back]
+        depths[rows], best[rows] = there[back], scores[back]
+    return depths, kept | (best > ALONE)
+
+
+def _found_back(
+    agreement: Agreement,
+    surfaces: Surfaces,
+    number: int,
+    pixels: Floats,
+    depths: Floats,
+    others: Sequence[int],
+    wanted: int,
+) -> NDArray[np.bool_]:
+    """Whether at least `wanted` of the others find pixels [M, 2] of a view back from `depths`."""
+    counts = np.zeros(len(pixels), np.intp)
+    for other in others:
+        rows = np.flatnonzero(counts < wanted)
+        if not surfaces.known(other) or not len(rows):
+            continue
+        at, far, inside = _shown(agreement, number, other, pixels[rows], depths[rows])
+        rows, at, far = rows[inside], at[inside], far[inside]
+        ranges = surfaces.ranges(other, at)
+        ranges = np.stack(
+            [np.minimum(ranges[:, 0], far / WIDENED), np.maximum(ranges[:, 1], far * WIDENED)], 1
+        )
+        there, agreed = agreement.depths(other, at, ranges)
+        counts[rows] += agreed & _back(agreement, number, other, pixels[rows], at, there)
+    return counts >= wanted
+
+
+def _seen_alike(
+    agreement: Agreement, number: int, other: int, pixels: Floats, depths: Floats
+) -> NDArray[np.bool_]:
+    """Whether the other photo, by the view alone, finds its pixels [M, 2] at `depths` back."""
+    at, far, inside = _shown(agreement, number, other, pixels, depths)
+    rows = np.flatnonzero(inside)
+    ranges = np.stack([far[rows] / WIDENED, far[rows] * WIDENED], 1)
+    there, scores = agreement.depths_by(other, at[rows], ranges, number)
+    inside[rows] = (scores > ALONE) & _back(agreement, number, other, pixels[rows], at[rows], there)
+    return inside
+
+
+def _shown(
+    agreement: Agreement, number: int, other: int, pixels: Floats, depths: Floats
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Where the other photo shows pixels [M, 2] of a view at `depths`, how far away, and whether."""
+    look, camera = agreement.looks[number], agreement.looks[other].camera
+    points = unproject(look.camera, pixels * look.scale, depths)
+    at, far = project(camera, points)
+    return at / agreement.looks[other].scale, far, in_frame(camera, points)
+
+
+def _back(
+    agreement: Agreement, number: int, other: int, pixels: Floats, at: Floats, depths: Floats
+) -> NDArray[np.bool_]:
+    """Whether pixels `at` [M, 2] of the other photo, at `depths`, lie where the view has its `pixels`."""
+    look, there = agreement.looks[number], agreement.looks[other]
+    again, _ = project(look.camera, unproject(there.camera, at * there.scale, depths))
+    return np.linalg.norm(again - pixels * look.scale, axis=1) < FOUND_BACK
