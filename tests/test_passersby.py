@@ -106,8 +106,8 @@ def test_where_the_scene_is_wrong_nobody_passes_by(crowd: WildRoom) -> None:
 def test_most_of_a_region_is_borne_out_by_others(
     scene: float, photo: float, passing: bool, crowd: WildRoom, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def depths(*asked: object) -> tuple[NDArray[np.float64], Mask]:
-        return np.ones(100), np.arange(100) < 100 * (scene if len(asked) > 4 else photo)
+    def depths(*_: object, grey: object = None) -> tuple[NDArray[np.float64], Mask]:
+        return np.ones(100), np.arange(100) < 100 * (photo if grey is None else scene)
 
     monkeypatch.setattr(Agreement, "depths", depths)
     regions = np.zeros((48, 64), np.intp)
