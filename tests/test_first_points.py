@@ -56,7 +56,7 @@ class Plane:
 
 
 def found_points(views: list[View], *arguments: Any, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    return points_along_edges(views, *arguments, seed, Plane(views))  # type: ignore[arg-type]
+    return points_along_edges(views, *arguments, seed, Plane(views))[:2]  # type: ignore[arg-type]
 
 
 CORNERS = np.array([[0.0, 0], [64, 0], [0, 48], [64, 48], [30, 20]])
@@ -162,7 +162,7 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
     (note,) = json.loads(run_report(started, tmp_path))["notes"]
     assert (
         note
-        == f"started from the scene's 20 points and {started.first_points - 20} more along the photos' edges"
+        == f"started from the scene's 20 points and {started.first_points - 20} more from the photos"
     )
     assert len(trainer(sparse, first_points=0.0).gaussians) == 20
     clean = trainer(sparse, formation="none")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement, SmallPhoto
 from hqgs.model.constants import AROUND, FLAT, LEAST_AROUND, WIDENED
 from hqgs.photos.pixels import as_floats, to_uint8
@@ -18,6 +19,7 @@ from hqgs.scene.scene import View
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+STAGE = "first points, from photos"
 
 
 def points_along_edges(
@@ -27,8 +29,10 @@ def points_along_edges(
     count: int,
     seed: int,
     agreement: Agreement,
-) -> tuple[Points, Colors]:
-    """About `count` points [M, 3] (world) under pixels of the photos, and those pixels' colours [M, 3].
+    on_stage: OnStage = silent,
+) -> tuple[Points, Colors, float]:
+    """About `count` points [M, 3] (world) under pixels of the photos, and those pixels' colours [M, 3];
+    and the share of so many that it found.
 
     Each view gets an equal share. Pixels are drawn without repetition, most of them in proportion to the
     photo's edges. Their depths are sought around those of the nearest points that the view sees, where other
@@ -42,15 +46,18 @@ def points_along_edges(
         seed: of the draw. Each view has its own numbers, whatever the others are.
         agreement: of the same views: how they are looked at; it tells the depths, and points that it does
             not find are left out.
+        on_stage: hears of each view.
     """
     surfaces, found = Surfaces(views, points, seen), list[tuple[int, Floats, Floats]]()
     for k in range(len(views)):
         share = count * (k + 1) // len(views) - count * k // len(views)
+        on_stage(Stage(STAGE, k + 1, len(views)))
         if share and surfaces.known(k):
             pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
             depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
             found.append((k, pixels[agreed], depths[agreed]))
-    return gathered(views, found)
+    agreeing = sum(len(depths) for _, _, depths in found)
+    return *gathered(views, found), agreeing / max(count, 1)
 
 
 class Surfaces:

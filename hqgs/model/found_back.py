@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement
 from hqgs.model.constants import ALONE, AROUND_KNOWN, ASKED_AGAIN, FOUND_BACK, WIDENED
-from hqgs.model.first_points import Colors, Points, Surfaces, drawn, gathered
+from hqgs.model.first_points import STAGE, Colors, Points, Surfaces, drawn, gathered
 from hqgs.scene.geometry import in_frame, project, unproject
 from hqgs.scene.scene import View
 
 Floats = NDArray[np.float64]
-STAGE = "first points, from photos"
 
 
 def points_found_back(

@@ -20,7 +20,7 @@ def run_notes(trainer: Trainer) -> list[str]:
     """Sentences, one for each thing."""
     own, left, notes = len(trainer.scene.points), trainer.method.rate_left, list[str]()
     if more := trainer.first_points - own:
-        notes.append(f"started from the scene's {own} points and {more} more along the photos' edges")
+        notes.append(f"started from the scene's {own} points and {more} more from the photos")
     if some := [entry["views"] for entry in trainer.history if "views" in entry]:
         notes.append(
             f"while it trained, {max(some)} of {len(trainer.scene.test)} held-out views were measured, which "

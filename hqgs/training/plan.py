@@ -91,6 +91,7 @@ class RunPlan:
     first_points: (
         int  # Gaussians to start from, as far as photos agree on so many; at least the scene's points
     )
+    found_back: bool  # they are what photos find back in each other; else what they agree on along edges
     discs: bool  # the first ones are flat, as their neighbours lie; else round
     held_photos: int  # training photos that are held back at first
     half_size_until: int  # the last iteration at half the photos' sides; 0: there is none
@@ -174,7 +175,7 @@ class Rule:
 
 def plan_by(rules: Sequence[Rule], facts: Facts, diagnosis: Diagnosis | None, asked: TrainConfig) -> RunPlan:
     """What the rules make of a run, one after the other: each sees what those before it have decided."""
-    plan = RunPlan(asked, facts.points, False, 0, 0, False)
+    plan = RunPlan(asked, facts.points, False, False, 0, 0, False)
     for rule in rules:
         name = f"{rule.decide.__name__}: {rule.source}"
         for choice in rule.decide(Draft(facts, diagnosis, asked, plan)):

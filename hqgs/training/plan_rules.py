@@ -25,6 +25,7 @@ from hqgs.training.constants import (
     HELD_PIXELS,
     HELD_SHARE,
     KNEE,
+    MANY_PHOTOS,
     MOST_HELD,
     PIXELS,
     SMALLEST_SIDE,
@@ -160,7 +161,10 @@ def first_points(draft: Draft) -> Sequence[Choice]:
     if facts.agreed == 0:
         return [Choice(own, "the photos agree on no more", left_out=what)]
     evidence = f"{facts.points:,} points of the reconstruction, {facts.pixels / 1e6:.1f} megapixels"
-    return [Choice(f"{wanted:,}, along the photos' edges", why, evidence, changes={"first_points": wanted})]
+    back = draft.undegraded and facts.photos <= MANY_PHOTOS
+    where = "found back in each other by the photos" if back else "along the photos' edges"
+    changes = {"first_points": wanted, "found_back": back}
+    return [Choice(f"{wanted:,}, {where}", why, evidence, changes=changes)]
 
 
 def shapes(draft: Draft) -> Sequence[Choice]:

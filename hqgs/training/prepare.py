@@ -13,7 +13,7 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.model.consistency import Agreement
-from hqgs.model.first_points import Colors, Points
+from hqgs.model.first_points import Colors, Points, points_along_edges
 from hqgs.model.found_back import points_found_back
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import as_discs
@@ -68,7 +68,7 @@ class Prepared:
             inspector.last
         )  # of more photos, where the method asks for it
         self._on_stage = inspector.on_stage
-        self._points: dict[int, tuple[Points, Colors, float]] = {}
+        self._points: dict[tuple[int, bool], tuple[Points, Colors, float]] = {}
         self._begin: Begin | None = begin
         self._has_tried: bool = False
 
@@ -77,7 +77,7 @@ class Prepared:
         facts = replace(self.facts, seconds=seconds)
         plan = plan_run(facts, self.diagnosis, self.asked)
         if plan.first_points > facts.points and self.scene.seen is not None:
-            facts = replace(facts, agreed=self._first_points(plan.first_points)[2])
+            facts = replace(facts, agreed=self._first_points(plan.first_points, plan.found_back)[2])
             plan = plan_run(facts, self.diagnosis, self.asked)
         draft = Draft(facts, self.diagnosis, self.asked, plan)
         timed = self.asked.seconds is None or seconds is not None  # else the run's length is not known yet
@@ -95,7 +95,7 @@ class Prepared:
         """Those that a run of this plan trains."""
         settings = plan.settings
         with one_torch_thread():
-            points, colors, _ = self._first_points(plan.first_points)
+            points, colors, _ = self._first_points(plan.first_points, plan.found_back)
             gaussians = Gaussians.from_points(points, colors, settings.sh_degree)
             if plan.discs and len(points) > len(self.scene.points):
                 gaussians = as_discs(gaussians)
@@ -105,21 +105,21 @@ class Prepared:
         """Gaussians of `scene` in the frame of `given`."""
         return trained if self._frame is None else self._frame.gaussians(trained)
 
-    def _first_points(self, wanted: int) -> tuple[Points, Colors, float]:
+    def _first_points(self, wanted: int, found_back: bool) -> tuple[Points, Colors, float]:
         """The scene's points and more that other photos agree with, at most `wanted` in all; and the share of
         the pixels asked at which they do."""
         scene, (points, colors) = self.scene, (self.scene.points, self.scene.point_colors)
         if scene.seen is None or wanted <= len(points):
             return points, colors, 1.0
-        if wanted not in self._points:
+        if (key := (wanted, found_back)) not in self._points:
             agreement = Agreement(scene.train, scene.seen)
+            search = points_found_back if found_back else points_along_edges
             count, seed = wanted - len(points), self.asked.seed
-            more, their_colors, agreed = points_found_back(
-                scene.train, points, scene.seen, count, seed, agreement, self._on_stage
-            )
+            found = search(scene.train, points, scene.seen, count, seed, agreement, self._on_stage)
+            more, their_colors, agreed = found
             both = np.concatenate([points, more]), np.concatenate([colors, their_colors])
-            self._points[wanted] = *both, agreed
-        return self._points[wanted]
+            self._points[key] = *both, agreed
+        return self._points[key]
 
 
 def plan_of_photos(scene: Scene, asked: TrainConfig) -> tuple[RunPlan, list[str]]:
