@@ -160,10 +160,7 @@ def test_hqgs_starts_from_them_where_points_are_few(tmp_path: Path) -> None:
     np.testing.assert_array_equal(started.gaussians.means[:20].detach().numpy(), sparse.points)
     assert "first points along edges" not in told(started)
     (note,) = json.loads(run_report(started, tmp_path))["notes"]
-    assert (
-        note
-        == f"started from the scene's 20 points and {started.first_points - 20} more from the photos"
-    )
+    assert note == f"started from the scene's 20 points and {started.first_points - 20} more from the photos"
     assert len(trainer(sparse, first_points=0.0).gaussians) == 20
     clean = trainer(sparse, formation="none")
     assert 20 < len(clean.gaussians) <= max(30, pixels // PIXELS)
