@@ -40,6 +40,7 @@ from hqgs.scene.world import middle_and_size
 
 Floats = NDArray[np.float64]
 _DRAWS = 100  # of photos, to see how far the answer moves; ten times as many of three points
+_LEAN = 0.5  # degrees that walls, furniture and floors are off themselves; 40 draws of photos of the room
 _LEAST = 3  # photos with upright edges
 _NEAR = math.cos(math.radians(UP_CONE))
 
@@ -93,7 +94,7 @@ def by_edges(views: Sequence[View], before: Floats) -> Up | None:
     drawn = rng.integers(0, len(edges), (_DRAWS, len(edges)))
     counts = [np.bincount(rows, minlength=len(edges))[photo] for rows in drawn]
     others = np.array([_meeting(planes, weights * count, up) for count in counts])
-    error = math.hypot(float(np.quantile(_degrees(others, up), 0.95)), UP_SURE / 4)
+    error = math.hypot(float(np.quantile(_degrees(others, up), 0.95)), _LEAN)
     told = share > EDGES_SHARE and upright.sum() >= EDGES_FEWEST and scores.max() > EDGES_CLEAR * beside
     if not told or photos < _LEAST or error > UP_SURE or up @ before < _NEAR:
         return None
@@ -131,7 +132,7 @@ def by_surface(scene: Scene, before: Floats) -> Up | None:
         held = points[np.abs(_along(points - at, up)) < LEVEL_THIN]
     if len(held) < LEVEL_SHARE * len(points) or error > UP_SURE or up @ before < _NEAR:
         return None
-    return Up(up, max(error, UP_SURE / 4), f"a level surface that holds {len(held)} of the points")
+    return Up(up, max(error, _LEAN), f"a level surface that holds {len(held)} of the points")
 
 
 def _by_gps(scene: Scene) -> Up | None:
