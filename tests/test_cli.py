@@ -391,7 +391,7 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     assert now == f"now look at it: hqgs view {tmp_path}"
     assert call("info", tmp_path) == 0
     assert "3 of 3 iterations" in capsys.readouterr().out
-    assert call("judge", tmp_path) == 0
+    assert call("eval", tmp_path) == 0
     assert "fitted" not in capsys.readouterr().out
     report = json.loads((tmp_path / "report.json").read_text())
     report["learned"] = [{"name": "view1.png", "gains": [1.2, 1.0, 1.0]}]

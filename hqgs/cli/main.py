@@ -32,6 +32,7 @@ COMMANDS = {
     "judge": Command(
         "hqgs.cli.judge", "say how good a run, or any scene file, is, how sure that is, and why"
     ),
+    "eval": Command("hqgs.cli.judge", "the same as judge"),
     "render": Command("hqgs.cli.render", "pictures and films of a trained scene"),
     "view": Command("hqgs.cli.view", "look at a scene in a browser (train --view: while it trains)"),
     "export": Command("hqgs.cli.export", "write a scene file with what the scene needs alone"),
