@@ -77,7 +77,8 @@ def test_slides_are_told_and_where_there_are_none_nothing_is() -> None:
     assert signs is not None
     assert straight is not None
     assert np.corrcoef(signs.slides.ravel(), truth.ravel())[0, 1] > 0.95
-    assert [rolling_finding(each).step for each in (signs, straight, None)] == ["rolling", None, None]
+    reasons = [rolling_finding(each).reason for each in (signs, straight, None)]
+    assert ["--formation rolling" in reason for reason in reasons] == [True, False, False]
     assert rolling_signs(replace(scene, seen=None)) is None
     assert rolling_signs(replace(scene, seen={v.name: np.arange(2) for v in scene.train})) is None
     assert rolling_signs(replace(scene, train=scene.train[:2])) is None

@@ -80,13 +80,16 @@ def shake_finding(scene: Scene) -> Finding:
 
 
 def rolling_finding(signs: RollingSigns | None) -> Finding:
+    """Never needed by itself: where poses come from such photos, what is learned costs more than it gains."""
     if signs is None:
         return Finding("rolling", False, None, None, None, "the photos share too few points to tell")
     reason = f"pictures slide by {signs.size:.1%} of their height from the first row to the last"
     least = max(SLIDES, SLIDES_SURE * signs.error)
     if signs.size < least:
-        return Finding("rolling", False, signs.size, None, None, f"{reason} (needed from {least:.1%})")
-    return Finding("rolling", True, signs.size, None, "rolling", f"{reason}, each in its own way")
+        reason += f" (seen from {least:.1%})"
+    else:
+        reason += ", each in its own way: seen, but learned only where --formation rolling asks for it"
+    return Finding("rolling", False, signs.size, None, None, reason)
 
 
 def focus_finding(scene: Scene, shaken: bool) -> Finding:
