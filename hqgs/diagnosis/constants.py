@@ -118,7 +118,7 @@ ROLLING_POINTS, ROLLING_PATCH = 50, 4  # that two photos share, and px around th
 ROLLING_FEWEST = 40  # patches of a photo that lie well on others
 ROLLING_STEPS, ROLLING_ROUNDS = 5, 8  # of laying a patch, and of weighing patches
 ROLLING_LIKE = 0.8  # correlation of a patch with another photo
-# Of the height, and standard errors: 22 captures without it, some shaken, noisy or as films, reach 0.8 % and
+# Of the height, and standard errors: 20 captures without it, some shaken, noisy or as films, reach 0.8 % and
 # 1.6 errors; the built-in room with it 1.9 % and 6.7, 1.6 % and 5.4 with poses from its photos.
 SLIDES, SLIDES_SURE = 0.005, 3.0
 ROLLING_RIDGE = 0.1  # patches of 1 px that say nothing moved: where nothing tells, nothing did
