@@ -163,3 +163,20 @@ def test_a_foreign_scene_renders(tmp_path: Path) -> None:
     c0 = 0.5 / np.sqrt(np.pi)
     wanted = 0.99 * torch.tensor([0.5 + c0, 0.5, 0.5 - c0])  # alpha ends at 0.99
     torch.testing.assert_close(image[12, 16], wanted, rtol=0, atol=1e-5, check_dtype=False)
+
+
+@pytest.mark.parametrize("lengths", [False, True])
+def test_shares_and_lengths_are_told_from_logits_and_logarithms(tmp_path: Path, lengths: bool) -> None:
+    names, _ = layout("gsplat", 0)
+    rng = np.random.default_rng(0)
+    rows = [dict.fromkeys(names, 0.5) | {"opacity": share} for share in rng.uniform(0, 1, 200)]
+    for row in rows:
+        row |= dict.fromkeys(SCALE, 0.02 if lengths else -4.0)
+    found = hqgs.Gaussians.load(write(tmp_path / "shares.ply", rows, names))
+    shares = torch.tensor([row["opacity"] for row in rows], dtype=torch.float32)
+    torch.testing.assert_close(torch.sigmoid(found.opacities), shares, rtol=0, atol=1e-6)
+    assert torch.allclose(found.scales, torch.full((200, 3), np.log(0.02) if lengths else -4.0))
+    for row in rows:
+        row["opacity"] = 9 * row["opacity"] - 3
+    logits = hqgs.Gaussians.load(write(tmp_path / "logits.ply", rows, names)).opacities
+    assert float(logits.max()) > 5  # as they stand
