@@ -133,7 +133,6 @@ def test_diagnose_prints_and_writes_what_it_found(
         "exposure",
         "vignetting",
         "response",
-        "rolling",
         "shake",
         "focus",
         "blur",

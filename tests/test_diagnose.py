@@ -226,7 +226,6 @@ def test_report_is_json_and_names_every_part() -> None:
         ("exposure", False),
         ("vignetting", False),
         ("response", False),
-        ("rolling", False),
         ("shake", False),
         ("focus", False),
         ("blur", False),

@@ -111,18 +111,6 @@ HIDING_QUALITY = 92  # from this quality on, JPEG leaves the luma's noise and sp
 PHOTO_FEW_BLOCKS = 1_000  # of all photos together, to look for noise in the luma alone
 LUMA_TELLS = 100  # px a side; the coefficients of smaller photos have the fine texture of large ones
 
-# rolling.py: whether rows were taken one after another while the camera moved
-ROLLING_SIDE, ROLLING_SMOOTH = 200, 1.0  # px: of the copies that are looked at, and their blur's sigma
-ROLLING_PHOTOS, ROLLING_OTHERS = 48, 2  # that are looked at, and that each is laid on
-ROLLING_POINTS, ROLLING_PATCH = 50, 4  # that two photos share, and px around them
-ROLLING_FEWEST = 40  # patches of a photo that lie well on others
-ROLLING_STEPS, ROLLING_ROUNDS = 5, 8  # of laying a patch, and of weighing patches
-ROLLING_LIKE = 0.8  # correlation of a patch with another photo
-# Of the height, and standard errors: 20 captures without it, some shaken, noisy or as films, reach 0.8 % and
-# 1.6 errors; the built-in room with it 1.9 % and 6.7, 1.6 % and 5.4 with poses from its photos.
-SLIDES, SLIDES_SURE = 0.005, 3.0
-ROLLING_RIDGE = 0.1  # patches of 1 px that say nothing moved: where nothing tells, nothing did
-
 # resolution.py: was a photo enlarged, and by how much?
 FACTORS = (2, 3, 4, 6, 8)  # of enlargement that are tried
 GRID_MIN_EVIDENCE = 2.1  # JPEG blocks reach 1.8 at factor 2; bicubic enlargement kept in 8 bits starts at 4.5

@@ -8,21 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.diagnosis.constants import (
-    DIFFERS,
-    GOES_WITH_DEPTH,
-    PAYS,
-    SLIDES,
-    SLIDES_SURE,
-    TURNED,
-    UNLIKE,
-    UNLIKE_GAINS,
-)
+from hqgs.diagnosis.constants import DIFFERS, GOES_WITH_DEPTH, PAYS, TURNED, UNLIKE, UNLIKE_GAINS
 from hqgs.diagnosis.devices import DeviceSigns
 from hqgs.diagnosis.differences import unlike_sharpness
 from hqgs.diagnosis.focus import focus_signs
 from hqgs.diagnosis.photo import PhotoDiagnosis
-from hqgs.diagnosis.rolling import RollingSigns
 from hqgs.photos.formula import DEVICES
 from hqgs.scene.scene import Scene
 
@@ -31,7 +21,7 @@ from hqgs.scene.scene import Scene
 class Finding:
     """One step of how the photos were made, and whether the method must undo it."""
 
-    name: str  # "exposure", "shake", "rolling", "focus", "blur", "lowres", "noise", "jpeg" or "video"
+    name: str  # "exposure", "shake", "focus", "blur", "lowres", "noise", "jpeg" or "video"
     needed: bool
     value: float | None  # median over photos: px, factor, levels or quality; None: not told
     spread: float | None  # robust standard deviation over photos; None: estimated from all of them together
@@ -77,19 +67,6 @@ def shake_finding(scene: Scene) -> Finding:
         reason += f" (needed from {UNLIKE:g} and {TURNED:g} in the logarithm of the power of fine details)"
         return Finding("shake", False, unlike.sharpness, None, None, reason)
     return Finding("shake", True, unlike.sharpness, None, "shake", reason)
-
-
-def rolling_finding(signs: RollingSigns | None) -> Finding:
-    """Never needed by itself: where poses come from such photos, what is learned costs more than it gains."""
-    if signs is None:
-        return Finding("rolling", False, None, None, None, "the photos share too few points to tell")
-    reason = f"pictures slide by {signs.size:.1%} of their height from the first row to the last"
-    least = max(SLIDES, SLIDES_SURE * signs.error)
-    if signs.size < least:
-        reason += f" (seen from {least:.1%})"
-    else:
-        reason += ", each in its own way: seen, but learned only where --formation rolling asks for it"
-    return Finding("rolling", False, signs.size, None, None, reason)
 
 
 def focus_finding(scene: Scene, shaken: bool) -> Finding:

@@ -22,17 +22,9 @@ from hqgs.diagnosis.constants import (
 )
 from hqgs.diagnosis.devices import DeviceSigns, device_signs
 from hqgs.diagnosis.gains import log_gains, shared_colors
-from hqgs.diagnosis.own import (
-    Finding,
-    device_findings,
-    exposure_finding,
-    focus_finding,
-    rolling_finding,
-    shake_finding,
-)
+from hqgs.diagnosis.own import Finding, device_findings, exposure_finding, focus_finding, shake_finding
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
-from hqgs.diagnosis.rolling import rolling_signs
 from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.scene import Scene, View
 
@@ -146,9 +138,7 @@ class Inspector:
             shake = shake_finding(scene)
             exposure = exposure_finding(self.log_gains(scene), photos)
             devices = device_findings(self.device_signs(scene))
-            rolling = rolling_finding(rolling_signs(scene))
-            focus = focus_finding(scene, shake.needed)
-            self._differences[everyone] = exposure, *devices, rolling, shake, focus
+            self._differences[everyone] = exposure, *devices, shake, focus_finding(scene, shake.needed)
         own = self._differences[everyone]
         *_, shake, focus = own
         blur = _blur(photos)

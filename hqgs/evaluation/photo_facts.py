@@ -46,8 +46,6 @@ def learned_words(record: LearnedRecord) -> dict[str, str]:
     if record["focus"] is not None:
         focus += f", sharp at {record['focus']:.2g} of the median depth"
     words = {"shake": shake, "out of focus": focus, "exposure, stops": f"{stops.mean():+.2f}", **rgb}
-    if slide := float(np.linalg.norm(record.get("rolling_px", [0.0]))):
-        words["rolling shutter"] = f"{slide:.1f} px from top to bottom"
     if (fall := sum(record.get("vignetting", [0.0]))) != 0:
         words["corners"] = f"{np.expm1(-fall):+.0%} of the light"
     if (bends := np.abs(record.get("response", [[0.0]]))).any():

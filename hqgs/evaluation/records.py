@@ -107,7 +107,6 @@ class LearnedRecord(TypedDict):
     gains: list[float]  # of red, green and blue in linear light; their logarithms' mean over photos is 0
     vignetting: NotRequired[list[float]]  # [2], as `hqgs.photos.look` has it; older runs do not tell
     response: NotRequired[list[list[float]]]  # [2, 3]
-    rolling_px: NotRequired[list[float]]  # [2], how far the picture slides from its first row to its last
 
 
 class RankRecord(TypedDict):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -33,28 +32,6 @@ def take_photo(
         ValueError: a wrong shape, dtype or value, with its name.
     """
     return _TakePhoto.apply(image, size, nearness, warps, gains)
-
-
-def take_rows(
-    image: Tensor, size: tuple[int, int], nearness: Tensor | None, warps: Tensor, gains: Tensor, rows: Tensor
-) -> Tensor:
-    """The same where rows are taken one after another: to `warps` come those of equal bands of rows from top
-    to bottom, [B, 3, 4], float64. A band sees no more of the render than its rows and the margin around."""
-    height, width = size
-    spare = image.shape[0] - height  # rows of the margin
-    edges = np.linspace(0, height, len(rows) + 1).round().astype(int).tolist()
-    bands = []
-    for row, top, end in zip(rows, edges[:-1], edges[1:], strict=True):
-        if top == end:
-            continue
-        each = warps + row if len(warps) else row[None]
-        # In the band y counts from its top: S^-1 (1 + M) S - 1 = S^-1 M S for the shift S by it.
-        there, back = torch.eye(4, dtype=each.dtype), torch.eye(3, dtype=each.dtype)
-        there[1, 2], back[1, 2] = top, -top
-        near = None if nearness is None else nearness[top:end].contiguous()
-        part = image[top : end + spare].contiguous()
-        bands.append(take_photo(part, (end - top, width), near, back @ each @ there, gains))
-    return torch.cat(bands)
 
 
 class _TakePhoto(torch.autograd.Function):

@@ -33,7 +33,6 @@ KINDS = {
     "defocus": Kind(0.5, 50, "a radius in px", "RADIUS", at_504=5.0),
     "motion": Kind(1, 200, "a length in px", "LENGTH", at_504=15.0),
     "shake": Kind(0.5, 200, "the longest extent of a shake in px", "PX", at_504=12.0, own="photo"),
-    "rolling": Kind(0, math.inf, "no value", default=0, some=False, own="photo"),
     "focus": Kind(0, math.inf, "no value", default=0, some=False, own="photo"),
     "exposure": Kind(0.01, 4, "the most stops to either side", "EV", default=1, own="photo"),
     "vignetting": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
@@ -66,8 +65,6 @@ OWN = tuple(name for name, kind in KINDS.items() if kind.own)  # of each photo i
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
     "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
-    "rolling": "a rolling shutter moves what is near more, which the photo does not tell; the built-in scene "
-    "true-rolling is photographed row by row",
     "vignetting": "it is of each camera, and photos do not tell which one took them; the built-in scene "
     "true-devices is photographed by several",
     "response": "it is of each camera, and photos do not tell which one took them; the built-in scene "
@@ -196,8 +193,8 @@ def parse_degradation(text: str) -> Degradation:
 def parse_formation(text: str) -> Degradation:
     """Read what a method is told of the photos: as `parse_degradation`, and ValueError for other kinds.
 
-    `shake`, `rolling` (shutter), `focus`, `exposure`, `grain` (noise) and `video` (a film's codec) stand
-    without a value: each photo has its own, which is learned with the scene, or, as noise, measured before.
+    `shake`, `focus`, `exposure`, `grain` (noise) and `video` (a film's codec) stand without a value: each
+    photo has its own, which is learned with the scene, or, as noise, measured before.
     """
     return check_formation(_parsed(text))
 

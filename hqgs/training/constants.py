@@ -111,8 +111,6 @@ STEEPEST = 0.9  # |a| + |b| of a response at most: below 1 it rises
 NARROW = 200  # px: narrower photos count as that wide
 TRAJECTORY_POINTS = 9  # that stand for a trajectory
 WARP_SPACING, MOST_WARPS = 1.5, 17  # px of a trajectory between samples of the exposure; and samples
-# px of a trajectory between bands of rows; and bands: one alone would never learn to move.
-BAND_SPACING, FEWEST_BANDS, MOST_BANDS = 0.5, 4, 64
 MOST_MARGIN = 48  # px around a render
 DEPTHS_REFRESH, DEPTHS_COARSER = 8, 4  # visits of a photo until its depths are rendered anew; px, as coarsely
 SATURATED = 254  # levels of 1/255

@@ -51,13 +51,6 @@ def run_notes(trainer: Trainer) -> list[str]:
                 f"median and {lengths[-1]:.1f} px at most; held-out photos that are shaken themselves "
                 "measure a sharp scene as worse than it is"
             )
-        slides = sorted(float(np.linalg.norm(photo.rolling)) for photo in found)
-        if slides[-1]:
-            notes.append(
-                "rows were taken one after another while the cameras moved: from top to bottom pictures "
-                f"slide by {slides[len(slides) // 2]:.1f} px in the median and {slides[-1]:.1f} px at most; "
-                "held-out photos that do so themselves measure a straight scene as worse than it is"
-            )
         discs = sorted(photo.defocus for photo in found)
         if soft := sum(disc > 0 for disc in discs):
             notes.append(
@@ -102,5 +95,4 @@ def learned_record(learned: LearnedCamera) -> LearnedRecord:
         "gains": learned.gains.tolist(),
         "vignetting": learned.vignetting.tolist(),
         "response": learned.response.tolist(),
-        "rolling_px": learned.rolling.tolist(),
     }

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
-from hqgs.photos.exposure import take_photo, take_rows
+from hqgs.photos.exposure import take_photo
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.constants import (
@@ -42,8 +42,6 @@ from hqgs.training.constants import (
 )
 from hqgs.training.methods.devices import LearnedDevices
 from hqgs.training.methods.lens import first_lens, lens_warps, samples, sharp_at, widest
-from hqgs.training.methods.rolling import LearnedRolling
-from hqgs.training.methods.trajectory import longest, middle_of, moved_by, trajectory_warps
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,6 @@ class LearnedCamera:
     lens: NDArray[np.float64]  # [2], px: see `hqgs.training.methods.lens`
     vignetting: NDArray[np.float64]  # [2] and
     response: NDArray[np.float64]  # [2, 3], as `hqgs.photos.look` has them
-    rolling: NDArray[np.float64]  # [2], px: how far the picture slides from its first row to its last
 
     @property
     def defocus(self) -> float:
@@ -83,8 +80,12 @@ class LearnedCamera:
 
 
 class LearnedCameras:
-    """The cameras of a scene's training photos; `devices`: what those do to all of their photos, `rolling`:
-    how they moved while rows were read."""
+    """The cameras of a scene's training photos; `devices`: what those do to all of their photos.
+
+    A trajectory is a polynomial: in t from -1/2 to 1/2, t v + 4 (t^2 - mean t^2) c, where v and c turn and
+    move in all six freedoms. Turns are in px of the picture's middle, moves in px at the photo's median
+    depth.
+    """
 
     def __init__(
         self,
@@ -94,7 +95,6 @@ class LearnedCameras:
         log_gains: NDArray[np.float64] | None,
         seed: int,
         devices: LearnedDevices | None = None,
-        rolling: LearnedRolling | None = None,
     ) -> None:
         """`log_gains` [N, 3] of the training photos: to start from, and their mean stays.
 
@@ -123,7 +123,7 @@ class LearnedCameras:
         self._sharp = torch.full((count,), not focus)
         self._active = False
         self._begin, self._looks = 0, (0, 0)
-        self._devices, self._rolling = devices, rolling
+        self._devices = devices
 
     def schedule(self, iterations: int) -> None:
         """Of a run of this length."""
@@ -135,32 +135,24 @@ class LearnedCameras:
         number, camera = self._numbers[view.name], view.camera
         size = camera.height, camera.width
         blurs = self._active and self._blurs(number) and self._sizes[number] == size
-        rolls = self._rolling is not None and self._sizes[number] == size
-        if not blurs and not rolls and not self._gains and self._devices is None:
+        if not blurs and not self._gains and self._devices is None:
             return Shot(camera, lambda render: render)
-        warps = rows = torch.zeros(0, 3, 4, dtype=torch.float64)
-        reach = 0.0
+        warps, margin = torch.zeros(0, 3, 4, dtype=torch.float64), 0
         if blurs:
             warps = self._warps(number, camera)
-            reach += float(moved_by(warps.detach(), camera, nearness=2.0).abs().max())
-        if rolls and self._rolling is not None:
-            rows = self._rolling.rows(number, camera)
-            reach += float(moved_by(rows.detach(), camera, nearness=2.0).abs().max())
-        margin = min(4 * math.ceil((reach + 1) / 4), MOST_MARGIN) if reach else 0
+            reach = float(_moved(warps.detach(), camera, nearness=2.0).abs().max())
+            margin = min(4 * math.ceil((reach + 1) / 4), MOST_MARGIN)
         K = camera.K.copy()
         K[:2, 2] += margin
         wide = Camera(camera.width + 2 * margin, camera.height + 2 * margin, K, camera.viewmat)
-        near = self._nearness[number] if blurs or rolls else None
+        near = self._nearness[number] if blurs else None
 
         def develop(render: Tensor) -> Tensor:
             gains = torch.ones(3, dtype=torch.float64)
             if self._gains:
                 gains = self._gains[number].exp()
             full = None if near is None else _enlarged(near, size).to(render)
-            if len(rows):
-                taken = take_rows(render, size, full, warps, gains, rows)
-            else:
-                taken = take_photo(render, size, full, warps, gains)
+            taken = take_photo(render, size, full, warps, gains)
             if self._devices is not None:
                 taken = self._devices.develop(number, camera, taken)
             exposed = self._gains or self._devices is not None
@@ -175,23 +167,23 @@ class LearnedCameras:
             _center(self._gains, self._mean)
         if self._devices is not None:
             self._devices.center()
-        if not self._paths and not self._lenses and self._rolling is None:
+        if not self._paths and not self._lenses:
             return
         self._active = iteration >= self._begin
         if not self._active:
             return
-        if self._blurs(number) or self._rolling is not None:
+        if self._blurs(number):
             if self._visits[number] % DEPTHS_REFRESH == 0:
                 near = nearness_map(gaussians, view.camera, DEPTHS_COARSER) * self._depths[number]
                 self._nearness[number] = near.clamp(0.05, 10).to(torch.float16)
             self._visits[number] += 1
         if iteration in self._looks:
             for k, path in enumerate(self._paths):
-                self._still[k] |= longest(middle_of(path)) < SHORTEST_TRAJECTORY
+                self._still[k] |= _longest(_middle(path)) < SHORTEST_TRAJECTORY
             for k, lens in enumerate(self._lenses):
                 self._sharp[k] |= widest(*lens.tolist()) < SHORTEST_TRAJECTORY / 2
             for k in range(len(self._nearness)):
-                if not self._blurs(k) and self._rolling is None:
+                if not self._blurs(k):
                     self._nearness[k] = None
 
     def learned(self) -> list[LearnedCamera]:
@@ -200,11 +192,10 @@ class LearnedCameras:
         return [
             LearnedCamera(
                 name,
-                np.zeros((TRAJECTORY_POINTS, 2)) if self._still[k] else middle_of(self._paths[k]).numpy(),
+                np.zeros((TRAJECTORY_POINTS, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
                 self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
                 *(none if self._devices is None else self._devices.learned(k)),
-                np.zeros(2) if self._rolling is None else self._rolling.learned(k),
             )
             for name, k in self._numbers.items()
         ]
@@ -217,11 +208,11 @@ class LearnedCameras:
             groups.append({"name": "lenses", "params": self._lenses, "lr": 0.0, "betas": (0.9, 0.99)})
         if self._gains:
             groups.append({"name": "gains", "params": self._gains, "lr": 0.0, "betas": (0.9, 0.99)})
-        return groups + [group for part in self._parts() for group in part.param_groups()]
+        return groups + ([] if self._devices is None else self._devices.param_groups())
 
     def rates(self, part: float) -> dict[str, float]:
         """Learning rates after this part of the run."""
-        rates = {name: rate for own in self._parts() for name, rate in own.rates(part).items()}
+        rates = {} if self._devices is None else self._devices.rates(part)
         if self._paths:
             rates["paths"] = TRAJECTORY_RATE * float(np.mean(self._widths)) * CAMERA_RATES_LEFT**part
         if self._lenses:
@@ -236,8 +227,8 @@ class LearnedCameras:
         state |= {f"path.{k}": path.detach() for k, path in enumerate(self._paths)}
         state |= {f"lens.{k}": lens.detach() for k, lens in enumerate(self._lenses)}
         state |= {f"gains.{k}": gains.detach() for k, gains in enumerate(self._gains)}
-        for part in self._parts():
-            state |= part.state_dict()
+        if self._devices is not None:
+            state |= self._devices.state_dict()
         return state | {f"near.{k}": near for k, near in enumerate(self._nearness) if near is not None}
 
     @torch.no_grad()
@@ -251,12 +242,9 @@ class LearnedCameras:
             lens.copy_(state[f"lens.{k}"])
         for k, gains in enumerate(self._gains):
             gains.copy_(state[f"gains.{k}"])
-        for part in self._parts():
-            part.load_state_dict(state)
+        if self._devices is not None:
+            self._devices.load_state_dict(state)
         self._nearness = [state.get(f"near.{k}") for k in range(len(self._nearness))]
-
-    def _parts(self) -> list[LearnedDevices | LearnedRolling]:
-        return [part for part in (self._devices, self._rolling) if part is not None]
 
     def _blurs(self, number: int) -> bool:
         """Whether a photo's camera moved or was out of focus."""
@@ -267,15 +255,15 @@ class LearnedCameras:
         count, still, sharp = 0, bool(self._still[number]), bool(self._sharp[number])
         if not still:
             with torch.no_grad():
-                whole = trajectory_warps(self._paths[number], camera, TRAJECTORY_POINTS)
-                moved = moved_by(whole, camera, nearness=1.0)
-            extent = max(longest(moved[:, k]) for k in range(moved.shape[1]))
+                whole = _trajectory_warps(self._paths[number], camera, TRAJECTORY_POINTS)
+                moved = _moved(whole, camera, nearness=1.0)
+            extent = max(_longest(moved[:, k]) for k in range(moved.shape[1]))
             count = min(max(3, math.ceil(extent / WARP_SPACING) + 1), MOST_WARPS)
         if not sharp:
             count = max(count, samples(self._lenses[number]))
         warps = torch.zeros(count, 3, 4, dtype=torch.float64)
         if not still:
-            warps = warps + trajectory_warps(self._paths[number], camera, count)
+            warps = warps + _trajectory_warps(self._paths[number], camera, count)
         if not sharp:
             warps = warps + lens_warps(self._lenses[number], count)
         return warps
@@ -293,12 +281,56 @@ def no_shot(view: View) -> Shot:
     return Shot(view.camera, lambda render: render)
 
 
+def _steps(path: Tensor, count: int) -> Tensor:
+    """Where a trajectory is in the middles of `count` equal parts of the exposure, [count, 6]; of mean 0."""
+    t = (torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5
+    square = t.square()
+    return t[:, None] * path[0] + 4 * (square - square.mean())[:, None] * path[1]
+
+
+def _trajectory_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
+    """Warps of a camera that goes along a trajectory, [count, 3, 4]."""
+    steps, focal, K = _steps(path, count), float(camera.K[0, 0]), torch.from_numpy(camera.K)
+    turned = K @ _turns(steps[:, :3] / focal) @ torch.linalg.inv(K)
+    moved = steps[:, 3:] @ (K / focal).T
+    return torch.cat([turned, moved[:, :, None]], dim=2)
+
+
 @torch.no_grad()
 def _center(tensors: Sequence[Tensor], wanted: Tensor) -> None:
     """Give them this mean."""
     shift = torch.stack([*tensors]).mean(0) - wanted
     for tensor in tensors:
         tensor -= shift
+
+
+def _middle(path: Tensor) -> Tensor:
+    """The trajectory of the picture's middle at the median depth, px, [9, 2]."""
+    steps = _steps(path.detach(), TRAJECTORY_POINTS)
+    return torch.stack([steps[:, 1] + steps[:, 3], steps[:, 4] - steps[:, 0]], dim=1)
+
+
+def _longest(points: Tensor) -> float:
+    """Distance of two of the points [K, 2]."""
+    return float((points[:, None] - points).norm(dim=-1).max())
+
+
+def _turns(vectors: Tensor) -> Tensor:
+    """Rotations less the identity by small vectors [K, 3], to third order, [K, 3, 3]."""
+    x, y, z = vectors.unbind(1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
+    square = cross @ cross
+    return cross + square / 2 + square @ cross / 6
+
+
+def _moved(warps: Tensor, camera: Camera, nearness: float) -> Tensor:
+    """How far warps take the corners and the middle of a picture, px, [K, 5, 2]."""
+    w, h = camera.width, camera.height
+    corners = [[x, y, 1.0, nearness] for x, y in ((0, 0), (w, 0), (0, h), (w, h), (w / 2, h / 2))]
+    points = torch.tensor(corners, dtype=torch.float64)
+    e = points @ warps.transpose(1, 2)  # [K, 5, 3]
+    return (e[..., :2] - points[:, :2] * e[..., 2:]) / (1 + e[..., 2:])
 
 
 def _enlarged(near: Tensor, size: tuple[int, int]) -> Tensor:

@@ -27,7 +27,6 @@ from hqgs.training.methods.devices import LearnedDevices
 from hqgs.training.methods.formed import Formation, FormedTarget, find_formation
 from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
-from hqgs.training.methods.rolling import LearnedRolling
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
 
@@ -42,9 +41,9 @@ class HQGS(Method[FormedTarget]):
       parts.
     - Noise: differences count by their square up to two standard deviations of the noise (Huber's function).
       The mean of Gaussian noise over the views is nearer to the truth than their median, which L1 asks for.
-    - Shake, rolling shutter, focus and exposure, each photo its own, vignetting and response, each camera its
-      own: what the cameras did is learned with the scene (`LearnedCameras`), and the render is taken like
-      that. With nothing else, the rest is 3DGS's.
+    - Shake, focus and exposure, each photo its own, vignetting and response, each camera its own: what the
+      cameras did is learned with the scene (`LearnedCameras`), and the render is taken like that. With
+      nothing else, the rest is 3DGS's.
     - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
       Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
@@ -85,10 +84,7 @@ class HQGS(Method[FormedTarget]):
                 signs = inspector.device_signs(scene)
                 first = plain_devices(scene.train) if signs is None else signs.devices
                 devices = LearnedDevices(first, "vignetting" in kinds, "response" in kinds)
-            rolling = LearnedRolling(scene.train) if "rolling" in kinds else None
-            self._cameras = LearnedCameras(
-                scene, "shake" in kinds, "focus" in kinds, gains, seed, devices, rolling
-            )
+            self._cameras = LearnedCameras(scene, "shake" in kinds, "focus" in kinds, gains, seed, devices)
         holds = self.noise and config.held_pixels and "jpeg" not in kinds
         self._plateau = Plateau(len(scene.train)) if holds else None
         self._smallest: Tensor | None = None  # [N] world units; None: there is no limit
