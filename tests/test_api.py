@@ -135,8 +135,8 @@ def test_the_preparation_is_told() -> None:
     hqgs.train(scene, config=tiny_config(2, method="hqgs"), on_stage=stages.append)
     counts = [(stage.what, stage.done, stage.total) for stage in stages]
     assert counts[:5] == [("photos diagnosed", k, 5) for k in range(1, 6)]
-    assert counts[5:10] == [("first points, from photos", k, 5) for k in range(1, 6)]
-    assert [what for what, *_ in counts[10:]] == ["planned"]
+    assert counts[5:15] == [("first points, from photos", k, 10) for k in range(1, 11)]  # two looks at each
+    assert [what for what, *_ in counts[15:]] == ["planned"]
 
 
 def test_the_first_ctrl_c_returns_what_there_is() -> None:

