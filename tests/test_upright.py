@@ -14,7 +14,7 @@ from hqgs.scene.builtin.scene import embedded_cameras
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.scene.upright import with_up
+from hqgs.scene.upright import as_asked, direction_of, with_up
 
 TURN = Rotation.from_euler("xyz", [30, 50, 70], degrees=True).as_matrix()
 UP = TURN @ [0, -1, 0]
@@ -78,3 +78,13 @@ def test_gps_tells_up_where_it_is_sure(room: Scene) -> None:
     assert "GPS of 38 photos" in told.notes[0]
     loose = replace(place, tilt=5.0)
     assert with_up(replace(bare, world=replace(bare.world, place=loose))).world.up is None
+
+
+def test_up_as_it_was_asked_for(room: Scene) -> None:
+    asked = as_asked(room, direction_of((0, 0, -2)))
+    assert asked.world.up == (0, 0, -1)
+    np.testing.assert_allclose(scene_up(asked), [0, 0, -1])
+    assert asked.notes[-1] == "up is (0.000, 0.000, -1.000), as it was asked for"
+    for wrong in ((0, 0, 0), (1, 2), (math.nan, 0, 1)):
+        with pytest.raises(ValueError, match=r"up is .*, wanted three numbers"):
+            direction_of(wrong)

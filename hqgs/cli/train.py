@@ -56,6 +56,7 @@ LOADING = (
     "frames",
     "distance",
     "tag_size",
+    "up",
 )
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
@@ -99,6 +100,10 @@ class Train(Photos):
     """Metres between the cameras of the photos A and B, or points x,y,z: the scene is written in metres."""
     tag_size: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
     """Width of printed tags (AprilTag 36h11, ArUco) in the scene: it is written in metres, upright."""
+    up: Annotated[
+        tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")
+    ] = None
+    """Where up is, in the frame of the photos' cameras (as upright edges, tags, GPS or EXIF tell it)."""
     degrade: Kind = "none"
     restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="")] = None
     """Send the training photos through this restoration network first."""

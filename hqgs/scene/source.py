@@ -29,7 +29,7 @@ from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.scene.sfm.run import SIFT, check_features
 from hqgs.scene.tags import by_tags, check_tag_size
-from hqgs.scene.upright import with_up
+from hqgs.scene.upright import as_asked, direction_of, with_up
 
 
 def load(
@@ -48,6 +48,7 @@ def load(
     frames: int | None = None,
     distance: Sequence[str | float] | None = None,
     tag_size: float | None = None,
+    up: Sequence[float] | None = None,
     points: bool = True,
     on_stage: OnStage = silent,
 ) -> Scene:
@@ -79,6 +80,7 @@ def load(
             files: what is written is in metres then.
         tag_size: metres; the width of the black square of printed tags (AprilTag 36h11, ArUco) that photos
             show: what is written is in metres then, and upright where a tag lies (the extra `tags`).
+        up: x, y, z in the frame of the files; None: as photos, tags or GPS tell it.
         points: where the files have cameras and no points, let COLMAP find points; False: random ones.
         on_stage: hears what is being done, and how far it is.
 
@@ -104,10 +106,12 @@ def load(
         "frames": frames,
         "distance": None if distance is None else [*distance],
         "tag_size": tag_size,
+        "up": None if up is None else [*up],
     }
     apart = None if distance is None else distance_of(distance)
     if tag_size is not None:
         check_tag_size(tag_size, distance)
+    asked = None if up is None else direction_of(up)
     check_features(features)
     degradation = parse_degradation(degrade)
     if restore is not None:
@@ -150,9 +154,10 @@ def load(
         scene = sfm_scene(scene, models, on_stage, features)
     scene = scene if restore is None else restore_scene(scene, restore)
     scene = with_points(scene, models, on_stage) if points else scene
-    scene = scene if is_room(path) else with_up(scene)
+    scene = scene if is_room(path) or asked is not None else with_up(scene)
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if tag_size is None else by_tags(scene, tag_size)
+    scene = scene if asked is None else as_asked(scene, asked)
     return replace(scene, origin=origin)
 
 

@@ -53,6 +53,22 @@ class Up(NamedTuple):
     said: str
 
 
+def direction_of(up: Sequence[float]) -> Floats:
+    """Up as somebody gave it, [3], of length 1. ValueError for what has no direction."""
+    given = np.asarray(up, np.float64)
+    length = float(np.linalg.norm(given)) if given.shape == (3,) else math.nan
+    if not 0 < length < math.inf:
+        raise ValueError(f"up is {[*up]}, wanted three numbers x, y, z that are not all 0")
+    return given / length
+
+
+def as_asked(scene: Scene, up: Floats) -> Scene:
+    """The scene with `up` as `direction_of` has it, and a note."""
+    x, y, z = up.tolist()
+    note = f"up is ({x:.3f}, {y:.3f}, {z:.3f}), as it was asked for"
+    return replace(scene, world=replace(scene.world, up=(x, y, z)), notes=[*scene.notes, note])
+
+
 def with_up(scene: Scene) -> Scene:
     """The scene with up as edges, a level surface or GPS tell it, in this order; a note says which.
 
