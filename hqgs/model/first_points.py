@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from hqgs.scene.scene import View
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
 Floats = NDArray[np.float64]
+Found = tuple[int, Floats, Floats]  # the number of a view, pixels [M, 2] of it, and their depths [M]
 STAGE = "first points, from photos"
 
 
@@ -48,16 +49,28 @@ def points_along_edges(
             not find are left out.
         on_stage: hears of each view.
     """
-    surfaces, found = Surfaces(views, points, seen), list[tuple[int, Floats, Floats]]()
-    for k in range(len(views)):
-        share = count * (k + 1) // len(views) - count * k // len(views)
-        on_stage(Stage(STAGE, k + 1, len(views)))
-        if share and surfaces.known(k):
-            pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
-            depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
-            found.append((k, pixels[agreed], depths[agreed]))
+    found = list[Found]()
+    for each in first_look(Surfaces(views, points, seen), shares(count, len(views)), seed, agreement):
+        found.append(each)
+        on_stage(Stage(STAGE, len(found), len(views)))
     agreeing = sum(len(depths) for _, _, depths in found)
     return *gathered(views, found), agreeing / max(count, 1)
+
+
+def shares(count: int, views: int) -> list[int]:
+    """So many points, shared out to the views equally."""
+    return [count * (k + 1) // views - count * k // views for k in range(views)]
+
+
+def first_look(surfaces: Surfaces, counts: Sequence[int], seed: int, agreement: Agreement) -> Iterator[Found]:
+    """Of each view those of so many pixels at which others agree; none where too little is known."""
+    for k, share in enumerate(counts):
+        if not share or not surfaces.known(k):
+            yield k, np.zeros((0, 2)), np.zeros(0)
+            continue
+        pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
+        depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
+        yield k, pixels[agreed], depths[agreed]
 
 
 class Surfaces:
@@ -90,7 +103,7 @@ class Surfaces:
         return np.stack([around.min(1) / widened, around.max(1) * widened], axis=1)
 
 
-def gathered(views: Sequence[View], found: Sequence[tuple[int, Floats, Floats]]) -> tuple[Points, Colors]:
+def gathered(views: Sequence[View], found: Sequence[Found]) -> tuple[Points, Colors]:
     """Points [M, 3] (world) under pixels of views at their depths, and those pixels' colours [M, 3]."""
     points, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
     for number, pixels, depths in found:

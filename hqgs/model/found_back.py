@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement
 from hqgs.model.constants import ALONE, AROUND_KNOWN, ASKED_AGAIN, FOUND_BACK, WIDENED
-from hqgs.model.first_points import STAGE, Colors, Points, Surfaces, drawn, gathered
+from hqgs.model.first_points import (
+    STAGE,
+    Colors,
+    Found,
+    Points,
+    Surfaces,
+    drawn,
+    first_look,
+    gathered,
+    shares,
+)
 from hqgs.scene.geometry import in_frame, project, unproject
 from hqgs.scene.scene import View
 
@@ -37,23 +47,21 @@ def points_found_back(
     finds it back: at the depth that it has there, within FOUND_BACK px.
     """
     surfaces = Surfaces(views, points, seen)
-    shares = [count * (k + 1) // len(views) - count * k // len(views) for k in range(len(views))]
-    asked = [k for k, share in enumerate(shares) if share and surfaces.known(k)]
-    sure, agreeing = list[tuple[int, Floats, Floats]](), 0
-    for done, k in enumerate(asked):
-        on_stage(Stage(STAGE, done + 1, 2 * len(asked)))
-        pixels = drawn(agreement.looks[k], shares[k], np.random.default_rng([seed, k]))
-        depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
-        agreeing += int(agreed.sum())
-        pixels, depths = pixels[agreed], depths[agreed]
+    each, looks = shares(count, len(views)), 2 * len(views)
+    sure, agreeing = list[Found](), 0
+    for k, pixels, depths in first_look(surfaces, each, seed, agreement):
+        on_stage(Stage(STAGE, k + 1, looks))
+        agreeing += len(depths)
         by_two = _found_back(agreement, surfaces, k, pixels, depths, agreement.asked(k), 2)
         sure.append((k, pixels[by_two], depths[by_two]))
     for k, pixels, depths in sure:
         surfaces.add(k, pixels, depths)
-    found = list[tuple[int, Floats, Floats]]()
-    for done, k in enumerate(asked):
-        on_stage(Stage(STAGE, len(asked) + done + 1, 2 * len(asked)))
-        pixels = drawn(agreement.looks[k], shares[k], np.random.default_rng([seed, k, 1]))
+    found = list[Found]()
+    for k, share in enumerate(each):
+        on_stage(Stage(STAGE, len(views) + k + 1, looks))
+        if not share or not surfaces.known(k):
+            continue
+        pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k, 1]))
         depths, kept = _borne_out(agreement, surfaces, k, pixels)
         found.append((k, pixels[kept], depths[kept]))
     return *gathered(views, found), agreeing / max(count, 1)
