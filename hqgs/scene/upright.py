@@ -64,9 +64,7 @@ def direction_of(up: Sequence[float]) -> Floats:
 
 def as_asked(scene: Scene, up: Floats) -> Scene:
     """The scene with `up` as `direction_of` has it, and a note."""
-    x, y, z = up.tolist()
-    note = f"up is ({x:.3f}, {y:.3f}, {z:.3f}), as it was asked for"
-    return replace(scene, world=replace(scene.world, up=(x, y, z)), notes=[*scene.notes, note])
+    return _told(scene, up, "as it was asked for")
 
 
 def with_up(scene: Scene) -> Scene:
@@ -82,12 +80,17 @@ def with_up(scene: Scene) -> Scene:
     if found is None:
         note = "up is as the photos were held: no upright edges, level surface or GPS tell it better"
         return replace(scene, notes=[*scene.notes, note])
-    x, y, z = found.direction.tolist()
     moved = math.degrees(math.acos(min(float(found.direction @ before), 1.0)))
-    note = (
-        f"up is ({x:.3f}, {y:.3f}, {z:.3f}), by {found.said}: 95 % of it within {found.error:.2g} degrees, "
+    why = (
+        f"by {found.said}: 95 % of it within {found.error:.2g} degrees, "
         f"and {moved:.2g} degrees from how the photos were held"
     )
+    return _told(scene, found.direction, why)
+
+
+def _told(scene: Scene, up: Floats, why: str) -> Scene:
+    x, y, z = up.tolist()
+    note = f"up is ({x:.3f}, {y:.3f}, {z:.3f}), {why}"
     return replace(scene, world=replace(scene.world, up=(x, y, z)), notes=[*scene.notes, note])
 
 
