@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 from pathlib import Path
 
 import pytest
+
+from hqgs.base.files import CHECKPOINT
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("benchmarks", "examples", "hqgs", "scripts")
@@ -41,3 +44,15 @@ def test_a_folder_says_in_a_sentence_what_lives_there(package: Path) -> None:
     told = ast.get_docstring(ast.parse(package.read_text(encoding="utf-8")))
     assert told is not None
     assert told.splitlines()[0].endswith(".")
+
+
+def test_no_run_lies_in_the_repository() -> None:
+    """What a run writes is large, and of somebody's photos."""
+    try:
+        told = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no clone, or git may not read it")
+    files = [ROOT / name for name in told.stdout.decode().split("\0") if name]
+    runs = [file for file in files if file.name in {CHECKPOINT, "scene.ply", "report.json", "report.html"}]
+    assert not runs
+    assert not [file for file in files if file.exists() and file.stat().st_size > 2**20]
