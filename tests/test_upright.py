@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from hqgs.scene.builtin import render_view
 from hqgs.scene.builtin.scene import embedded_cameras
+from hqgs.scene.formats.colmap import write_colmap
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.paths import scene_up
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.source import load
 from hqgs.scene.upright import as_asked, direction_of, with_up
 
 TURN = Rotation.from_euler("xyz", [30, 50, 70], degrees=True).as_matrix()
@@ -51,6 +55,21 @@ def test_upright_edges_tell_up_better_than_how_photos_were_held(room: Scene) -> 
     stated = float(note.split("within ")[1].split()[0])
     assert degrees(scene_up(found), UP) < stated
     assert "upright edges in" in note
+
+
+def test_up_is_sought_where_a_scene_is_to_be_trained(room: Scene, tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    views = [*room.train, *room.test]
+    for view in views:
+        Image.fromarray(view.image).save(tmp_path / "images" / view.name)
+    points = np.random.default_rng(2).uniform(-1, 1, (8, 3)) + [0, 0, 3]
+    cameras = {view.name: view.camera for view in views}
+    write_colmap(tmp_path / "sparse" / "0", cameras, points, np.zeros((8, 3), np.uint8), None, 0.0)
+    told = load(tmp_path, test_every=0)
+    assert degrees(scene_up(told), UP) < 1
+    looked_at = load(tmp_path, test_every=0, points=False)
+    assert looked_at.world.up is None
+    assert looked_at.notes == told.notes[:-1]
 
 
 def test_a_floor_tells_up_where_photos_do_not(room: Scene) -> None:

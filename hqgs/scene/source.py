@@ -81,7 +81,8 @@ def load(
         tag_size: metres; the width of the black square of printed tags (AprilTag 36h11, ArUco) that photos
             show: what is written is in metres then, and upright where a tag lies (the extra `tags`).
         up: x, y, z in the frame of the files; None: as photos, tags or GPS tell it.
-        points: where the files have cameras and no points, let COLMAP find points; False: random ones.
+        points: where the files have cameras and no points, let COLMAP find points, and seek up. False, for a
+            scene that is only looked at: random ones, and up as the photos were held.
         on_stage: hears what is being done, and how far it is.
 
     Returns:
@@ -153,8 +154,9 @@ def load(
     if sfm and (scene.source != "photos" or degradation.steps):
         scene = sfm_scene(scene, models, on_stage, features)
     scene = scene if restore is None else restore_scene(scene, restore)
-    scene = with_points(scene, models, on_stage) if points else scene
-    scene = scene if is_room(path) or asked is not None else with_up(scene)
+    if points:
+        scene = with_points(scene, models, on_stage)
+        scene = scene if is_room(path) or asked is not None else with_up(scene)
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if tag_size is None else by_tags(scene, tag_size)
     scene = scene if asked is None else as_asked(scene, asked)
