@@ -27,6 +27,7 @@ from hqgs.training.constants import (
     CAMERAS_BEGIN,
     DEPTHS_COARSER,
     DEPTHS_REFRESH,
+    DEVICE_RATE,
     FIRST_TRAJECTORY,
     GAIN_RATE,
     GIVE_UP_AT,
@@ -40,7 +41,7 @@ from hqgs.training.constants import (
     TRAJECTORY_RATE,
     WARP_SPACING,
 )
-from hqgs.training.methods.devices import LearnedDevices
+from hqgs.training.methods.devices import LearnedDevices, groups_of, load_into, state_of
 from hqgs.training.methods.lens import first_lens, lens_warps, samples, sharp_at, widest
 
 
@@ -201,50 +202,35 @@ class LearnedCameras:
         ]
 
     def param_groups(self) -> list[dict[str, Any]]:
-        groups: list[dict[str, Any]] = []
-        if self._paths:
-            groups.append({"name": "paths", "params": self._paths, "lr": 0.0, "betas": (0.9, 0.99)})
-        if self._lenses:
-            groups.append({"name": "lenses", "params": self._lenses, "lr": 0.0, "betas": (0.9, 0.99)})
-        if self._gains:
-            groups.append({"name": "gains", "params": self._gains, "lr": 0.0, "betas": (0.9, 0.99)})
+        groups = groups_of({"paths": self._paths, "lenses": self._lenses, "gains": self._gains})
         return groups + ([] if self._devices is None else self._devices.param_groups())
 
     def rates(self, part: float) -> dict[str, float]:
         """Learning rates after this part of the run."""
-        rates = {} if self._devices is None else self._devices.rates(part)
-        if self._paths:
-            rates["paths"] = TRAJECTORY_RATE * float(np.mean(self._widths)) * CAMERA_RATES_LEFT**part
-        if self._lenses:
-            rates["lenses"] = LENS_RATE * float(np.mean(self._widths)) * CAMERA_RATES_LEFT**part
-        if self._gains:
-            rates["gains"] = GAIN_RATE * CAMERA_RATES_LEFT**part
-        return rates
+        width, trained = float(np.mean(self._widths)), {group["name"] for group in self.param_groups()}
+        first = {"paths": TRAJECTORY_RATE * width, "lenses": LENS_RATE * width, "gains": GAIN_RATE}
+        first |= {"vignetting": DEVICE_RATE, "response": DEVICE_RATE}
+        return {name: rate * CAMERA_RATES_LEFT**part for name, rate in first.items() if name in trained}
 
     def state_dict(self) -> dict[str, Tensor]:
         state = {"visits": self._visits, "still": self._still, "sharp": self._sharp}
-        state["active"] = torch.tensor(self._active)
-        state |= {f"path.{k}": path.detach() for k, path in enumerate(self._paths)}
-        state |= {f"lens.{k}": lens.detach() for k, lens in enumerate(self._lenses)}
-        state |= {f"gains.{k}": gains.detach() for k, gains in enumerate(self._gains)}
+        state |= {"active": torch.tensor(self._active)} | state_of(self._named())
         if self._devices is not None:
             state |= self._devices.state_dict()
         return state | {f"near.{k}": near for k, near in enumerate(self._nearness) if near is not None}
 
-    @torch.no_grad()
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self._visits = state["visits"].clone()
         self._still, self._sharp = state["still"].clone(), state["sharp"].clone()
         self._active = bool(state["active"])
-        for k, path in enumerate(self._paths):
-            path.copy_(state[f"path.{k}"])
-        for k, lens in enumerate(self._lenses):
-            lens.copy_(state[f"lens.{k}"])
-        for k, gains in enumerate(self._gains):
-            gains.copy_(state[f"gains.{k}"])
+        load_into(self._named(), state)
         if self._devices is not None:
             self._devices.load_state_dict(state)
         self._nearness = [state.get(f"near.{k}") for k in range(len(self._nearness))]
+
+    def _named(self) -> dict[str, list[Tensor]]:
+        """What is trained of each photo's camera, as a checkpoint names it."""
+        return {"path": self._paths, "lens": self._lenses, "gains": self._gains}
 
     def _blurs(self, number: int) -> bool:
         """Whether a photo's camera moved or was out of focus."""

@@ -6,7 +6,7 @@ photos cannot tell it. A scene is shown as that mean camera would, without its v
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor
 from hqgs.diagnosis.devices import Devices
 from hqgs.photos.look import darken, falloff, respond, squared_radii
 from hqgs.scene.scene import Camera
-from hqgs.training.constants import CAMERA_RATES_LEFT, DEVICE_RATE, STEEPEST
+from hqgs.training.constants import STEEPEST
 
 
 class LearnedDevices:
@@ -71,26 +71,38 @@ class LearnedDevices:
         return vignetting, response
 
     def param_groups(self) -> list[dict[str, Any]]:
-        found = {"vignetting": self._vignetting, "response": self._response}
-        return [
-            {"name": name, "params": params, "lr": 0.0, "betas": (0.9, 0.99)}
-            for name, params in found.items()
-            if params
-        ]
-
-    def rates(self, part: float) -> dict[str, float]:
-        """Learning rates after this part of the run."""
-        return {group["name"]: DEVICE_RATE * CAMERA_RATES_LEFT**part for group in self.param_groups()}
+        return groups_of(self._named())
 
     def state_dict(self) -> dict[str, Tensor]:
-        state = {f"vignetting.{k}": value.detach() for k, value in enumerate(self._vignetting)}
-        return state | {f"response.{k}": value.detach() for k, value in enumerate(self._response)}
+        return state_of(self._named())
 
-    @torch.no_grad()
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        for name, params in (("vignetting", self._vignetting), ("response", self._response)):
-            for k, value in enumerate(params):
-                value.copy_(state[f"{name}.{k}"])
+        load_into(self._named(), state)
+
+    def _named(self) -> dict[str, list[Tensor]]:
+        return {"vignetting": self._vignetting, "response": self._response}
+
+
+def groups_of(named: Mapping[str, list[Tensor]]) -> list[dict[str, Any]]:
+    """Groups of an optimizer, of the tensors that are trained under each name; none where there are none."""
+    return [
+        {"name": name, "params": params, "lr": 0.0, "betas": (0.9, 0.99)}
+        for name, params in named.items()
+        if params
+    ]
+
+
+def state_of(named: Mapping[str, list[Tensor]]) -> dict[str, Tensor]:
+    """The tensors as a checkpoint names them."""
+    return {f"{name}.{k}": value.detach() for name, values in named.items() for k, value in enumerate(values)}
+
+
+@torch.no_grad()
+def load_into(named: Mapping[str, list[Tensor]], state: dict[str, Tensor]) -> None:
+    """The values of `state_of` into these tensors."""
+    for name, values in named.items():
+        for k, value in enumerate(values):
+            value.copy_(state[f"{name}.{k}"])
 
 
 def _trained(values: Iterable[NDArray[np.float64]]) -> list[Tensor]:
