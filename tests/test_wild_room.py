@@ -16,11 +16,11 @@ from hqgs.photos.shake import path_points
 from hqgs.photos.walkers import draw_figure
 from hqgs.scene.builtin import scene, shading, sparse_room, wild, wild_room
 from hqgs.scene.builtin.crowd import Walker, draw_walkers
-from hqgs.scene.builtin.exposure import Exposure, path_viewmats, rolling, shaken, spread, still, through_lens
+from hqgs.scene.builtin.exposure import Exposure, path_viewmats, shaken, spread, still, through_lens
 from hqgs.scene.builtin.points import SparsePoints, surface_points
 from hqgs.scene.builtin.scene import embedded_cameras
 from hqgs.scene.builtin.shading import render_depth, render_exposure, render_view, sample_pattern
-from hqgs.scene.builtin.sparse import TABLE, sparse_cameras, thinned
+from hqgs.scene.builtin.sparse import TABLE, sparse_cameras
 from hqgs.scene.builtin.studio import studio
 from hqgs.scene.builtin.wild import DISTANCE, TRUE_KINDS, PhotoTruth, parse_true_kind
 from hqgs.scene.scene import Camera, Scene, View
@@ -118,18 +118,6 @@ def test_a_shaken_photo_is_the_mean_of_frames() -> None:
     assert np.abs(light(frames[0]) - expected).mean() > 5 * difference.mean()
 
 
-def test_a_rolling_shutter_takes_each_row_at_its_time() -> None:
-    camera, knots = small_camera(), knots_of(2, 0.05)
-    photo = render_exposure(rolling(camera, knots, ONE))
-    times = (np.arange(54) + 0.5) / 54 - 0.5
-    viewmats = path_viewmats(camera.viewmat, knots, times)
-    for row in (0, 9, 31, 53):
-        frame = render_exposure(still(replace(camera, viewmat=viewmats[row]), ONE))
-        assert (np.abs(photo[row].astype(int) - frame[row]).max(-1) <= 2).mean() > 0.97
-    first = render_exposure(still(replace(camera, viewmat=viewmats[0]), ONE))
-    assert (np.abs(photo[53].astype(int) - first[53]).max(-1) > 2).mean() > 0.2
-
-
 def test_the_plane_in_focus_stays_and_others_spread() -> None:
     """Where the samples of one pixel meet surfaces: by the pinholes' own projections."""
     camera, aperture, focus = embedded_cameras()[4], 0.04, 3.0
@@ -137,7 +125,7 @@ def test_the_plane_in_focus_stays_and_others_spread() -> None:
     for depth in (1.5, 3.0, 12.0):
         point = np.linalg.inv(camera.viewmat) @ [0.2, -0.1, depth, 1]
         pixels = []
-        for pinhole in lens.cameras[0]:
+        for pinhole in lens.cameras:
             p = pinhole.K @ (pinhole.viewmat @ point)[:3]
             pixels.append(p[:2] / p[2])
         pixels = np.array(pixels)
@@ -170,12 +158,11 @@ def test_gains_are_on_the_light() -> None:
         assert slope == pytest.approx(gains[c], rel=0.01)
 
 
-@pytest.mark.parametrize("kind", ["shake", "rolling", "lens"])
+@pytest.mark.parametrize("kind", ["shake", "lens"])
 def test_culling_changes_nothing(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     camera, knots = small_camera(11), knots_of(5, 0.06)
     made: dict[str, Exposure] = {
         "shake": shaken(camera, knots, 10),
-        "rolling": rolling(camera, knots, ONE),
         "lens": through_lens(camera, 0.1, 2.0, 10),
     }
     photo = render_exposure(made[kind])
@@ -252,7 +239,7 @@ def test_the_truth_of_each_kind() -> None:
     for kind, (name, value) in {k: parse_true_kind(k) for k in TRUE_KINDS}.items():
         drawn = [wild._draw(name, value, c, np.random.default_rng([0, k])) for k, c in enumerate(cameras)]
         neutral = PhotoTruth()
-        if kind in ("true-shake", "true-rolling"):
+        if kind == "true-shake":
             extents = [truth.extent for truth in drawn]
             assert 2.4 <= min(extents) < 3
             assert 11.4 < max(extents) <= 12
@@ -318,21 +305,16 @@ def test_bad_kinds_are_refused() -> None:
 
 
 def test_the_sparse_room(quick: list[int], tmp_path: Path) -> None:
-    made = sparse_room(tmp_path, 32, 24, num_points=250)
+    made = sparse_room(tmp_path, 32, 24)
     assert (len(made.train), len(made.test)) == (21, 4)
     assert made.name == "sparse"
-    assert made.notes == ["cast, thinned out to 250"]
-    assert len(made.points) == 250
     assert made.seen is not None
     for view in made.train:
         rows = made.seen[view.name]
         p = made.points[rows] @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3]
         assert (p[:, 2] > 0).all()
-    assert sorted(np.concatenate(list(made.seen.values()))) == list(range(250))
-    again: Scene = sparse_room(tmp_path, 32, 24, num_points=250)
+    again: Scene = sparse_room(tmp_path, 32, 24)
     np.testing.assert_array_equal(again.points, made.points)
-    with pytest.raises(ValueError, match="num_points must be at least 1, got 0"):
-        sparse_room(num_points=0)
 
 
 def test_cameras_around_the_table() -> None:
@@ -349,17 +331,3 @@ def test_cameras_around_the_table() -> None:
         for a, b in zip(rays[2:], rays[:-2], strict=True)
     ]
     assert 5 < np.median(angles) < 20
-
-
-def test_thinning_keeps_what_is_seen_of_the_points() -> None:
-    points = np.arange(30, dtype=np.float32).reshape(10, 3)
-    rows = np.repeat(np.arange(10), 3)
-    photos = np.arange(30) % 7
-    given = SparsePoints(points, np.zeros((10, 3), np.uint8), photos, rows, "ten")
-    few = thinned(given, 4)
-    assert len(few.points) == 4
-    assert few.note == "ten, thinned out to 4"
-    for point, own in zip(few.points, range(4), strict=True):
-        old = int(np.flatnonzero((points == point).all(1))[0])
-        np.testing.assert_array_equal(few.photos[few.rows == own], photos[rows == old])
-    assert thinned(given, 10) is given

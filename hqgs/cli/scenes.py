@@ -47,8 +47,8 @@ class Photos:
 
     scene: SceneName
     """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
-    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-rolling,
-    true-exposure, true-devices, true-crowd or true-panorama."""
+    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-exposure, true-devices,
+    true-crowd or true-panorama."""
     downscale: Factor = None
     """Divide the photos' sides by F."""
 

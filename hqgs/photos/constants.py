@@ -5,6 +5,8 @@ Those of a phone and of shaken hands are typical values, chosen by hand; no one 
 
 from __future__ import annotations
 
+import math
+
 # blocks.py: the 8 x 8 blocks in which JPEG and films store pictures
 # Of blocks, or coefficients that are not zero: with fewer no estimate is made; fewer without clipped pixels,
 # and all blocks are taken.
@@ -26,6 +28,7 @@ SOBEL_ROUNDING = 1e-5
 LARGEST = 1 << 28  # px of a photo: more come from damaged files, and would fill the memory
 
 # kernels.py: the kernels of defocus and motion blur
+GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower, which fills a disc, to the next
 KERNEL_REACH = 4  # sigmas at which the Gaussian kernel ends
 
 # phone.py: a phone's camera in low light: from linear light to the JPEG file that it stores

@@ -14,7 +14,6 @@ ROOMS = (
     BEYOND,
     "true-shake",
     "true-defocus",
-    "true-rolling",
     "true-exposure",
     "true-devices",
     "true-crowd",

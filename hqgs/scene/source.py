@@ -57,8 +57,8 @@ def load(
     Args:
         path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
             Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or a scene that is built in
-            (`hqgs.scene.builtin.room`): "embedded", "sparse", "true-shake", "true-defocus", "true-rolling",
-            "true-exposure", "true-devices", "true-crowd" or "true-panorama".
+            (`hqgs.scene.builtin.room`): "embedded", "sparse", "true-shake", "true-defocus", "true-exposure",
+            "true-devices", "true-crowd" or "true-panorama".
         downscale: divide the photos' sides by this, at least 1.
         test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).

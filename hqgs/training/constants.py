@@ -116,7 +116,6 @@ DEPTHS_REFRESH, DEPTHS_COARSER = 8, 4  # visits of a photo until its depths are 
 SATURATED = 254  # levels of 1/255
 LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
 FEWEST_SAMPLES, MOST_SAMPLES = 6, 24  # of the aperture
-GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
 
 # The paper's form.
 SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS

@@ -1,4 +1,4 @@
-"""Which rays make up a photo: still, along a camera's path, through a lens, or row by row."""
+"""Which rays make up a photo: still, along a camera's path, or through a lens."""
 
 from __future__ import annotations
 
@@ -11,62 +11,49 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.evenly import evenly
+from hqgs.photos.constants import GOLDEN
 from hqgs.photos.shake import exposure_times, path_points
 from hqgs.scene.scene import Camera
 
 Floats = NDArray[np.float64]
 
-GOLDEN = math.pi * (3 - math.sqrt(5))  # radians from one seed of a sunflower to the next
 OUTLINES = 8  # cameras that stand for all when a tile asks what it may see
 MARGIN = 2.0  # px that a tile looks beyond its border for the cameras between them
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """A photo as the mean of samples, each through a camera of its own.
+    """A photo as the mean of samples, each through a camera of its own, or all through one.
 
-    Sample s of a pixel in row y is the ray of `cameras[y][s]` through the pixel's corner + `jitter[s]`. One
-    list stands for all rows, one camera in a list for all samples.
+    Sample s of a pixel is the ray of `cameras[s]` through the pixel's corner + `jitter[s]`.
     """
 
-    cameras: Sequence[Sequence[Camera]]  # 1 or height lists of 1 or S cameras
+    cameras: Sequence[Camera]  # 1 or S
     jitter: Floats  # [S, 2], x and y in the unit square
     outline: Sequence[Camera] = ()  # whose views enclose those of all samples; none: they are found
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the photo."""
-        camera = self.cameras[0][0]
-        return camera.width, camera.height
+        return self.cameras[0].width, self.cameras[0].height
 
-    def seen_from(self, rows: slice) -> tuple[Sequence[Camera], float]:
-        """Cameras whose views of these rows, widened by as many px, enclose what all samples see."""
-        if self.outline:
-            return self.outline, MARGIN
-        if len(self.cameras) == 1 and len(self.cameras[0]) == 1:
-            return self.cameras[0], 0.0
+    def seen_from(self) -> tuple[Sequence[Camera], float]:
+        """Cameras whose views, widened by as many px, enclose what all samples see."""
         if len(self.cameras) == 1:
-            every = list(self.cameras[0])
-        else:
-            every = [camera for row in self.cameras[rows] for camera in row]
-        picks = evenly(len(every), OUTLINES)
-        return [every[k] for k in picks], MARGIN
+            return self.cameras, 0.0
+        return self.outline or [self.cameras[k] for k in evenly(len(self.cameras), OUTLINES)], MARGIN
 
 
 def still(camera: Camera, jitter: Floats) -> Exposure:
     """A photo in an instant through a pinhole."""
-    return Exposure([[camera]], jitter)
+    return Exposure([camera], jitter)
 
 
 def shaken(camera: Camera, knots: Floats, count: int) -> Exposure:
     """The mean over `count` equal parts of an exposure during which the camera moves; see `path_viewmats`."""
-    return Exposure([_moved(camera, knots, exposure_times(count))], spread(count))
-
-
-def rolling(camera: Camera, knots: Floats, jitter: Floats) -> Exposure:
-    """Row y of H in an instant at time (y + 1/2) / H - 1/2, while the camera moves; see `path_viewmats`."""
-    cameras = _moved(camera, knots, exposure_times(camera.height))
-    return Exposure([[moved] for moved in cameras], jitter)
+    viewmats = path_viewmats(camera.viewmat, knots, exposure_times(count))
+    moved = [Camera(camera.width, camera.height, camera.K, viewmat) for viewmat in viewmats]
+    return Exposure(moved, spread(count))
 
 
 def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> Exposure:
@@ -92,7 +79,7 @@ def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> E
             cameras.append(Camera(camera.width, camera.height, K, viewmat))
         return cameras
 
-    return Exposure([pinholes(radii, angles)], spread(count), pinholes(np.full(6, around), hexagon))
+    return Exposure(pinholes(radii, angles), spread(count), pinholes(np.full(6, around), hexagon))
 
 
 def path_viewmats(viewmat: Floats, knots: Floats, times: Floats) -> Floats:
@@ -122,8 +109,3 @@ def spread(count: int) -> Floats:
     offsets = np.stack([x, y], -1)
     drift = times @ offsets / max(np.square(times).sum(), 1e-12)
     return 0.5 + offsets - times[:, None] * drift
-
-
-def _moved(camera: Camera, knots: Floats, times: Floats) -> list[Camera]:
-    viewmats = path_viewmats(camera.viewmat, knots, times)
-    return [Camera(camera.width, camera.height, camera.K, viewmat) for viewmat in viewmats]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.photos.constants import GOLDEN
 from hqgs.scene import paths
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.points import SparsePoints, sfm_points
@@ -45,14 +46,13 @@ def assemble(
     cameras: list[Camera],
     cache: Path | None,
     made: dict[str, Any],
-    thin: Callable[[SparsePoints], SparsePoints] = lambda points: points,
     held_out: Mapping[int, str] | None = None,
     names: Sequence[str] | None = None,
 ) -> Scene:
     """A scene of clean photos of the room by these cameras; points from those that are trained on.
 
-    The points pass through `thin`. `made` says what cameras and `thin` depend on beside the photos' size and
-    number, in JSON values, for the key of the cache. `held_out`: numbers of the test views, and what they are
+    `made` says what cameras depend on beside the photos' size and number, in JSON values, for the key of the
+    cache. `held_out`: numbers of the test views, and what they are
     called; None: every 8th. `names`: of all views, in place of `view_NN.png` and such. ValueError for
     cameras below 1 x 1.
     """
@@ -70,7 +70,7 @@ def assemble(
     if kept is None:
         photos = {name: render_view(camera) for name, camera in zip(names, cameras, strict=True)}
         views = [View(name, camera, photos[name]) for name, camera in zip(names, cameras, strict=True)]
-        points = thin(sfm_points([v for k, v in enumerate(views) if k not in held_out]))
+        points = sfm_points([v for k, v in enumerate(views) if k not in held_out])
         if cache is not None:
             arrays = {key: value for key, value in points._asdict().items() if key != "note"}
             write_kept(cache, made, Kept(photos, arrays, points.note))
@@ -95,7 +95,7 @@ def embedded_cameras(width: int = WIDTH, height: int = HEIGHT, num_views: int = 
     rng = np.random.default_rng(2025)
     cameras = []
     for k in range(num_views):
-        radius, angle = math.sqrt((k + 0.5) / num_views), k * math.pi * (3 - math.sqrt(5))
+        radius, angle = math.sqrt((k + 0.5) / num_views), GOLDEN * k
         jitter = rng.uniform(-1, 1, 5)
         x = math.cos(angle) * radius + 0.08 * jitter[0]
         y = math.sin(angle) * radius + 0.08 * jitter[1]

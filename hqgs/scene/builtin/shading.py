@@ -49,7 +49,7 @@ def render_exposure(
     """
     width, height = exposure.size
     image = np.empty((height, width, 3), np.uint8)
-    shade = None if device is None else device.shade(exposure.cameras[0][0]).astype(np.float32)
+    shade = None if device is None else device.shade(exposure.cameras[0]).astype(np.float32)
     factor = None if gains is None else gains.astype(np.float32)
 
     def work(tile: _Tile) -> None:
@@ -103,11 +103,13 @@ class _Tile:
         row, col = (a.reshape(-1, 1) * BLOCK for a in np.indices(self.grid))
         i, j = (a.reshape(-1) for a in np.indices((BLOCK, BLOCK)))
         px, py = (x + col + j)[:, None], (y + row + i)[:, None]
-        self.eye, directions = _rays(exposure, py, px + self.jitter[:, :1], py + self.jitter[:, 1:], dtype)
+        self.eye, directions = _rays(
+            exposure.cameras, px + self.jitter[:, :1], py + self.jitter[:, 1:], dtype
+        )
         dx, dy, dz = (a.astype(dtype) for a in directions)
         self.d: Vec = (dx, dy, dz)
 
-        cameras, margin = exposure.seen_from(self.rows)
+        cameras, margin = exposure.seen_from()
         square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
         def meets(corners: NDArray[np.float64], left: Any, top: Any, side: int) -> NDArray[np.bool_]:
@@ -140,28 +142,23 @@ def _directions(camera: Camera, x: NDArray[Any], y: NDArray[Any]) -> list[NDArra
 
 
 def _rays(
-    exposure: Exposure, row: NDArray[np.int64], x: NDArray[Any], y: NDArray[Any], dtype: type
+    cameras: Sequence[Camera], x: NDArray[Any], y: NDArray[Any], dtype: type
 ) -> tuple[Vec, list[NDArray[np.float64]]]:
-    """Origins and world directions, as `_directions`, of the samples at x, y [B, S, n] in rows [B, 1, n].
+    """Origins and world directions, as `_directions`, of the samples at x, y [B, S, n].
 
-    Origins are numbers for a still pinhole, otherwise arrays [1, S, 1] or [B, S or 1, n].
+    Origins are numbers for one camera, otherwise arrays [1, S, 1].
     """
-    rows = exposure.cameras
-    if len(rows) == 1 and len(rows[0]) == 1:
-        center = rows[0][0].center
-        return (float(center[0]), float(center[1]), float(center[2])), _directions(rows[0][0], x, y)
+    if len(cameras) == 1:
+        center = cameras[0].center
+        return (float(center[0]), float(center[1]), float(center[2])), _directions(cameras[0], x, y)
 
-    def gather(values: list[list[Any]]) -> NDArray[np.float64]:
-        """Per row and sample, [rows, samples, ...], as [..., B, S, n]."""
-        table = np.moveaxis(np.array(values), (0, 1), (-2, -1))
-        if len(rows) == 1:
-            return table[..., 0, None, :, None]
-        last = np.minimum(row[:, 0], len(rows) - 1)  # blocks may reach past the picture
-        return np.moveaxis(table[..., last, :], -1, -2)
+    def gather(values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Of each sample, [S, ...], as [..., 1, S, 1]."""
+        return np.moveaxis(np.stack(values), 0, -1)[..., None, :, None]
 
-    K, R = (gather([[getattr(c, what) for c in cameras] for cameras in rows]) for what in ("K", "viewmat"))
+    K, R = (gather([getattr(camera, what) for camera in cameras]) for what in ("K", "viewmat"))
     a, b = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
-    ox, oy, oz = gather([[c.center for c in cameras] for cameras in rows]).astype(dtype)
+    ox, oy, oz = gather([camera.center for camera in cameras]).astype(dtype)
     return (ox, oy, oz), [R[0, k] * a + R[1, k] * b + R[2, k] for k in range(3)]
 
 
@@ -176,7 +173,7 @@ def _each_tile(
     width, height = exposure.size
     if width < 1 or height < 1:
         raise ValueError(f"camera must be at least 1 x 1 pixels, got {width} x {height}")
-    skew = exposure.cameras[0][0].K[0, 1]
+    skew = exposure.cameras[0].K[0, 1]
     if skew != 0:
         raise ValueError(f"camera.K must have skew 0, got {skew}")
     if threads is not None and threads < 1:

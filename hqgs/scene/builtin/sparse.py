@@ -1,4 +1,4 @@
-"""Few photos of the room from far apart: with few points, or judged between and beyond their cameras."""
+"""Few photos of the room from far apart, and judged between and beyond their cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.builtin.points import SparsePoints
 from hqgs.scene.builtin.scene import HEIGHT, WIDTH, assemble, intrinsics, look_at
 from hqgs.scene.scene import Camera, Scene
 
@@ -21,27 +20,13 @@ SIDEWAYS, NEARER, HIGHER = math.radians(8), 0.75, 0.45  # past the arc's ends; o
 BEYOND = 6  # held-out cameras, two of each of these
 
 
-def sparse_room(
-    cache: Path | None = None,
-    width: int = WIDTH,
-    height: int = HEIGHT,
-    num_views: int = 25,
-    num_points: int = 3000,
-) -> Scene:
-    """The room by `num_views` cameras on an arc of 130 degrees around its table; every 8th is a test view.
+def sparse_room(cache: Path | None = None, width: int = WIDTH, height: int = HEIGHT) -> Scene:
+    """The room by 25 cameras on an arc of 130 degrees around its table; every 8th is a test view.
 
     Neighbours stand 5 degrees apart, in turns low and high, so that two of one height are 10 degrees apart;
-    each sees the table from about 2.8. At most `num_points` points, a seeded choice, are kept of those that
-    the training photos give (`sfm_points`: 2,174 at the default size). The rest is as in `embedded_scene`,
-    errors included.
+    each sees the table from about 2.8. The rest is as in `embedded_scene`, errors included.
     """
-    if num_views < 2:
-        raise ValueError(f"num_views must be at least 2 (one to train, one to test), got {num_views}")
-    if num_points < 1:
-        raise ValueError(f"num_points must be at least 1, got {num_points}")
-    cameras = sparse_cameras(width, height, num_views)
-    made = {"cameras": "sparse", "num_points": num_points}
-    return assemble("sparse", cameras, cache, made, lambda points: thinned(points, num_points))
+    return assemble("sparse", sparse_cameras(width, height), cache, {"cameras": "sparse"})
 
 
 def sparse_cameras(
@@ -70,24 +55,6 @@ def camera_on_arc(
     target = np.array(TABLE) + jitter[3:6] * [0.25, 0.12, 0.25]
     viewmat = look_at(center, target, math.radians(2 * jitter[6]))
     return Camera(width, height, intrinsics(width, height), viewmat)
-
-
-def thinned(points: SparsePoints, count: int) -> SparsePoints:
-    """At most `count` of the points, a seeded choice, in their order."""
-    found = len(points.points)
-    if found <= count:
-        return points
-    keep = np.zeros(found, bool)
-    keep[np.random.default_rng(0).permutation(found)[:count]] = True
-    sighted = keep[points.rows]
-    place = np.cumsum(keep) - 1
-    return SparsePoints(
-        points.points[keep],
-        points.colors[keep],
-        points.photos[sighted],
-        place[points.rows[sighted]],
-        f"{points.note}, thinned out to {count}",
-    )
 
 
 def beyond_room(

@@ -16,7 +16,7 @@ from hqgs.photos.shake import draw_path, draw_strength, knots_mean, path_extent,
 from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.crowd import Walker, draw_walkers
 from hqgs.scene.builtin.devices import Device, draw_devices
-from hqgs.scene.builtin.exposure import Exposure, rolling, shaken, still, through_lens
+from hqgs.scene.builtin.exposure import Exposure, shaken, still, through_lens
 from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene
 from hqgs.scene.builtin.shading import render_exposure, sample_pattern
 from hqgs.scene.scene import Camera, Scene
@@ -26,7 +26,6 @@ Floats = NDArray[np.float64]
 TRUE_KINDS = {
     "true-shake": Kind(0.5, 100, "the longest extent of a shake in px", at_504=12.0),
     "true-defocus": Kind(0.5, 20, "the largest radius in px of a point at infinity", at_504=4.0),
-    "true-rolling": Kind(0.5, 100, "the longest way of the picture during the readout in px", at_504=12.0),
     "true-exposure": Kind(0.01, 4, "the most stops to either side", default=1),
     "true-devices": Kind(2, 12, "cameras that took turns", integer=True, default=4),
     "true-crowd": Kind(1, 9, "the most walkers in a photo", integer=True, default=3),
@@ -96,8 +95,6 @@ def wild_room(
       up, down and sideways carry 0.75 of the extent, and 0.25 of it each: moves up, down and sideways (at
       DISTANCE), a roll, and a move forwards (both at a corner). The extent of the centre's path at DISTANCE
       is uniform in [0.2, 1] PX. The mean of the path is the photo's pose.
-    - `true-rolling[:PX]` (12): the same path over the rows instead: each row is taken in an instant, from the
-      top one at its start to the last one at its end.
     - `true-defocus[:R]` (4): a thin lens. Its radius makes a point at infinity a disc of radius r px when it
       is focused at DISTANCE, r uniform in [0.2, 1] R; the focus of each photo is uniform in 1/z between
       depths of 2.5 and 8.
@@ -165,8 +162,6 @@ def exposure(kind: str, camera: Camera, truth: PhotoTruth) -> Exposure:
     """The exposure that the truth of a photo stands for."""
     if kind == "true-shake":
         return shaken(camera, truth.path, truth.samples)
-    if kind == "true-rolling":
-        return rolling(camera, truth.path, STILL)
     if kind == "true-defocus":
         return through_lens(camera, truth.aperture, truth.focus, truth.samples)
     return still(camera, STILL)
@@ -203,8 +198,6 @@ def _draw(kind: str, value: float, camera: Camera, rng: np.random.Generator) -> 
         samples = int(np.clip(math.ceil(math.pi * widest**2 / 2), *LENS_SAMPLES))  # one for 2 px of the disc
         return PhotoTruth(aperture=aperture, focus=focus, samples=samples)
     knots = _draw_knots(camera, strength, rng)
-    if kind == "true-rolling":
-        return PhotoTruth(extent=strength, path=knots)
     length = path_length(_picture_path(camera, knots))
     samples = int(np.clip(math.ceil(1.5 * length), *SHAKE_SAMPLES))
     return PhotoTruth(extent=strength, path=knots, samples=samples)

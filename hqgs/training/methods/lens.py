@@ -12,14 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from hqgs.training.constants import (
-    FEWEST_SAMPLES,
-    FIRST_RADIUS,
-    GOLDEN,
-    LENS_FARTHEST,
-    LENS_NEAREST,
-    MOST_SAMPLES,
-)
+from hqgs.photos.constants import GOLDEN
+from hqgs.training.constants import FEWEST_SAMPLES, FIRST_RADIUS, LENS_FARTHEST, LENS_NEAREST, MOST_SAMPLES
 
 
 def first_lens(width: float) -> Tensor:
