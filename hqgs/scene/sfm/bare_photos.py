@@ -203,7 +203,15 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     looked, tags = {name: looked[name] for name in names}, {name: exif[name] for name in names}
     if film and frames_around(photos.folder):
         tags = {name: replace(tag, panorama=True) for name, tag in tags.items()}
-    sphere = all_around(photos.folder, looked, tags)
+    sphere, aside = all_around(photos.folder, looked, tags)
+    if aside:
+        kind = "flat, most are not" if sphere else "panoramas of 360 x 180 degrees, most are not"
+        notes.append(
+            f"{len(aside)} of {len(names)} photos are {kind}, and were left out: {some(aside)}; they need a "
+            "folder of their own"
+        )
+        names = [name for name in names if name not in set(aside)]
+        looked, tags = {name: looked[name] for name in names}, {name: tags[name] for name in names}
     if not film or sphere:
         notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
         told = maybe_two([*tags.values()], names)

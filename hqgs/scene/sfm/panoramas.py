@@ -16,42 +16,41 @@ from hqgs.scene.sfm.constants import FINER, LEAST_PHOTOS, PANORAMA_PLAIN, PANORA
 from hqgs.scene.views import to_pinhole
 
 
-def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> bool:
-    """Whether the photos are panoramas of the whole sphere (equirectangular).
+def all_around(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> tuple[bool, list[str]]:
+    """Whether the photos are panoramas of the whole sphere (equirectangular), and those of the other kind.
 
-    Their files say so (GPano), or they are twice as wide as high, end on the right where they begin on the
-    left, and show one point along their upper and lower borders. Where files do not say so, some of the
-    photos of that shape, spread over them, stand for the others.
+    Panoramas say so in their files (GPano), or they are twice as wide as high, end on the right where they
+    begin on the left, and show one point along their upper and lower borders. Where files do not say so and
+    most photos are of that shape, some of them, spread over them, stand for the others. COLMAP matches no
+    face with a flat photo, so a run takes the kind that has more.
 
-    ValueError where panoramas are mixed with other photos, are parts of a sphere, or are too few.
+    ValueError where panoramas are parts of a sphere, or too few.
     """
     tagged = [name for name, tags in exif.items() if tags.panorama]
     whole = [name for name, seen in looked.items() if seen.size[0] == 2 * seen.size[1]]
     found = [name for name in whole if name in set(tagged)]
     untold = [name for name in whole if name not in set(tagged)]
-    picks = [untold[k] for k in evenly(len(untold), PROBED)] if 2 * len(untold) > len(looked) else []
-    if 2 * sum(_closes(folder / name) for name in picks) > len(picks):
-        found = whole
-    if not found:
-        if 2 * len(tagged) <= len(looked):
-            return False
+    if 2 * len(untold) > len(looked):
+        picks = [untold[k] for k in evenly(len(untold), PROBED)]
+        found = whole if 2 * sum(_closes(folder / name) for name in picks) > len(picks) else found
+    else:
+        found += [name for name in untold if _closes(folder / name)]
+    if not found and 2 * len(tagged) > len(looked):
         name = tagged[0]
         width, height = looked[name].size
         raise ValueError(
             f"{folder}: {len(tagged)} of {len(looked)} photos say that they are panoramas, but are not twice "
             f"as wide as high ({name}: {width} x {height} px): export the whole sphere, 360 x 180 degrees"
         )
-    if others := [name for name in looked if name not in set(found)]:
-        raise ValueError(
-            f"{folder}: {len(found)} of {len(looked)} photos are panoramas of 360 x 180 degrees, others are "
-            f"not ({some(others)}): put each kind into a folder of its own"
-        )
-    if len(found) < LEAST_PHOTOS:
+    flat = [name for name in looked if name not in set(found)]
+    if len(flat) >= max(len(found), LEAST_PHOTOS):
+        return False, found
+    if found and len(found) < LEAST_PHOTOS:
         raise ValueError(
             f"{folder}: {len(found)} panorama{'s' * (len(found) > 1)} of 360 x 180 degrees ({some(found)}) "
             f"show no depth, wanted at least {LEAST_PHOTOS}: take 10 to 50, a step apart"
         )
-    return True
+    return bool(found), flat if found else []
 
 
 def _closes(path: Path) -> bool:
