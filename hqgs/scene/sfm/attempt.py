@@ -22,6 +22,7 @@ from hqgs.scene.sfm.constants import (
     ALWAYS_CHECKED,
     COARSE,
     FALSE,
+    FEWER,
     LARGEST,
     LEAST_PHOTOS,
     LOG_LOOKS,
@@ -161,11 +162,11 @@ class Attempt:
         if self.model is None or self.faces > 1:
             return
         plain, unsure = self.model, self._off(self.model) > UNSURE
-        if unsure:
-            self._tell("sharpen", 0)
-            # Weaker evidence leaves photos farther off than patches reach at once.
-            for _ in range(1 if self._sure >= placed_names(plain) else 2):
-                self.model = sharpened(self.model, self.photos, self._adjust, not self.fixed)
+        self._tell("sharpen", 0)
+        rounds = ROUNDS if unsure else FEWER
+        # Weaker evidence leaves photos farther off than patches reach at once.
+        for _ in range(1 if self._sure >= placed_names(plain) else 2):
+            self.model = sharpened(self.model, self.photos, self._adjust, not self.fixed, rounds)
         if self.model is plain and not self._sure >= placed_names(plain):
             self._settle(plain)
         if not (unsure or self.registered < len(self.names) or len(self.names) < ALWAYS_CHECKED):

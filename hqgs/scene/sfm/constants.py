@@ -70,8 +70,9 @@ JOINT = 20
 
 # What is left out, and adjusted.
 ROUNDS = 3  # of patches, or of leaving out what lies far off, and adjustment
+FEWER = 2  # of patches where features are precise already
 FALSE = 2.5  # medians of the points' errors; what lies farther off is taken for a false match at last
-UNSURE = 0.3  # px of what SIFT sees that observations are usually off, from where on patches tell more
+UNSURE = 0.3  # px of what SIFT sees that observations are usually off, from where on photos may be bad
 SELDOM = 1.3  # times the photos or points: until then, no adjustment of all that was found coarsely
 POSE_LEAST = 4  # observations of a photo that tell a pose and more
 RAYLEIGH = math.sqrt(2 * math.log(2))  # median distance of points in a plane that scatter by 1 each way
@@ -81,7 +82,7 @@ HALF = 6  # nodes of a patch to each side of its middle
 WINDOW = 3.5  # nodes, sigma of the weights over a patch
 SMOOTH = 1.0  # px, sigma, of the photos that patches are taken from
 PATCH_SIDE = 1000  # px, of these photos, and of those in which tags are looked for
-PATCH_STEPS = 5  # of Gauss-Newton
+PATCH_STEPS, STILL = 5, 0.05  # of Gauss-Newton, at most; nodes, the usual step after which none follows
 REACH = 3.0  # px that an observation may move
 SURE, NEW = 0.6, 0.7  # correlation with the others' mean, of what stays; of what no feature told of
 UNLIKE = 0.3  # of a photo's observations that are sure: with fewer, patches tell nothing of it

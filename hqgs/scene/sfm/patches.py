@@ -27,6 +27,7 @@ from hqgs.scene.sfm.constants import (
     REACH,
     ROUGH,
     SMOOTH,
+    STILL,
     SURE,
     UNLIKE,
     WINDOW,
@@ -66,8 +67,8 @@ class PatchView:
         return np.where(front[:, None], at, -1e6), inside[:, 2]
 
     def sample(self, at: Floats) -> NDArray[np.float32]:
-        """Values [..] at pixels [.., 2] of the camera, whose middles lie at halves."""
-        x, y = at[..., 0] * self.ratio[0] - 0.5, at[..., 1] * self.ratio[1] - 0.5
+        """Values [O, N] at pixels [O, 2, N] of the camera, whose middles lie at halves."""
+        x, y = at[:, 0] * self.ratio[0] - 0.5, at[:, 1] * self.ratio[1] - 0.5
         return np.asarray(
             map_coordinates(self.photo, [y, x], np.float32, order=1, mode="nearest"), np.float32
         )
@@ -113,7 +114,7 @@ def _patches(views: list[PatchView], tracks: Tracks, turns: Floats, at: Floats) 
     values = np.zeros((len(at), len(_GRID)), np.float32)
     for k, view in enumerate(views):
         mine = np.flatnonzero(tracks.view == k)
-        values[mine] = view.sample(at[mine, None] + np.einsum("oij,nj->oni", turns[mine], _GRID))
+        values[mine] = view.sample(at[mine, :, None] + turns[mine] @ _GRID.T)
     return _normalised(values)
 
 
@@ -161,6 +162,8 @@ def fitted(
         step = np.stack([yy * xo - xy * yo, xx * yo - xy * xo], 1) / (xx * yy - xy**2)[:, None]
         step /= np.maximum(np.abs(step).max(1, keepdims=True), 1)  # a node at most
         at = tracks.xy + np.clip(at + np.einsum("oij,oj->oi", turns, step) - tracks.xy, -reach, reach)
+        if 2 * (np.linalg.norm(step[usable], axis=1) > STILL).sum() < usable.sum():
+            break
     patches = _patches(views, tracks, turns, at)
     alike = (patches * _means(patches, tracks, counted) * _WEIGHTS).sum(1)
     near = (np.abs(at - tracks.xy) < reach).all(1)

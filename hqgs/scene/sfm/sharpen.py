@@ -25,9 +25,9 @@ Adjust = Callable[[pycolmap.Reconstruction, float, bool], None]
 
 
 def sharpened(
-    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, free: bool
+    model: pycolmap.Reconstruction, folder: Path, adjust: Adjust, free: bool, rounds: int = ROUNDS
 ) -> pycolmap.Reconstruction:
-    """The model after ROUNDS of patches and adjustment; as it is where the patches do not fit.
+    """The model after `rounds` of patches and adjustment; as it is where the patches do not fit.
 
     `folder` holds the photos. `adjust` gets a model, the error in px from where on it counts an error less,
     and whether the photos move or the points alone. `free`: focal lengths and distortion are adjusted, too.
@@ -40,7 +40,7 @@ def sharpened(
     sides = [max(camera.width, camera.height) for camera in model.cameras.values()]
     used, fresh = _used(tracks, len(names), CELL * max(1, float(np.median(sides)) / PATCH_SIDE))
     now, some = rebuilt(model, names, tracks), tracks.chosen(used[tracks.point])
-    for number in range(ROUNDS):
+    for number in range(rounds):
         views = [PatchView(now, name, photos[name]) for name in names]
         new = np.zeros(len(some.view), bool)
         if number > 0:
