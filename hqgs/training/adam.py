@@ -75,50 +75,56 @@ class Adam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        moved = list[tuple[Tensor, dict[str, Any], int]]()
+        counts = views or {}
+        writes, changed, steps = (
+            list[tuple[Any, ...]](),
+            list[Tensor](),
+            list[tuple[dict[str, Any], Tensor]](),
+        )
         for group in self.param_groups:
             if asked := [name for name in UNSUPPORTED if group.get(name)]:
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
+            used = group.get("used")
             for param in group["params"]:
-                if param.grad is not None or group.get("used") == 0:
-                    moved.append((param, group, 1 if views is None else views.get(param, 1)))
-        steps = [self._next_step(param) for param, *_ in moved]
-        written = [
-            (param, self._write(param, int(step), group, count))
-            for (param, group, count), step in zip(moved, steps, strict=True)
-            if group.get("used") != 0
-        ]
-        _rust.adam_steps([write for _, write in written])
-        for param, _ in written:
-            for tensor in (param, self.state[param]["exp_avg"], self.state[param]["exp_avg_sq"]):
-                increment_version(tensor)  # written behind torch's back
-        for (param, *_), step in zip(moved, steps, strict=True):
-            self.state[param]["step"] = step  # a new tensor: a loaded state dict may share the old one
+                if param.grad is None and used != 0:
+                    continue
+                state = self._state_of(param)
+                steps.append((state, state["step"] + 1))
+                if used != 0:
+                    moments = state["exp_avg"], state["exp_avg_sq"]
+                    step, count = int(steps[-1][1]), counts.get(param, 1)
+                    writes.append(_write(param, *moments, step, group, count))
+                    changed += param, *moments
+        _rust.adam_steps(writes)
+        increment_version(changed)  # written behind torch's back
+        for state, step in steps:
+            state["step"] = step  # a new tensor: a loaded state dict may share the old one
         return loss
 
-    def _next_step(self, param: Tensor) -> Tensor:
+    def _state_of(self, param: Tensor) -> dict[str, Any]:
         state = self.state[param]
         if not state:
             state["step"] = torch.tensor(0.0)
             state["exp_avg"] = torch.zeros_like(param)
             state["exp_avg_sq"] = torch.zeros_like(param)
-        return state["step"] + 1
+        return state
 
-    def _write(self, param: Tensor, step: int, group: dict[str, Any], views: int) -> tuple[Any, ...]:
-        """What `_rust.adam_steps` is to do."""
-        grad = param.grad
-        assert grad is not None
-        if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
-            raise ValueError(
-                "param: must be a contiguous CPU tensor with a dense gradient, got shape "
-                f"{list(param.shape)}, strides {param.stride()}, {param.device}, gradient {grad.layout}"
-            )
-        moments = self.state[param]["exp_avg"], self.state[param]["exp_avg_sq"]
-        values, first, second = (t.detach().numpy() for t in (param, *moments))
-        beta1, beta2 = group["betas"]
-        options = (float(group["lr"]) * math.sqrt(views), beta1**views, beta2**views, group["eps"])
-        used = group.get("used")
-        return values, grad.contiguous().numpy(), first, second, step, options, used
+
+def _write(
+    param: Tensor, first: Tensor, second: Tensor, step: int, group: dict[str, Any], views: int
+) -> tuple[Any, ...]:
+    """What `_rust.adam_steps` is to do."""
+    grad = param.grad
+    assert grad is not None
+    if param.device.type != "cpu" or grad.is_sparse or not param.is_contiguous():
+        raise ValueError(
+            "param: must be a contiguous CPU tensor with a dense gradient, got shape "
+            f"{list(param.shape)}, strides {param.stride()}, {param.device}, gradient {grad.layout}"
+        )
+    values, grad = param.detach().numpy(), grad.contiguous().numpy()
+    beta1, beta2 = group["betas"]
+    options = (float(group["lr"]) * math.sqrt(views), beta1**views, beta2**views, group["eps"])
+    return values, grad, first.numpy(), second.numpy(), step, options, group.get("used")
 
 
 def select_rows(gaussians: Gaussians, optimizer: Optimizer, rows: Tensor, old: int) -> None:

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from hqgs.base.evenly import middles
@@ -117,7 +116,7 @@ class Frugality:
     @property
     def step_seconds(self) -> float:
         """Of a step now, the mean of the last ones; 0 before the first."""
-        return float(np.mean(self._seconds)) if self._seconds else 0.0
+        return sum(self._seconds) / len(self._seconds) if self._seconds else 0.0
 
     def left_out(self) -> list[LeftOut]:
         """What was left out, in the order of the decisions."""
