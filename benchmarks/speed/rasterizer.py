@@ -18,7 +18,7 @@ from benchmarks.speed.timing import Seconds, StageClock, interleaved, warmed, wh
 from hqgs.base.threads import one_torch_thread
 
 STAGES = list(CRATE.values())
-BIN = "bin"  # the part of "bin and composite" before the first pixel
+BIN = "bin"  # what the tile lists take of "bin and composite"
 BLOCK_PIXELS = 16  # lanes of a block of 4 x 4 pixels
 LIMIT_NS = 0.65 + 1.05  # of one core, for a pair that blends: forward, backward
 

@@ -68,18 +68,19 @@ fn stages(c: &mut Criterion, name: &str, s: &Synthetic<f32>) {
     group.bench_function(BenchmarkId::new("bin and order", n), |b| {
         b.iter(|| tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs"));
     });
-    let tiles = tiles::bin(&projection, &colors, 3, &s.camera).expect("few pairs");
+    let pixels = s.camera.width() * s.camera.height();
+    let composite =
+        || composite::forward(&projection, &colors, 3, &s.camera, None).expect("few pairs");
+    group.bench_function(BenchmarkId::new("bin and composite", n), |b| {
+        b.iter(composite);
+    });
+    let view = composite();
     let input = CompositeInput {
         projection: &projection,
-        tiles: &tiles,
+        tiles: &view.tiles,
         camera: &s.camera,
         background: None,
     };
-    let pixels = s.camera.width() * s.camera.height();
-    group.bench_function(BenchmarkId::new("composite", n), |b| {
-        b.iter(|| composite::forward(&input).expect("right lengths"));
-    });
-    let view = composite::forward(&input).expect("right lengths");
     println!("{name}, {n} Gaussians: {:?}", view.counts);
     let v_image: Vec<f32> = (0..3 * pixels).map(|i| (i as f32 * 0.37).sin()).collect();
     let v = CompositeCotangents {

@@ -7,15 +7,17 @@ use super::{
 use crate::{
     constants::{BLOCK, BLOCK_PIXELS, TILE, TILE_BLOCKS, TILE_PIXELS},
     counts::Counts,
-    error::Error,
+    error::{Error, check_len},
     memory,
+    project::Projection,
+    scene::Camera,
     simd::Real,
-    tiles::List,
+    tiles::{self, List, Scratch, Tiles},
     uninit::UninitVec,
 };
 use fearless_simd::{Simd, dispatch};
 use rayon::prelude::*;
-use std::iter::repeat_n;
+use std::{iter::repeat_n, time::Instant};
 
 /// One view.
 #[derive(Debug)]
@@ -25,46 +27,74 @@ pub struct Image<T> {
     /// [H, W]
     pub alphas: Vec<T>,
     /// For the backward pass.
+    pub tiles: Tiles<T>,
+    /// For the backward pass.
     pub composited: Composited<T>,
     /// Counts.
     pub counts: Counts,
+    /// Wall-clock seconds that the tile lists took. Each is blended as soon as it is made: of the time that all threads
+    /// spent on lists, one thread's part.
+    pub bin_seconds: f64,
 }
 
-/// Composite all tiles.
+/// Bin and composite all tiles, with the colours [N, channels] of the Gaussians, in front of `background`,
+/// `[channels]`.
 ///
 /// # Errors
-/// When the length of an array does not fit.
-pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
-    input.check()?;
-    let (tiles, channels) = (input.tiles, input.channels());
+/// As for `bin`, and when the length of the background does not fit.
+pub fn forward<T: Real>(
+    projection: &Projection,
+    colors: &[T],
+    channels: usize,
+    camera: &Camera,
+    background: Option<&[T]>,
+) -> Result<Image<T>, Error> {
+    background.map_or(Ok(()), |b| check_len("background", b, channels))?;
+    let started = Instant::now();
+    let (mut tiles, scattered) = tiles::scattered(projection, colors, channels, camera)?;
+    let scattering = started.elapsed().as_secs_f64();
     let count = tiles.tiles_x * tiles.tiles_y;
+    let mut lists = memory::with_capacity(count, "tile lists")?;
+    lists.resize_with(count, List::default);
     let mut depths = memory::filled([0; TILE_BLOCKS], count, "image")?;
     let mut transmittance = UninitVec::new(count * TILE_PIXELS, "image")?;
-    let mut colors = UninitVec::new(count * channels, "image")?;
+    let mut painted = UninitVec::new(count * channels, "image")?;
     let grid = Grid::new();
-    let level = input.projection.level.token;
-    let counts = depths
+    let level = projection.level.token;
+    let input = CompositeInput {
+        projection,
+        tiles: &tiles,
+        camera,
+        background,
+    };
+    let (counts, listing) = lists
         .par_iter_mut()
+        .zip(&mut depths)
         .zip(transmittance.cut(repeat_n(TILE_PIXELS, count)))
-        .zip(colors.cut(repeat_n(channels, count)))
+        .zip(painted.cut(repeat_n(channels, count)))
         .enumerate()
-        .map(|(tile, ((depths, transmittance), colors))| {
-            let transmittance = transmittance.fill(T::ZERO);
-            let colors = colors.fill([T::ZERO; TILE_PIXELS]);
-            if let Some(next) = tiles.lists.get(tile + 1) {
-                next.prefetch();
-            }
-            let list = &tiles.lists[tile];
-            dispatch!(level, simd => for_channels!(
-                channels, forward_tile, simd, T, (input, &grid, tile, list, depths, transmittance, colors)
-            ))
-        })
-        .reduce(Counts::default, Counts::plus);
-    let (transmittance, colors) = (transmittance.finish(), colors.finish());
-    let (image, alphas) = image_from_tiles(input, &transmittance, &colors)?;
+        .map_init(
+            Scratch::default,
+            |scratch, (tile, (((list, depths), transmittance), colors))| {
+                let started = Instant::now();
+                scattered.list(projection, channels, tile, scratch, list)?;
+                let listing = started.elapsed().as_secs_f64();
+                let transmittance = transmittance.fill(T::ZERO);
+                let colors = colors.fill([T::ZERO; TILE_PIXELS]);
+                let counts = dispatch!(level, simd => for_channels!(
+                    channels, forward_tile, simd, T, (&input, &grid, tile, list, depths, transmittance, colors)
+                ));
+                Ok((counts, listing))
+            },
+        )
+        .try_reduce(Default::default, |(a, b), (c, d)| Ok((a.plus(c), b + d)))?;
+    let (transmittance, painted) = (transmittance.finish(), painted.finish());
+    let (image, alphas) = image_from_tiles(&input, &transmittance, &painted)?;
+    tiles.lists = lists;
     Ok(Image {
         image,
         alphas,
+        tiles,
         composited: Composited {
             depths,
             transmittance,
@@ -73,6 +103,7 @@ pub fn forward<T: Real>(input: &CompositeInput<T>) -> Result<Image<T>, Error> {
             channels: channels as u64,
             ..counts
         },
+        bin_seconds: scattering + listing / rayon::current_num_threads() as f64,
     })
 }
 

@@ -12,11 +12,11 @@ use hqgs::internals::{
     Error,
     composite::{self, CompositeCotangents, CompositeInput, Composited},
     counts::Counts,
-    tiles::{self, Tiles},
+    tiles::Tiles,
 };
 use numpy::IntoPyArray;
 use pyo3::{IntoPyObjectExt, prelude::*};
-use std::{sync::Arc, time::Instant};
+use std::sync::Arc;
 
 /// Add the functions and classes of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -124,26 +124,21 @@ fn composite_as<'py, T: Scalar>(
             for (i, (camera, projection)) in
                 frame.cameras.iter().zip(&frame.projections).enumerate()
             {
-                let started = Instant::now();
-                let tiles = tiles::bin(
+                let view = composite::forward(
                     projection,
                     of_camera(colors, i, frame.n * channels),
                     channels,
                     camera,
+                    backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
                 )?;
-                bin_seconds += started.elapsed().as_secs_f64();
-                let input = CompositeInput {
-                    projection,
-                    tiles: &tiles,
-                    camera,
-                    background: backgrounds.map(|b| &b[i * channels..(i + 1) * channels]),
-                };
-                let view = composite::forward(&input)?;
+                bin_seconds += view.bin_seconds;
                 total = total.plus(view.counts);
                 images.push(view.image);
                 alphas.push(view.alphas);
-                let composited = view.composited;
-                views.push(View { tiles, composited });
+                views.push(View {
+                    tiles: view.tiles,
+                    composited: view.composited,
+                });
             }
             Ok((
                 Composite {

@@ -9,7 +9,7 @@ use crate::{
     project::{self, ProjectCotangents, Projected, Projection, Shading},
     scene::{Camera, Colors, Gaussians},
     simd::Real,
-    tiles::{self, Tiles},
+    tiles::Tiles,
 };
 
 /// An image, and what its backward pass replays: the inputs stay borrowed, so that no others can stand in.
@@ -125,19 +125,13 @@ pub fn forward<'a, T: Real>(
         Colors::Harmonics(_) => (true, &shaded[..]),
         Colors::Channels(data, _) => (false, data),
     };
-    let tiles = tiles::bin(&projection, given, channels, camera)?;
-    let input = CompositeInput {
-        projection: &projection,
-        tiles: &tiles,
-        camera,
-        background,
-    };
     let Image {
         image,
         alphas,
+        tiles,
         composited,
         ..
-    } = composite::forward(&input)?;
+    } = composite::forward(&projection, given, channels, camera, background)?;
     Ok(Rendered {
         image,
         alphas,

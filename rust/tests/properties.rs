@@ -8,7 +8,6 @@ use hqgs::internals::{
     project::{self, ProjectCotangents, RenderOptions},
     scene::{Camera, Colors, Gaussians, Harmonics},
     simd::{Real, levels},
-    tiles,
 };
 use proptest::{collection::vec, prelude::*, sample::select, test_runner::RngSeed};
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -131,15 +130,15 @@ impl Scene {
         } else {
             &given
         };
-        let tiles = tiles::bin(&projection, colors, 3, &camera).expect("few pairs");
+        let behind = Some(&background[..]);
+        let view = composite::forward(&projection, colors, 3, &camera, behind).expect("few pairs");
         let input = CompositeInput {
             projection: &projection,
-            tiles: &tiles,
+            tiles: &view.tiles,
             camera: &camera,
-            background: Some(&background),
+            background: behind,
         };
         let pixels = WIDTH * HEIGHT;
-        let view = composite::forward(&input).expect("lengths");
 
         let wave = |n: usize| -> Vec<T> {
             let values = (0..n).map(|i| (1.0 + i as f64 * 0.37).sin());

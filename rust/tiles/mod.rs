@@ -76,31 +76,8 @@ pub fn bin<T: Real>(
     channels: usize,
     camera: &Camera,
 ) -> Result<Tiles<T>, Error> {
-    bin_at_most(projection, colors, channels, camera, limit::<T>(channels))
-}
-
-/// The most pairs that there may be.
-fn limit<T>(channels: usize) -> u64 {
-    (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS)
-}
-
-/// `bin` with at most `limit` pairs.
-fn bin_at_most<T: Real>(
-    projection: &Projection,
-    colors: &[T],
-    channels: usize,
-    camera: &Camera,
-    limit: u64,
-) -> Result<Tiles<T>, Error> {
-    let (mut tiles, pairs) = scatter(projection, colors, channels, camera, limit)?;
+    let (mut tiles, pairs) = scattered(projection, colors, channels, camera)?;
     let count = tiles.tiles_x * tiles.tiles_y;
-    // Counts to places: in a tile chunk by chunk.
-    let mut sums = memory::filled(0u32, count, NAME)?;
-    for chunk in &mut tiles.chunks {
-        for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
-            *sum += std::mem::replace(start, *sum);
-        }
-    }
     let mut lists = memory::with_capacity(count, NAME)?;
     lists.resize_with(count, List::default);
     lists
@@ -142,9 +119,11 @@ pub(crate) fn scattered<T: Real>(
     channels: usize,
     camera: &Camera,
 ) -> Result<(Tiles<T>, Scattered<T>), Error> {
-    scatter(projection, colors, channels, camera, limit::<T>(channels))
+    let limit = (MAX_PAIR_BYTES / pair_bytes::<T>(channels)).min(MAX_PAIRS);
+    scatter(projection, colors, channels, camera, limit)
 }
 
+/// The same with at most `limit` pairs.
 fn scatter<T: Real>(
     projection: &Projection,
     colors: &[T],
@@ -175,7 +154,7 @@ fn scatter<T: Real>(
             dispatch!(level, simd => source.chunk(simd, range))
         })
         .collect::<Result<_, Error>>()?;
-    let (chunks, pairs): (Vec<_>, Vec<_>) = made.into_iter().unzip();
+    let (mut chunks, pairs): (Vec<_>, Vec<_>) = made.into_iter().unzip();
     if source.total.into_inner() > limit {
         return Err(Error::TooManyPairs {
             gaussians: n as u64,
@@ -183,6 +162,13 @@ fn scatter<T: Real>(
             limit,
             bytes: limit * pair_bytes::<T>(channels),
         });
+    }
+    // Counts to places: in a tile chunk by chunk.
+    let mut sums = memory::filled(0u32, tiles_x * tiles_y, NAME)?;
+    for chunk in &mut chunks {
+        for (start, sum) in chunk.starts.iter_mut().zip(&mut sums) {
+            *sum += std::mem::replace(start, *sum);
+        }
     }
     let tiles = Tiles {
         tiles_x,
@@ -215,8 +201,10 @@ mod tests {
         for threads in [1, 3] {
             let pool = ThreadPoolBuilder::new().num_threads(threads);
             pool.build().unwrap().install(|| {
-                let bin = |limit| bin_at_most::<f32>(&projection, &[], 0, &s.camera, limit);
-                assert_eq!(bin(pairs).unwrap().pairs() as u64, pairs);
+                let scatter = |limit| scatter::<f32>(&projection, &[], 0, &s.camera, limit);
+                let (tiles, _) = scatter(pairs).unwrap();
+                let reached: usize = tiles.chunks.iter().map(|chunk| chunk.reaches.len()).sum();
+                assert_eq!(reached as u64, pairs);
                 for limit in [pairs - 1, pairs / 2, 0] {
                     let expected = Error::TooManyPairs {
                         gaussians: 9000,
@@ -224,7 +212,7 @@ mod tests {
                         limit,
                         bytes: limit * pair_bytes::<f32>(0),
                     };
-                    assert_eq!(bin(limit).unwrap_err(), expected);
+                    assert_eq!(scatter(limit).map(|_| ()).unwrap_err(), expected);
                 }
             });
         }
