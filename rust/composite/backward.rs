@@ -11,6 +11,7 @@ use crate::{
     error::{Error, check_len},
     memory,
     simd::{Real, groups::Column},
+    tiles::List,
     uninit::prefetch_all,
 };
 use fearless_simd::{Simd, dispatch};
@@ -170,9 +171,16 @@ fn backward_tile<T: Real>(
     let begins = dispatch!(level, simd => replay_blocks::<_, T>(
         simd, input, grid, tile, &depths, adjoint, layers
     ))?;
-    let out = dispatch!(level, simd => for_channels!(
-        channels, unblend_tile, simd, T, (input, grid, tile, &begins, layout, adjoint, layers)
-    ))?;
+    let replayed = Replayed {
+        list,
+        grid,
+        layout,
+        begins,
+        adjoint,
+        layers,
+    };
+    let out =
+        dispatch!(level, simd => for_channels!(channels, unblend_tile, simd, T, (&replayed)))?;
     Ok((out, counts))
 }
 
@@ -272,33 +280,39 @@ fn replay_blocks<S: Simd, T: Real>(
 #[repr(C, align(64))]
 struct Lines<A>(A);
 
+/// A tile whose blocks have been replayed.
+struct Replayed<'a, T: Real> {
+    list: &'a List<T>,
+    grid: &'a Grid<T>,
+    layout: PairLayout,
+    /// Begin of each block in `layers`, and the end.
+    begins: [usize; TILE_BLOCKS + 1],
+    adjoint: &'a Adjoint<T>,
+    layers: &'a [Layer<T>],
+}
+
 #[inline(always)]
 fn unblend_tile<S: Simd, T: Real, const D: usize>(
     simd: S,
-    input: &CompositeInput<T>,
-    grid: &Grid<T>,
-    tile: usize,
-    begins: &[usize; TILE_BLOCKS + 1],
-    layout: PairLayout,
-    adjoint: &Adjoint<T>,
-    layers: &[Layer<T>],
+    tile: &Replayed<T>,
 ) -> Result<Vec<T>, Error> {
-    for_parts!(S, T, P => unblend::<S, T, D, P>(simd, input, grid, tile, begins, layout, adjoint, layers))
+    for_parts!(S, T, P => unblend::<S, T, D, P>(simd, tile))
 }
 
 /// Gaussian by Gaussian, back to front, the sums over its blocks.
 #[inline(always)]
 fn unblend<S: Simd, T: Real, const D: usize, const P: usize>(
     simd: S,
-    input: &CompositeInput<T>,
-    grid: &Grid<T>,
-    tile: usize,
-    begins: &[usize; TILE_BLOCKS + 1],
-    layout: PairLayout,
-    adjoint: &Adjoint<T>,
-    layers: &[Layer<T>],
+    tile: &Replayed<T>,
 ) -> Result<Vec<T>, Error> {
-    let list = &input.tiles.lists[tile];
+    let &Replayed {
+        list,
+        grid,
+        layout,
+        ref begins,
+        adjoint,
+        layers,
+    } = tile;
     let channels = if D > 0 { D } else { layout.channels };
     // Copies, which the compiler knows to lie apart from everything else.
     let mut behind = Lines(adjoint.behind);

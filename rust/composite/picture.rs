@@ -67,7 +67,7 @@ pub fn picture<T: Real>(
             let out = out.fill(0);
             for (p, pixel) in out.chunks_exact_mut(channels.max(1)).enumerate() {
                 for (byte, color) in pixel.iter_mut().zip(&*colors) {
-                    *byte = level_of(color[p]);
+                    *byte = byte_of(color[p]);
                 }
             }
             Ok(())
@@ -96,7 +96,7 @@ impl<T: Real> Default for Buffers<T> {
 
 /// The nearest of 255 levels; NaN is 0.
 #[inline(always)]
-fn level_of<T: Real>(value: T) -> u8 {
+fn byte_of<T: Real>(value: T) -> u8 {
     (value * T::from_f64(255.0)).to_f64().round_ties_even() as u8 // saturates
 }
 

@@ -17,7 +17,10 @@
 //!
 //! Lanes that turn out invalid are computed to the end and ignored.
 
-use super::camera_lanes::{CameraGradLanes, CameraLanes};
+use super::{
+    Mask,
+    camera_lanes::{CameraGradLanes, CameraLanes},
+};
 use crate::{
     constants::QUAT_NORM2_MIN,
     simd::{
@@ -26,8 +29,6 @@ use crate::{
     },
 };
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
-
-type Mask<S> = <Wide<S> as SimdBase<S>>::Mask;
 
 /// What projection computes; the VJP computes it again instead of storing it.
 pub(crate) struct Geometry<S: Simd> {

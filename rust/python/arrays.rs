@@ -139,7 +139,7 @@ fn as_it_is<'a, 'py, T: Element>(
 }
 
 /// Memory that a call of the binding reads or writes at this moment.
-struct Place {
+struct Claim {
     name: &'static str,
     addresses: Range<usize>,
     written: bool,
@@ -149,9 +149,9 @@ struct Place {
 }
 
 /// Those of all calls, in the order in which they were borrowed, and the number of the next one.
-static PLACES: Mutex<(Vec<Place>, u64)> = Mutex::new((Vec::new(), 0));
+static CLAIMS: Mutex<(Vec<Claim>, u64)> = Mutex::new((Vec::new(), 0));
 
-/// The entry of one array in [`PLACES`], as long as it is borrowed.
+/// The entry of one array in [`CLAIMS`], as long as it is borrowed.
 ///
 /// Memory that is written under one name and read or written under another is refused, in one call and in calls
 /// from several threads. rust-numpy knows views of one array, but two tensors over the same memory come as arrays
@@ -170,9 +170,9 @@ impl Lease {
         let begin = array.data().addr();
         let addresses = begin..begin + array.len() * size_of::<T>();
         let process = process::id();
-        let (places, next) = &mut *PLACES.lock().unwrap_or_else(PoisonError::into_inner);
-        places.retain(|place| place.process == process);
-        for other in places.iter() {
+        let (claims, next) = &mut *CLAIMS.lock().unwrap_or_else(PoisonError::into_inner);
+        claims.retain(|place| place.process == process);
+        for other in claims.iter() {
             let both =
                 addresses.start.max(other.addresses.start) < addresses.end.min(other.addresses.end);
             if both && (written || other.written) {
@@ -187,7 +187,7 @@ impl Lease {
         }
         let number = *next;
         *next += 1;
-        places.push(Place {
+        claims.push(Claim {
             name,
             addresses,
             written,
@@ -200,8 +200,8 @@ impl Lease {
 
 impl Drop for Lease {
     fn drop(&mut self) {
-        let (places, _) = &mut *PLACES.lock().unwrap_or_else(PoisonError::into_inner);
-        places.retain(|place| place.number != self.number);
+        let (claims, _) = &mut *CLAIMS.lock().unwrap_or_else(PoisonError::into_inner);
+        claims.retain(|place| place.number != self.number);
     }
 }
 

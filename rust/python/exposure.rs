@@ -6,7 +6,7 @@ use crate::{
     error::BindingResult,
 };
 use hqgs::Error;
-use hqgs_training::exposure::{Frame, Light, Photograph, Warp};
+use hqgs_training::exposure::{Light, Photograph, Sizes, Warp};
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
 
@@ -65,7 +65,7 @@ fn forward_as<'py, T: Scalar + Light>(
         return Err(Error::shape("warps", "[K, 3, 4]", got).into());
     };
     let warps: &[Warp] = warps.slice()?.as_chunks().0;
-    let frame = Frame { size, margin };
+    let sizes = Sizes { size, margin };
     let (image, near) = (
         image.slice()?,
         nearness
@@ -76,7 +76,7 @@ fn forward_as<'py, T: Scalar + Light>(
     );
     let (taken, photo) = py.detach(|| {
         threads::install(|| -> Result<_, Error> {
-            let taken = Photograph::<T>::take(frame, image, near, warps, gains)?;
+            let taken = Photograph::<T>::take(sizes, image, near, warps, gains)?;
             let photo = filled(taken.photo.iter().copied(), "photo")?;
             Ok((taken, photo))
         })

@@ -4,7 +4,7 @@ use crate::arrays::{Array, filled};
 use crate::error::BindingResult;
 use crate::threads;
 use hqgs::Error;
-use hqgs_training::stereo::{Other, Picture, Sweep};
+use hqgs_training::stereo::{Other, Photo, Sweep};
 use numpy::IntoPyArray;
 use pyo3::prelude::*;
 
@@ -58,11 +58,11 @@ fn agreed_depths<'py>(
     ))
 }
 
-fn picture<'a>(name: &'static str, array: &'a Array<'_, f32>) -> BindingResult<Picture<'a>> {
+fn picture<'a>(name: &'static str, array: &'a Array<'_, f32>) -> BindingResult<Photo<'a>> {
     let &[height, width] = array.shape() else {
         return Err(Error::shape(name, "[H, W]", format!("{:?}", array.shape())).into());
     };
-    Ok(Picture {
+    Ok(Photo {
         size: [height, width],
         grey: array.slice()?,
     })

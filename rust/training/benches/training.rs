@@ -6,11 +6,11 @@ mod table;
 use criterion::{BenchmarkId, Criterion};
 use hqgs_training::{
     adam::{self, AdamArrays, AdamOptions, Selection},
-    exposure::{Frame, Photograph, Warp},
+    exposure::{Photograph, Sizes, Warp},
     jpeg_cells,
     loss::{self, Images, LossOptions, LossScratch},
     separable::{Dense, Separable},
-    stereo::{Other, Picture, Sweep},
+    stereo::{Other, Photo, Sweep},
     views::{self, ViewColors, ViewRows},
 };
 use std::time::Duration;
@@ -52,7 +52,7 @@ fn losses(c: &mut Criterion) {
 
 /// Five samples of a hand that shakes.
 fn exposures(c: &mut Criterion) {
-    let frame = Frame {
+    let sizes = Sizes {
         size: [HEIGHT, WIDTH],
         margin: MARGIN,
     };
@@ -65,7 +65,7 @@ fn exposures(c: &mut Criterion) {
             warp
         })
         .collect();
-    let take = || Photograph::take(frame, &image, &near, &warps, [1.0; 3]).expect("right lengths");
+    let take = || Photograph::take(sizes, &image, &near, &warps, [1.0; 3]).expect("right lengths");
     let mut group = c.benchmark_group("exposure");
     group.bench_function("forward", |b| b.iter(take));
     let (taken, v_photo) = (take(), wave(3 * PIXELS, 0.23));
@@ -128,7 +128,7 @@ fn operators(c: &mut Criterion) {
 /// 2,000 pixels of one photo in four others.
 fn depths(c: &mut Criterion) {
     let grey = wave(PIXELS, 0.05);
-    let picture = Picture {
+    let picture = Photo {
         size: [HEIGHT, WIDTH],
         grey: &grey,
     };

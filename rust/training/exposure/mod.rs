@@ -23,14 +23,14 @@ const WIDE: usize = 4;
 
 /// The sizes of a render and of the photo in its middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Frame {
+pub struct Sizes {
     /// Height and width of the photo.
     pub size: [usize; 2],
     /// Pixels that the render is larger by on each side.
     pub margin: usize,
 }
 
-impl Frame {
+impl Sizes {
     /// That it has pixels, and no more than can be counted. Returns the size of the render.
     fn check(&self) -> Result<[usize; 2], Error> {
         let side = |side: usize| side.checked_add(self.margin.checked_mul(2)?);
@@ -62,7 +62,7 @@ pub type Warp = [f64; 12];
 /// A photo, and what its gradient needs.
 #[derive(Debug)]
 pub struct Photograph<T> {
-    frame: Frame,
+    sizes: Sizes,
     /// [H, W, 3], values
     pub photo: Vec<T>,
     /// Of the render, values.
@@ -110,16 +110,16 @@ impl<T: Light> Photograph<T> {
     /// # Errors
     /// Names an array of another size, or a warp or gain that is not finite.
     pub fn take(
-        frame: Frame,
+        sizes: Sizes,
         image: &[T],
         nearness: &[T],
         warps: &[Warp],
         gains: [f64; 3],
     ) -> Result<Self, Error> {
-        let [height, width] = frame.check()?;
+        let [height, width] = sizes.check()?;
         check_len("image", image, height * width * 3)?;
         if !nearness.is_empty() {
-            check_len("nearness", nearness, frame.pixels())?;
+            check_len("nearness", nearness, sizes.pixels())?;
         }
         for (name, finite) in [
             ("warps", warps.iter().flatten().all(|x| x.is_finite())),
@@ -144,7 +144,7 @@ impl<T: Light> Photograph<T> {
                 }
             });
         let mut taken = Self {
-            frame,
+            sizes,
             photo: Vec::new(),
             image: copied(image, "image")?,
             light: light.finish(),
@@ -153,16 +153,16 @@ impl<T: Light> Photograph<T> {
             warps: memory::copied(warps, "warps")?,
             gains,
         };
-        let mut mean = UninitVec::new(frame.pixels(), "mean")?;
-        let mut photo = UninitVec::new(frame.pixels() * 3, "photo")?;
-        let (across, token) = (frame.size[1], simd::level()?.token());
-        pieces(&mut mean, frame.pixels(), across)
+        let mut mean = UninitVec::new(sizes.pixels(), "mean")?;
+        let mut photo = UninitVec::new(sizes.pixels() * 3, "photo")?;
+        let (across, token) = (sizes.size[1], simd::level()?.token());
+        pieces(&mut mean, sizes.pixels(), across)
             .into_par_iter()
-            .zip(pieces(&mut photo, frame.pixels() * 3, across * 3))
+            .zip(pieces(&mut photo, sizes.pixels() * 3, across * 3))
             .enumerate()
-            .try_for_each_init(Places::default, |places, (row, (mean, photo))| {
+            .try_for_each_init(Sources::default, |sources, (row, (mean, photo))| {
                 let (mean, photo) = (mean.fill([T::ZERO; WIDE]), photo.fill(T::ZERO));
-                dispatch!(token, simd => taken.take_row(simd, row, places, tables, mean, photo))
+                dispatch!(token, simd => taken.take_row(simd, row, sources, tables, mean, photo))
             })?;
         (taken.mean, taken.photo) = (mean.finish(), photo.finish());
         Ok(taken)
@@ -170,7 +170,7 @@ impl<T: Light> Photograph<T> {
 
     /// Height and width of the photo.
     pub fn size(&self) -> [usize; 2] {
-        self.frame.size
+        self.sizes.size
     }
 
     /// Gradients for the cotangent `v_photo` [H, W, 3]. None flows to `nearness`.
@@ -179,7 +179,7 @@ impl<T: Light> Photograph<T> {
     /// Names the array when its length differs from that of the photo.
     pub fn backward(&self, v_photo: &[T]) -> Result<PhotographGradients<T>, Error> {
         check_len("v_photo", v_photo, self.photo.len())?;
-        let ([height, width], across) = (self.frame.render_size(), self.frame.size[1]);
+        let ([height, width], across) = (self.sizes.render_size(), self.sizes.size[1]);
         let token = simd::level()?.token();
         let mut image = zeros::<T>(height * width * 3, "gradient")?;
         let mut warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
@@ -253,22 +253,22 @@ impl<T: Light> Photograph<T> {
         &self,
         _: S, // the instructions that this is compiled for
         row: usize,
-        places: &mut Places<T>,
+        sources: &mut Sources<T>,
         tables: &Tables,
         mean: &mut [[T; WIDE]],
         photo: &mut [T],
     ) -> Result<(), Error> {
-        let width = self.frame.render_size()[1];
+        let width = self.sizes.render_size()[1];
         if self.warps.is_empty() {
-            let at = (row + self.frame.margin) * width + self.frame.margin;
+            let at = (row + self.sizes.margin) * width + self.sizes.margin;
             mean.copy_from_slice(&self.light[at..at + mean.len()]);
         }
         let share = T::from_f64(1.0 / self.warps.len().max(1) as f64);
         for warp in &self.warps {
-            self.find(row, warp, places)?;
-            for (place, mean) in places.of_row.iter().zip(mean.iter_mut()) {
-                let [a, b, c, d] = self.corners(place);
-                let (x, y) = (place.fx, place.fy);
+            self.find(row, warp, sources)?;
+            for (source, mean) in sources.of_row.iter().zip(mean.iter_mut()) {
+                let [a, b, c, d] = self.corners(source);
+                let (x, y) = (source.fx, source.fy);
                 for i in 0..WIDE {
                     let top = a[i] + x * (b[i] - a[i]);
                     let bottom = c[i] + x * (d[i] - c[i]);
@@ -287,14 +287,14 @@ impl<T: Light> Photograph<T> {
 
     #[inline(always)]
     fn backward_band<S: Simd>(&self, _: S, first: usize, v_photo: &[T]) -> Result<Band<T>, Error> {
-        let ([_, width], across) = (self.frame.render_size(), self.frame.size[1]);
+        let ([_, width], across) = (self.sizes.render_size(), self.sizes.size[1]);
         let count = v_photo.len() / (across * 3);
         let rows = self.reached(first..first + count);
         let mut v_light = memory::filled([T::ZERO; WIDE], rows.len() * width, "gradient")?;
         let mut v_warps = memory::filled([0.0; 12], self.warps.len(), "gradient")?;
         let mut v_gains = [0.0; 3];
         let mut v_mean = memory::filled([T::ZERO; WIDE], across, "gradient")?;
-        let mut places = Places::default();
+        let mut sources = Sources::default();
         let gains = self.gains.map(T::from_f64);
         let share = T::from_f64(1.0 / self.warps.len().max(1) as f64);
         for (row, v_photo) in (first..).zip(v_photo.chunks_exact(across * 3)) {
@@ -318,24 +318,24 @@ impl<T: Light> Photograph<T> {
                 v_gains[c] += v_gain[c].to_f64();
             }
             if self.warps.is_empty() {
-                let at = (row + self.frame.margin - rows.start) * width + self.frame.margin;
+                let at = (row + self.sizes.margin - rows.start) * width + self.sizes.margin;
                 v_light[at..at + across].copy_from_slice(&v_mean);
             }
             for (warp, v_warp) in self.warps.iter().zip(&mut v_warps) {
-                self.find(row, warp, &mut places)?;
+                self.find(row, warp, &mut sources)?;
                 let mut sums = [T::ZERO; 12];
                 let y = T::from_f64(row as f64 + 0.5);
-                for (x, (place, v)) in places.of_row.iter().zip(&v_mean).enumerate() {
-                    let [a, b, c, d] = self.corners(place);
-                    let (fx, fy) = (place.fx, place.fy);
+                for (x, (source, v)) in sources.of_row.iter().zip(&v_mean).enumerate() {
+                    let [a, b, c, d] = self.corners(source);
+                    let (fx, fy) = (source.fx, source.fy);
                     let (mut v_x, mut v_y) = (T::ZERO, T::ZERO);
                     for i in 0..WIDE {
                         let (top, bottom) = (b[i] - a[i], d[i] - c[i]);
                         v_x += v[i] * (top + fy * (bottom - top));
                         v_y += v[i] * (c[i] - a[i] + fx * (bottom - top));
                     }
-                    let (right, below) = (place.right, place.below);
-                    let at = place.at.wrapping_sub(rows.start * width);
+                    let (right, below) = (source.right, source.below);
+                    let at = source.at.wrapping_sub(rows.start * width);
                     if at.wrapping_add(right + below) >= v_light.len() {
                         continue; // coordinates beyond the range of T
                     }
@@ -350,9 +350,9 @@ impl<T: Light> Photograph<T> {
                             v_light[at][i] += weight * v[i];
                         }
                     }
-                    let v_u = v_x * place.slope_x;
-                    let v_v = v_y * place.slope_y;
-                    let v_w = T::ZERO - (v_u * place.x + v_v * place.y);
+                    let v_u = v_x * source.slope_x;
+                    let v_v = v_y * source.slope_y;
+                    let v_w = T::ZERO - (v_u * source.x + v_v * source.y);
                     let point = [
                         T::from_f64(x as f64 + 0.5),
                         y,
@@ -387,27 +387,27 @@ impl<T: Light> Photograph<T> {
         }
     }
 
-    /// The four pixels around a place.
+    /// The four pixels around a source.
     #[inline(always)]
-    fn corners(&self, place: &Place<T>) -> [&[T; WIDE]; 4] {
-        let (at, right, below) = (place.at, place.right, place.below);
+    fn corners(&self, source: &Source<T>) -> [&[T; WIDE]; 4] {
+        let (at, right, below) = (source.at, source.right, source.below);
         [0, right, below, right + below].map(|step| &self.light[at + step])
     }
 
     /// Where a warp takes the pixels of a row.
     #[inline(always)]
-    fn find(&self, row: usize, warp: &Warp, places: &mut Places<T>) -> Result<(), Error> {
-        let [height, width] = self.frame.render_size();
-        let across = self.frame.size[1];
-        memory::resize(&mut places.of_row, across, Place::default(), "photo")?;
+    fn find(&self, row: usize, warp: &Warp, sources: &mut Sources<T>) -> Result<(), Error> {
+        let [height, width] = self.sizes.render_size();
+        let across = self.sizes.size[1];
+        memory::resize(&mut sources.of_row, across, Source::default(), "photo")?;
         let m = warp.map(T::from_f64);
         let y = T::from_f64(row as f64 + 0.5);
-        let shift = T::from_f64(self.frame.margin as f64 - 0.5);
+        let shift = T::from_f64(self.sizes.margin as f64 - 0.5);
         let (last_x, last_y) = (
             T::from_f64((width - 1) as f64),
             T::from_f64((height - 1) as f64),
         );
-        for (x, place) in places.of_row.iter_mut().enumerate() {
+        for (x, source) in sources.of_row.iter_mut().enumerate() {
             let nearness = self.nearness_at(row * across + x);
             let x = T::from_f64(x as f64 + 0.5);
             let e = |r: usize| m[r] * x + m[r + 1] * y + m[r + 2] + m[r + 3] * nearness;
@@ -418,7 +418,7 @@ impl<T: Light> Photograph<T> {
             let (column, slope_x) = clamp(column, last_x, slope);
             let (line, slope_y) = clamp(line, last_y, slope);
             let ((i, fx), (j, fy)) = (column.split(), line.split());
-            *place = Place {
+            *source = Source {
                 at: j * width + i,
                 right: usize::from(i + 1 < width),
                 below: if j + 1 < height { width } else { 0 },
@@ -436,9 +436,9 @@ impl<T: Light> Photograph<T> {
     /// The rows of the render that the warps of these rows of the photo reach.
     fn reached(&self, rows: std::ops::Range<usize>) -> std::ops::Range<usize> {
         let ([height, _], margin, across) = (
-            self.frame.render_size(),
-            self.frame.margin,
-            self.frame.size[1],
+            self.sizes.render_size(),
+            self.sizes.margin,
+            self.sizes.size[1],
         );
         if self.warps.is_empty() {
             return rows.start + margin..rows.end + margin;
@@ -491,7 +491,7 @@ fn clamp<T: Light>(x: T, last: T, slope: T) -> (T, T) {
 
 /// Where a pixel of the photo lies in the render.
 #[derive(Debug, Default, Clone, Copy)]
-struct Place<T> {
+struct Source<T> {
     /// The pixel of the render above it to the left.
     at: usize,
     /// Steps from there to the next pixel and to the next row.
@@ -510,8 +510,8 @@ struct Place<T> {
 
 /// Buffer of one thread.
 #[derive(Default)]
-struct Places<T> {
-    of_row: Vec<Place<T>>,
+struct Sources<T> {
+    of_row: Vec<Source<T>>,
 }
 
 /// Gradients from one band of the photo.

@@ -3,7 +3,7 @@ use crate::at_each_level;
 use hqgs::{internals::simd::at_level, levels};
 use rayon::ThreadPoolBuilder;
 
-const FRAME: Frame = Frame {
+const SIZES: Sizes = Sizes {
     size: [21, 18],
     margin: 3,
 };
@@ -40,37 +40,37 @@ struct Case<T> {
 }
 
 fn case<T: Light>() -> Case<T> {
-    let [h, w] = FRAME.render_size();
+    let [h, w] = SIZES.render_size();
     Case {
         image: numbers(h * w * 3, 0.0, -0.05, 1.1),
-        nearness: numbers(FRAME.pixels(), 1.0, 0.1, 0.6),
-        v: numbers(FRAME.pixels() * 3, 2.0, -1.0, 1.0),
+        nearness: numbers(SIZES.pixels(), 1.0, 0.1, 0.6),
+        v: numbers(SIZES.pixels() * 3, 2.0, -1.0, 1.0),
     }
 }
 
 const GAINS: [f64; 3] = [0.8, 1.0, 1.3];
 
 fn loss(image: &[f64], near: &[f64], warps: &[Warp], gains: [f64; 3], v: &[f64]) -> f64 {
-    let taken = Photograph::take(FRAME, image, near, warps, gains).unwrap();
+    let taken = Photograph::take(SIZES, image, near, warps, gains).unwrap();
     taken.photo.iter().zip(v).map(|(p, v)| p * v).sum()
 }
 
 /// The same by its definition, pixel by pixel.
 fn plain(case: &Case<f64>, warps: &[Warp], gains: [f64; 3]) -> Vec<f64> {
-    let (tables, [h, w]) = (tables(), FRAME.render_size());
+    let (tables, [h, w]) = (tables(), SIZES.render_size());
     let light = |j: usize, i: usize, c: usize| case.image[(j * w + i) * 3 + c].to_light(tables);
     let mut photo = Vec::new();
-    for row in 0..FRAME.size[0] {
-        for column in 0..FRAME.size[1] {
+    for row in 0..SIZES.size[0] {
+        for column in 0..SIZES.size[1] {
             for (c, gain) in gains.iter().enumerate() {
                 let mut sum = 0.0;
                 for m in warps {
                     let (x, y) = (column as f64 + 0.5, row as f64 + 0.5);
-                    let n = case.nearness[row * FRAME.size[1] + column];
+                    let n = case.nearness[row * SIZES.size[1] + column];
                     let e = |r: usize| m[r] * x + m[r + 1] * y + m[r + 2] + m[r + 3] * n;
                     let (u, v, s) = (x + e(0), y + e(4), 1.0 + e(8));
                     let at = |u: f64, side: usize| {
-                        (u / s + FRAME.margin as f64 - 0.5).clamp(0.0, (side - 1) as f64)
+                        (u / s + SIZES.margin as f64 - 0.5).clamp(0.0, (side - 1) as f64)
                     };
                     let (u, v) = (at(u, w), at(v, h));
                     let (i, j) = ((u as usize).min(w - 2), (v as usize).min(h - 2));
@@ -88,7 +88,7 @@ fn plain(case: &Case<f64>, warps: &[Warp], gains: [f64; 3]) -> Vec<f64> {
 #[test]
 fn is_the_mean_of_the_warped_light() {
     let case = case::<f64>();
-    let taken = Photograph::take(FRAME, &case.image, &case.nearness, &warps(), GAINS).unwrap();
+    let taken = Photograph::take(SIZES, &case.image, &case.nearness, &warps(), GAINS).unwrap();
     for (got, expected) in taken.photo.iter().zip(plain(&case, &warps(), GAINS)) {
         assert!((got - expected).abs() < 1e-12);
     }
@@ -96,12 +96,12 @@ fn is_the_mean_of_the_warped_light() {
 
 #[test]
 fn without_warps_it_is_the_middle_of_the_render() {
-    let (case, [_, w]) = (case::<f32>(), FRAME.render_size());
-    let taken = Photograph::take(FRAME, &case.image, &[], &[], [1.0; 3]).unwrap();
-    let still = Photograph::take(FRAME, &case.image, &[], &[[0.0; 12]], [1.0; 3]).unwrap();
+    let (case, [_, w]) = (case::<f32>(), SIZES.render_size());
+    let taken = Photograph::take(SIZES, &case.image, &[], &[], [1.0; 3]).unwrap();
+    let still = Photograph::take(SIZES, &case.image, &[], &[[0.0; 12]], [1.0; 3]).unwrap();
     for (i, got) in taken.photo.iter().enumerate() {
-        let (row, at) = (i / (FRAME.size[1] * 3), i % (FRAME.size[1] * 3));
-        let expected = case.image[(row + FRAME.margin) * w * 3 + FRAME.margin * 3 + at];
+        let (row, at) = (i / (SIZES.size[1] * 3), i % (SIZES.size[1] * 3));
+        let expected = case.image[(row + SIZES.margin) * w * 3 + SIZES.margin * 3 + at];
         assert!((got - expected).abs() < 1e-6, "{got} {expected}");
         assert!((still.photo[i] - got).abs() < 1e-6);
     }
@@ -110,7 +110,7 @@ fn without_warps_it_is_the_middle_of_the_render() {
 #[test]
 fn gradients_are_those_of_differences() {
     let (case, warps, h) = (case::<f64>(), warps(), 1e-6);
-    let taken = Photograph::take(FRAME, &case.image, &case.nearness, &warps, GAINS).unwrap();
+    let taken = Photograph::take(SIZES, &case.image, &case.nearness, &warps, GAINS).unwrap();
     let v = taken.backward(&case.v).unwrap();
     let close = |got: f64, f: &dyn Fn(f64) -> f64, what: &str| {
         let expected = (f(h) - f(-h)) / (2.0 * h);
@@ -153,9 +153,9 @@ fn f32_is_near_f64() {
     at_each_level(|level| {
         let (single, double) = (case::<f32>(), case::<f64>());
         let a = at_level(level, || {
-            Photograph::take(FRAME, &single.image, &single.nearness, &warps(), GAINS)
+            Photograph::take(SIZES, &single.image, &single.nearness, &warps(), GAINS)
         });
-        let b = Photograph::take(FRAME, &double.image, &double.nearness, &warps(), GAINS);
+        let b = Photograph::take(SIZES, &double.image, &double.nearness, &warps(), GAINS);
         let (a, b) = (a.unwrap(), b.unwrap());
         for (a, b) in a.photo.iter().zip(&b.photo) {
             assert!((f64::from(*a) - b).abs() < 1e-5);
@@ -184,7 +184,7 @@ fn any_number_of_threads_gives_the_same_bits() {
             .unwrap();
         pool.install(|| {
             let taken = at_level(level, || {
-                Photograph::take(FRAME, &case.image, &case.nearness, &warps(), GAINS)
+                Photograph::take(SIZES, &case.image, &case.nearness, &warps(), GAINS)
             });
             let taken = taken.unwrap();
             let v = at_level(level, || taken.backward(&case.v)).unwrap();
@@ -202,7 +202,7 @@ fn extreme_warps_do_no_harm() {
         for i in 0..12 {
             let mut warp = [0.0; 12];
             warp[i] = value;
-            let taken = Photograph::take(FRAME, &case.image, &case.nearness, &[warp], GAINS);
+            let taken = Photograph::take(SIZES, &case.image, &case.nearness, &[warp], GAINS);
             let taken = taken.unwrap();
             assert!(taken.photo.iter().all(|x| x.is_finite()));
             taken.backward(&case.v).unwrap();
@@ -214,7 +214,7 @@ fn extreme_warps_do_no_harm() {
 fn wrong_arrays_are_named() {
     let case = case::<f32>();
     let name = |image: &[f32], near: &[f32], warps: &[Warp], gains| {
-        Photograph::take(FRAME, image, near, warps, gains)
+        Photograph::take(SIZES, image, near, warps, gains)
             .unwrap_err()
             .name()
             .to_owned()
@@ -225,29 +225,29 @@ fn wrong_arrays_are_named() {
         "nearness"
     );
     assert_eq!(
-        name(&case.image, &vec![f32::NAN; FRAME.pixels()], &[], GAINS),
+        name(&case.image, &vec![f32::NAN; SIZES.pixels()], &[], GAINS),
         "nearness"
     );
     assert_eq!(name(&case.image, &[], &[[f64::NAN; 12]], GAINS), "warps");
     assert_eq!(name(&case.image, &[], &[], [f64::INFINITY; 3]), "gains");
-    let taken = Photograph::take(FRAME, &case.image, &[], &[], GAINS).unwrap();
+    let taken = Photograph::take(SIZES, &case.image, &[], &[], GAINS).unwrap();
     assert_eq!(taken.backward(&case.v[1..]).unwrap_err().name(), "v_photo");
 }
 
 #[test]
 fn waves_of_bands_add_up_as_all_at_once() {
     // The second warp folds the picture over: every band may reach every row, so that each is a wave of its own.
-    let frame = Frame {
+    let sizes = Sizes {
         size: [70, 9],
         margin: 2,
     };
-    let [h, w] = frame.render_size();
+    let [h, w] = sizes.render_size();
     let image = numbers::<f64>(h * w * 3, 0.0, 0.0, 1.0);
-    let v = numbers::<f64>(frame.pixels() * 3, 2.0, -1.0, 1.0);
+    let v = numbers::<f64>(sizes.pixels() * 3, 2.0, -1.0, 1.0);
     let mut folded = [0.0; 12];
     folded[8] = -0.2;
     for warps in [warps(), vec![warps()[0], folded]] {
-        let taken = Photograph::take(frame, &image, &[], &warps, GAINS).unwrap();
+        let taken = Photograph::take(sizes, &image, &[], &warps, GAINS).unwrap();
         let all = taken.backward(&v).unwrap();
         // By its definition: the sum over what each band alone gives.
         let mut sum = vec![0.0; image.len()];

@@ -6,7 +6,7 @@
 //!
 //! No closure holds SIMD code here: one that the compiler does not inline loses the instruction set.
 
-use super::{Images, NAME, Plan, Sample, Sums};
+use super::{Images, NAME, Plan, RowSums, Sample};
 use fearless_simd::{Select, Simd, SimdBase, SimdFloat};
 use hqgs::internals::{
     Error, memory,
@@ -138,7 +138,7 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
 
     /// Fill in the sums of each row and, if wanted, the gradient of all rows.
     #[inline(always)]
-    pub fn run<S: Simd>(mut self, simd: S, mut grad: Option<&mut [T]>, sums: &mut [Sums]) {
+    pub fn run<S: Simd>(mut self, simd: S, mut grad: Option<&mut [T]>, sums: &mut [RowSums]) {
         if self.plan.ssim {
             self.run_ssim(simd, grad.as_deref_mut(), sums);
         }
@@ -151,7 +151,7 @@ impl<'a, T: Real, Y: Sample<T>> Band<'a, T, Y> {
     }
 
     #[inline(always)]
-    fn run_ssim<S: Simd>(&mut self, simd: S, mut grad: Option<&mut [T]>, sums: &mut [Sums]) {
+    fn run_ssim<S: Simd>(&mut self, simd: S, mut grad: Option<&mut [T]>, sums: &mut [RowSums]) {
         let kernel = window::<T, S>(simd);
         let (first, reach) = (self.first as isize, REACH as isize);
         let end = first + sums.len() as isize;

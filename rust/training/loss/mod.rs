@@ -73,13 +73,13 @@ pub struct Photometric {
 /// Buffers that [`photometric`] and [`ssim`] reuse from call to call.
 #[derive(Debug, Default)]
 pub struct LossScratch<T> {
-    sums: Vec<Sums>,
+    sums: Vec<RowSums>,
     bands: Vec<Vec<T>>,
 }
 
 /// Sums over one row.
 #[derive(Debug, Default, Clone, Copy)]
-struct Sums {
+struct RowSums {
     l1: f64,
     dissimilarity: f64,
 }
@@ -245,7 +245,7 @@ fn run<T: Real, Y: Sample<T>>(
     plan: Plan,
     mut grad: Option<&mut [T]>,
     scratch: &mut LossScratch<T>,
-) -> Result<Sums, Error> {
+) -> Result<RowSums, Error> {
     let level = simd::level()?.token();
     let [height, width, channels] = images.size;
     let n = width * channels;
@@ -255,7 +255,7 @@ fn run<T: Real, Y: Sample<T>>(
     let rows = height.div_ceil(wanted).max(MIN_BAND);
     let count = height.div_ceil(rows);
     scratch.sums.clear();
-    memory::resize(&mut scratch.sums, height, Sums::default(), NAME)?;
+    memory::resize(&mut scratch.sums, height, RowSums::default(), NAME)?;
     if scratch.bands.len() < count {
         scratch.bands.resize_with(count, Vec::new);
     }
@@ -272,10 +272,13 @@ fn run<T: Real, Y: Sample<T>>(
             dispatch!(level, simd => band.run(simd, grad, sums));
             Ok(())
         })?;
-    Ok(scratch.sums.iter().fold(Sums::default(), |a, b| Sums {
-        l1: a.l1 + b.l1,
-        dissimilarity: a.dissimilarity + b.dissimilarity,
-    }))
+    Ok(scratch
+        .sums
+        .iter()
+        .fold(RowSums::default(), |a, b| RowSums {
+            l1: a.l1 + b.l1,
+            dissimilarity: a.dissimilarity + b.dissimilarity,
+        }))
 }
 
 #[cfg(test)]

@@ -180,7 +180,7 @@ impl<T: Real> Separable<T> {
                 to[..row].copy_from_slice(from);
             }
         }
-        let picture = Picture {
+        let picture = Padded {
             data: if row < GROUP { &padded } else { image },
             pitch,
             channels: shape[2],
@@ -203,7 +203,7 @@ impl<T: Real> Separable<T> {
     fn group<S: Simd>(
         &self,
         simd: S,
-        image: &Picture<T>,
+        image: &Padded<T>,
         mut first: usize,
         channels: usize,
         buffers: &mut Buffers<T>,
@@ -248,7 +248,7 @@ impl<T: Real> Separable<T> {
     fn over_rows<S: Simd>(
         &self,
         simd: S,
-        image: &Picture<T>,
+        image: &Padded<T>,
         first: usize,
         lanes: usize,
         tall: &mut Vec<T>,
@@ -274,7 +274,7 @@ impl<T: Real> Separable<T> {
 }
 
 /// What the kernel reads.
-struct Picture<'a, T> {
+struct Padded<'a, T> {
     /// [H, pitch]
     data: &'a [T],
     /// Numbers from one row to the next, at least a vector.

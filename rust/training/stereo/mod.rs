@@ -43,14 +43,14 @@ const fn steps_of_samples(every: usize) -> [f32; SAMPLES] {
 
 /// A photo [H, W] in one channel, where 1 is white.
 #[derive(Debug, Clone, Copy)]
-pub struct Picture<'a> {
+pub struct Photo<'a> {
     /// Height and width.
     pub size: [usize; 2],
     /// [H, W]
     pub grey: &'a [f32],
 }
 
-impl Picture<'_> {
+impl Photo<'_> {
     /// That it has as many pixels as its size says, and that they can be numbered.
     fn check(&self, name: &str) -> Result<(), Error> {
         let [height, width] = self.size;
@@ -67,7 +67,7 @@ impl Picture<'_> {
 #[derive(Debug, Clone, Copy)]
 pub struct Other<'a> {
     /// As the first one.
-    pub picture: Picture<'a>,
+    pub picture: Photo<'a>,
     /// [3, 4]
     pub map: [f64; 12],
 }
@@ -89,7 +89,7 @@ impl Sweep {
     /// there is no memory for.
     pub fn depths(
         &self,
-        first: Picture<'_>,
+        first: Photo<'_>,
         others: &[Other<'_>],
         pixels: &[[f64; 2]],
         ranges: &[[f64; 2]],
@@ -134,7 +134,7 @@ impl Sweep {
     fn chunk<S: Simd>(
         &self,
         _: S, // the instructions that this is compiled for
-        first: Picture<'_>,
+        first: Photo<'_>,
         others: &[Other<'_>],
         pixels: &[[f64; 2]],
         ranges: &[[f64; 2]],
@@ -211,13 +211,13 @@ struct Patch {
 impl Patch {
     /// None where it is flat or reaches out of the picture.
     #[inline(always)]
-    fn of(picture: Picture<'_>, pixel: [f64; 2]) -> Option<Self> {
-        let place = Place {
+    fn of(picture: Photo<'_>, pixel: [f64; 2]) -> Option<Self> {
+        let samples = Samples {
             base: [pixel[0] as f32, pixel[1] as f32, 1.0],
             across: [STRIDE, 0.0, 0.0],
             down: [0.0, STRIDE, 0.0],
         };
-        let mut values = place.sampled(picture)?;
+        let mut values = samples.sampled(picture)?;
         let mean = values.iter().sum::<f32>() / SAMPLES as f32;
         let mut sum = 0.0;
         for value in &mut values {
@@ -252,12 +252,12 @@ impl Patch {
     fn correlation(&self, other: &Other<'_>, pixel: [f64; 2], nearness: f64) -> f32 {
         let map = &other.map;
         let base = mapped(map, pixel, nearness).map(|x| x as f32);
-        let place = Place {
+        let samples = Samples {
             base,
             across: [map[0], map[4], map[8]].map(|x| x as f32 * STRIDE),
             down: [map[1], map[5], map[9]].map(|x| x as f32 * STRIDE),
         };
-        let Some(values) = place.sampled(other.picture) else {
+        let Some(values) = samples.sampled(other.picture) else {
             return NOTHING;
         };
         let (mut sum, mut squares, mut products) = (0.0, 0.0, 0.0);
@@ -274,13 +274,13 @@ impl Patch {
 }
 
 /// Where the samples of a patch lie in a picture, (x, y, 1) times w: the middle's, and what a step adds.
-struct Place {
+struct Samples {
     base: [f32; 3],
     across: [f32; 3],
     down: [f32; 3],
 }
 
-impl Place {
+impl Samples {
     #[inline(always)]
     fn at(&self, across: f32, down: f32) -> [f32; 3] {
         std::array::from_fn(|i| self.base[i] + across * self.across[i] + down * self.down[i])
@@ -288,7 +288,7 @@ impl Place {
 
     /// None where one of them is behind the camera or outside.
     #[inline(always)]
-    fn sampled(&self, picture: Picture<'_>) -> Option<[f32; SAMPLES]> {
+    fn sampled(&self, picture: Photo<'_>) -> Option<[f32; SAMPLES]> {
         let [height, width] = picture.size;
         if height < 2 || width < 2 {
             return None;

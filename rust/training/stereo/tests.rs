@@ -40,7 +40,7 @@ fn pixels() -> Vec<[f64; 2]> {
 fn swept(shifts: &[f64], range: [f64; 2], agreeing: usize) -> Vec<(f64, f32)> {
     let first = photo(0.0);
     let photos: Vec<_> = shifts.iter().map(|&t| photo(t)).collect();
-    let picture = |grey| Picture { size: SIZE, grey };
+    let picture = |grey| Photo { size: SIZE, grey };
     let others: Vec<_> = photos
         .iter()
         .zip(shifts)
@@ -90,7 +90,7 @@ fn where_too_few_photos_show_a_pixel_nothing_is_found() {
 #[test]
 fn borders_flat_patches_and_bad_input() {
     let (grey, flat) = (photo(0.0), vec![0.5; SIZE[0] * SIZE[1]]);
-    let picture = Picture {
+    let picture = Photo {
         size: SIZE,
         grey: &grey,
     };
@@ -102,7 +102,7 @@ fn borders_flat_patches_and_bad_input() {
     let run = |first, pixel, near| sweep.depths(first, &[other], &[pixel], &[[near, 1.5]]);
     assert!(run(picture, [1.0, 30.0], 1.0).unwrap()[0].1 <= -1.0);
     assert!(run(picture, [-1e30, 1e30], 1.0).unwrap()[0].1 <= -1.0);
-    let flat = Picture {
+    let flat = Photo {
         size: SIZE,
         grey: &flat,
     };
@@ -120,7 +120,7 @@ fn borders_flat_patches_and_bad_input() {
             .1
             <= -1.0
     );
-    let short = Picture {
+    let short = Photo {
         size: SIZE,
         grey: &grey[1..],
     };
@@ -135,7 +135,7 @@ fn borders_flat_patches_and_bad_input() {
 #[test]
 fn each_level_and_number_of_threads_gives_the_same_bits() {
     let grey = [photo(0.0), photo(0.1), photo(-0.1)];
-    let picture = |k: usize| Picture {
+    let picture = |k: usize| Photo {
         size: SIZE,
         grey: &grey[k],
     };
@@ -177,16 +177,16 @@ fn a_patch_at_the_corner_of_a_wide_picture_stays_inside() {
         let grey: Vec<f32> = (0..size[0] * size[1])
             .map(|k| texture(k as f64 * 0.013, k as f64 * 0.007))
             .collect();
-        let picture = Picture { size, grey: &grey };
+        let picture = Photo { size, grey: &grey };
         for k in 0..200 {
             let [y, x] = size.map(|side| side as f64 - 3.45 - f64::from(k) * 0.002);
             let base = [x as f32, y as f32, 1.0];
-            let place = Place {
+            let samples = Samples {
                 base,
                 across: [STRIDE, 0.0, 0.0],
                 down: [0.0, STRIDE, 0.0],
             };
-            if let Some(values) = place.sampled(picture) {
+            if let Some(values) = samples.sampled(picture) {
                 assert!(values.iter().all(|x| (0.0..=1.0).contains(x)));
             }
         }
@@ -196,7 +196,7 @@ fn a_patch_at_the_corner_of_a_wide_picture_stays_inside() {
 #[test]
 fn more_pixels_than_can_be_numbered_are_refused() {
     let size = [1 << 32, 1 << 32];
-    let picture = Picture { size, grey: &[] };
+    let picture = Photo { size, grey: &[] };
     let found = Sweep { agreeing: 1 }.depths(picture, &[], &[], &[]);
     assert_eq!(found.unwrap_err().name(), "first");
 }
