@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.sfm.align import Observations, Similarity, align, camera_centers, refine, rotation_angles
+from hqgs.scene.sfm.align import Similarity, align, camera_centers, refine, rotation_angles
+from hqgs.scene.sfm.tracks import Tracks
 
 Floats = NDArray[np.float64]
 TRUE = Similarity(
@@ -107,19 +110,17 @@ def test_refining_finds_the_similarity_of_the_pictures() -> None:
 
     pixels = project(source, points)
     target = moved(source, TRUE)
-    seen = Observations(camera, point, pixels)
+    seen = Tracks(points, np.zeros((80, 3), np.uint8), camera, point, pixels)
     wrong = pixels.copy()
     wrong[::10] += 40  # mismatches
     off = Similarity(
         TRUE.scale * 1.05, TRUE.R @ Rotation.from_rotvec([0.03, -0.02, 0.01]).as_matrix(), TRUE.t + 0.05
     )
-    for observations, tolerance in ((seen, 1e-9), (Observations(camera, point, wrong), 2e-2)):
-        found, apart = refine(off, points, observations, Ks, target)
+    for observations, tolerance in ((seen, 1e-9), (replace(seen, xy=wrong), 2e-2)):
+        found, apart = refine(off, observations, Ks, target)
         assert_same(found, TRUE, tolerance)
         np.testing.assert_allclose(
-            apart,
-            np.linalg.norm(project(target, found.points(points)) - observations.pixels, axis=1),
-            atol=1e-9,
+            apart, np.linalg.norm(project(target, found.points(points)) - observations.xy, axis=1), atol=1e-9
         )
 
 
@@ -128,9 +129,10 @@ def test_refining_never_makes_it_worse() -> None:
     source = rig(rng, 5)
     points = rng.uniform([1, -1, 2], [5, 3, 4], (9, 3))
     Ks = np.tile(np.diag([200.0, 200, 1]), (5, 1, 1))
-    nonsense = Observations(rng.integers(0, 5, 60), rng.integers(0, 9, 60), rng.uniform(-100, 100, (60, 2)))
+    drawn = rng.integers(0, 5, 60), rng.integers(0, 9, 60), rng.uniform(-100, 100, (60, 2))
+    nonsense = Tracks(points, np.zeros((9, 3), np.uint8), *drawn)
     identity = Similarity(1.0, np.eye(3), np.zeros(3))
-    found, apart = refine(identity, points, nonsense, Ks, source)
+    found, apart = refine(identity, nonsense, Ks, source)
     assert np.isfinite(found.t).all()
     assert found.scale > 0
     assert (apart >= 0).all()

@@ -18,9 +18,9 @@ from hqgs.scene.sfm.attempt import Attempt
 from hqgs.scene.sfm.facts import placed_names
 from hqgs.scene.sfm.failure import Pass, doubtful, why_doubtful
 from hqgs.scene.sfm.home import without
-from hqgs.scene.sfm.reconstruct import _write_photos
 from hqgs.scene.sfm.run import Model
 from hqgs.scene.sfm.tracks import Tracks, rebuilt
+from hqgs.scene.sfm.triangulated import write_photos
 
 Made = tuple[pycolmap.Reconstruction, list[np.ndarray], Path]
 
@@ -52,7 +52,7 @@ def attempt(cards: Scene, tmp_path: Path) -> Attempt:  # noqa: F811
     """A pass over the cards' photos, all of which have a place."""
     views = {f"{k:05d}.png": view for k, view in enumerate(cards.train)}
     (tmp_path / "photos").mkdir()
-    _write_photos(tmp_path / "photos", views)
+    write_photos(tmp_path / "photos", views)
     cameras = [view.camera for view in cards.train]
     given = {
         "names": np.array(list(views)),

@@ -38,9 +38,7 @@ class Degraded:
 
     image: Float32  # [H, W, 3], the size of the clean photo; may leave [0, 1]
     low: Float32 | None  # [h, w, 3]: with a low-res step, the small photo that `image` was enlarged from
-    jpeg: (
-        bytes | None
-    )  # where JPEG or a phone is the last step: the file whose pixels `low`, or else `image`, holds
+    jpeg: bytes | None  # where JPEG or a phone is the last step: the file that `low`, or else `image`, holds
     records: list[Record] = field(default_factory=list)  # one for each step that happened to this photo
 
 

@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from hqgs.photos.light import to_srgb
 
 KNEE = 0.75
 _BT709, _BT2020 = 1, (9, 10)  # libavutil's AVColorSpace
@@ -64,7 +67,7 @@ def toned(signal: Floats, curve: int) -> Floats:
     light = (light @ _TO_709.T).clip(0, None)
     bent = KNEE + (1 - KNEE) * -np.expm1((KNEE - light) / (1 - KNEE))
     light = np.where(light > KNEE, bent, light)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return to_srgb(light)
 
 
 def _from_pq(signal: Floats) -> Floats:
@@ -116,18 +119,7 @@ def _plane(plane: Any, bits: int) -> Floats:
 
 def _stretched(chroma: Floats, height: int, width: int) -> Floats:
     """At the size of the luma, linear: between rows of two, on the first column of two, as H.264 has it."""
-    rows, columns = chroma.shape
-    if rows < height:
-        at = (np.arange(height) - 0.5) / 2
-        chroma = _between(chroma, at)
-    if columns < width:
-        chroma = _between(chroma.T, np.arange(width) / 2).T
-    return chroma[:height, :width]
-
-
-def _between(values: Floats, at: Floats) -> Floats:
-    """Rows of values at places between them; those at an end beyond it."""
-    at = at.clip(0, len(values) - 1)
-    low = np.floor(at).astype(np.intp)
-    high, share = np.minimum(low + 1, len(values) - 1), (at - low)[:, None]
-    return values[low] * (1 - share) + values[high] * share
+    rows = np.arange(height) if len(chroma) >= height else (np.arange(height) - 0.5) / 2
+    columns = np.arange(width) / (1 if chroma.shape[1] >= width else 2)
+    at = np.meshgrid(rows, columns, indexing="ij")
+    return np.asarray(map_coordinates(chroma, at, order=1, mode="nearest"), np.float64)

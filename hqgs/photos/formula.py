@@ -45,19 +45,9 @@ KINDS = {
     "video": Kind(
         0, 51, "a constant rate factor", "CRF", integer=True, default=36, some=False, film=True, own="found"
     ),
-    "video265": Kind(
-        0,
-        51,
-        "a constant rate factor",
-        "CRF",
-        integer=True,
-        default=36,
-        formation=False,
-        some=False,
-        film=True,
-    ),
     "crowd": Kind(1, 99, "the most walkers in a photo", "N", integer=True, default=3, formation=False),
 }
+KINDS["video265"] = replace(KINDS["video"], formation=False, own=None)
 NONE, MIXED, SOME = "none", "mixed", "some"
 DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  # in all photos of a camera
 LEARNED = tuple(name for name, kind in KINDS.items() if kind.own in ("photo", "camera"))
@@ -65,10 +55,11 @@ OWN = tuple(name for name, kind in KINDS.items() if kind.own)  # of each photo i
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
     "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
-    "vignetting": "it is of each camera, and photos do not tell which one took them; the built-in scene "
-    "true-devices is photographed by several",
-    "response": "it is of each camera, and photos do not tell which one took them; the built-in scene "
-    "true-devices is photographed by several",
+    **dict.fromkeys(
+        DEVICES,
+        "it is of each camera, and photos do not tell which one took them; the built-in scene true-devices "
+        "is photographed by several",
+    ),
     "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
 }  # what a method can be told of only, and what to write for photos
 

@@ -42,9 +42,7 @@ class Capture:
     downscale: float  # what is left to do on the photos' stored size
     points: NDArray[np.floating]  # [P, 3], world of the files; P may be 0
     point_colors: NDArray[np.uint8]  # [P, 3]
-    folder: Path | None = (
-        None  # where every photo lies, registered or not; None: the photos have no one folder
-    )
+    folder: Path | None = None  # where every photo lies, registered or not; None: in several
     test_names: frozenset[str] | None = None  # the test views, where the format names them
     near_far: dict[str, tuple[float, float]] = field(default_factory=dict)  # depth range by photo name
     notes: list[str] = field(default_factory=list)

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.scene.constants import GPS_LEAST, OUTLIER
 from hqgs.scene.similarity import robust, similarity
-
-_A, _E2 = 6378137.0, 6.69437999014e-3  # WGS84: semi-major axis, m, and squared eccentricity
 
 Array = NDArray[np.float64]
 Gps = tuple[float, float, float]  # degrees north and east, metres above the ellipsoid or the sea, or nan
@@ -31,9 +30,7 @@ class Georeference:
     interval: list[float]  # two values: the true scale lies between in 95 % of cases
     rotation: list[list[float]]  # [3, 3], from the axes of the files to east, north, up
     up: list[float]  # [3], up in the frame of the files
-    origin: list[
-        float
-    ]  # degrees north, degrees east, m: where the origin of the files lies; two: no altitude
+    origin: list[float]  # degrees north and east, m: where the origin of the files lies; two: no altitude
     photos: int  # that have a place
     used: int  # of them
     residual: float  # m, root of the mean square of what is left over
@@ -118,11 +115,8 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
 
 
 def _ecef(gps: Array) -> Array:
-    """Geocentric metres [..., 3] of degrees north, degrees east and metres of height [..., 3], on WGS84."""
-    north, east, up = np.radians(gps[..., 0]), np.radians(gps[..., 1]), gps[..., 2]
-    normal = _A / np.sqrt(1 - _E2 * np.sin(north) ** 2)
-    flat = (normal + up) * np.cos(north)
-    return np.stack([flat * np.cos(east), flat * np.sin(east), (normal * (1 - _E2) + up) * np.sin(north)], -1)
+    """Geocentric metres [N, 3] of degrees north, degrees east and metres of height [N, 3]."""
+    return np.asarray(pycolmap.GPSTransform().ellipsoid_to_ecef(gps))
 
 
 def _axes(start: Array) -> Array:
@@ -134,17 +128,11 @@ def _axes(start: Array) -> Array:
 
 def _enu(gps: Array, start: Array) -> Array:
     """Metres east, north and up of `start`, [N, 3]."""
-    return (_ecef(gps) - _ecef(start)) @ _axes(start).T
+    return (_ecef(gps) - _ecef(start[None])) @ _axes(start).T
 
 
 def _geodetic(enu: Array, start: Array) -> tuple[float, float, float]:
     """Degrees north and east, and metres of height, of a point [3] in metres from `start`."""
-    x, y, z = _ecef(start) + enu @ _axes(start)
-    flat = math.hypot(x, y)
-    north = math.atan2(z, flat * (1 - _E2))
-    for _ in range(10):  # each takes the error down by some 300 times
-        normal = _A / math.sqrt(1 - _E2 * math.sin(north) ** 2)
-        north = math.atan2(z + _E2 * normal * math.sin(north), flat)
-    normal = _A / math.sqrt(1 - _E2 * math.sin(north) ** 2)
-    up = flat * math.cos(north) + z * math.sin(north) - _A * math.sqrt(1 - _E2 * math.sin(north) ** 2)
-    return math.degrees(north), math.degrees(math.atan2(y, x)), up
+    at = _ecef(start[None]) + enu @ _axes(start)
+    north, east, up = np.asarray(pycolmap.GPSTransform().ecef_to_ellipsoid(at))[0].tolist()
+    return north, east, up

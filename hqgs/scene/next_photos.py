@@ -7,7 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.scene.constants import ALONE, FEWEST_PHOTOS, GAP, LONELIER, LOOSE, LOOSER, NEXT_MOST, WIDER
+from hqgs.scene.constants import (
+    ALONE,
+    ENOUGH_SHOW,
+    FEWEST_PHOTOS,
+    GAP,
+    LONELIER,
+    LOOSE,
+    LOOSER,
+    NEXT_MOST,
+    WIDER,
+)
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Scene, View
 
@@ -109,7 +119,9 @@ def _alone(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
         counts[rows] += 1
     shares = np.array(
         [
-            float((counts[scene.seen[v.name]] < 3).mean()) if len(scene.seen.get(v.name, ())) else 0.0
+            float((counts[scene.seen[v.name]] < ENOUGH_SHOW).mean())
+            if len(scene.seen.get(v.name, ()))
+            else 0.0
             for v in views
         ]
     )

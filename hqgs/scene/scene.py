@@ -73,9 +73,7 @@ class Scene:
     tracks: TrackStatistics | None = None  # of the points, px of the views; None: its files do not tell
     seen: dict[str, NDArray[np.intp]] | None = None  # rows of the points that each photo shows; None as above
     sfm: SfmReport | None = None  # of poses and points from the photos; None: they are its files'
-    origin: dict[str, Any] | None = (
-        None  # what `hqgs.load` was asked for, as JSON values; None: made otherwise
-    )
+    origin: dict[str, Any] | None = None  # what `hqgs.load` was asked for, JSON values; None: made otherwise
     world: World = field(default_factory=World)  # the frame of its files, where that is another
     guessed: bool = False  # whether its points lie at random depths
 
@@ -148,22 +146,19 @@ class SfmReport:
 
     photos: int  # that were given
     not_registered: list[str]  # those that COLMAP found no place for
-    outliers: list[str]  # those that the alignment of the two frames left out
-    rotation_error_deg: dict[str, float] | None  # of the cameras: "median", "max"
-    translation_error: dict[str, float] | None
-    own_cameras_px: (
-        float | None  # median distance from where the scene's own cameras see the new points to the photos;
-        # None: they have most of them behind them
-    )
     points: int
-    point_distance: (
-        float | None  # median over the new points to the nearest of the scene's own, which may be random
-    )
     track_length: float  # photos that see a point, mean
     reprojection_error_px: float  # mean
-    own_points: int | None  # the scene's, and of them
-    own_track_length: float | None  # None: its files do not tell
-    own_reprojection_error_px: float | None
+    outliers: list[str] = field(default_factory=list)  # photos that the alignment of the frames left out
+    rotation_error_deg: dict[str, float] | None = None  # of the cameras: "median", "max"
+    translation_error: dict[str, float] | None = None
+    # Median distance from where the scene's own cameras see the new points to the photos; None: most are
+    # behind them.
+    own_cameras_px: float | None = None
+    point_distance: float | None = None  # from the new points to the nearest of the scene's own, median
+    own_points: int | None = None  # the scene's, and of them
+    own_track_length: float | None = None  # None: its files do not tell
+    own_reprojection_error_px: float | None = None
     unreadable: dict[str, str] = field(default_factory=dict)  # files that were left out before, and why
     first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do

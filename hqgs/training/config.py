@@ -224,9 +224,7 @@ class TrainConfig:
     faster_rates: bool | None = None  # in short runs (`learning_rates`); None: if the method has them
     start_points: int = 100_000  # to start from at most, where photos agree on more than the scene has
     opacity_decay: float | None = None  # share of the opacities that each view takes away; None: by the plan
-    dropout: float | None = (
-        None  # share of Gaussians left out of a step, at the end of the run; None: likewise
-    )
+    dropout: float | None = None  # share of Gaussians left out of a step, at the end; None: likewise
     averaged: float | None = (
         None  # share of the steps, the last ones, whose mean is the scene; None: likewise
     )

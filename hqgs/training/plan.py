@@ -88,9 +88,7 @@ class RunPlan:
     """Everything that a run reads of what was decided before its first step."""
 
     settings: TrainConfig  # the one asked for, with what the rules decided
-    first_points: (
-        int  # Gaussians to start from, as far as photos agree on so many; at least the scene's points
-    )
+    first_points: int  # Gaussians to start from, as far as photos agree on so many; at least its points
     found_back: bool  # they are what photos find back in each other; else what they agree on along edges
     discs: bool  # the first ones are flat, as their neighbours lie; else round
     held_photos: int  # training photos that are held back at first

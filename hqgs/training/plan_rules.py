@@ -25,6 +25,7 @@ from hqgs.training.constants import (
     HELD_PIXELS,
     HELD_SHARE,
     KNEE,
+    LAMBDA_DSSIM,
     MANY_PHOTOS,
     MOST_HELD,
     PIXELS,
@@ -107,7 +108,7 @@ def loss(draft: Draft) -> Sequence[Choice]:
         why = "the photos' mean is nearer to the truth than their median, and D-SSIM asks for the noise"
         rows = [Choice(f"squares up to {KNEE:g} sigma of the noise, then L1", why)]
     else:
-        rows = [Choice("0.8 L1 + 0.2 D-SSIM", "as 3DGS has it")]
+        rows = [Choice(f"{1 - LAMBDA_DSSIM:g} L1 + {LAMBDA_DSSIM:g} D-SSIM", "as 3DGS has it")]
     if "grain" in has:
         what = f"D-SSIM in the loss of {facts.noisy} {of}"
         rows.append(

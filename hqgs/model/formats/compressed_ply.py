@@ -26,7 +26,15 @@ from hqgs.base.files import atomic_path
 from hqgs.base.ply import MAX_HEADER_BYTES, read_elements
 from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import curve_order, finite_rows, pick, to_logits, to_opacities
+from hqgs.model.formats.rows import (
+    curve_order,
+    finite_rows,
+    of_smallest_three,
+    pick,
+    smallest_three,
+    to_logits,
+    to_opacities,
+)
 
 CHUNK = 256
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -35,7 +43,7 @@ BOUNDS = [f"{end}_{kind}{axis}" for kind, axes in _PARTS for end in ("min", "max
 LOG_LIMIT = 20.0
 SPREAD = np.sqrt(0.5)  # a component that is not the largest is no larger
 _COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]
-_BITS = (11, 10, 11)
+_BITS, _TURN_BITS = (11, 10, 11), (10, 10, 10)  # above those of a rotation: which component is left out
 
 
 def write_compressed_ply(path: str | Path, arrays: Arrays) -> int:
@@ -62,7 +70,9 @@ def write_compressed_ply(path: str | Path, arrays: Arrays) -> int:
     words["packed_scale"] = _pack(shares[1], _BITS)
     alphas = to_opacities(g["opacities"])[:, None]
     words["packed_color"] = _pack(np.concatenate([shares[2], alphas], axis=1), (8, 8, 8, 8))
-    words["packed_rotation"] = _pack_quats(g["quats"].astype(np.float64))
+    place, three = smallest_three(g["quats"].astype(np.float64))
+    turns = _pack((three / SPREAD * 0.5 + 0.5).clip(0, 1), _TURN_BITS)
+    words["packed_rotation"] = place.astype(np.uint32) << np.uint32(sum(_TURN_BITS)) | turns
     elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(words, "vertex")]
     if count := 3 * g["shN"].shape[1]:
         rest = g["shN"].astype(np.float64).transpose(0, 2, 1).reshape(n, count)
@@ -106,6 +116,7 @@ def read_compressed_ply(path: str | Path) -> Arrays:
         return own[:, k, 0] * (1 - shares) + own[:, k, 1] * shares
 
     color = _unpack(words[:, 3], (8, 8, 8, 8))
+    three = (_unpack(words[:, 1], _TURN_BITS) - 0.5) * 2 * SPREAD
     with np.errstate(over="ignore", invalid="ignore"):
         means = between(_unpack(words[:, 0], _BITS), 0).astype(np.float32)
         scales = between(_unpack(words[:, 2], _BITS), 1).astype(np.float32)
@@ -116,7 +127,7 @@ def read_compressed_ply(path: str | Path) -> Arrays:
     return {
         "means": means,
         "scales": scales,
-        "quats": _unpack_quats(words[:, 1]).astype(np.float32),
+        "quats": of_smallest_three(words[:, 1] >> np.uint32(sum(_TURN_BITS)), three).astype(np.float32),
         "opacities": to_logits(color[:, 3], 1 / 255),
         "sh0": sh0[:, None],
         "shN": _harmonics(path, elements.get("sh"), n),
@@ -159,24 +170,3 @@ def _unpack(word: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.float
         most = (1 << width) - 1
         shares.append((word >> np.uint32(shift) & np.uint32(most)) / most)
     return np.stack(shares, axis=1)
-
-
-def _pack_quats(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
-    n = len(quats)
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    place = np.abs(quats).argmax(axis=1)
-    quats = quats * np.where(quats[np.arange(n), place] < 0, -1, 1)[:, None]
-    others = np.arange(4)[None].repeat(n, 0)[np.arange(4)[None] != place[:, None]].reshape(n, 3)
-    shares = (np.take_along_axis(quats, others, 1) / SPREAD * 0.5 + 0.5).clip(0, 1)
-    return place.astype(np.uint32) << np.uint32(30) | _pack(shares, (10, 10, 10))
-
-
-def _unpack_quats(word: NDArray[np.uint32]) -> NDArray[np.float64]:
-    n = len(word)
-    place = (word >> np.uint32(30)).astype(np.intp)
-    small = (_unpack(word & np.uint32((1 << 30) - 1), (10, 10, 10)) - 0.5) * 2 * SPREAD
-    others = np.arange(4)[None].repeat(n, 0)[np.arange(4)[None] != place[:, None]].reshape(n, 3)
-    quats = np.zeros((n, 4))
-    np.put_along_axis(quats, others, small, 1)
-    quats[np.arange(n), place] = np.sqrt(np.maximum(0, 1 - np.square(small).sum(axis=1)))
-    return quats

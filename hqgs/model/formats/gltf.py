@@ -13,7 +13,7 @@ import json
 import math
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,14 +132,12 @@ def read_gltf(path: str | Path) -> Arrays:
     if said is None and len(means):
         world = World(1.0, world_for(means, means).shift)
         means = world.into(means)
-    found: Arrays = {
-        "means": means.astype(np.float32),
-        "scales": np.concatenate([part["scales"] for part in parts]).astype(np.float32),
-        "quats": np.concatenate([part["quats"] for part in parts]).astype(np.float32),
-        "opacities": np.concatenate([part["opacities"] for part in parts]).astype(np.float32),
-        "sh0": np.concatenate([part["sh0"] for part in parts]).astype(np.float32),
-        "shN": np.concatenate([_widened(part["shN"], most) for part in parts]),
+    whole = {
+        name: np.concatenate([part[name] for part in parts]).astype(np.float32)
+        for name in ("scales", "quats", "opacities", "sh0")
     }
+    shN = np.concatenate([_widened(part["shN"], most) for part in parts])
+    found = cast(Arrays, {"means": means.astype(np.float32), **whole, "shN": shN})
     if all("errors" in part for part in parts):
         found["errors"] = np.concatenate([part["errors"] for part in parts if "errors" in part])
     if world != World():

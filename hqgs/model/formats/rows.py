@@ -62,3 +62,20 @@ def to_logits(opacities: NDArray[np.floating], step: float) -> NDArray[np.float3
 def to_opacities(logits: NDArray[np.floating]) -> NDArray[np.float64]:
     """The sigmoid."""
     return 1 / (1 + np.exp(-logits.astype(np.float64).clip(-700, 700)))
+
+
+def smallest_three(quats: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Of quaternions [N, 4] of any norm the place of the largest component [N], and the others [N, 3] where
+    that one is positive and the norm 1: no larger than sqrt(1/2)."""
+    quats = np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True), np.float64)
+    place = np.abs(quats).argmax(axis=1)
+    largest = np.arange(4) == place[:, None]
+    return place, (quats * np.where(quats[largest] < 0, -1, 1)[:, None])[~largest].reshape(-1, 3)
+
+
+def of_smallest_three(place: NDArray[np.integer], three: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The quaternions [N, 4] of `smallest_three`."""
+    quats, largest = np.empty((len(three), 4)), np.arange(4) == place[:, None]
+    quats[~largest] = three.ravel()
+    quats[largest] = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
+    return quats

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import to_logits
+from hqgs.model.formats.rows import of_smallest_three, to_logits
 from hqgs.photos.files import DECODE_ERRORS
 
 META = "meta.json"
@@ -127,11 +127,7 @@ def _quats(packed: Bytes) -> NDArray[np.float64]:
     place = packed[:, 3].astype(np.int64) - LARGEST
     if (place < 0).any():
         raise ValueError("a rotation does not say which component it leaves out")
-    three = (packed[:, :3] / 255 - 0.5) * np.sqrt(2)
-    quats, others = np.empty((len(packed), 4)), np.arange(4)[None] != place[:, None]
-    quats[others] = three.ravel()
-    quats[~others] = np.sqrt(np.maximum(0, 1 - np.square(three).sum(axis=1)))
-    return quats
+    return of_smallest_three(place, (packed[:, :3] / 255 - 0.5) * np.sqrt(2))
 
 
 def _harmonics(part: dict[str, Any] | None, pixels: Callable[..., Bytes], count: int) -> NDArray[np.float64]:

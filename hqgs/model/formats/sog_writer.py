@@ -22,7 +22,7 @@ from PIL import Image
 from hqgs.base.files import atomic_path
 from hqgs.model.formats.arrays import Arrays
 from hqgs.model.formats.codebooks import codebook, palette
-from hqgs.model.formats.rows import curve_order, finite_rows, pick, to_opacities
+from hqgs.model.formats.rows import curve_order, finite_rows, pick, smallest_three, to_opacities
 from hqgs.model.formats.sog import ACROSS, LARGEST, META
 
 MOST_SETS = 1 << 16  # of harmonics: a label has two bytes
@@ -81,11 +81,9 @@ def encode_sog(g: Arrays, antialiased: bool) -> dict[str, bytes]:
 
 def _smallest_three(quats: Array) -> Array:
     """Three components in 8 bits each, and in the fourth byte which one, the largest, is not among them."""
-    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    place = np.abs(quats).argmax(1)
-    largest = np.arange(4)[None] == place[:, None]
-    three = (quats * np.where(quats[largest] < 0, -1, 1)[:, None])[~largest].reshape(-1, 3)
-    return np.concatenate([np.rint((three / np.sqrt(2) + 0.5) * 255), LARGEST + place[:, None]], axis=1)
+    place, three = smallest_three(quats)
+    three = np.rint((three / np.sqrt(2) + 0.5) * 255)
+    return np.concatenate([three, LARGEST + place[:, None].astype(np.float64)], axis=1)
 
 
 def _webp(values: NDArray[Any], across: int = 0) -> bytes:

@@ -32,6 +32,14 @@ from numpy.typing import NDArray
 
 from hqgs.base.files import atomic_path
 from hqgs.model.formats.arrays import TENSORS, Arrays
+from hqgs.model.formats.rows import (
+    finite_rows,
+    of_smallest_three,
+    pick,
+    smallest_three,
+    to_logits,
+    to_opacities,
+)
 from hqgs.model.formats.spz_container import (
     MAX_FRACTION,
     MAX_GAUSSIANS,
@@ -103,14 +111,8 @@ def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS, version: i
     n, rest = gaussians["shN"].shape[:2]
     if n > MAX_GAUSSIANS:
         raise ValueError(f"{n:,} Gaussians, but an SPZ file takes at most {MAX_GAUSSIANS:,}")
-    from scipy.special import expit  # here: what reads no SPZ needs no scipy
-
-    arrays: dict[str, Array] = {name: np.asarray(gaussians[name], np.float64) for name in TENSORS}
-    norm = np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        arrays["quats"] = np.roll(arrays["quats"] / norm, -1, axis=1)  # x y z w
-    finite = np.all([np.isfinite(a).all(axis=tuple(range(1, a.ndim))) for a in arrays.values()], axis=0)
-    arrays = {name: a[finite] for name, a in arrays.items()}
+    g = pick(gaussians, finite_rows(gaussians))
+    arrays: dict[str, Array] = {name: np.asarray(g[name], np.float64) for name in TENSORS}
     means = FLIP_MEANS * arrays["means"]
     fraction = _fraction(means, arrays["scales"])
     clipped: dict[str, int] = {}
@@ -125,10 +127,10 @@ def encode_spz(gaussians: Arrays, sh_bits: tuple[int, int] = SH_BITS, version: i
     fixed = np.rint(means * 2.0**fraction).astype("<i4")
     sections = [
         fixed[..., None].view(np.uint8)[..., :3],
-        byte("opacities", 255 * expit(arrays["opacities"])),
+        byte("opacities", 255 * to_opacities(arrays["opacities"])),
         byte("sh0", arrays["sh0"][:, 0] * COLOR + 127.5),
         byte("scales", (arrays["scales"] + LOG_OFFSET) * LOG_SCALE),
-        _pack_quats(FLIP_QUATS * arrays["quats"]),
+        _pack_quats(FLIP_QUATS * np.roll(arrays["quats"], -1, axis=1)),
         byte("shN", FLIP_SH[:rest, None] * arrays["shN"] * SH_ONE + SH_ONE, steps[:rest, None]),
     ]
     antialiased = gaussians.get("antialiased", False)
@@ -156,13 +158,11 @@ def read_spz(path: str | Path) -> Arrays:
     fixed = np.zeros((n, 3, 4), np.uint8)
     fixed[..., 1:] = means.reshape(n, 3, 3)  # in the upper bytes, so that the shift below keeps the sign
     xyzw = _unpack_quats(quats) if file.version >= 3 else _first_three(quats)
-    from scipy.special import logit
-
     found: Arrays = {
         "means": _floats(FLIP_MEANS * (fixed.view("<i4")[..., 0] >> 8) / 2.0**file.fraction),
         "scales": _floats(scales / LOG_SCALE - LOG_OFFSET),
         "quats": _floats(np.roll(FLIP_QUATS * xyzw, 1, axis=1)),
-        "opacities": _floats(logit(opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255)),
+        "opacities": to_logits(opacities[:, 0] / 255, 1 / 255),
         "sh0": _floats(((colors - 127.5) / COLOR)[:, None]),
         "shN": _floats(FLIP_SH[:rest, None] * (sh.reshape(n, stored, 3)[:, :rest] / SH_ONE - 1)),
     }
@@ -208,29 +208,20 @@ def _fraction(means: Array, scales: Array) -> int:
 
 
 def _pack_quats(xyzw: Array) -> Bytes:
-    """[n, 4] unit quaternions: the place of the largest component, sign and magnitude of the others."""
-    n = len(xyzw)
-    place = np.abs(xyzw).argmax(axis=1)
-    xyzw = xyzw * np.where(xyzw[np.arange(n), place] < 0, -1, 1)[:, None]
-    magnitude = np.rint(np.abs(xyzw) * QUAT_ONE).astype(np.uint32)
-    parts = magnitude | ((xyzw < 0).astype(np.uint32) << QUAT_BITS)
+    """Quaternions [n, 4] as 32 bits: the place of the largest component, sign and magnitude of the others."""
+    place, three = smallest_three(xyzw)
+    parts = np.rint(np.abs(three) * QUAT_ONE).astype(np.uint32) | (three < 0).astype(np.uint32) << QUAT_BITS
     word = place.astype(np.uint32)
-    for k in range(4):
-        word = np.where(place == k, word, word << (QUAT_BITS + 1) | parts[:, k])
+    for part in parts.T:
+        word = word << (QUAT_BITS + 1) | part
     return word.astype("<u4")[:, None].view(np.uint8)
 
 
 def _unpack_quats(packed: Bytes) -> Array:
-    word = np.ascontiguousarray(packed).view("<u4")[:, 0]
-    place = word >> 30
-    xyzw = np.zeros((len(word), 4))
-    for k in (3, 2, 1, 0):
-        here = place == k
-        value = (word & ((1 << QUAT_BITS) - 1)) / QUAT_ONE * np.where(word >> QUAT_BITS & 1, -1, 1)
-        xyzw[:, k] = np.where(here, 0, value)
-        word = np.where(here, word, word >> (QUAT_BITS + 1))
-    xyzw[np.arange(len(word)), place] = np.sqrt(np.maximum(0, 1 - np.square(xyzw).sum(axis=1)))
-    return xyzw
+    word = np.ascontiguousarray(packed).view("<u4")
+    parts = word >> np.arange(2, -1, -1, dtype=np.uint32) * (QUAT_BITS + 1)
+    three = (parts & ((1 << QUAT_BITS) - 1)) / QUAT_ONE * np.where(parts >> QUAT_BITS & 1, -1, 1)
+    return of_smallest_three(word[:, 0] >> 30, three)
 
 
 def _first_three(packed: Bytes) -> Array:

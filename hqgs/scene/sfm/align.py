@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hqgs.scene.constants import ROUNDING
 from hqgs.scene.sfm.constants import FARTHEST, HUBER
+from hqgs.scene.sfm.tracks import Tracks
 from hqgs.scene.similarity import Rows, robust, similarity
 
 Floats = NDArray[np.float64]
@@ -100,19 +101,8 @@ def pose_auc(found: Floats, own: Floats, photos: int, limits: Sequence[float] = 
     return [float(np.maximum(1 - errors / limit, 0).sum() / max(pairs, 1)) for limit in limits]
 
 
-@dataclass(frozen=True)
-class Observations:
-    """Where photos see points: photo `camera[k]` has point `point[k]` at `pixels[k]`."""
-
-    camera: NDArray[np.intp]  # [O]
-    point: NDArray[np.intp]  # [O]
-    pixels: Floats  # [O, 2], x and y
-
-
-def refine(
-    start: Similarity, points: Floats, seen: Observations, Ks: Floats, viewmats: Floats
-) -> tuple[Similarity, Floats]:
-    """The similarity under which cameras see another frame's points [P, 3] where their photos saw them.
+def refine(start: Similarity, seen: Tracks, Ks: Floats, viewmats: Floats) -> tuple[Similarity, Floats]:
+    """The similarity under which cameras see the points of another frame where their photos saw them.
 
     By centres alone a frame whose cameras lie close together, compared with what they look at, can be turned
     by a degree: the errors of centres and orientations go together so that the pictures stay the same. What
@@ -120,8 +110,8 @@ def refine(
     either axis, from `start`. `Ks` [V, 3, 3] and `viewmats` [V, 4, 4] are the target's cameras. Also
     returns the distances [O], px; infinite where a camera has the point behind it.
     """
-    center = start.points(points).mean(0)
-    R, t, K = viewmats[seen.camera, :3, :3], viewmats[seen.camera, :3, 3], Ks[seen.camera, :2]
+    center = start.points(seen.points).mean(0)
+    R, t, K = viewmats[seen.view, :3, :3], viewmats[seen.view, :3, 3], Ks[seen.view, :2]
 
     def moved(by: Floats) -> Similarity:
         """By a turn and the logarithm of a scale about the points' centroid, and a shift, [7]."""
@@ -131,10 +121,10 @@ def refine(
 
     def off(by: Floats) -> Floats:
         """[O, 2], px; infinite behind the camera."""
-        p = np.einsum("nij,nj->ni", R, moved(by).points(points)[seen.point]) + t
+        p = np.einsum("nij,nj->ni", R, moved(by).points(seen.points)[seen.point]) + t
         front = p[:, 2:] > 0
         pixels = np.einsum("nij,nj->ni", K, p / np.where(front, p[:, 2:], 1))
-        return np.where(front, pixels - seen.pixels, np.inf)
+        return np.where(front, pixels - seen.xy, np.inf)
 
     found = least_squares(
         lambda by: off(by).clip(-FARTHEST, FARTHEST).ravel(),

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from hqgs.base.evenly import evenly
 from hqgs.base.machine import AT_ONCE
 from hqgs.scene.sfm.constants import COMPARED, DESCRIPTOR, FILM_NEAR, FILM_THIN, LOWE_RATIO, NEXT, PARTNERS
 
@@ -55,7 +56,7 @@ def film_pairs(count: int) -> NDArray[np.int64]:
     """
     first, second = np.triu_indices(count, 1)
     apart = second - first
-    thin = np.isin(np.arange(count), np.linspace(0, count - 1, FILM_THIN).round())
+    thin = np.isin(np.arange(count), evenly(count, FILM_THIN))
     near = (apart <= FILM_NEAR) | ((apart & (apart - 1)) == 0)
     chosen = near | (thin[first] & thin[second])
     return np.stack([first[chosen], second[chosen]], axis=1)

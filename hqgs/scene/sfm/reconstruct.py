@@ -6,18 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
-from PIL import Image
 from scipy.spatial import KDTree
 
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.formats.colmap import model_points, seen_points
+from hqgs.scene.formats.colmap import seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
-from hqgs.scene.sfm.align import Observations, align, camera_centers, pose_auc, refine, rotation_angles
+from hqgs.scene.sfm.align import align, camera_centers, pose_auc, refine, rotation_angles
 from hqgs.scene.sfm.run import SIFT, run_colmap
-from hqgs.scene.sfm.tracks import sureness
+from hqgs.scene.sfm.tracks import read_tracks, sureness
+from hqgs.scene.sfm.triangulated import write_photos
 
 
 def sfm_scene(
@@ -42,7 +41,7 @@ def sfm_scene(
         list(views),
         contents,
         cameras,
-        lambda folder: _write_photos(folder, views),
+        lambda folder: write_photos(folder, views),
         keep,
         on_stage,
         called={file: view.name for file, view in views.items()},
@@ -52,11 +51,11 @@ def sfm_scene(
     poses = ran.poses()
     kept = [views[file] for file in poses]
     viewmats, own = np.stack(list(poses.values())), np.stack([view.camera.viewmat for view in kept])
-    points, colors = model_points(model)
+    _, seen = read_tracks(model)
     similarity, inliers = align(viewmats, own)
     Ks = np.stack([view.camera.K for view in kept])
-    similarity, misses = refine(similarity, points, _observations(model, list(poses)), Ks, own)
-    viewmats, points = similarity.viewmats(viewmats), similarity.points(points)
+    similarity, misses = refine(similarity, seen, Ks, own)
+    viewmats, points = similarity.viewmats(viewmats), similarity.points(seen.points)
 
     train = [
         replace(view, camera=replace(view.camera, viewmat=viewmat))
@@ -91,7 +90,7 @@ def sfm_scene(
         scene,
         train=train,
         points=points.astype(np.float32),
-        point_colors=colors,
+        point_colors=seen.colors,
         notes=[*scene.notes, str(report)],
         tracks=tracks,
         seen={views[file].name: rows for file, rows in seen_points(model).items()},
@@ -100,37 +99,10 @@ def sfm_scene(
     )
 
 
-def _observations(model: pycolmap.Reconstruction, names: list[str]) -> Observations:
-    """Which of these photos sees which point of `model_points`, and where."""
-    row = {point: k for k, point in enumerate(sorted(model.points3D))}
-    images = {image.name: image for image in model.images.values()}
-    found = [
-        (k, row[seen.point3D_id], *seen.xy)
-        for k, name in enumerate(names)
-        for seen in images[name].points2D
-        if seen.has_point3D()
-    ]
-    table = np.array(found, np.float64).reshape(-1, 4)
-    return Observations(table[:, 0].astype(np.intp), table[:, 1].astype(np.intp), table[:, 2:])
-
-
 def _content(view: View) -> bytes:
     """What tells a photo and its mask from others."""
     mask = b"" if view.mask is None else view.mask.tobytes()
     return to_uint8(as_floats(view.image)).tobytes() + mask
-
-
-def _write_photos(folder: Path, views: dict[str, View]) -> None:
-    """The photos as PNG files, and masks in `masks` beside the folder where a view has one."""
-    masked = any(view.mask is not None for view in views.values())
-    masks = folder.with_name("masks")
-    if masked:
-        masks.mkdir()
-    for file, view in views.items():
-        Image.fromarray(to_uint8(as_floats(view.image))).save(folder / file, compress_level=1)
-        if masked:
-            counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
-            Image.fromarray(counts.astype(np.uint8) * 255).save(masks / f"{file}.png")
 
 
 def _median_and_max(values: NDArray[np.float64]) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,15 +39,8 @@ def triangulated(views: Sequence[View], time_limit: float = TRIANGULATION) -> Sp
     with tempfile.TemporaryDirectory(prefix="hqgs-sfm-") as name:
         directory = Path(name)
         names = [f"{k:06d}.png" for k in range(len(views))]
-        masked = any(view.mask is not None for view in views)
-        for folder in ("photos", "masks") if masked else ("photos",):
-            (directory / folder).mkdir()
-        for view, file in zip(views, names, strict=True):
-            image = to_uint8(as_floats(view.image))
-            Image.fromarray(image).save(directory / "photos" / file, compress_level=1)
-            if masked:
-                mask = np.ones(image.shape[:2], bool) if view.mask is None else view.mask
-                Image.fromarray(mask).save(directory / "masks" / f"{file}.png")
+        (directory / "photos").mkdir()
+        write_photos(directory / "photos", dict(zip(names, views, strict=True)))
         cameras = [view.camera for view in views]
         given = {
             "photos": np.array(str(directory / "photos")),
@@ -78,6 +71,18 @@ def triangulated(views: Sequence[View], time_limit: float = TRIANGULATION) -> Sp
     if len(points) < POINTS_WANTED:
         return f"it found only {len(points)} points"
     return in_order(points, colors, photos, rows, f"{len(points)} points by COLMAP with the known cameras")
+
+
+def write_photos(folder: Path, views: Mapping[str, View]) -> None:
+    """The photos as PNG files of those names, and masks in `masks` beside the folder where a view has one."""
+    masks = folder.with_name("masks")
+    if masked := any(view.mask is not None for view in views.values()):
+        masks.mkdir()
+    for file, view in views.items():
+        Image.fromarray(to_uint8(as_floats(view.image))).save(folder / file, compress_level=1)
+        if masked:
+            counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
+            Image.fromarray(counts.astype(np.uint8) * 255).save(masks / f"{file}.png")
 
 
 def pairs_of(views: Sequence[View]) -> NDArray[np.intp]:
