@@ -23,13 +23,11 @@ from hqgs.diagnosis.constants import (
     DEVICES_MOST,
 )
 from hqgs.diagnosis.gains import SharedColors
-from hqgs.photos.light import to_srgb
+from hqgs.photos.light import EXPONENT, OFFSET, to_srgb
 from hqgs.scene.scene import View
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.intp]
-
-_OFFSET, _EXPONENT = 0.055, 2.4  # of sRGB's curve
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ class _Table:
         table = _Table(photo, point, of_photo[photo], logs, basis, int(of_photo.max()) + 1)
         value = to_srgb(np.exp(table.expected()))
         # d log(light) / d value, times the bend of the response there
-        bend = _EXPONENT / (value + _OFFSET) * value * (1 - value)
+        bend = EXPONENT / (value + OFFSET) * value * (1 - value)
         basis[:, 2:] = np.stack([bend, bend * (1 - 2 * value)], 1)
         return table
 

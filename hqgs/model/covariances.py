@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hqgs.model.formats.turned import quaternions
+
 # Rows and columns of the six entries that count: xx, xy, xz, yy, yz, zz.
 UPPER = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
@@ -39,24 +41,5 @@ def quats_and_scales(upper: Tensor) -> tuple[Tensor, Tensor]:
     values, axes = torch.linalg.eigh(matrices)
     axes = axes * torch.where(torch.linalg.det(axes) < 0, -1.0, 1.0)[..., None, None]
     scales = values.clamp(min=0).sqrt().where(finite, torch.nan)
-    return _quaternions(axes).to(upper.dtype), scales.to(upper.dtype)
-
-
-def _quaternions(R: Tensor) -> Tensor:
-    """Of rotations [..., 3, 3]: the largest component from the diagonal, the others over it."""
-    x, y, z = R.diagonal(dim1=-2, dim2=-1).unbind(-1)
-    squares = 1 + torch.stack([x + y + z, x - y - z, y - x - z, z - x - y], -1)  # 4 w^2, ...
-    a, b, c = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    d, e, f = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
-    w, i, j, k = squares.unbind(-1)
-    rows = torch.stack(  # each times 4 w, 4 x, 4 y or 4 z
-        [
-            torch.stack([w, a, b, c], -1),
-            torch.stack([a, i, d, e], -1),
-            torch.stack([b, d, j, f], -1),
-            torch.stack([c, e, f, k], -1),
-        ],
-        -2,
-    )
-    largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
-    return torch.nn.functional.normalize(rows.gather(-2, largest).squeeze(-2), dim=-1)
+    quats = torch.from_numpy(quaternions(axes.reshape(-1, 3, 3).numpy())).view(*axes.shape[:-2], 4)
+    return quats.to(upper.dtype), scales.to(upper.dtype)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from hqgs.model.constants import (
     SH_C0,
 )
 from hqgs.model.content import around
-from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.arrays import TENSORS, Arrays
 from hqgs.model.formats.files import format_of, read_scene, scene_file, write_scene
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
@@ -100,12 +101,8 @@ class Gaussians:
     def like(self, tensors: dict[str, Tensor]) -> Gaussians:
         """Others with these tensors, in the same frame and seen in the same way."""
         made = Gaussians(**tensors)
-        made.look, made.world, made.antialiased, made.notes = (
-            self.look,
-            self.world,
-            self.antialiased,
-            self.notes,
-        )
+        made.look, made.world = self.look, self.world
+        made.antialiased, made.notes = self.antialiased, self.notes
         if self.errors is not None and len(self.errors) == len(made):
             made.errors = self.errors
         return made
@@ -140,14 +137,7 @@ class Gaussians:
 
     def arrays(self) -> Arrays:
         """The same values (shared memory) as numpy arrays, by the names of the fields."""
-        arrays: Arrays = {
-            "means": self.means.detach().numpy(),
-            "scales": self.scales.detach().numpy(),
-            "quats": self.quats.detach().numpy(),
-            "opacities": self.opacities.detach().numpy(),
-            "sh0": self.sh0.detach().numpy(),
-            "shN": self.shN.detach().numpy(),
-        }
+        arrays = cast(Arrays, {name: tensor.detach().numpy() for name, tensor in self.named().items()})
         if self.world != World():
             arrays["world"] = self.world
         if self.antialiased:
@@ -265,14 +255,7 @@ class Gaussians:
         """
         file = scene_file(path)
         arrays = read_scene(file, format_of(file, format))
-        made = cls(
-            means=torch.from_numpy(arrays["means"]),
-            scales=torch.from_numpy(arrays["scales"]),
-            quats=torch.from_numpy(arrays["quats"]),
-            opacities=torch.from_numpy(np.ascontiguousarray(arrays["opacities"])),
-            sh0=torch.from_numpy(arrays["sh0"]),
-            shN=torch.from_numpy(arrays["shN"]),
-        )
+        made = cls(**{name: torch.from_numpy(np.ascontiguousarray(arrays[name])) for name in TENSORS})
         made.look = first_camera(file.parent) if file.name == PLY else None
         made.world = arrays.get("world", made.world)
         made.antialiased, made.notes = arrays.get("antialiased", False), arrays.get("notes", [])

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+OFFSET, EXPONENT = 0.055, 2.4  # of sRGB's curve above its straight toe
 Real = TypeVar("Real", bound="np.floating[Any]")
 
 
@@ -15,11 +16,11 @@ def to_linear(srgb: NDArray[Real]) -> NDArray[Real]:
 
     Beyond [0, 1] the curve goes on as it is (straight below 0), so that noise loses nothing on the way.
     """
-    curve = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
+    curve = ((np.maximum(srgb, 0.04045) + OFFSET) / (1 + OFFSET)) ** EXPONENT
     return np.where(srgb <= 0.04045, srgb / 12.92, curve).astype(srgb.dtype)
 
 
 def to_srgb(linear: NDArray[Real]) -> NDArray[Real]:
     """Linear light to sRGB values, the inverse of `to_linear`."""
-    curve = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    curve = (1 + OFFSET) * np.maximum(linear, 0.0031308) ** (1 / EXPONENT) - OFFSET
     return np.where(linear <= 0.0031308, 12.92 * linear, curve).astype(linear.dtype)

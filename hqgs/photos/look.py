@@ -18,9 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.photos.light import to_linear, to_srgb
-
-_OFFSET, _EXPONENT = 0.055, 2.4  # of sRGB's curve above its straight toe
+from hqgs.photos.light import EXPONENT, OFFSET, to_linear, to_srgb
 
 
 @dataclass(frozen=True)
@@ -58,8 +56,8 @@ def darken(values: Tensor, fall: Tensor) -> Tensor:
     Exact but where light goes from the curve into its toe: there by half a level at a third of the light.
     """
     fall = fall.to(values.dtype)
-    root, straight = torch.exp(fall / -_EXPONENT), torch.exp(-fall)
-    curved, straight = (values + _OFFSET) * root - _OFFSET, values * straight
+    root, straight = torch.exp(fall / -EXPONENT), torch.exp(-fall)
+    curved, straight = (values + OFFSET) * root - OFFSET, values * straight
     if bool((fall >= 0).all()):
         return torch.maximum(curved, straight)
     return torch.where(fall > 0, torch.maximum(curved, straight), torch.minimum(curved, straight))
