@@ -25,10 +25,9 @@ WORST, LEAST = 3, 0.005  # photos that the screen names; share of the error that
 
 # Fitted cameras, by Levenberg's steps: those turned by 1.5 degrees come home (`tests/test_fit_cameras.py`).
 SMOOTHED = (3.0, 1.0, 0.0)  # px; coarse to fine, so that a camera may be several pixels off
-FIT_STEPS = 10  # of Gauss-Newton at each of them, at most
+FIT_STEPS = 10  # at each of them, at most
 DIFFERENCE = 0.3  # px by which a camera is moved to see what that changes
 SETTLED = 1e-4  # of the squared error; less gained ends a level
-DAMPING, GIVEN_UP = 1e-3, 1e4  # of the normal matrix's diagonal, at first and at most
 
 # Faults of viewers: with these all are told apart in five scenes (`tests/test_viewers.py`).
 ROUNDED = 0.4  # levels, root mean square: rounding to 8 bits leaves 0.29, float32 a little more

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.threads import one_torch_thread
-from hqgs.evaluation.constants import DAMPING, DIFFERENCE, FIT_STEPS, GIVEN_UP, SETTLED, SMOOTHED
+from hqgs.evaluation.constants import DIFFERENCE, FIT_STEPS, SETTLED, SMOOTHED
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats
@@ -116,27 +117,18 @@ def _level(
     units: Floats,
     sigma: float,
 ) -> Camera:
-    """Levenberg's steps with photo and renders smoothed by `sigma` px."""
-    render = seen(camera)
-    cost, damping = _cost(render, photo, counted, sigma), DAMPING
-    for _ in range(FIT_STEPS):
-        moves = DIFFERENCE * np.diag(units)
-        slopes = np.stack([_smooth(seen(_moved(camera, move)) - render, sigma) for move in moves])
-        off = _smooth(render - photo, sigma)
-        normal = np.einsum("ahwc,bhwc,hw->ab", slopes, slopes, counted)
-        right = np.einsum("ahwc,hwc,hw->a", slopes, off, counted)
-        while damping < GIVEN_UP:
-            damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
-            there = _moved(camera, -np.linalg.solve(damped, right) * DIFFERENCE * units)
-            now = seen(there)
-            now_cost = _cost(now, photo, counted, sigma)
-            if now_cost < cost:
-                break
-            damping *= 10
-        else:
-            break
-        settled = now_cost > cost * (1 - SETTLED)
-        camera, render, cost, damping = there, now, now_cost, damping / 10
-        if settled:
-            break
-    return camera
+    """Steps with photo and renders smoothed by `sigma` px, until they gain little."""
+    weight, known = np.sqrt(counted)[..., None], dict[bytes, Floats]()
+
+    def off(move: Floats) -> Floats:
+        if (key := move.tobytes()) not in known:  # slopes are asked for where it was last
+            known.clear()
+            known[key] = (_smooth(seen(_moved(camera, move * units)) - photo, sigma) * weight).ravel()
+        return known[key]
+
+    def slopes(move: Floats) -> Floats:
+        here = off(move)
+        return np.stack([(off(move + one) - here) / DIFFERENCE for one in DIFFERENCE * np.eye(6)], axis=1)
+
+    found = least_squares(off, np.zeros(6), slopes, ftol=SETTLED, max_nfev=FIT_STEPS)
+    return _moved(camera, found.x * units)
