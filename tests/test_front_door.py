@@ -210,7 +210,7 @@ def test_a_screenshot_is_left_out_where_it_has_no_place_and_used_where_it_has(
     tmp_path: Path,
 ) -> None:
     views = sorted([*cards.train, *cards.test], key=lambda view: view.name)
-    for k, view in enumerate(views):
+    for k, view in enumerate(views[:6]):
         if k == 4:  # a photo that was cut and sent on as PNG
             Image.fromarray(view.image[: HEIGHT - 6]).save(tmp_path / f"{k}.png")
         else:
@@ -220,7 +220,7 @@ def test_a_screenshot_is_left_out_where_it_has_no_place_and_used_where_it_has(
     scene = load_scene(tmp_path)
     assert scene.sfm is not None
     assert scene.sfm.not_registered == ["shot.png"]
-    assert scene.notes[1] == "10 photos, 8 of them of 1 camera"
+    assert scene.notes[1] == "7 photos, 5 of them of 1 camera"
     size = f"{HEIGHT // 2} x {WIDTH} px"
     assert scene.notes[2:4] == [
         f"4.png looks like a screenshot (PNG of {WIDTH} x {HEIGHT - 6} px, no camera in EXIF): it fits among "

@@ -198,7 +198,7 @@ def read_photos(
 
 def background_of(source: Path) -> tuple[float, float, float]:
     """What a run was trained on, or black."""
-    from hqgs.model.constants import BACKGROUND
+    from hqgs.scene.constants import BACKGROUND
 
     path = source / CONFIG
     asked = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}

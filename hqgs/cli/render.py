@@ -112,9 +112,9 @@ def run(options: Render) -> int:
 def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
     from hqgs.model.orbit import orbit
+    from hqgs.photos.constants import FPS
     from hqgs.scene.camera_files import load_path, moved, picked
     from hqgs.scene.paths import UP, camera_path
-    from hqgs.show.constants import FPS
 
     source, views, path, frames = options.source, options.views, options.path, options.frames
     known = cameras_beside(source)

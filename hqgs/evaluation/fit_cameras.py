@@ -130,5 +130,5 @@ def _level(
         here = off(move)
         return np.stack([(off(move + one) - here) / DIFFERENCE for one in DIFFERENCE * np.eye(6)], axis=1)
 
-    found = least_squares(off, np.zeros(6), slopes, ftol=SETTLED, max_nfev=FIT_STEPS)
+    found = least_squares(off, np.zeros(6), slopes, ftol=SETTLED, max_nfev=FIT_STEPS)  # pyright: ignore[reportArgumentType]
     return _moved(camera, found.x * units)

@@ -19,9 +19,9 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.constants import KEPT_BYTES
 from hqgs.evaluation.metrics import ViewMetrics, evaluate_view, psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
-from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
+from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.scene import Scene, View
 
 

@@ -20,10 +20,10 @@ from hqgs.evaluation.fit_cameras import Fitted, fit_cameras
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView, held_out_renders, measured
 from hqgs.evaluation.intervals import difference, half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
-from hqgs.model.constants import BACKGROUND
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats
+from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.scene import Scene, View
 
 Background = tuple[float, float, float]

@@ -17,7 +17,6 @@ from hqgs._rust import EPS2D, NEAR_PLANE
 from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import (
-    BACKGROUND,
     CONTENT_SAMPLED,
     INITIAL_OPACITY,
     MAX_SH_DEGREE,
@@ -31,7 +30,7 @@ from hqgs.model.formats.files import format_of, read_scene, scene_file, write_sc
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.photos.pixels import png
 from hqgs.scene.camera_files import first_camera
-from hqgs.scene.constants import SMALLEST, USUAL
+from hqgs.scene.constants import BACKGROUND, SMALLEST, USUAL
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 from hqgs.scene.world import World

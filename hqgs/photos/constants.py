@@ -50,3 +50,6 @@ RESIZE_BAND = 8  # new rows at a time: what is between then fits into the caches
 WEAKEST = 0.2  # of the longest extent: how far the stillest photo moves
 SHAKE_TURN = 0.6  # radians, standard deviation of the turn from one stretch of a path to the next
 SAMPLES_PER_PX = 8  # along a path, at least; a kernel is a mean over them
+
+# video.py: photos as a film
+FPS = 30  # frames a second of films and camera paths, where nothing else is said

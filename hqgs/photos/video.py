@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
+from hqgs.photos.constants import FPS
 from hqgs.photos.pixels import Float32, as_floats, to_uint8
 
-RATE = 30  # frames per second; only the rate control knows it
 # The vector code of x264 gives other bits from call to call; without it a film takes 2.5 times as long.
 _X264 = {"x264-params": "asm=0"}
 _X265 = {"x265-params": "pools=none:frame-threads=1:wpp=0:info=0:log-level=none"}
@@ -65,7 +65,7 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[FilmF
     except (ValueError, av.error.FFmpegError) as error:  # a PyAV that was built without the encoder
         raise ValueError(f"{kind} needs PyAV with the encoder {encoder}: {error}") from error
     out.width, out.height, out.pix_fmt = width + odd_columns, height + odd_rows, "yuv420p"
-    out.time_base, out.framerate = Fraction(1, RATE), Fraction(RATE)
+    out.time_base, out.framerate = Fraction(1, FPS), Fraction(FPS)
     out.thread_count = 1
     out.options = {"crf": str(crf), "preset": "medium", **options}
     back = av.CodecContext.create(decoder, "r")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import atomic_path, read_json, write_json
-from hqgs.photos.constants import LARGEST
+from hqgs.photos.constants import FPS, LARGEST
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES
 from hqgs.scene.paths import scene_up, view_matrix
@@ -159,7 +159,7 @@ def moved(camera: Camera, world: World) -> Camera:
 
 
 def save_path(
-    path: str | Path, cameras: Sequence[Camera], fps: float = 30.0, world: World | None = None
+    path: str | Path, cameras: Sequence[Camera], fps: float = FPS, world: World | None = None
 ) -> None:
     """Write a camera path as JSON, in the style of nerfstudio's camera_path files, atomically.
 
@@ -197,7 +197,7 @@ def load_path(path: str | Path) -> tuple[list[Camera], float]:
     path = Path(path)
     value = read_json(path)
     try:
-        width, height, fps = value["render_width"], value["render_height"], float(value.get("fps", 30))
+        width, height, fps = value["render_width"], value["render_height"], float(value.get("fps", FPS))
         frames = value["camera_path"]
         if not 0 < len(frames) <= MOST_FRAMES:
             raise ValueError(f"{len(frames)} frames")

@@ -45,6 +45,7 @@ ONE_PLACE = 1e-12  # of the distance from the origin: what differs by less is in
 FAR_ORIGIN = 16.0  # sizes from the origin: from here on it is moved, before float32 is 1e-3 of 1,000 px off
 AXES_PAIRS = 6  # of neighbours, spread over the photos
 AXES_FEWEST, AXES_CLEAR = 30, 3  # matches that must fit; times as many as with the stated axes
+BACKGROUND = (0.0, 0.0, 0.0)  # RGB behind everything, in renders and cut-out photos, unless asked for
 EMPTY = 255  # of `View.empty`: nothing of the pixel shows anything
 RANDOM_POINTS = 20_000  # to start from where a scene has none
 

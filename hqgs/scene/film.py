@@ -18,6 +18,7 @@ from PIL import Image
 from hqgs.base.files import missing_folders, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.blocks import fine_detail
+from hqgs.photos.constants import FPS
 from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
 from hqgs.photos.spherical import projection
 from hqgs.photos.video import pyav
@@ -140,7 +141,7 @@ def _sharpest(
             best, at, best_sharpness = None, 0, -1.0
             number, start = -1, None
             for number, frame in enumerate(film.decode(stream)):
-                time = frame.time if frame.time is not None else number / 30
+                time = frame.time if frame.time is not None else number / FPS
                 start = time if start is None else start
                 now = min(int((time - start) / interval), wanted - 1)
                 if now > at and best is not None:

@@ -15,7 +15,7 @@ from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
-from hqgs.scene.constants import COPY_SIDE, MOST_BYTES
+from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES
 from hqgs.scene.faces import CUBE, around, faces_of
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import find_models, find_models_below, half_model, read_colmap
@@ -26,7 +26,6 @@ from hqgs.scene.lenses import odd_lenses
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
 from hqgs.scene.place import (
-    BEHIND,
     cut_outs,
     located,
     masks_told,
@@ -104,7 +103,7 @@ def load_scene(
     capture = placed(without_strays(capture, notes), notes)
     names = frozenset(photo.name for photo in capture.photos)
     optional = names if skip_unreadable else frozenset[str]()
-    over = BEHIND if cut_outs(capture) else None
+    over = BACKGROUND if cut_outs(capture) else None
     views, unreadable = load_views(capture.photos, capture.downscale, optional, on_stage, over)
     if any(view.empty is not None for view in views):
         notes.append(

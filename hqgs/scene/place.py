@@ -17,8 +17,6 @@ from hqgs.scene.georeference import Georeference, georeference
 from hqgs.scene.scene import strays
 from hqgs.scene.world import world_for
 
-BEHIND = (0.0, 0.0, 0.0)  # cut-out photos: what renders have behind everything, unless they are told
-
 
 def without_missing(root: Path, capture: Capture, notes: list[str]) -> Capture:
     """The capture without cameras whose photo is not there; `notes` names them.

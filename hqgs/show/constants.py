@@ -4,7 +4,6 @@ The layout of charts is beside them.
 """
 
 # Films.
-FPS = 30.0
 # Frames that say which depths a film shows; ends of its colours.
 DEPTH_SAMPLES, DEPTH_PERCENTILES = 8, (2, 98)
 

@@ -19,17 +19,18 @@ from hqgs._rust import EPS2D, FAR_PLANE
 from hqgs.base.evenly import evenly
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
-from hqgs.model.constants import BACKGROUND
 from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
+from hqgs.photos.constants import FPS
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.look import Look
 from hqgs.photos.video import pyav
+from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera
-from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, FPS, THICKNESS_OF, WORST_SHOWN
+from hqgs.show.constants import DEPTH_PERCENTILES, DEPTH_SAMPLES, THICKNESS_OF, WORST_SHOWN
 from hqgs.show.trust import Trust
 
 SHOWN = ("color", "depth", "alpha", "trust")

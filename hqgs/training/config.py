@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
-from hqgs.model.constants import BACKGROUND, MAX_SH_DEGREE
+from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.photos.formula import parse_formation
+from hqgs.scene.constants import BACKGROUND
 from hqgs.training.constants import EVALUATIONS_APART
 
 AUTO, NONE = "auto", "none"

@@ -21,12 +21,13 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.constants import GAINS_DARK
 from hqgs.model.consistency import Agreement
-from hqgs.model.constants import AGREE_SMOOTH, AGREEING, BACKGROUND
+from hqgs.model.constants import AGREE_SMOOTH, AGREEING
 from hqgs.model.first_points import points_along_edges
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map, render_view
 from hqgs.model.shapes import as_discs
 from hqgs.photos.pixels import as_floats
+from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene, View
 from hqgs.training.adam import Adam

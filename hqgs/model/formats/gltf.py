@@ -22,7 +22,7 @@ from hqgs.base.files import atomic_path
 from hqgs.model.constants import LEAST_SCALE, MAX_SH_DEGREE
 from hqgs.model.formats.arrays import Arrays, Floats
 from hqgs.model.formats.gltf_nodes import BIN, JSON, MAGIC, VERSION, content_of, placed_meshes
-from hqgs.model.formats.rows import finite_rows, pick, sound_errors, to_logits, to_opacities
+from hqgs.model.formats.rows import SHARE_STEP, finite_rows, pick, sound_errors, to_logits, to_opacities
 from hqgs.model.formats.spz import FLIP_MEANS, FLIP_QUATS, FLIP_SH
 from hqgs.model.formats.turned import mapped
 from hqgs.scene.world import World, world_for
@@ -34,7 +34,6 @@ NAME = "KHR_gaussian_splatting"
 ERROR = "_HQGS_ERROR"  # glTF keeps names that begin so for applications
 FLOAT, POINTS = 5126, 0
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-STEP = 2.0**-24  # of opacities near 1
 
 
 def write_gltf(path: str | Path, arrays: Arrays) -> int:
@@ -194,7 +193,7 @@ def _gaussians(content: Any, buffers: list[bytes], primitive: Any) -> Arrays:
         "means": FLIP_MEANS * means,
         "scales": np.log(np.maximum(scales, LEAST_SCALE)).astype(np.float32),
         "quats": np.roll(FLIP_QUATS * values(f"{NAME}:ROTATION", "VEC4"), 1, axis=1).astype(np.float32),
-        "opacities": to_logits(values(f"{NAME}:OPACITY", "SCALAR")[:, 0], STEP),
+        "opacities": to_logits(values(f"{NAME}:OPACITY", "SCALAR")[:, 0], SHARE_STEP),
         "sh0": values(f"{NAME}:SH_DEGREE_0_COEF_0", "VEC3")[:, None].astype(np.float32),
         "shN": (np.stack(rest, axis=1) if rest else np.zeros((count, 0, 3))).astype(np.float32),
     }

@@ -21,7 +21,7 @@ from hqgs.base.files import atomic_path
 from hqgs.base.ply import header_of, read_vertices
 from hqgs.model.constants import MAX_SH_DEGREE, SH_C0
 from hqgs.model.formats.arrays import Arrays
-from hqgs.model.formats.rows import pick, sound_errors, to_logits, whole_rows
+from hqgs.model.formats.rows import SHARE_STEP, pick, sound_errors, to_logits, whole_rows
 from hqgs.scene.world import World, world_for
 
 _REST_COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1)]  # 0, 9, 24, 45
@@ -33,7 +33,7 @@ _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _ERROR = "hqgs_error"
 _WORLD, _ANTIALIASED = "hqgs world ", "hqgs antialiased"  # comments of the header
-_TELLING, _SHARE_STEP = 100, 2.0**-24  # Gaussians that tell what opacities are; between shares near 1
+_TELLING = 100  # Gaussians that tell what opacities are
 MOST_LOGIT = 18.0  # of an opacity that is stored as infinite: float32 rounds its sigmoid to 1 or next to 0
 FLAT = math.log(1e-3)  # of the smaller radius of a disc: its thickness
 LEAST_LOG = math.log(1e-20)  # of a scale of 0
@@ -139,7 +139,7 @@ def read_ply(path: str | Path) -> Arrays:
     opacities = columns(["opacity"])[:, 0]
     scales = columns(_SCALES[:2] if discs else _SCALES)
     if _are_shares(opacities):
-        opacities = to_logits(opacities, _SHARE_STEP)
+        opacities = to_logits(opacities, SHARE_STEP)
         notes.append("its opacities lie between 0 and 1: they were read as shares, not as logits")
         if (scales > 0).all():
             scales = np.log(scales)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hqgs.model.formats.arrays import TENSORS, Arrays
 
 CURVE_BITS = 10  # of a cell along each axis
+SHARE_STEP = 2.0**-24  # between float32 shares near 1
 
 
 def finite_rows(arrays: Arrays) -> NDArray[np.bool_]:

@@ -9,12 +9,11 @@ import numpy as np
 from hqgs.scene.builtin.shading import render_depth
 from hqgs.scene.geometry import unproject
 from hqgs.scene.scene import View
+from hqgs.scene.sfm.constants import TRIANGULATION
 from hqgs.scene.sfm.triangulated import SparsePoints, in_order, triangulated
 
-TIME_LIMIT = 300.0  # s: for a COLMAP that hangs; a slow or busy machine is to get the same points as others
 
-
-def sfm_points(views: Sequence[View], time_limit: float = TIME_LIMIT) -> SparsePoints:
+def sfm_points(views: Sequence[View], time_limit: float = TRIANGULATION) -> SparsePoints:
     """Points of the views by COLMAP.
 
     COLMAP (SIFT, exhaustive matching, triangulation with the known cameras) runs in its own process and is

@@ -17,12 +17,12 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import PHOTO_SUFFIXES, Glance, UnreadableError, decode, glance, needs_heic
 from hqgs.scene.capture import photo_folder
-from hqgs.scene.constants import JPEG_QUALITY
+from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS
 from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
 from hqgs.scene.photo_files import MASK_FOLDERS, MASKS, is_run
-from hqgs.scene.sfm.constants import DECODERS, FOLDERS_DEEP
+from hqgs.scene.sfm.constants import FOLDERS_DEEP
 from hqgs.scene.sfm.front_door import (
     cameras_beside,
     copies,
@@ -180,7 +180,7 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         except UnreadableError as error:
             return str(error)
 
-    with ThreadPoolExecutor(min(DECODERS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
         for k, (name, found) in enumerate(zip(photos.names, pool.map(look, photos.names), strict=True)):
             if isinstance(found, str):
                 unreadable[name.encode(errors="replace").decode()] = found

@@ -31,7 +31,6 @@ MIN_TRACK, MAX_ERROR = 3, 1.0  # a point needs so many photos, and may miss them
 PROBED = 8  # photos that tell of all what files do not: how rich they are, whether they are panoramas
 LEAST_AGREED = 0.3  # length of the cameras' mean up; shorter: they agree on none
 FOLDERS_DEEP = 5  # below the one named in which photos are looked for: Takeout/Google Photos/Walk
-DECODERS = 2  # photos that are read at once
 
 # Time.
 LONG, MANY = 60.0, 150  # s, photos: from where on the user is told before it begins
