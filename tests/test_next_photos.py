@@ -60,7 +60,7 @@ def test_neighbours_that_look_the_same_way_have_no_gap_between_them() -> None:
 def test_loose_poses_and_what_one_other_photo_shows_are_told() -> None:
     scene = ring([*range(0, 360, 15)])
     sure = {view.name: 0.2 for view in scene.train} | {"07.jpg": 2.5}
-    report = SfmReport(24, [], [], None, None, None, 60, None, 3.0, 0.5, None, None, None, sure_px=sure)
+    report = SfmReport(24, [], 60, 3.0, 0.5, sure_px=sure)
     seen = {name: rows[:40] for name, rows in (scene.seen or {}).items()} | {"11.jpg": np.arange(30, 60)}
     scene = replace(scene, sfm=report, seen=seen)
     loose, alone = next_photos(scene)

@@ -27,7 +27,8 @@ from hqgs.evaluation.judge_words import (
 )
 from hqgs.photos.pixels import png, upright
 from hqgs.show.constants import DIFFERENCE_SHOWN, WORST_SHOWN
-from hqgs.show.page.page import pair, rendered
+from hqgs.show.page.filled import filled
+from hqgs.show.page.page import pair
 
 COLORS = ("#d0672a", "#8a5fbf", "#7a7a7a", "#b8c4d0", "#c9b458", "#2f7fc4", "#3f9b57")
 
@@ -43,7 +44,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
     shown = [name for name in LABELS if one["mean"][name] is not None]
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
     chosen = [judged[0].names.index(name) for name in order[:SHEET_PHOTOS]]
-    return rendered(
+    return filled(
         "judge.html.j2",
         title=f"{Path(one['name']).name} on {protocol['photos']} photos",
         verdict=f"Quality: {quality(found)}.",

@@ -31,11 +31,11 @@ from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Camera, Scene
 from hqgs.show.constants import PAGE_QUALITY, PAIR_SIDE, PAIRS, SHEET_SIDE
 from hqgs.show.page.charts import line_chart
+from hqgs.show.page.filled import TEMPLATES, filled
 from hqgs.show.page.packing import pack_scene
 from hqgs.show.page.places import places_chart
 from hqgs.show.page.trust_part import trust_part
 
-TEMPLATES = Path(__file__).parent / "templates"
 SCRIPTS = ("splat_shaders.js", "splats.js")
 CHARTS = (
     ("Held-out PSNR", "dB", "psnr", "#2f7fc4"),
@@ -107,7 +107,7 @@ def page_text(page: Page) -> str:
     if page.folder is not None and page.gaussians is not None and len(page.gaussians):
         trust = trust_part(page.folder, page.scene, page.gaussians, report["iterations"])
         spots = [*spots, *trust.spots]
-    return rendered(
+    return filled(
         "report.html.j2",
         title=f"{report['scene']}, {report['method']}",
         verdict=told_verdict(report),
@@ -137,15 +137,6 @@ def page_text(page: Page) -> str:
         environment=_environment(report),
         config=json.dumps(report["config"], indent=1),
     )
-
-
-def rendered(template: str, **values: Any) -> str:
-    """A template of a page, filled; values are escaped."""
-    from jinja2 import Environment, FileSystemLoader  # here: only a page needs it
-
-    loader = FileSystemLoader(TEMPLATES)
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.get_template(template).render(**values)
 
 
 def _sure(report: Report) -> list[tuple[str, str]]:

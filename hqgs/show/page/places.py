@@ -9,12 +9,12 @@ from markupsafe import Markup
 
 from hqgs.scene.next_photos import Spot, around, loose_photos
 from hqgs.scene.scene import Scene
+from hqgs.show.page.filled import filled
 
-WIDTH, HEIGHT, BORDER = 640, 420, 24  # px
+WIDTH, HEIGHT, BORDER = 640, 420, 24  # px, as its template has them
 DOTS = 300  # points that are drawn
 INNER = 90.0  # percent of the points that the picture has room for
 ARROW = 9.0  # px, of a camera
-SURE, LOOSE, NEXT = "#2f7fc4", "#d0672a", "#c03030"
 
 
 def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
@@ -44,34 +44,14 @@ def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
 
     named = {name for spot in spots for name in spot.photos}
     sure = {} if scene.sfm is None else scene.sfm.sure_px
-    loose = loose_photos(scene)
-    parts = [
-        Markup('<svg viewBox="0 0 {} {}" role="img"><title>cameras from above</title>').format(WIDTH, HEIGHT)
-    ]
-    label = Markup('<text x="{}" y="{}" text-anchor="middle" font-size="11">{}</text>')
-    dot = Markup('<circle cx="{}" cy="{}" r="1" fill="currentColor" opacity=".35"/>')
-    parts += [dot.format(*at(place)) for place in points]
+    loose, shown = loose_photos(scene), []
     for view, place in zip(views, cameras, strict=True):
         ahead = plane @ view.camera.viewmat[2, :3]
         length = float(np.linalg.norm(ahead))
         ahead = ahead / length * ARROW if length > 1e-6 else np.zeros(2)
-        x, y = at(place)
         px = sure.get(view.name)
-        color = LOOSE if view.name in loose else SURE
         words = view.name if px is None else f"{view.name}: sure to {px:.2f} px"
-        mark = Markup(
-            '<g stroke="{}"><circle cx="{}" cy="{}" r="3" fill="{}"><title>{}</title></circle>'
-            '<line x1="{}" y1="{}" x2="{}" y2="{}" stroke-width="1.5"/></g>'
-        )
-        tip = round(x + float(ahead[0]), 1), round(y + float(ahead[1]), 1)
-        parts.append(mark.format(color, x, y, color, words, x, y, *tip))
-        if view.name in named:
-            parts.append(label.format(x, y - 8, view.name))
-    star = Markup(
-        '<circle cx="{}" cy="{}" r="9" fill="none" stroke="{}" stroke-width="2"><title>{}</title></circle>'
-        '<text x="{}" y="{}" text-anchor="middle" font-weight="600">{}</text>'
-    )
-    for number, (spot, place) in enumerate(zip(spots, stars, strict=True), 1):
-        x, y = at(place)
-        parts.append(star.format(x, y, NEXT, spot.told, x, y + 4, number))
-    return Markup("").join([*parts, Markup("</svg>")])
+        name = view.name if view.name in named else ""
+        shown.append((*at(place), *at(place + ahead / scale), view.name in loose, words, name))
+    told = [(*at(place), spot.told) for spot, place in zip(spots, stars, strict=True)]
+    return filled("places.svg.j2", points=[*map(at, points)], cameras=shown, spots=told)
