@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from hqgs.scene.constants import GPS_LEAST, OUTLIER
@@ -114,9 +114,15 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
     )
 
 
+def _earth() -> Any:
+    import pycolmap  # here: to read a scene does not need it
+
+    return pycolmap.GPSTransform()
+
+
 def _ecef(gps: Array) -> Array:
     """Geocentric metres [N, 3] of degrees north, degrees east and metres of height [N, 3]."""
-    return np.asarray(pycolmap.GPSTransform().ellipsoid_to_ecef(gps))
+    return np.asarray(_earth().ellipsoid_to_ecef(gps))
 
 
 def _axes(start: Array) -> Array:
@@ -134,5 +140,5 @@ def _enu(gps: Array, start: Array) -> Array:
 def _geodetic(enu: Array, start: Array) -> tuple[float, float, float]:
     """Degrees north and east, and metres of height, of a point [3] in metres from `start`."""
     at = _ecef(start[None]) + enu @ _axes(start)
-    north, east, up = np.asarray(pycolmap.GPSTransform().ecef_to_ellipsoid(at))[0].tolist()
+    north, east, up = np.asarray(_earth().ecef_to_ellipsoid(at))[0].tolist()
     return north, east, up
