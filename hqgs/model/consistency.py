@@ -29,9 +29,9 @@ class SmallPhoto:
     scale: Floats  # [2]: what takes a pixel (x, y) of the view to one of this photo
 
     @classmethod
-    def of(cls, view: View) -> SmallPhoto:
+    def of(cls, view: View, longest: int = AGREE_LONGEST) -> SmallPhoto:
         whole = view.camera
-        view = shrunk(view, AGREE_LONGEST)
+        view = shrunk(view, longest)
         camera, grey = view.camera, as_floats(view.image).mean(2, dtype=np.float32)
         smooth = np.ascontiguousarray(gaussian_filter(grey, AGREE_SMOOTH), np.float32)
         scale = np.array([camera.width / whole.width, camera.height / whole.height])
@@ -92,14 +92,14 @@ class Agreement:
         return _rust.agreed_depths(
             look.grey if grey is None else grey,
             [self.looks[k].grey for k in others],
-            np.stack([_map(look.camera, self.looks[k].camera) for k in others]),
+            np.stack([pixel_map(look.camera, self.looks[k].camera) for k in others]),
             np.ascontiguousarray(pixels * look.scale),
             np.ascontiguousarray(ranges),
             agreeing,
         )
 
 
-def _map(first: Camera, second: Camera) -> Floats:
+def pixel_map(first: Camera, second: Camera) -> Floats:
     """The matrix [3, 4] that takes (x, y, 1, 1 / depth) of a pixel of the first camera to the second's."""
     relative = second.viewmat @ np.linalg.inv(first.viewmat)
     turn = second.K @ relative[:3, :3] @ np.linalg.inv(first.K)

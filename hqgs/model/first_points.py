@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement, SmallPhoto
-from hqgs.model.constants import AROUND, FLAT, LEAST_AROUND, WIDENED
+from hqgs.model.constants import AROUND, FLAT, LEAST_AROUND, STRAY, WIDENED
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.geometry import project, unproject
 from hqgs.scene.scene import View
@@ -101,6 +101,11 @@ class Surfaces:
         _, nearest = KDTree(self._pixels[number]).query(pixels, min(AROUND, len(depths)))
         around = depths[nearest]
         return np.stack([around.min(1) / widened, around.max(1) * widened], axis=1)
+
+    def bounds(self, number: int) -> Floats:
+        """The nearest and the farthest depth [2] at which anything of a view is sought, but for strays."""
+        ends = np.quantile(self._depths[number], (STRAY, 1 - STRAY)) if self.known(number) else np.ones(2)
+        return ends * (1 / WIDENED, WIDENED)
 
 
 def gathered(views: Sequence[View], found: Sequence[Found]) -> tuple[Points, Colors]:

@@ -1,7 +1,9 @@
 """First points that photos find in each other: all over what at least two of them show.
 
 Between points of a reconstruction depths are sought twice. What is found at first, and found back by other
-photos, tells more closely where to look; so does it where no two others agree, and one alone must.
+photos, tells more closely where to look; so does it where no two others agree, and one alone must. What none
+bears out gets, of few photos, the depth that lies smoothly between (`semi_global`), unless a surface speaks
+against it.
 """
 
 from __future__ import annotations
@@ -12,8 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.model.consistency import Agreement
-from hqgs.model.constants import ALONE, AROUND_KNOWN, ASKED_AGAIN, FOUND_BACK, WIDENED
+from hqgs.model.consistency import Agreement, SmallPhoto
+from hqgs.model.constants import (
+    ALONE,
+    AROUND_KNOWN,
+    ASKED_AGAIN,
+    FOUND_BACK,
+    SMOOTH_LONGEST,
+    SMOOTH_PHOTOS,
+    WIDENED,
+)
 from hqgs.model.first_points import (
     STAGE,
     Colors,
@@ -25,6 +35,7 @@ from hqgs.model.first_points import (
     gathered,
     shares,
 )
+from hqgs.model.semi_global import DenseDepths
 from hqgs.scene.geometry import in_frame, project, unproject
 from hqgs.scene.scene import View
 
@@ -56,6 +67,7 @@ def points_found_back(
         sure.append((k, pixels[by_two], depths[by_two]))
     for k, pixels, depths in sure:
         surfaces.add(k, pixels, depths)
+    smooth = _smooth_depths(views, surfaces, agreement) if len(views) <= SMOOTH_PHOTOS else None
     found = list[Found]()
     for k, share in enumerate(each):
         on_stage(Stage(STAGE, len(views) + k + 1, looks))
@@ -63,8 +75,20 @@ def points_found_back(
             continue
         pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k, 1]))
         depths, kept = _borne_out(agreement, surfaces, k, pixels)
+        if smooth is not None:
+            between, stands = smooth.at(k, pixels)
+            depths, kept = np.where(kept, depths, between), kept | stands
         found.append((k, pixels[kept], depths[kept]))
     return *gathered(views, found), agreeing / max(count, 1)
+
+
+def _smooth_depths(views: Sequence[View], surfaces: Surfaces, agreement: Agreement) -> DenseDepths:
+    looks = [SmallPhoto.of(view, SMOOTH_LONGEST) for view in views]
+    return DenseDepths(
+        looks,
+        [agreement.asked(k) for k in range(len(views))],
+        [surfaces.bounds(k) for k in range(len(views))],
+    )
 
 
 def _borne_out(
