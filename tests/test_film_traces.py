@@ -15,6 +15,7 @@ from hqgs.diagnosis.scene import diagnose_scene
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import area_downscale
+from hqgs.training.constants import FILM_NOISE
 from hqgs.training.trainer import Trainer
 from tests.tiny_scene import tiny_config, tiny_scene
 
@@ -66,18 +67,23 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     )
 
 
-def test_a_coarse_film_has_the_rates_of_3dgs() -> None:
-    """Alone; what else happened to the photos asks for the higher ones."""
-    scene, faster = tiny_scene(), {}
-    for kind in ("none", "video", "jpeg:30", "video+exposure", "noise:10"):
-        faster[kind] = Trainer(scene, tiny_config(method="hqgs", hqgs=fixed(kind))).config.faster_rates
-    assert faster == {
-        "none": True,
-        "video": False,
-        "jpeg:30": False,
-        "video+exposure": True,
-        "noise:10": True,
-    }
+def test_a_coarse_film_trains_as_noisy_photos() -> None:
+    """Alone; where cameras are learned beside it, as photos without a fault."""
+    noisy, film, plain, both = (
+        Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=replace(fixed(kind), held_pixels=False)))
+        for kind in (f"noise:{FILM_NOISE:g}", "video", "exposure", "video+exposure")
+    )
+    assert replace(film.config, hqgs=noisy.config.hqgs) == noisy.config
+    assert film.config.densify != both.config.densify == plain.config.densify
+    film.step()
+    noisy.step()
+    assert (film.gaussians.means == noisy.gaussians.means).all()
+
+
+def test_the_errors_of_a_codec_hold_no_pixels_back() -> None:
+    """They go together from pixel to pixel, so that one tells of the next."""
+    film = Trainer(tiny_scene(), tiny_config(method="hqgs", hqgs=fixed("video")))
+    assert not any("held" in name for name in film.method.state_dict())
 
 
 def test_a_shaken_film_trains_as_shaken_photos() -> None:

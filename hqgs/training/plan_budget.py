@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from hqgs.photos.formula import Degradation
+from hqgs.photos.formula import FILM, Degradation
 from hqgs.training.config import DensifyConfig
-from hqgs.training.constants import DETERMINED, NOISE_HALVING, PIXELS, TIMES_OWN_POINTS
+from hqgs.training.constants import DETERMINED, FILM_NOISE, NOISE_HALVING, PIXELS, TIMES_OWN_POINTS
 from hqgs.training.plan import Facts
 
 
@@ -62,7 +62,9 @@ def sharp_pixels(facts: Facts, formation: Degradation, noise: float = 0.0) -> fl
 
 
 def noise_of(formation: Degradation) -> float:
-    """Standard deviation of the photos' noise, where 1 is white."""
+    """Standard deviation of the photos' noise, where 1 is white; of a coarse film what its codec left."""
+    if {step.kind for step in formation.steps} == FILM:
+        return FILM_NOISE / 255
     return next((step.value or 0.0 for step in formation.steps if step.kind == "noise"), 0.0) / 255
 
 

@@ -13,7 +13,7 @@ from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.constants import SCATTER
-from hqgs.photos.formula import LEARNED, parse_formation
+from hqgs.photos.formula import FILM, LEARNED, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
     COARSE_FACTOR,
@@ -104,7 +104,7 @@ def loss(draft: Draft) -> Sequence[Choice]:
     if "jpeg" in has:
         why = "a file says no more of a coefficient than the cell that it lies in"
         rows = [Choice(f"distance to the JPEG's cells + {draft.settings.hqgs.jpeg_pixels:g} L1", why)]
-    elif "noise" in has:
+    elif "noise" in has or has == FILM:
         why = "the photos' mean is nearer to the truth than their median, and D-SSIM asks for the noise"
         rows = [Choice(f"squares up to {KNEE:g} sigma of the noise, then L1", why)]
     else:
@@ -134,7 +134,7 @@ def rates(draft: Draft) -> Sequence[Choice]:
     if asked is not None or not draft.formed:
         value = "higher in short runs" if asked else "those of 3DGS"
         return [Choice(value, "as published" if asked is None else "asked for")]
-    if has in ({"jpeg"}, {"video"}):
+    if has == {"jpeg"}:
         why = "what a codec leaves open is learned sooner at higher rates, and nothing holds it back"
         return [Choice("those of 3DGS", why, changes={"faster_rates": False})]
     why = "those of 3DGS suit its 30,000 iterations"

@@ -21,6 +21,7 @@ from hqgs.training.config import AUTO
 from hqgs.training.methods.base import Target
 from hqgs.training.methods.held_pixels import HeldPixels
 from hqgs.training.methods.jpeg_cells import Coefficients, JpegCells
+from hqgs.training.plan_budget import noise_of
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Formation:
         self.degradation = degradation
         kinds = {step.kind: step.value for step in degradation.steps}
         self.kinds: frozenset[str] = frozenset(kinds)
-        self.noise: float = float(kinds.get("noise") or 0.0) / 255  # standard deviation, where 1 is white
+        self.noise: float = noise_of(degradation)  # standard deviation, where 1 is white
         self.factor: int = int(kinds.get("lowres") or 1)  # by which the photos were enlarged
         self._quality = int(kinds["jpeg"] or 0) if "jpeg" in kinds else None
         self.directions: Mapping[str, float] = directions

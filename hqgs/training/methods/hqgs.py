@@ -14,7 +14,7 @@ from hqgs.diagnosis.devices import plain_devices
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import enlarge
-from hqgs.photos.formula import DEVICES, LEARNED, OWN
+from hqgs.photos.formula import DEVICES, FILM, LEARNED, OWN
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
@@ -47,8 +47,8 @@ class HQGS(Method[FormedTarget]):
     - Noise, each photo its own (grain): the noisy ones are compared as above, the others as 3DGS does.
       Those show what is noise: a budget or other rates are not needed.
     - None of them: the loss of 3DGS, and the start below.
-    - A film's codec (video): 3DGS's loss and rates.
-    - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG or video alone.
+    - A coarse film's codec (video) and nothing else: as noise of FILM_NOISE levels, without held pixels.
+    - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG alone.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
     - Growth has a budget, and no resets (plan_budget.py).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
@@ -70,7 +70,8 @@ class HQGS(Method[FormedTarget]):
         self.formation: Formation = find_formation(scene, config.formation, inspector)
         kinds = self.formation.kinds
         self.as_photographed: bool = not kinds
-        self.noise: float = self.formation.noise
+        # A film's photos share what its codec left, so that a scene learns it: it is nothing to expect.
+        self.noise: float = 0.0 if kinds == FILM else self.formation.noise
         self._views = scene.train
         self._numbers = {view.name: k for k, view in enumerate(scene.train)}
         self._cameras: LearnedCameras | None = None
@@ -117,7 +118,7 @@ class HQGS(Method[FormedTarget]):
     def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
         if self._cameras is not None:
             self._cameras.schedule(iterations)
-        if not self.formation.kinds <= set(OWN):
+        if not self.formation.kinds <= set(OWN) or self.formation.kinds == FILM:
             self._measure(gaussians, 0)
         return gaussians
 
