@@ -7,7 +7,7 @@ size, never on test photos. Those of 3DGS's densification are the defaults of `D
 import math
 
 # The plan: points to start from, budget, length.
-PIXELS = 50  # of the photos, for each point to start from where they are as photographed
+PIXELS = 100  # of the photos, for each point to start from where they are as photographed
 TIMES_OWN_POINTS = 1.5  # the scene's own points so many times at least
 NOISE_HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 # Levels of noise that the codec of a coarse film counts as. On fern, fox, horns and the room (168 px,
