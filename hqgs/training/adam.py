@@ -76,11 +76,8 @@ class Adam(torch.optim.Optimizer):
             with torch.enable_grad():
                 loss = closure()
         counts = views or {}
-        writes, changed, steps = (
-            list[tuple[Any, ...]](),
-            list[Tensor](),
-            list[tuple[dict[str, Any], Tensor]](),
-        )
+        writes, changed = list[tuple[Any, ...]](), list[Tensor]()
+        steps = list[tuple[dict[str, Any], Tensor]]()
         for group in self.param_groups:
             if asked := [name for name in UNSUPPORTED if group.get(name)]:
                 raise ValueError(f"param_groups: {asked} of torch.optim.Adam cannot be had here")
@@ -96,7 +93,8 @@ class Adam(torch.optim.Optimizer):
                     writes.append(_write(param, *moments, step, group, count))
                     changed += param, *moments
         _rust.adam_steps(writes)
-        increment_version(changed)  # written behind torch's back
+        for tensor in changed:  # written behind torch's back; torch 2.5 takes one at a time
+            increment_version(tensor)
         for state, step in steps:
             state["step"] = step  # a new tensor: a loaded state dict may share the old one
         return loss
