@@ -55,7 +55,8 @@ def points_found_back(
     pixels at which photos agree.
 
     A pixel counts where two others agree and one of them finds it back, or where one alone agrees much and
-    finds it back: at the depth that it has there, within FOUND_BACK px.
+    finds it back: at the depth that it has there, within FOUND_BACK px. Of at most SMOOTH_PHOTOS photos the
+    others count at the depth that lies smoothly between, where that can stand (`DenseDepths.at`).
     """
     surfaces = Surfaces(views, points, seen)
     each, looks = shares(count, len(views)), 2 * len(views)

@@ -27,7 +27,7 @@ from hqgs.model.constants import (
     SMOOTH_PATCH,
     UNLIKE,
 )
-from hqgs.scene.geometry import in_frame, project, unproject
+from hqgs.scene.geometry import project, unproject, within
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.float32]  # [h, w]
@@ -77,8 +77,9 @@ class DenseDepths:
         for other, there in enumerate(self._looks):
             if other == number:
                 continue
-            rows = np.flatnonzero(in_frame(there.camera, points))
-            at, far = project(there.camera, points[rows])
+            at, far = project(there.camera, points)
+            rows = np.flatnonzero(within(there.camera, at, far))
+            at, far = at[rows], far[rows]
             cell = _cells(at, self._depths[other].shape)
             theirs = self._depths[other][cell]
             back, _ = project(look.camera, unproject(there.camera, at, theirs))

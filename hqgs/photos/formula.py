@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Set
 from dataclasses import dataclass, replace
 
 
@@ -63,6 +64,11 @@ NOT_MADE = {
     ),
     "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
 }  # what a method can be told of only, and what to write for photos
+
+
+def undegraded(kinds: Set[str]) -> bool:
+    """Whether photos are as photographed, or each with what its own camera did; a film alone is not."""
+    return kinds <= set(OWN) and kinds != FILM
 
 
 def grammar() -> str:

@@ -15,7 +15,7 @@ from hqgs.base.text import aligned
 from hqgs.base.typed import build
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.records import PlanRowRecord
-from hqgs.photos.formula import FILM, NONE, OWN, Degradation, parse_formation
+from hqgs.photos.formula import NONE, Degradation, parse_formation, undegraded
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
 
 
@@ -141,7 +141,7 @@ class Draft:
     @property
     def undegraded(self) -> bool:
         """Photos as photographed, or each with what its own camera did: they bear 3DGS's growth."""
-        return self.formed and self.kinds <= set(OWN) and self.kinds != FILM
+        return self.formed and undegraded(self.kinds)
 
     @property
     def dense(self) -> bool:

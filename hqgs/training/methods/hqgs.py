@@ -14,7 +14,7 @@ from hqgs.diagnosis.devices import plain_devices
 from hqgs.diagnosis.scene import Inspector
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import enlarge
-from hqgs.photos.formula import DEVICES, FILM, LEARNED, OWN
+from hqgs.photos.formula import DEVICES, FILM, LEARNED, undegraded
 from hqgs.photos.pixels import floats
 from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
@@ -118,7 +118,7 @@ class HQGS(Method[FormedTarget]):
     def start(self, gaussians: Gaussians, iterations: int) -> Gaussians:
         if self._cameras is not None:
             self._cameras.schedule(iterations)
-        if not self.formation.kinds <= set(OWN) or self.formation.kinds == FILM:
+        if not undegraded(self.formation.kinds):
             self._measure(gaussians, 0)
         return gaussians
 
