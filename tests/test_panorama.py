@@ -19,6 +19,7 @@ from hqgs.base.stages import Stage
 from hqgs.diagnosis.constants import TURNED
 from hqgs.diagnosis.differences import unlike_sharpness
 from hqgs.evaluation.metrics import psnr
+from hqgs.scene import views
 from hqgs.scene.builtin.panorama import panorama_room
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
 from hqgs.scene.geometry import project
@@ -131,10 +132,13 @@ def off(view: View) -> Floats:
     return found if view.mask is None else np.where(view.mask, found, 0)
 
 
-def test_a_panorama_is_read_as_the_faces_of_a_cube(tmp_path: Path) -> None:
-    width = 720
+def test_a_panorama_is_read_as_the_faces_of_a_cube(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And decoded once for all of them."""
+    width, real, opened = 720, views.decode, list[str]()
+    monkeypatch.setattr(views, "decode", lambda path, *rest: opened.append(path.name) or real(path, *rest))
     write_model(tmp_path, around(width, width // 2), [panorama(pose, width) for pose in walk(2)])
     scene = load_scene(tmp_path, test_every=2)
+    assert sorted(opened) == ["00.png", "01.png"]
     assert [view.name for view in scene.test] == sorted(face_name("00.png", face) for face in CUBE)
     assert [view.name for view in scene.train] == sorted(face_name("01.png", face) for face in CUBE)
     for view in [*scene.train, *scene.test]:

@@ -11,8 +11,9 @@ import os
 from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import groupby
 from threading import Lock
 
 import numpy as np
@@ -38,7 +39,7 @@ from hqgs.scene.constants import (
     MAX_WORKERS,
     SMALLEST_SIDE,
 )
-from hqgs.scene.faces import AROUND, Face, faces_of, lit, projected
+from hqgs.scene.faces import AROUND, CUBE, Face, faces_of, lit, projected
 from hqgs.scene.geometry import parts_of
 from hqgs.scene.lenses import check_camera, check_size, fits
 from hqgs.scene.scene import Camera, View
@@ -58,7 +59,8 @@ def load_views(
 
     Intrinsics scale with the true ratio of sizes, per axis. The second result tells, by name, why photos of
     the names in `optional` have no view: they, or their masks, cannot be decoded. `on_stage` hears each.
-    No more than MAX_WORKERS photos are in memory at more than the wanted size.
+    No more than MAX_WORKERS photos are in memory at more than the wanted size. A photo whose faces follow
+    each other is decoded once for all of them.
 
     `over`: what shows where photos are transparent, in place of a mask (`decode`).
 
@@ -72,7 +74,7 @@ def load_views(
 
     keep_large_arrays_apart()
 
-    @lru_cache(maxsize=_CAMERAS_KEPT)
+    @lru_cache(maxsize=len(CUBE) if any(photo.face for photo in photos) else _CAMERAS_KEPT)
     def made(key: _CameraKey) -> Pinhole:
         model, params, camera_width, camera_height, width, height, name = key
         camera = pycolmap.Camera(model=model, params=params, width=camera_width, height=camera_height)
@@ -87,36 +89,54 @@ def load_views(
 
     unreadable: dict[str, UnreadableError] = {}
 
-    def load(photo: Photo) -> View | None:
-        try:
-            return _load_view(photo, downscale, pinhole, over)
-        except UnreadableError as error:
-            if photo.name not in optional:
-                raise
-            unreadable[photo.name] = error
-            return None
+    def load(faces: list[Photo]) -> list[View]:
+        views, decoded = list[View](), None
+        for photo in faces:
+            try:
+                decoded = decoded or _decoded(photo, downscale, over)
+                views.append(_view(photo, decoded, downscale, pinhole, over is not None))
+            except UnreadableError as error:
+                if photo.name not in optional:
+                    raise
+                unreadable[photo.name] = error
+        return views
 
+    groups = [list(faces) for _, faces in groupby(photos, lambda photo: (photo.path, id(photo.camera)))]
     with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
-        jobs = [pool.submit(load, photo) for photo in photos]
+        jobs = [pool.submit(load, faces) for faces in groups]
         try:
-            views = list[View]()
-            for k, job in enumerate(jobs):
-                if (view := job.result()) is not None:
-                    views.append(view)
-                on_stage(Stage("photos read", k + 1, len(photos)))
-                if (k + 1) % GIVEN_BACK == 0 or k + 1 == len(photos):
+            views, done = list[View](), 0
+            for k, (faces, job) in enumerate(zip(groups, jobs, strict=True)):
+                views += job.result()
+                done += len(faces)
+                on_stage(Stage("photos read", done, len(photos)))
+                if (k + 1) % GIVEN_BACK == 0 or done == len(photos):
                     give_back_memory()
         finally:
             pool.shutdown(cancel_futures=True)  # after an error the photos still waiting are not wanted
     return views, {photo.name: unreadable[photo.name] for photo in photos if photo.name in unreadable}
 
 
-def _load_view(
-    photo: Photo,
-    downscale: float,
-    pinhole: Callable[[_CameraKey], Pinhole],
-    over: tuple[float, float, float] | None,
-) -> View:
+@dataclass
+class _Decoded:
+    """A photo, for the views that are made of it."""
+
+    image: Pixels  # [H, W, 3], of a cut-out photo with a fourth channel
+    mask: NDArray[np.bool_] | None  # [H, W]
+    stored: tuple[int, int]  # width and height of the file
+    size: tuple[float, float]  # width and height of the photo in pixels of `image`
+    turns: int
+    device: str
+    kept: dict[tuple[int, int], tuple[Pixels, NDArray[np.bool_] | None]] = field(default_factory=dict)
+
+    def coarser(self, width: int, height: int) -> tuple[Pixels, NDArray[np.bool_] | None]:
+        """Means over so many areas, kept for the next face."""
+        if (width, height) not in self.kept:
+            self.kept[width, height] = area_downscale(self.image, self.mask, width, height, self.size)
+        return self.kept[width, height]
+
+
+def _decoded(photo: Photo, downscale: float, over: tuple[float, float, float] | None) -> _Decoded:
     camera, stored = photo.camera, stored_size(photo.path)
     exif = read_exif(photo.path)
     turns, upright = exif.quarter_turns, 0
@@ -138,10 +158,18 @@ def _load_view(
     if photo.mask_path is not None:
         counts = decode_mask(photo.mask_path, width, height)
         mask = counts if mask is None else mask & counts
-    size = stored[0] / shrunk(stored[0], width), stored[1] / shrunk(stored[1], height)
     if photo.face is not None and camera.model.name != AROUND and not (light := lit(image[..., :3])).all():
         mask = light if mask is None else mask & light
+    alike = f"{camera.model.name} {camera.params.tolist()} {stored[0]} x {stored[1]}"
+    size = stored[0] / shrunk(stored[0], width), stored[1] / shrunk(stored[1], height)
+    return _Decoded(image, mask, stored, size, turns, " ".join(exif.camera) or alike)
 
+
+def _view(
+    photo: Photo, decoded: _Decoded, downscale: float, pinhole: Callable[[_CameraKey], Pinhole], cut_out: bool
+) -> View:
+    camera, stored = photo.camera, decoded.stored
+    image, mask, size = decoded.image, decoded.mask, decoded.size
     face = "" if photo.face is None else photo.face.name
     key = (camera.model.name, tuple(camera.params), camera.width, camera.height, *stored, face)
     try:
@@ -159,7 +187,7 @@ def _load_view(
         apart = flat.width / columns * size[0] / stored[0]  # pixels of the photo from one sample to the next
         if apart > FAR_SAMPLES:
             w, h = (max(1, round(side / apart)) for side in size)
-            (image, mask), size = area_downscale(image, mask, w, h, size), (w, h)
+            (image, mask), size = decoded.coarser(w, h), (w, h)
         image, mask = flat.picture(image, size), flat.mask(mask)
         size = None
     image, mask = area_downscale(image, mask, width, height, size)
@@ -168,10 +196,8 @@ def _load_view(
         mask = None
     camera_now = Camera(width, height, K, photo.viewmat)
     film = photo.film if downscale <= FILM_SHRUNK else None
-    alike = f"{camera.model.name} {camera.params.tolist()} {stored[0]} x {stored[1]}"
-    device = " ".join(exif.camera) or alike
-    image, empty = (image, None) if over is None else parts_of(image)
-    return View(photo.name, camera_now, image, mask, None, turns, film, device, face, empty)
+    image, empty = parts_of(image) if cut_out else (image, None)
+    return View(photo.name, camera_now, image, mask, None, decoded.turns, film, decoded.device, face, empty)
 
 
 @dataclass(frozen=True)
@@ -196,11 +222,12 @@ class Pinhole:
         grid, (height, width) = self.grid, image.shape[:2]
         if size is not None and size != (width, height):
             grid = (grid + 1) * torch.tensor([size[0] / width, size[1] / height]) - 1
-        channels = torch.from_numpy(image).permute(2, 0, 1)[None].float()
+        pixels = torch.from_numpy(image)
         if self.around:
             seam = CUBIC_RADIUS  # columns beyond both ends that the interpolation reads
-            channels = torch.nn.functional.pad(channels, (seam, seam, 0, 0), mode="circular")
+            pixels = torch.cat([pixels[:, -seam:], pixels, pixels[:, :seam]], 1)
             grid = grid * torch.tensor([width / (width + 2 * seam), 1.0])
+        channels = pixels.permute(2, 0, 1)[None].float()
         out = torch.nn.functional.grid_sample(
             channels, grid, mode="bicubic", padding_mode="border", align_corners=False
         )
