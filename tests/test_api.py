@@ -134,6 +134,9 @@ def test_the_preparation_is_told() -> None:
     scene = replace(scene, points=scene.points[:5], point_colors=scene.point_colors[:5], seen=seen)
     hqgs.train(scene, config=tiny_config(2, method="hqgs"), on_stage=stages.append)
     counts = [(stage.what, stage.done, stage.total) for stage in stages]
+    between = [count for count in counts if count[0] == "depths between first points"]
+    assert between == [("depths between first points", k, 5) for k in range(1, 6)] == counts[10:15]
+    counts = counts[:10] + counts[15:]
     assert counts[:5] == [("photos diagnosed", k, 5) for k in range(1, 6)]
     assert counts[5:15] == [("first points, from photos", k, 10) for k in range(1, 11)]  # two looks at each
     assert [what for what, *_ in counts[15:]] == ["planned"]

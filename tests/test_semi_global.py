@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 from test_learned_cameras import textured_scene
 
-from hqgs.model.consistency import SmallPhoto
+from hqgs.model.consistency import SmallPhoto, pixel_map
 from hqgs.model.constants import ACROSS_EDGES, JUMP, LAYERS, SLOPE
 from hqgs.model.semi_global import DenseDepths, _along, _smoothed, depths_of
 
@@ -59,3 +60,26 @@ def test_what_no_other_photo_bears_out_does_not_stand() -> None:
     noise = [looks[0], *(replace(look, grey=rng.random(look.grey.shape, np.float32)) for look in looks[1:])]
     _, stands = DenseDepths(noise, everyone, [BOUNDS] * 4).at(0, pixels)
     assert stands.mean() < 0.3
+
+
+def test_masked_pixels_are_compared_with_nothing() -> None:
+    """Someone who walks along looks alike in two photos, at a depth that is not the scene's."""
+    looks = [SmallPhoto.of(view) for view in VIEWS]
+    high, wide = looks[3].grey.shape
+    x, y = np.meshgrid(np.arange(wide) + 0.5, np.arange(high) + 0.5)
+    m = pixel_map(looks[3].camera, looks[0].camera)
+    to_x, to_y, w = (row[0] * x + row[1] * y + row[2] + row[3] * 1.6 for row in m)
+    walked = map_coordinates(looks[0].grey, [to_y / w - 0.5, to_x / w - 0.5], order=1, mode="nearest")
+    seen = np.ones((high, wide), bool)
+    seen[20:70, 20:70] = False
+    passing = replace(looks[3], grey=np.where(seen, looks[3].grey, walked))
+    off = []
+    for other in (passing, replace(passing, mask=seen)):
+        depths, _ = depths_of(looks[0], [other], BOUNDS)
+        off.append(np.abs(1 / depths - 1)[30:60, 30:60])
+    assert np.median(off[0]) > 0.4
+    assert np.median(off[1]) < 0.1
+    everyone = [[j for j in range(4) if j != k] for k in range(4)]
+    hidden = [looks[0], *(replace(look, mask=np.zeros_like(seen)) for look in looks[1:])]
+    _, stands = DenseDepths(hidden, everyone, [BOUNDS] * 4).at(0, np.full((1, 2), 48.0))
+    assert not stands.any()

@@ -68,7 +68,13 @@ def points_found_back(
         sure.append((k, pixels[by_two], depths[by_two]))
     for k, pixels, depths in sure:
         surfaces.add(k, pixels, depths)
-    smooth = _smooth_depths(views, surfaces, agreement) if len(views) <= SMOOTH_PHOTOS else None
+    smooth = None
+    if len(views) <= SMOOTH_PHOTOS:
+        small = [SmallPhoto.of(view, SMOOTH_LONGEST) for view in views]
+        asked, bounds = zip(
+            *((agreement.asked(k), surfaces.bounds(k)) for k in range(len(views))), strict=True
+        )
+        smooth = DenseDepths(small, asked, bounds, on_stage)
     found = list[Found]()
     for k, share in enumerate(each):
         on_stage(Stage(STAGE, len(views) + k + 1, looks))
@@ -81,15 +87,6 @@ def points_found_back(
             depths, kept = np.where(kept, depths, between), kept | stands
         found.append((k, pixels[kept], depths[kept]))
     return *gathered(views, found), agreeing / max(count, 1)
-
-
-def _smooth_depths(views: Sequence[View], surfaces: Surfaces, agreement: Agreement) -> DenseDepths:
-    looks = [SmallPhoto.of(view, SMOOTH_LONGEST) for view in views]
-    return DenseDepths(
-        looks,
-        [agreement.asked(k) for k in range(len(views))],
-        [surfaces.bounds(k) for k in range(len(views))],
-    )
 
 
 def _borne_out(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 
+from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import SmallPhoto, pixel_map
 from hqgs.model.constants import (
     ACROSS_EDGES,
@@ -38,17 +39,25 @@ class DenseDepths:
     """Depths of all pixels of small photos, and which of them another photo confirms.
 
     None is confirmed where the photo shows something that no other shows there: smooth it is all the same.
+    Masked pixels are compared with nothing, and bear nothing out.
     """
 
     def __init__(
-        self, looks: Sequence[SmallPhoto], asked: Sequence[Sequence[int]], bounds: Sequence[Floats]
+        self,
+        looks: Sequence[SmallPhoto],
+        asked: Sequence[Sequence[int]],
+        bounds: Sequence[Floats],
+        on_stage: OnStage = silent,
     ) -> None:
         """`asked`: for each photo the numbers of those that it is compared with; `bounds`: its nearest and
-        farthest depth [2]."""
+        farthest depth [2]; `on_stage` hears of each."""
         self._looks = looks
-        found = [depths_of(looks[k], [looks[j] for j in asked[k]], bounds[k]) for k in range(len(looks))]
-        self._depths = [depths for depths, _ in found]
-        self._scores = [scores for _, scores in found]
+        self._depths, self._scores = list[Floats](), list[Grey]()
+        for k, look in enumerate(looks):
+            depths, scores = depths_of(look, [looks[j] for j in asked[k]], bounds[k])
+            self._depths.append(depths)
+            self._scores.append(scores)
+            on_stage(Stage("depths between first points", k + 1, len(looks)))
         self._confirmed: list[NDArray[np.bool_]] = []
         for number, depths in enumerate(self._depths):
             confirmed, _ = self._asked_back(number, _all_pixels(looks[number]), depths.ravel())
@@ -79,6 +88,7 @@ class DenseDepths:
                 continue
             at, far = project(there.camera, points)
             rows = np.flatnonzero(within(there.camera, at, far))
+            rows = rows[_counts(there, at[rows])]
             at, far = at[rows], far[rows]
             cell = _cells(at, self._depths[other].shape)
             theirs = self._depths[other][cell]
@@ -121,6 +131,9 @@ def _likeness(look: SmallPhoto, others: Sequence[SmallPhoto], nearness: Floats) 
             front = w > 0
             to_x, to_y = to_x / np.where(front, w, 1), to_y / np.where(front, w, 1)
             shown = front & (to_x > 0.5) & (to_y > 0.5) & (to_x < wide - 0.5) & (to_y < high - 0.5)
+            if other.mask is not None:
+                pixels = np.stack([to_x, to_y], -1).reshape(-1, 2)
+                shown &= _counts(other, np.where(shown.reshape(-1, 1), pixels, 0)).reshape(shown.shape)
             if not shown.any():
                 continue
             at = [to_y - 0.5, to_x - 0.5]
@@ -129,6 +142,8 @@ def _likeness(look: SmallPhoto, others: Sequence[SmallPhoto], nearness: Floats) 
             products = _blurred(own * seen) - mean * their_mean
             correlation = products / np.sqrt(variance * their_variance)
             np.maximum(alike[layer], np.where(shown, correlation, -1), out=alike[layer])
+    if look.mask is not None:
+        alike[:, ~look.mask] = -1
     return np.ascontiguousarray(alike.transpose(1, 2, 0))
 
 
@@ -169,6 +184,11 @@ def _all_pixels(look: SmallPhoto) -> Floats:
     """Centres [h w, 2] of the pixels of a small photo."""
     high, wide = look.grey.shape
     return np.stack(np.meshgrid(np.arange(wide) + 0.5, np.arange(high) + 0.5), -1).reshape(-1, 2)
+
+
+def _counts(look: SmallPhoto, pixels: Floats) -> NDArray[np.bool_]:
+    """Which pixels [M, 2] no mask hides."""
+    return np.ones(len(pixels), bool) if look.mask is None else look.mask[_cells(pixels, look.mask.shape)]
 
 
 def _cells(pixels: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
