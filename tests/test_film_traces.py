@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from test_diagnose import clean_photo, degraded_scene
 from test_hqgs import fixed
 
+from hqgs.diagnosis import scene
 from hqgs.diagnosis.film_traces import film_detail
+from hqgs.diagnosis.own import Finding
 from hqgs.diagnosis.scene import diagnose_scene
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.pixels import as_floats
@@ -65,6 +67,14 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     assert why.startswith(
         "3 of 3 photos are told to be frames of a film; as decoded, the finest details are 0."
     )
+
+
+def test_frames_of_a_coarse_film_differ_by_its_codec(monkeypatch: pytest.MonkeyPatch) -> None:
+    shaken = Finding("shake", True, 0.25, None, "shake", "photos differ by 0.25 in sharpness")
+    monkeypatch.setattr(scene, "shake_finding", lambda _: shaken)
+    good, coarse = (diagnose_scene(degraded_scene(f"video:{crf}")) for crf in (12, 40))
+    assert (good.formation, coarse.formation) == ("shake", "video")
+    assert {name: needed for name, needed, _ in coarse.needs()}["shake"] is False
 
 
 def test_a_coarse_film_trains_as_noisy_photos() -> None:

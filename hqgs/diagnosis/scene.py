@@ -139,13 +139,15 @@ class Inspector:
             exposure = exposure_finding(self.log_gains(scene), photos)
             devices = device_findings(self.device_signs(scene))
             self._differences[everyone] = exposure, *devices, shake, focus_finding(scene, shake.needed)
-        own = self._differences[everyone]
+        own, film = self._differences[everyone], _video(photos)
+        if film.needed:
+            own = *own[:-2], *(_by_codec(part) for part in own[-2:])
         *_, shake, focus = own
         blur = _blur(photos)
         if unlike := [part.name for part in (shake, focus) if part.needed]:
             reason = f"each photo has its own, see {' and '.join(unlike)}"
             blur = replace(blur, needed=False, step=None, reason=reason)
-        parts = (*own, blur, _lowres(photos), _noise(photos), _jpeg(photos), _video(photos))
+        parts = (*own, blur, _lowres(photos), _noise(photos), _jpeg(photos), film)
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
         passed_over = _passed_over(len(scene.train), len(photos), taken)
         self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
@@ -221,6 +223,12 @@ def _video(photos: Sequence[PhotoDiagnosis]) -> Finding:
     if detail >= COARSE_FILM:
         return Finding("video", False, detail, spread, None, f"{reason} (needed below {COARSE_FILM:g})")
     return Finding("video", True, detail, spread, "video", reason)
+
+
+def _by_codec(unlike: Finding) -> Finding:
+    """Shake or focus of a coarse film, whose codec takes more of some frames than of others."""
+    reason = f"{unlike.reason}; in a coarse film its codec does that"
+    return replace(unlike, needed=False, step=None, reason=reason) if unlike.needed else unlike
 
 
 def _noise(photos: Sequence[PhotoDiagnosis]) -> Finding:
