@@ -20,7 +20,7 @@ from benchmarks.quality.run import PROTOCOLS
 from benchmarks.rows import RUN, Table
 from benchmarks.study import PHOTOS, Cell, Study, digest_of, grid
 from hqgs.photos.formula import parse_formation
-from hqgs.scene.scene import Scene, SfmReport
+from hqgs.scene.scene import Scene, SfmReport, View
 from hqgs.training.checkpoint import scene_fingerprint
 from hqgs.training.config import SRGSConfig, TrainConfig
 from hqgs.training.methods.paper import VARIANTS
@@ -123,6 +123,28 @@ def test_sheets_show_the_photo_and_every_render(out: Path, runs: dict[Any, dict[
         assert np.array_equal(sheet[line : line + 36, left : left + 48], render)
         below = sheet[2 * line + 36 + gap :, left : left + 48]
         assert np.array_equal(below, np.minimum(4 * np.abs(render - photo), 255))
+
+
+def test_a_small_sheet_shows_some_views_of_one_size_beside_their_renders(tmp_path: Path) -> None:
+    scene, width, height = tiny_scene(), 480, 360  # shown at half the size
+    view = scene.test[0]
+
+    def filled(level: int, height: int = height) -> View:
+        camera = replace(view.camera, width=width, height=height)
+        return replace(view, camera=camera, image=np.full((height, width, 3), level, np.uint8))
+
+    scene = replace(scene, test=[filled(20), filled(0, height + 40), *map(filled, (60, 100, 140, 180))])
+    for number in range(6):
+        Image.new("RGB", (width, height), (200 - 20 * number,) * 3).save(tmp_path / f"{number}.png")
+    kept = {number: {"hqgs": tmp_path / f"{number}.png"} for number in range(6)}
+    quality_cell.write_contacts(tmp_path / "all.jpg", scene, kept)
+    with Image.open(tmp_path / "all.jpg") as image:
+        assert image.width == 2 * 240 + 8
+        step = (image.height + 8) // 4  # of a line of a caption and pictures of 180 px
+        rows = [step * (k + 1) - 8 - 90 for k in range(4)]
+        found = [[image.getpixel((x, y)) for x in (120, 368)] for y in rows]
+    levels = np.array(found)[..., 0]
+    assert np.abs(levels - [[20, 200], [60, 160], [140, 120], [180, 100]]).max() <= 2, levels
 
 
 def test_finished_runs_are_not_repeated(

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.measure import MEASURED, Run, Training, train
 from benchmarks.protocol import degraded_view
 from benchmarks.quality.rivals import RIVALS
 from benchmarks.study import Cell
+from hqgs.base.evenly import middles
 from hqgs.base.files import atomic_path
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.constants import AMPLIFICATION, MASKED
@@ -25,10 +27,12 @@ from hqgs.evaluation.metrics import evaluate_view, mean_metrics, psnr
 from hqgs.model.render import render_view
 from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.photos.sheet import printable, sheet
+from hqgs.scene.geometry import shrunk_camera
 from hqgs.scene.scene import Scene, SfmReport
 from hqgs.training.config import AUTO
 from hqgs.training.trainer import Trainer
 
+CONTACTS, CONTACT_SIDE = 4, 240  # views of a small sheet, at most; their longest side there, px
 RENDERS = 3  # times that each held-out view is rendered
 METRICS = ("psnr", "ssim", "haarpsi", "psnr_aligned")  # that the table has
 FITTED = ("psnr_fitted", "ssim_fitted", "moved_px")  # with held-out cameras fitted, and their median move
@@ -129,6 +133,28 @@ def write_sheet(
     with atomic_path(path) as tmp:
         sheet([above, below]).save(tmp)
     return True
+
+
+def write_contacts(path: Path, clean: Scene, kept: Mapping[int, Mapping[str, Path]]) -> None:
+    """Write a small sheet: a line for some of the held-out views, its photo and the render of each row.
+
+    `kept`: the renders by the view's number. Views of another size than the first are not shown.
+    """
+    cameras = {number: shrunk_camera(clean.test[number].camera, CONTACT_SIDE) for number in kept}
+    sizes = {number: (camera.width, camera.height) for number, camera in cameras.items()}
+    size = next(iter(sizes.values()))
+    alike = [number for number in kept if sizes[number] == size]
+    lines = list[list[tuple[str, NDArray[np.uint8]]]]()
+    for k in middles(len(alike), CONTACTS):
+        view, files = clean.test[alike[k]], kept[alike[k]]
+        photo = Image.fromarray(to_uint8(as_floats(view.image)))
+        line = [(printable(view.name), np.asarray(photo.resize(size)))]
+        for label, file in files.items():
+            with Image.open(file) as image:
+                line.append((printable(label), np.asarray(image.convert("RGB").resize(size))))
+        lines.append(line)
+    with atomic_path(path) as tmp:
+        sheet(lines).save(tmp, quality=90)
 
 
 def _caption(label: str, value: float | None) -> str:

@@ -11,7 +11,7 @@ from benchmarks.command import Benchmark
 from benchmarks.measure import Run
 from benchmarks.pages.figures import crossed, gains
 from benchmarks.protocol import read_protocols
-from benchmarks.quality.cell import reconstruction, run_cell, write_sheet
+from benchmarks.quality.cell import reconstruction, run_cell, write_contacts, write_sheet
 from benchmarks.quality.rivals import RivalRow
 from benchmarks.rows import Table, facts
 from benchmarks.study import Cell, Study, begin
@@ -85,12 +85,17 @@ class Quality:
         for (name, kind, seed), cells in groups.items():
             if any(cell not in self.study.runs for cell in cells):
                 continue
-            scene = cells[0].scene
+            scene, kept = cells[0].scene, dict[int, dict[str, Path]]()
+            stem = self.args.out / "pictures" / f"{name}-{kind.replace(':', '_')}-s{seed}"
             for number in range(min(self.args.pictures, len(scene.test))):
-                path = self.args.out / "pictures" / f"{name}-{kind.replace(':', '_')}-s{seed}-{number}.png"
+                path = stem.with_name(f"{stem.name}-{number}.png")
                 renders = {cell.row.label: self.render(cell, number) for cell in cells}
-                if not write_sheet(path, scene, kind, seed, renders, number):
+                if write_sheet(path, scene, kind, seed, renders, number):
+                    kept[number] = renders
+                else:
                     lost.append(f"left out: picture {path.name}: the runs did not keep its renders")
+            if len(kept) > 1:
+                write_contacts(stem.with_name(f"{stem.name}.jpg"), scene, kept)
         return lost
 
     def tables(self) -> list[str]:
@@ -136,6 +141,7 @@ LISTED = "; ".join(f"{name}: {protocol.help}" for name, protocol in PROTOCOLS.it
 FIT = "measure a second time with each held-out camera fitted to the trained scene, as --sfm does"
 SFM = "poses and points from the degraded photos, the same for all rows"
 ALONE = "poses and points from the degraded photos against the scenes' own, without training"
+PICTURES = "sheets per scene and degradation, and a small one of some of them"
 OPTIONS: dict[str, dict[str, Any]] = {
     "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": LISTED},
     "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
@@ -143,6 +149,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--sfm": {"action": "store_true", "help": SFM},
     "--poses-only": {"action": "store_true", "help": ALONE},
     "--fit-cameras": {"action": "store_true", "help": FIT},
-    "--pictures": {"type": int, "default": 1, "metavar": "N", "help": "sheets per scene and degradation"},
+    "--pictures": {"type": int, "default": 1, "metavar": "N", "help": PICTURES},
 }
 BENCHMARK = Benchmark("error of each method over scenes, degradations and seeds", run, PROTOCOLS, OPTIONS)
