@@ -32,7 +32,7 @@ from hqgs.scene.scene import Scene, SfmReport
 from hqgs.training.config import AUTO
 from hqgs.training.trainer import Trainer
 
-CONTACTS, CONTACT_SIDE = 4, 240  # views of a small sheet, at most; their longest side there, px
+CONTACTS, CONTACT_SIDE, CONTACT_COLORS = 4, 232, 128  # of a small sheet: views, their longest side in px
 RENDERS = 3  # times that each held-out view is rendered
 METRICS = ("psnr", "ssim", "haarpsi", "psnr_aligned")  # that the table has
 FITTED = ("psnr_fitted", "ssim_fitted", "moved_px")  # with held-out cameras fitted, and their median move
@@ -154,7 +154,7 @@ def write_contacts(path: Path, clean: Scene, kept: Mapping[int, Mapping[str, Pat
                 line.append((printable(label), np.asarray(image.convert("RGB").resize(size))))
         lines.append(line)
     with atomic_path(path) as tmp:
-        sheet(lines).save(tmp, quality=90)
+        sheet(lines).quantize(CONTACT_COLORS, dither=Image.Dither.NONE).save(tmp, optimize=True)
 
 
 def _caption(label: str, value: float | None) -> str:

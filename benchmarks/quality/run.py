@@ -95,7 +95,7 @@ class Quality:
                 else:
                     lost.append(f"left out: picture {path.name}: the runs did not keep its renders")
             if len(kept) > 1:
-                write_contacts(stem.with_name(f"{stem.name}.jpg"), scene, kept)
+                write_contacts(stem.with_name(f"{stem.name}.png"), scene, kept)
         return lost
 
     def tables(self) -> list[str]:
