@@ -40,6 +40,13 @@ def poses_beside(runs: DataFrame, value: str = "psnr") -> DataFrame:
     return both.assign(cost=both["photos"] - both["own"])
 
 
+def costs_in_words(runs: DataFrame) -> str:
+    """The mean and the worst cost of poses from the photos, as held-out cameras are, and with them fitted."""
+    costs = [poses_beside(runs, value)["cost"] for value in ("psnr", "psnr_fitted")]
+    words = [f"{cost.mean():+.2f} dB (at worst {cost.min():+.2f})" for cost in costs]
+    return f"{words[0]}, fitted {words[1]}"
+
+
 def cost_of_poses(runs: DataFrame) -> str:
     """What poses from the photos cost, run by run: as held-out cameras are, and with them fitted."""
     kinds = ("psnr", *(["psnr_fitted"] if "psnr_fitted" in runs else []))

@@ -223,7 +223,7 @@ class TrainConfig:
     lr_sh0: float = 2.5e-3
     lr_shN: float = 2.5e-3 / 20  # noqa: N815
     faster_rates: bool | None = None  # in short runs (`learning_rates`); None: if the method has them
-    start_points: int = 100_000  # to start from at most, where photos agree on more than the scene has
+    start_points: int = 100_000  # to start from at most (twice that in short runs) where photos agree on more
     opacity_decay: float | None = None  # share of the opacities that each view takes away; None: by the plan
     dropout: float | None = None  # share of Gaussians left out of a step, at the end; None: likewise
     averaged: float | None = (

@@ -10,13 +10,13 @@ from hqgs.training.constants import DETERMINED, FILM_NOISE, NOISE_HALVING, PIXEL
 from hqgs.training.plan import Facts
 
 
-def first_points_wanted(facts: Facts, most: int) -> int:
-    """How many points photos without a fault call for, `most` at most.
+def first_points_wanted(facts: Facts, most: int, times: int = 1) -> int:
+    """How many points photos without a fault call for, `times` as many as usual, and as `most`.
 
     More than the scene's own always: those lie at corners alone, and a run from points all over the photos
     costs less.
     """
-    return min(most, max(facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))
+    return min(times * most, max(times * facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))
 
 
 def no_growth(growth: DensifyConfig) -> dict[str, int]:
