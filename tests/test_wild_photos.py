@@ -15,7 +15,7 @@ from scipy import ndimage
 from test_diagnose import clean_photo
 
 from hqgs.photos.camera import draw_gains
-from hqgs.photos.constants import PHONE_WHITE_BALANCE
+from hqgs.photos.constants import FPS, PHONE_WHITE_BALANCE
 from hqgs.photos.degrade import degrade_image, degrade_sequence, shake
 from hqgs.photos.formation import formation
 from hqgs.photos.formula import KINDS, OWN, parse_degradation, parse_formation
@@ -34,7 +34,7 @@ from hqgs.photos.shake import (
 from hqgs.photos.video import film
 from hqgs.photos.walkers import Figure
 
-NEW = ("shake", "exposure", "chat", "phone", "video", "video265", "crowd")
+NEW = ("shake", "exposure", "chat", "phone", "video", "video265", "videorate", "crowd")
 NOT_TOLD = tuple(kind for kind in NEW if kind not in OWN)
 
 
@@ -354,6 +354,21 @@ def test_a_film_comes_back(kind: str, size: tuple[int, int]) -> None:
     assert loss[1] > 4 * loss[0]
 
 
+def test_a_film_keeps_to_its_rate() -> None:
+    """And the bits that one second may be ahead; its frames take what they need."""
+    pytest.importorskip("av")
+    photo = as_floats(clean_photo(0))
+    images = [photo[2 * (k % 7) :][:64, 3 * (k % 9) :][:, :96] for k in range(40)]
+    loss = []
+    for bits in (0.05, 0.2):
+        frames = film(images, bits, "videorate")
+        sizes = np.array([frame.bytes for frame in frames])
+        assert 0.7 < 8 * sizes.sum() / (40 * 64 * 96 * bits) < (40 + FPS) / 40
+        assert sizes.max() > 3 * np.median(sizes)
+        loss.append(np.mean([np.square(f.image - i).mean() for f, i in zip(frames, images, strict=True)]))
+    assert loss[0] > 2 * loss[1]
+
+
 def test_a_film_has_the_same_bits_in_every_call() -> None:
     """Wherever its frames lie in memory; x264's vector code made another film of these in each call."""
     pytest.importorskip("av")
@@ -451,10 +466,10 @@ def test_bad_text_is_refused(text: str, message: str) -> None:
 def test_defaults() -> None:
     text = "+".join(NEW)
     assert str(parse_degradation(text).for_width(504)) == (
-        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36+crowd:3"
+        "shake:12+exposure:1+chat:252+phone:4+video:36+video265:36+videorate:0.1+crowd:3"
     )
     assert str(parse_degradation(text).for_width(252, 504)) == (
-        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36+crowd:3"
+        "shake:6+exposure:1+chat:252+phone:4+video:36+video265:36+videorate:0.1+crowd:3"
     )
     assert str(parse_degradation("some:shake").for_width(252)) == "some:shake:6"
 

@@ -64,7 +64,7 @@ def degrade_image(
     crowd: "walkers", each with place and looks (`hqgs.photos.walkers`);
     chat: "size" of the small photo [width, height] and "quality";
     phone: "electrons" of white;
-    video, video265: "frame" (its type: I, P or B) and "bytes" of the compressed frame.
+    video, video265, videorate: "frame" (its type: I, P or B) and "bytes" of the compressed frame.
     """
     return degrade_sequence([image], degradation, [rng], [factor])[0]
 
@@ -84,12 +84,13 @@ def degrade_sequence(
     all_steps = [degradation.for_width(*photo.size).steps for photo in photos]
     for k, step in enumerate(degradation.steps):
         if KINDS[step.kind].film:
-            crf = int(all_steps[0][k].value or 0)
-            frames = film([photo.now for photo in photos], crf, step.kind)
+            value = all_steps[0][k].value or 0
+            value = int(value) if KINDS[step.kind].integer else value
+            frames = film([photo.now for photo in photos], value, step.kind)
             for photo, frame in zip(photos, frames, strict=True):
                 photo.now, photo.jpeg = frame.image, None
                 photo.records.append(
-                    {"kind": step.kind, "value": crf, "frame": frame.kind, "bytes": frame.bytes}
+                    {"kind": step.kind, "value": value, "frame": frame.kind, "bytes": frame.bytes}
                 )
             continue
         for photo, steps, factor in zip(photos, all_steps, factors, strict=True):

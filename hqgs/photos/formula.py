@@ -49,6 +49,9 @@ KINDS = {
     "crowd": Kind(1, 99, "the most walkers in a photo", "N", integer=True, default=3, formation=False),
 }
 KINDS["video265"] = replace(KINDS["video"], formation=False, own=None)
+KINDS["videorate"] = Kind(
+    0.01, 8, "bits a pixel", "BITS", default=0.1, formation=False, some=False, film=True
+)
 NONE, MIXED, SOME = "none", "mixed", "some"
 DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  # in all photos of a camera
 LEARNED = tuple(name for name, kind in KINDS.items() if kind.own in ("photo", "camera"))
@@ -174,12 +177,13 @@ def parse_degradation(text: str) -> Degradation:
     | `chat[:SIDE]` | a messenger: shrunk, JPEG, enlarged | `hqgs.photos.degrade` |
     | `phone[:EV]` | a phone in low light: mosaic, noise, its processing, JPEG | `hqgs.photos.phone` |
     | `video[:CRF]`, `video265[:CRF]` | H.264 or H.265 over all photos, sorted by name | `hqgs.photos.video` |
+    | `videorate[:BITS]` | H.264 at a rate that varies below a bound, in bits a pixel | same |
     | `mixed` | `blur+lowres:2+noise:10+jpeg:20` | |
     | `some:STEP` | the step in half of the training photos only, at mixed strengths | `hqgs.scene.degrade` |
 
     Without a value, blur, defocus, motion and shake take 2.5, 5, 15 and 12 px for a width of 504 px and scale
-    with the photo's width; chat takes half of the longest side, exposure 1, crowd 3, phone 4 and both videos
-    36. ValueError names what is wrong and the values there are.
+    with the photo's width; chat takes half of the longest side, exposure 1, crowd 3, phone 4, videos 36
+    and 0.1 bits. ValueError names what is wrong and the values there are.
     """
     degradation = _parsed(text)
     for step in degradation.steps:

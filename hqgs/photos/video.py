@@ -21,6 +21,7 @@ _X265 = {"x265-params": "pools=none:frame-threads=1:wpp=0:info=0:log-level=none"
 CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
     "video": ("libx264", "h264", _X264),
     "video265": ("libx265", "hevc", _X265),
+    "videorate": ("libx264", "h264", _X264),
 }
 # Luma and chroma of 8 bits, ITU-R BT.601 with limited range: Y in 16..235, Cb and Cr in 16..240.
 _TO_YUV = np.array(
@@ -43,15 +44,15 @@ class FilmFrame:
     bytes: int  # of the compressed frame, in the first one with the headers
 
 
-def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[FilmFrame]:
+def film(images: Sequence[Float32], value: float, kind: str = "video") -> list[FilmFrame]:
     """Encode photos [H, W, 3] of one size, clipped and rounded to 8 bits, as one film, and decode it.
 
-    x264 (`video`) or x265 (`video265`) at a constant rate factor, preset medium, 30 frames per second, on one
+    x264 (`video`) or x265 (`video265`) at a constant rate factor, or x264 as in a phone (`videorate`):
+    `value` bits a pixel on the average, and no more in a second; preset medium, 30 frames per second, on one
     thread; otherwise the encoder's own defaults. Photos are BT.601 with limited range and 4:2:0 chroma, the
     mean of each 2 x 2 pixels; the way back interpolates the chroma bilinearly. Odd sides get their last row
     or column once more, which is cut off again. The same photos give the same bits with the same build of
-    PyAV. ValueError without PyAV (the extra `video`) or its encoder,
-    or for photos of several sizes.
+    PyAV. ValueError without PyAV (the extra `video`) or its encoder, or for photos of several sizes.
     """
     av = pyav("video")
     sizes = sorted({image.shape[1::-1] for image in images})
@@ -67,7 +68,10 @@ def film(images: Sequence[Float32], crf: int, kind: str = "video") -> list[FilmF
     out.width, out.height, out.pix_fmt = width + odd_columns, height + odd_rows, "yuv420p"
     out.time_base, out.framerate = Fraction(1, FPS), Fraction(FPS)
     out.thread_count = 1
-    out.options = {"crf": str(crf), "preset": "medium", **options}
+    out.options = {"crf": str(value), "preset": "medium", **options}
+    if kind == "videorate":
+        bits = str(round(value * FPS * width * height))
+        out.options |= {"crf": "-1", "b": bits, "maxrate": bits, "bufsize": bits}
     back = av.CodecContext.create(decoder, "r")
     back.thread_count = 1
 
