@@ -15,8 +15,8 @@ TIMES_OWN_POINTS = 1.5  # the scene's own points so many times at least
 NOISE_HALVING = 6.0  # levels of noise at which two pixels tell what one does without noise
 # Levels of noise that the codec of a coarse film counts as. On fern, fox, horns and the room (168 px,
 # `video:36`, 500 steps, held-out photos, one seed) +0.4 dB to none, +0.9 to 3dgs; in 2,000 steps +0.1 or so.
-# Of photos held back, at `video:40` (fox, the room) twice as much gains nothing; at `video:28` none is 0.15 dB
-# better than this (mean of the four), 0.6 on horns, where 10 levels win 0.1 of that back.
+# By photos held back, at `video:40` (fox, the room) twice as much gains nothing; at `video:28` none is 0.15
+# dB better than this (mean of the four), 0.6 on horns, where 10 levels win 0.1 of that back.
 FILM_NOISE = 20.0
 DETERMINED = 600.0  # Gaussians under noise, times the cube root of the pixels' worth of photos
 # So many iterations are enough where cameras are learned or photos are as photographed; of the latter also so
