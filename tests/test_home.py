@@ -47,6 +47,28 @@ def test_places_that_photos_bear_out_are_told_from_others(made: Made) -> None:  
     assert doubtful(few) == []  # too little was looked for
 
 
+def test_a_part_that_lies_wrong_as_a_whole_is_told(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
+    """Its photos bear each other out, and 12 points join it to the rest: two sides of a house look alike."""
+    monkeypatch.setattr("hqgs.scene.sfm.agree.WEAKLY_JOINT", 20)  # photos share fewer here than real ones
+    model, true, folder = made
+    names, tracks = read_tracks(model)
+    part = (tracks.view >= 5).astype(np.intp)
+    count, joint = len(tracks.points), tracks.point < 12
+    turn = Rotation.from_euler("y", 6, degrees=True).as_matrix()
+    for shift in (np.eye(3), turn):  # of the world of photos 5 to 7
+        for k, pose in enumerate(true):
+            placed = np.concatenate([pose[:, :3] @ shift.T, pose[:, 3:]], 1) if k >= 5 else pose
+            model.frames[model.images[k + 1].frame_id].rig_from_world = pycolmap.Rigid3d(placed)
+        point = np.where(joint, tracks.point, tracks.point + part * count)
+        points = np.concatenate([tracks.points, tracks.points @ shift.T])
+        apart = replace(
+            tracks, points=points, colors=np.zeros((2 * count, 3), np.uint8), view=tracks.view, point=point
+        )
+        told = agreement(rebuilt(model, names, apart.chosen(np.ones(len(point), bool))), folder)
+        doubted = [name for name, counts in told.items() if not confirmed(*counts)]
+        assert doubted == ([] if shift is not turn else ["5.png", "6.png", "7.png"])
+
+
 @pytest.fixture
 def attempt(cards: Scene, tmp_path: Path) -> Attempt:  # noqa: F811
     """A pass over the cards' photos, all of which have a place."""

@@ -1,8 +1,10 @@
 """Whether photos show what a model says that they should: a check of their places that needs no truth.
 
 Points that a photo should show are looked for in it by their patches: where its place says that they are,
-whatever features told, and beside it, where only chance lets them agree. It imports of hqgs what needs
-nothing else: `program.py` uses it in COLMAP's process.
+whatever features told, and beside it, where only chance lets them agree. Photos of a part that few points
+join to the rest bear each other out wherever it lies (two sides of a building look alike): there the points
+of the other parts alone are looked for. It imports of hqgs what needs nothing else: `program.py` uses it in
+COLMAP's process.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from hqgs.scene.sfm.constants import DEVIATIONS, JOINT, REACH, SEARCHED, TIMES
+from hqgs.scene.sfm.constants import DEVIATIONS, JOINT, REACH, SEARCHED, TIMES, WEAKLY_JOINT
 from hqgs.scene.sfm.patches import PatchView, fitted, read_photo, widened
 from hqgs.scene.sfm.tracks import read_tracks
 
@@ -39,16 +41,31 @@ def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
         mine = chosen.view == k
         should[mine] = view.project(chosen.points[chosen.point[mine]])[0]
     some, new = widened(views, chosen)
+    part = np.zeros(len(names), np.intp)
+    for k, (photos, _) in enumerate(loose_parts(model, WEAKLY_JOINT)):
+        part[[names.index(name) for name in photos]] = k + 1
+    own = np.zeros((part.max() + 1, len(chosen.points)), bool)
+    own[part[chosen.view], chosen.point] = True
+    foreign = new & ~own[part[some.view], some.point]
     some = some.more(chosen.view, chosen.point, should)
     new = np.concatenate([new, np.ones(len(should), bool)])
+    foreign = np.concatenate([foreign, np.zeros(len(should), bool)])
     sizes, ratios = (np.array([getattr(v, key) for v in views])[some.view] for key in ("size", "ratio"))
     rows, axis = np.arange(len(new)), np.arange(len(new)) % 2
     shift = np.zeros(some.xy.shape)
     towards = np.where(some.xy[rows, axis] < sizes[rows, axis] / 2, BESIDE, -BESIDE)  # stays in the photo
     shift[rows, axis] = np.where(new, towards / ratios[rows, axis], 0)
     at, beside = (fitted(views, replace(some, xy=xy), new)[1] for xy in (some.xy, some.xy + shift))
-    counted = [np.bincount(some.view[new & that], minlength=len(names)) for that in (new, at, beside)]
-    return {name: (int(a), int(b), int(c)) for name, a, b, c in zip(names, *counted, strict=True)}
+    all_of_it, others = (
+        np.array([np.bincount(some.view[rows & that], minlength=len(names)) for that in (new, at, beside)])
+        for rows in (new, foreign)
+    )
+    for k in range(1, len(own)):
+        mine = part == k
+        looked, agreed, by_chance = others[:, mine].sum(1).tolist()
+        if looked >= JOINT and not confirmed(looked, agreed, by_chance):
+            all_of_it[:, mine] = others[:, mine]
+    return {name: (int(a), int(b), int(c)) for name, a, b, c in zip(names, *all_of_it, strict=True)}
 
 
 def confirmed(looked: int, agreed: int, beside: int) -> bool:
@@ -57,17 +74,18 @@ def confirmed(looked: int, agreed: int, beside: int) -> bool:
     return more > DEVIATIONS * (agreed + beside) ** 0.5 and agreed > TIMES * beside
 
 
-def loose_parts(model: pycolmap.Reconstruction) -> list[tuple[list[str], int]]:
-    """Photos, all but those of the largest part, that share fewer than JOINT points with any others, and how
-    many: inside such a part all may agree, and yet it lies where it does by a few false matches."""
+def loose_parts(model: pycolmap.Reconstruction, joint: int = JOINT) -> list[tuple[list[str], int]]:
+    """Photos, all but those of the largest part, that share fewer than `joint` points with any others, and
+    how many: inside such a part all may agree, and yet it lies where it does by a few false matches."""
     names, tracks = read_tracks(model)
     part = np.arange(len(names))
     while True:
-        seen = coo_matrix((np.ones(len(tracks.view), np.int64), (part[tracks.view], tracks.point))).tocsr()
+        ones, shape = np.ones(len(tracks.view), np.int64), (part.max() + 1, len(tracks.points))
+        seen = coo_matrix((ones, (part[tracks.view], tracks.point)), shape).tocsr()
         seen.data[:] = 1
         shared = (seen @ seen.T).toarray()
         np.fill_diagonal(shared, 0)
-        count, joined = connected_components(shared >= JOINT, directed=False)
+        count, joined = connected_components(shared >= joint, directed=False)
         if count < len(shared):
             part = joined[part]
             continue

@@ -33,6 +33,7 @@ from hqgs.scene.sfm.constants import (
     SELDOM,
     SIGMAS,
     UNSURE,
+    WEAKLY_JOINT,
 )
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
 from hqgs.scene.sfm.facts import apart, borne_out, counts, placed_names
@@ -161,19 +162,18 @@ class Attempt:
         """
         if self.model is None or self.faces > 1:
             return
-        plain, unsure = self.model, self._off(self.model) > UNSURE
         self._tell("sharpen", 0)
+        plain, unsure = self.model, self._off(self.model) > UNSURE
         rounds = ROUNDS if unsure else FEWER
-        # Weaker evidence leaves photos farther off than patches reach at once.
-        for _ in range(1 if self._sure >= placed_names(plain) else 2):
+        for _ in range(1 if self._sure >= placed_names(plain) else 2):  # weaker evidence: farther off
             self.model = sharpened(self.model, self.photos, self._adjust, not self.fixed, rounds)
         if self.model is plain and not self._sure >= placed_names(plain):
             self._settle(plain)
-        if not (unsure or self.registered < len(self.names) or len(self.names) < ALWAYS_CHECKED):
+        whole = self.registered == len(self.names) >= ALWAYS_CHECKED
+        if whole and not unsure and not loose_parts(plain, WEAKLY_JOINT):
             return
         self._tell("agree", 0)
-        names, tracks = read_tracks(plain)
-        rest = rebuilt(self.model, names, tracks)
+        rest = rebuilt(self.model, *read_tracks(plain))
         self._adjust(rest, usual(plain), False)
         self.agree = agreement(rest, self.photos)
         strange = {name for name, counts in self.agree.items() if not confirmed(*counts)} - self._sure

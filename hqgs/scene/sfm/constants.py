@@ -66,6 +66,7 @@ DEVIATIONS, TIMES = 3.0, 1.5  # by which more must agree at the place than besid
 # Points that a photo must show, or share with others, to be told by them; parts share 12 and 15 with the rest
 # where they are wrong, 36 and more where right.
 JOINT = 20
+WEAKLY_JOINT = 60  # parts that share fewer are looked for in each other: two like sides of a house share 46
 
 # What is left out, and adjusted.
 ROUNDS = 3  # of patches, or of leaving out what lies far off, and adjustment
