@@ -21,7 +21,7 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, plan_length
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config
-from hqgs.training.constants import ENOUGH, FOR_EACH_PHOTO, GROWS_FROM, PIXELS
+from hqgs.training.constants import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.notes import run_notes
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
@@ -175,21 +175,25 @@ def test_clean_photos_start_from_points_that_they_agree_on() -> None:
 def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no number of iterations is given, or more seconds than that takes."""
     scene = textured_scene(8, 96)
-    length = "iterations 7001 to 30000"
+    length = "iterations 4001 to 30000"
 
     def trainer(**changes: Any) -> Trainer:
         return Trainer(scene, run_config(formation="none", **changes))
 
     short = trainer()
-    assert short.config.iterations == ENOUGH == 7_000
-    assert short.config.densify.stop == run_config(iterations=ENOUGH).densify.stop
+    assert short.config.iterations == LEAST_ENOUGH == 4_000
+    assert short.config.densify.stop == run_config(iterations=LEAST_ENOUGH).densify.stop
     assert "iterations" not in short.schedule.items  # nothing is held back for it
     assert length in [item.what for item in short.left_out()]
     assert trainer(eval_every=123).config.eval_every == 123
-    assert trainer(iterations=9_000).config.iterations == 9_000
+    asked = trainer(iterations=9_000)
+    assert asked.config.iterations == 9_000
+    assert "asked for; more than 4,000 of 7 photos seldom pay" in [row.why for row in asked.rows]
+    assert "asked for" in [row.why for row in trainer(iterations=4_000).rows if row.what == "length"]
     assert trainer(leave_out="none").config.iterations == 30_000
     assert trainer(method="3dgs").config.iterations == 30_000
-    monkeypatch.setattr("hqgs.training.plan_rules.ENOUGH", 700)
+    for name in ("ENOUGH", "LEAST_ENOUGH"):
+        monkeypatch.setattr(f"hqgs.training.plan_rules.{name}", 700)
     many = trainer()
     assert many.config.iterations == FOR_EACH_PHOTO * len(scene.train) == 1_050
     assert "iterations" in many.schedule.items
@@ -201,13 +205,13 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
 
     long = timed(1e6)
     assert (long.config.iterations, long.plan.follows_clock) == (1_050, False)
-    assert any("more looks at the same photos do not pay" in note for note in run_notes(long))
+    assert any("more looks at the photos do not pay" in note for note in run_notes(long))
     short_of = timed(1e-3)
     assert (short_of.config.iterations, short_of.plan.follows_clock) == (plan_length.FEWEST_ITERATIONS, True)
 
 
 def test_a_run_without_a_number_can_be_made_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.training.plan_rules.ENOUGH", 20)
+    monkeypatch.setattr("hqgs.training.plan_rules.LEAST_ENOUGH", 20)
     monkeypatch.setattr("hqgs.training.plan_rules.FOR_EACH_PHOTO", 1)
     scene, out = tmp_path / "desk", tmp_path / "run"
     write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)

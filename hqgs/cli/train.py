@@ -71,8 +71,8 @@ class Train(Photos):
     """quick: 1,000 iterations on small photos, a first look. standard: as long as it pays,
     photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
     iterations: Number = None
-    """Training views to see (standard: 7,000 of clean photos or 150 for each, at most 30,000, fewer where the
-    scene has stopped improving)."""
+    """Training views to see (standard: 150 for each clean photo, 4,000 at least, at most 30,000, fewer where
+    the scene has stopped improving)."""
     batch: Number = None
     """Views in a step (1). Several processes of torchrun share them out: docs/machines.md."""
     seconds: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None

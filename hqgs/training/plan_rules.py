@@ -26,6 +26,7 @@ from hqgs.training.constants import (
     HELD_SHARE,
     KNEE,
     LAMBDA_DSSIM,
+    LEAST_ENOUGH,
     MANY_PHOTOS,
     MOST_HELD,
     PIXELS,
@@ -198,14 +199,13 @@ def half_size(draft: Draft) -> Sequence[Choice]:
 
 
 def length(draft: Draft) -> Sequence[Choice]:
-    settings, facts, has, most = draft.settings, draft.facts, draft.kinds, None
-    open_ended, why = "iterations" in settings.leave_out, ""
+    settings, facts, has = draft.settings, draft.facts, draft.kinds
+    open_ended, enough, why = "iterations" in settings.leave_out, settings.iterations, ""
     if has & set(LEARNED):
-        most, why = ENOUGH, "no photo can be held back to tell when to end: its camera would not be learned"
+        enough, why = ENOUGH, "no photo can be held back to tell when to end: its camera would not be learned"
     elif draft.formed and not has:
-        most, why = max(ENOUGH, FOR_EACH_PHOTO * facts.photos), "more looks at the same photos do not pay"
-    if not open_ended or (most is not None and settings.iterations <= most):
-        most = None
+        enough, why = max(LEAST_ENOUGH, FOR_EACH_PHOTO * facts.photos), "more looks at the photos do not pay"
+    most = enough if open_ended and enough < settings.iterations else None
     if facts.seconds is not None and settings.seconds is not None:
         return [_timed(draft, facts.seconds, settings.seconds, None if has else most)]
     if most is not None:
@@ -217,6 +217,8 @@ def length(draft: Draft) -> Sequence[Choice]:
             Choice(f"{most:,} iterations", why, f"{facts.photos} photos", left, changes={"settings": new})
         ]
     why = "at most: held-back photos tell when they no longer pay" if open_ended else "asked for"
+    if not open_ended and not has and enough < settings.iterations:
+        why += f"; more than {enough:,} of {facts.photos} photos seldom pay"
     return [Choice(f"{settings.iterations:,} iterations", why)]
 
 
@@ -226,7 +228,7 @@ def _timed(draft: Draft, step: StepSeconds, seconds: float, most: int | None) ->
     halves = "resolution" in draft.settings.leave_out
     planned = fitting(seconds, step, first, lambda n: half_size_end(n) if halves else 0, most)
     pays = planned != most
-    why = f"as many as fit into {seconds:g} s" if pays else "more looks at the same photos do not pay"
+    why = f"as many as fit into {seconds:g} s" if pays else "more looks at the photos do not pay"
     half = f", {1e3 * step.half:.1f} ms at half size" if halves else ""
     return Choice(
         f"{planned:,} iterations",
@@ -323,7 +325,11 @@ RULES = (
     Rule("first shapes", shapes, "0.1 to 0.8 dB at 30 s on fern, fox and horns"),
     Rule("smallest Gaussian", smallest, "the 3D smoothing of Mip-Splatting, Yu et al. 2024"),
     Rule("photos' size", half_size, CHOSEN),
-    Rule("length", length, f"{ENOUGH:,}, or {FOR_EACH_PHOTO} for each photo: {CHOSEN}"),
+    Rule(
+        "length",
+        length,
+        f"{FOR_EACH_PHOTO} for each photo, {LEAST_ENOUGH:,} at least, or {ENOUGH:,}: {CHOSEN}",
+    ),
     Rule("half size", half_size_until, f"{COARSE_PART:.0%} of the run, {COARSE_MOST:,} at most: {CHOSEN}"),
     Rule("growth", growth, f"Kerbl et al. 2023, section 5.2; from {GROWS_FROM} on: {CHOSEN}; none: tried"),
     Rule("resets of the opacities", resets, "what a reset takes away seldom comes back where it was"),
