@@ -48,20 +48,18 @@ def costs_in_words(runs: DataFrame) -> str:
 
 
 def cost_of_poses(runs: DataFrame) -> str:
-    """What poses from the photos cost, run by run: as held-out cameras are, and with them fitted."""
-    kinds = ("psnr", *(["psnr_fitted"] if "psnr_fitted" in runs else []))
-    tables = [poses_beside(runs, value) for value in kinds]
+    """PSNR with the scenes' own poses, and what poses from the photos cost: as they are, and fitted."""
+    plain, fitted = (poses_beside(runs, value) for value in ("psnr", "psnr_fitted"))
+    scenes = list(dict.fromkeys(plain["scene"]))
     rows = []
-    for lines in zip(*map(records, tables), strict=True):
-        cells = [number(line[name], ".2f") for line in lines for name in ("own", "photos")]
-        costs = [number(line["cost"], "+.2f") for line in lines]
-        rows.append([f"{lines[0]['scene']}, {lines[0]['degradation']}", *cells, *costs])
-    heads = [
-        f"{poses}{how}"
-        for _, how in zip(kinds, ("", ", fitted"), strict=False)
-        for poses in ("own", "photos")
-    ]
-    return table(["", *heads, *("cost", "cost, fitted")[: len(kinds)]], rows)
+    for kind in dict.fromkeys(plain["degradation"]):
+        cells = []
+        for scene in scenes:
+            one, moved = (records(pick(part, scene=scene, degradation=kind)) for part in (plain, fitted))
+            costs = [number(line[0]["cost"] if line else None, "+.2f") for line in (one, moved)]
+            cells.append(f"{number(one[0]['own'] if one else None, '.2f')}: {'/'.join(costs)}")
+        rows.append([str(kind), *cells])
+    return table(["", *scenes], rows)
 
 
 def reconstructions(poses: DataFrame) -> str:
@@ -69,13 +67,13 @@ def reconstructions(poses: DataFrame) -> str:
     rows = []
     for line in records(poses):
         rotation, center = (
-            f"{line[f'{name}_median']:{form}}, {line[f'{name}_max']:{form}}"
+            f"{line[f'{name}_median']:{form}}/{line[f'{name}_max']:{form}}"
             for name, form in (("rotation", ".3f"), ("centre", ".1%"))
         )
-        name, registered = f"{line['scene']}, {line['degradation']}", f"{line['registered']}/{line['photos']}"
+        name = f"{line['scene']}/{line['degradation']}"
         auc = "/".join(number(line.get(f"auc_{degrees}"), ".2f") for degrees in (1, 3, 5))
-        rows.append([name, registered, rotation, auc, center, number(line.get("search_cpu_s"), ".0f")])
-    first = ("registered", "rotation (deg), median, max", "AUC at 1/3/5 deg", "centre, median, max")
+        rows.append([name, rotation, auc, center, number(line.get("search_cpu_s"), ".0f")])
+    first = ("rotation (deg)", "AUC at 1/3/5 deg", "centre")
     return table(["", *first, "CPU (s)"], rows)
 
 
