@@ -23,7 +23,7 @@ from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import plan_length
 from hqgs.training.config import HQGSConfig, run_config
 from hqgs.training.constants import FEW_STEPS, PIXELS
-from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, Tried, plan_by
+from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import first_points_wanted
 from hqgs.training.plan_rules import RULES, plan_run
 from hqgs.training.prepare import Prepared, facts_of
@@ -78,15 +78,14 @@ def test_photos_that_agree_on_no_more_points_have_the_rules_of_few() -> None:
     assert (plan.discs, plan.half_size_until) == (False, 0)
 
 
-def test_a_run_of_few_steps_that_grows_starts_from_twice_as_many_points() -> None:
+def test_a_run_of_few_steps_starts_from_twice_as_many_points_that_photos_agree_on() -> None:
     config = run_config(iterations=50, method="hqgs", formation="none")
     facts = replace(Prepared(textured_scene(8, 64), config).facts, points=10)
     usual = facts.pixels // PIXELS
     longer = replace(config, iterations=FEW_STEPS * facts.photos)
-    pays, harms = (Tried(gain, 0.1, 4, 2.0) for gain in (-1.0, 1.0))
-    for tried, asked, times in ((pays, config, 2), (pays, longer, 1), (harms, config, 1), (None, config, 1)):
-        plan = plan_run(replace(facts, agreed=0.9, tried=tried), None, asked)
-        assert plan.first_points == times * facts.pixels // PIXELS, (tried, asked.iterations)
+    for agreed, asked, times in ((0.9, config, 2), (0.9, longer, 1), (0.6, config, 1), (None, config, 1)):
+        plan = plan_run(replace(facts, agreed=agreed), None, asked)
+        assert plan.first_points == times * facts.pixels // PIXELS, (agreed, asked.iterations)
     assert first_points_wanted(facts, usual // 4, 2) == 2 * (usual // 4)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hqgs.evaluation.constants import SCATTER
 from hqgs.training.constants import DECAY, DEPTHS_AGREED, DROPOUT, DROPOUT_PHOTOS, FEW_PHOTOS, MANY_PHOTOS
 from hqgs.training.plan import Choice, Draft, Facts
 
@@ -14,13 +13,6 @@ WHERE = "where it pays: 25 sets of 3 to 43 photos"
 def in_agreement(facts: Facts) -> bool:
     """Whether the photos bear each other out: more than FEW_PHOTOS, which agree on where things are."""
     return facts.photos > FEW_PHOTOS and facts.agreed is not None and facts.agreed >= DEPTHS_AGREED
-
-
-def grows(facts: Facts) -> bool:
-    """Whether growth is known to pay, or at least not to harm: photos agree, or it was tried."""
-    if facts.tried is None:
-        return in_agreement(facts)
-    return facts.tried.gain <= SCATTER or facts.tried.sure <= 1
 
 
 def opacity_decay(draft: Draft) -> Sequence[Choice]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
+from hqgs.evaluation.constants import SCATTER
 from hqgs.photos.formula import FILM, LEARNED, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
@@ -30,6 +31,7 @@ from hqgs.training.constants import (
     MANY_PHOTOS,
     MOST_HELD,
     PIXELS,
+    POINTS_AGREED,
     SMALLEST_SIDE,
 )
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
@@ -40,7 +42,7 @@ from hqgs.training.plan_budget import (
     no_growth,
     sharp_pixels,
 )
-from hqgs.training.plan_few_photos import WHERE, dropout, grows, opacity_decay
+from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
 from hqgs.training.plan_left_out import held_photos, needless
 from hqgs.training.plan_length import fitting, shown
 from hqgs.training.plan_photos import passersby, photos
@@ -148,7 +150,7 @@ def first_points(draft: Draft) -> Sequence[Choice]:
         return [Choice(f"the scene's own {facts.points:,}", "as published")]
     if draft.undegraded:
         few = settings.seconds is None and settings.iterations < FEW_STEPS * facts.photos
-        times = 2 if few and grows(facts) else 1
+        times = 2 if few and (facts.agreed or 0) >= POINTS_AGREED else 1
         wanted, what = first_points_wanted(facts, settings.start_points, times), None
         wanted = min(wanted, settings.densify.max_gaussians)
         why = "points lie at corners alone, and a run from points all over the photos costs less"
@@ -292,7 +294,7 @@ def growth(draft: Draft) -> Sequence[Choice]:
         told = f"without it {gain} on {tried.photos} photos held back from short runs"
         told += f"; PSNR, SSIM and HaarPSI gain {tried.sure:.1f} times their error"
     dense = draft.undegraded and draft.dense
-    if dense and tried is not None and not grows(draft.facts):
+    if dense and tried is not None and tried.gain > SCATTER and tried.sure > 1:
         why = "what grows explains each photo alone, and views between photos are worse"
         changes = {f"densify.{name}": value for name, value in no_growth(densify).items()}
         return [Choice("none", why, told, "growth", changes=changes)]
@@ -320,7 +322,7 @@ RULES = (
     Rule(
         "first points",
         first_points,
-        f"one for each {PIXELS} pixels, two in short runs that grow, or the budget: {CHOSEN}",
+        f"one for each {PIXELS} pixels, two in short runs, or the budget: {CHOSEN}",
     ),
     Rule("first shapes", shapes, "0.1 to 0.8 dB at 30 s on fern, fox and horns"),
     Rule("smallest Gaussian", smallest, "the 3D smoothing of Mip-Splatting, Yu et al. 2024"),
