@@ -86,7 +86,8 @@ def test_a_run_of_few_steps_starts_from_twice_as_many_points_that_photos_agree_o
     for agreed, asked, times in ((0.9, config, 2), (0.9, longer, 1), (0.6, config, 1), (None, config, 1)):
         plan = plan_run(replace(facts, agreed=agreed), None, asked)
         assert plan.first_points == times * facts.pixels // PIXELS, (agreed, asked.iterations)
-    assert first_points_wanted(facts, usual // 4, 2) == 2 * (usual // 4)
+    fewer = replace(config, start_points=usual // 4)
+    assert first_points_wanted(replace(facts, agreed=0.9), fewer) == 2 * (usual // 4)
 
 
 @pytest.mark.parametrize("left", ["passersby", "photos", ""])

@@ -5,18 +5,29 @@ from __future__ import annotations
 import math
 
 from hqgs.photos.formula import FILM, Degradation
-from hqgs.training.config import DensifyConfig
-from hqgs.training.constants import DETERMINED, FILM_NOISE, NOISE_HALVING, PIXELS, TIMES_OWN_POINTS
+from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.constants import (
+    DETERMINED,
+    FEW_STEPS,
+    FILM_NOISE,
+    NOISE_HALVING,
+    PIXELS,
+    POINTS_AGREED,
+    TIMES_OWN_POINTS,
+)
 from hqgs.training.plan import Facts
 
 
-def first_points_wanted(facts: Facts, most: int, times: int = 1) -> int:
-    """How many points photos without a fault call for, `times` as many as usual, and as `most`.
+def first_points_wanted(facts: Facts, settings: TrainConfig) -> int:
+    """How many points photos without a fault call for.
 
     More than the scene's own always: those lie at corners alone, and a run from points all over the photos
-    costs less.
+    costs less. Twice as many where few steps are to come, in which little grows, and the photos agree.
     """
-    return min(times * most, max(times * facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))
+    few = settings.seconds is None and settings.iterations < FEW_STEPS * facts.photos
+    times = 2 if few and (facts.agreed or 0) >= POINTS_AGREED else 1
+    most = min(times * settings.start_points, settings.densify.max_gaussians)
+    return min(most, max(times * facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))
 
 
 def no_growth(growth: DensifyConfig) -> dict[str, int]:

@@ -20,7 +20,6 @@ from hqgs.training.constants import (
     COARSE_MOST,
     COARSE_PART,
     ENOUGH,
-    FEW_STEPS,
     FOR_EACH_PHOTO,
     GROWS_FROM,
     HELD_PIXELS,
@@ -31,7 +30,6 @@ from hqgs.training.constants import (
     MANY_PHOTOS,
     MOST_HELD,
     PIXELS,
-    POINTS_AGREED,
     SMALLEST_SIDE,
 )
 from hqgs.training.plan import Choice, Draft, Facts, Rule, RunPlan, StepSeconds, plan_by
@@ -149,10 +147,7 @@ def first_points(draft: Draft) -> Sequence[Choice]:
     if not draft.formed:
         return [Choice(f"the scene's own {facts.points:,}", "as published")]
     if draft.undegraded:
-        few = settings.seconds is None and settings.iterations < FEW_STEPS * facts.photos
-        times = 2 if few and (facts.agreed or 0) >= POINTS_AGREED else 1
-        wanted, what = first_points_wanted(facts, settings.start_points, times), None
-        wanted = min(wanted, settings.densify.max_gaussians)
+        wanted, what = first_points_wanted(facts, settings), None
         why = "points lie at corners alone, and a run from points all over the photos costs less"
     else:
         wanted = int(settings.hqgs.first_points * settings.densify.max_gaussians)
