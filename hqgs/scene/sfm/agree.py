@@ -63,7 +63,8 @@ def agreement(model: pycolmap.Reconstruction, folder: Path) -> Agreement:
     for k in range(1, len(own)):
         mine = part == k
         looked, agreed, by_chance = others[:, mine].sum(1).tolist()
-        if looked >= JOINT and not confirmed(looked, agreed, by_chance):
+        # Within one deviation of chance: bad photos in their places show such points seldom, but more often.
+        if looked >= JOINT and agreed - by_chance <= (agreed + by_chance) ** 0.5:
             all_of_it[:, mine] = others[:, mine]
     return {name: (int(a), int(b), int(c)) for name, a, b, c in zip(names, *all_of_it, strict=True)}
 
