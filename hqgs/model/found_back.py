@@ -71,9 +71,8 @@ def points_found_back(
     smooth = None
     if len(views) <= SMOOTH_PHOTOS:
         small = [SmallPhoto.of(view, SMOOTH_LONGEST) for view in views]
-        asked, bounds = zip(
-            *((agreement.asked(k), surfaces.bounds(k)) for k in range(len(views))), strict=True
-        )
+        asked = [agreement.asked(k) for k in range(len(views))]
+        bounds = [surfaces.bounds(k) for k in range(len(views))]
         smooth = DenseDepths(small, asked, bounds, on_stage)
     found = list[Found]()
     for k, share in enumerate(each):
