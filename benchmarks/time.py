@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from benchmarks.command import Benchmark
 from benchmarks.measure import Run, train
@@ -49,4 +50,7 @@ def run(args: argparse.Namespace) -> list[str]:
     return [*([listed(runs, SHOWN)] if len(runs) else []), *study.missing()]
 
 
-BENCHMARK = Benchmark("held-out error against seconds of training", run, PROTOCOLS)
+OPTIONS: dict[str, dict[str, Any]] = {
+    "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": "(%(default)s)"}
+}
+BENCHMARK = Benchmark("held-out error against seconds of training", run, PROTOCOLS, OPTIONS)

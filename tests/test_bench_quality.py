@@ -353,12 +353,10 @@ def test_protocols() -> None:
         assert cell.config.hqgs.guidance == "paper"
         if cell.row.label != "l1":
             assert cell.config.hqgs.paper == VARIANTS[cell.row.label.replace("paper", "V7")]
-    assert [cell.config.hqgs.first_points for cell in grid(PROTOCOLS["points"], [scene])[:2]] == [0.0, 1.0]
     assert [cell.config.batch for cell in grid(PROTOCOLS["ranks"], [scene])] == [1, 2, 4, 8]
-    assert grid(PROTOCOLS["long"], [scene])[0].config.densify.stop == 15_000
     for cell in standard:
         if not cell.row.paper:
-            config = TrainConfig(3_000, cell.row.label, cell.seed, leave_out=()).scaled()
+            config = TrainConfig(2_000, cell.row.label, cell.seed, leave_out=()).scaled()
             assert cell.config == config
 
 

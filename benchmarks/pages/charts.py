@@ -25,7 +25,7 @@ def charts(tables: dict[str, DataFrame]) -> dict[str, Figure]:
     captures = ["fern", "fox", "horns"]
     standard = ["none", "jpeg:10", "noise:25", "lowres:4", "blur", "mixed"]
     life = ["shake", "some:shake", "some:defocus", "exposure", "some:noise:25", "phone", "chat", "video"]
-    main = pick(quality, iterations=3000, scene=captures, degradation=standard, seed=0)
+    main = pick(quality, iterations=2000, scene=captures, degradation=standard, seed=0)
     wild = pick(quality, iterations=2000, scene=[*captures, "embedded"], degradation=["none", *life])
     trained = pick(tables["accuracy"], inputs="built-in scene, trained")
     wanted = {
@@ -81,7 +81,7 @@ def gain_map(runs: DataFrame, row: str = "hqgs", base: str = "3dgs") -> Figure:
 
 def against_seconds(times: DataFrame) -> Figure:
     """Held-out PSNR against seconds of training, a panel for each scene."""
-    scenes = list(dict.fromkeys(times["scene"]))
+    scenes = list(dict.fromkeys(pick(times, row="3dgs")["scene"]))
     figure, grid = panels(4 * len(scenes), 4, 1, len(scenes))
     for axes, scene in zip(grid, scenes, strict=True):
         for row, shade in ((FIRST, GREEN), (OPENSPLAT, ORANGE), ("3dgs", GREY)):

@@ -96,7 +96,7 @@ def seconds_of(row: str) -> float:
 def over_time(times: DataFrame, scenes: Sequence[str], against: str = "") -> str:
     """PSNR after the seconds that were asked for, a line for each scene; `against`: its gain over that row
     at as many of its own seconds."""
-    rows, body = asked(times), []
+    rows, body = asked(pick(times, scene=list(scenes))), []
     for scene in scenes:
         line = []
         for row in rows:
@@ -166,13 +166,6 @@ def files_head(export: DataFrame) -> str:
     size = f"{first['width']:,} x {first['height']:,} px"
     what = f"{first['gaussians']:,} Gaussians of degree {first['sh_degree']}"
     return f"{first['scene'].capitalize()}, {size}, {what}."
-
-
-def after_best(times: DataFrame, scene: str) -> float:
-    """By how much the longest of a scene's runs ends below its best, dB."""
-    runs = [pick(times, scene=scene, row=row) for row in asked(times)]
-    psnrs = [float(part["psnr"].mean()) for part in runs if len(part)]
-    return max(psnrs) - psnrs[-1]
 
 
 def listed_views(runs: DataFrame) -> str:
