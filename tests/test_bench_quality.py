@@ -354,6 +354,7 @@ def test_protocols() -> None:
         if cell.row.label != "l1":
             assert cell.config.hqgs.paper == VARIANTS[cell.row.label.replace("paper", "V7")]
     assert [cell.config.batch for cell in grid(PROTOCOLS["ranks"], [scene])] == [1, 2, 4, 8]
+    assert TrainConfig(50_000).scaled().densify.stop == 15_000
     for cell in standard:
         if not cell.row.paper:
             config = TrainConfig(2_000, cell.row.label, cell.seed, leave_out=()).scaled()
