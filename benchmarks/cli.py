@@ -38,7 +38,7 @@ def make_parser() -> argparse.ArgumentParser:
         add("--threads", type=int, metavar="T", help="(all cores)")
         add("--quick", action="store_true", help="tiny sizes, seconds: only a test")
         if benchmark.protocols is not None:
-            add_options(parser_of_one, benchmark.protocols["standard"])
+            add_options(parser_of_one, benchmark.protocols)
         for flag, how in benchmark.options.items():
             add(flag, **how)
     for name, module in (("all", everything), ("pages", pages)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -265,10 +265,13 @@ def degraded_view(scene: Scene, view: View, degradation: str, seed: int) -> View
     return degraded(replace(scene, train=[view], test=others), degradation, seed).train[0]
 
 
-def add_options(parser: argparse.ArgumentParser, protocol: Protocol) -> None:
-    """The options that narrow a protocol, and those about finished runs."""
+def add_options(parser: argparse.ArgumentParser, protocols: Mapping[str, Protocol]) -> None:
+    """The options that choose a protocol and narrow it, and those about finished runs."""
     parser.set_defaults(validate=False, sfm=False)
     add: Any = parser.add_argument
+    about = "; ".join(f"{name}: {one.help}" if one.help else name for name, one in protocols.items())
+    add("--protocol", choices=protocols, default="standard", metavar="NAME", help=about)
+    protocol = protocols["standard"]
     add(
         "--scenes", nargs="+", type=Path, default=[EMBEDDED], metavar="SCENE",
         help="folders, or names of built-in scenes (%(default)s)",

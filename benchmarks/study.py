@@ -201,7 +201,7 @@ def chosen(
     args: argparse.Namespace, protocols: Mapping[str, Protocol], **changes: Any
 ) -> tuple[Protocol, list[Scene]]:
     """One of the protocols, which the options of `add_options`, and then `changes`, narrow; its scenes."""
-    name = "quick" if args.quick else vars(args).get("protocol", "standard")
+    name = "quick" if args.quick else args.protocol
     options = ("degradations", "rows", "seeds", "iterations", "downscale", "repeats", "photos")
     given = {option: vars(args).get(option) for option in options} | changes
     protocol = narrowed(protocols[name], **given)

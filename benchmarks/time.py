@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from benchmarks.command import Benchmark
 from benchmarks.measure import Run, train
@@ -50,7 +49,4 @@ def run(args: argparse.Namespace) -> list[str]:
     return [*([listed(runs, SHOWN)] if len(runs) else []), *study.missing()]
 
 
-OPTIONS: dict[str, dict[str, Any]] = {
-    "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": "(%(default)s)"}
-}
-BENCHMARK = Benchmark("held-out error against seconds of training", run, PROTOCOLS, OPTIONS)
+BENCHMARK = Benchmark("held-out error against seconds of training", run, PROTOCOLS)

@@ -137,13 +137,11 @@ def run(args: argparse.Namespace) -> list[str]:
     return [*quality.tables(), *quality.sheets(), *quality.study.missing()]
 
 
-LISTED = "; ".join(f"{name}: {protocol.help}" for name, protocol in PROTOCOLS.items())
 FIT = "measure a second time with each held-out camera fitted to the trained scene, as --sfm does"
 SFM = "poses and points from the degraded photos, the same for all rows"
 ALONE = "poses and points from the degraded photos against the scenes' own, without training"
 PICTURES = "sheets per scene and degradation, and a small one of some of them"
 OPTIONS: dict[str, dict[str, Any]] = {
-    "--protocol": {"choices": PROTOCOLS, "default": "standard", "metavar": "NAME", "help": LISTED},
     "--degradations": {"nargs": "+", "metavar": "KIND", "help": "instead of the protocol's"},
     "--validate": {"action": "store_true", "help": "for tuning: judge on training photos, not on test views"},
     "--sfm": {"action": "store_true", "help": SFM},
