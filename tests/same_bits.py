@@ -5,6 +5,7 @@ python tests/same_bits.py [--record] [CASE ...]
 A line for each run: a hash of all of its tensors at the end, and whether it is the recorded one. Runs that
 are stopped and resumed, or shared out to two processes, must come to what they come to in one go. `--record`
 writes what they come to now: that belongs into a commit of its own, which says why the bits are others.
+The network of `paper` multiplies matrices by MKL: these two runs come to others on other makes of CPU.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.metrics import METRICS
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source as scene_source
+from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene
 
 SIZE = 64
@@ -102,7 +103,21 @@ def test_two_scenes_are_compared_photo_by_photo(
     assert "(not sure)" in capsys.readouterr().out
 
 
-def test_what_poses_cost_is_set_aside(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def with_wrong_poses() -> Scene:
+    """Held-out cameras that are two pixels off."""
+    scene = held_out_scene()
+    moved = []
+    for view in scene.test:
+        viewmat = view.camera.viewmat.copy()
+        viewmat[0, 3] += 2 * median_depth(scene, view) / view.camera.K[0, 0]
+        moved.append(replace(view, camera=replace(view.camera, viewmat=viewmat)))
+    return replace(scene, test=moved)
+
+
+def test_what_poses_cost_is_set_aside(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_source, "room", lambda *_: with_wrong_poses())
     assert judge(run, "--fit-cameras", "--out", tmp_path) == 0
     assert "cameras fitted" in capsys.readouterr().out
     one = json.loads((tmp_path / "judge.json").read_text())["scene"]

@@ -78,6 +78,7 @@ NEARNESS = (0.2, 3.0)  # that count; the photo's median depth has 1
 FOCUS_LEAST = 0.25  # added to the sum of squares of a photo's nearness: few points tell no slope
 
 # gains.py: the gain of each photo, from the colours in which the photos show the same points
+GAINS_GRID = 2.0**-24  # of the logarithms of gains
 GAINS_WINDOW = 5  # px around a point, whose mean is its colour there
 # of white in linear light: beyond them noise and the sensor's white tell nothing
 GAINS_DARK, BRIGHT = 0.02, 0.9

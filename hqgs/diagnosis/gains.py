@@ -16,6 +16,7 @@ from hqgs.diagnosis.constants import (
     BRIGHT,
     GAINS_DARK,
     GAINS_DOUBT,
+    GAINS_GRID,
     GAINS_LENGTHS,
     GAINS_WINDOW,
     MOST_VALUES,
@@ -138,4 +139,5 @@ def _apart(views: Sequence[View], gains: Floats) -> Floats:
         shared.append((np.exp(likely - total)[:, None] * means).sum(0))
     weights = np.exp(np.array(evidence) - logsumexp(evidence))
     rest = gains - np.tensordot(weights, shared, 1) @ OPPONENTS
+    rest = np.round(rest / GAINS_GRID) * GAINS_GRID  # a BLAS rounds as the CPU's maker has it
     return rest - rest.mean(0)

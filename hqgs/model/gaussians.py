@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs._rust import EPS2D, NEAR_PLANE
+from hqgs.base.elementary import exp
 from hqgs.base.files import PLY
 from hqgs.base.threads import one_torch_thread
 from hqgs.model.constants import (
@@ -147,7 +148,7 @@ class Gaussians:
 
     def activated_scales(self) -> Tensor:
         """Standard deviations [N, 3] in world units."""
-        return torch.exp(self.scales)
+        return exp(self.scales)
 
     def activated_opacities(self) -> Tensor:
         """Opacities [N] in (0, 1)."""

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from hqgs.base.elementary import exp, log
 from hqgs.model.constants import NEAREST_OF_DISCS, THINNEST
 from hqgs.model.formats.turned import quaternions
 from hqgs.model.gaussians import Gaussians
@@ -55,10 +56,10 @@ class _Enlarge(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, scales: Tensor, smallest: Tensor) -> Tensor:
-        own = torch.exp(2 * scales)  # variances
+        own = exp(2 * scales)  # variances
         variances = own + smallest.square()[:, None]
         ctx.save_for_backward(own.div_(variances))
-        return variances.log_().mul_(0.5)
+        return log(variances).mul_(0.5)
 
     @staticmethod
     @once_differentiable

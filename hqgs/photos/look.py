@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hqgs.base.elementary import exp
 from hqgs.photos.light import EXPONENT, OFFSET, to_linear, to_srgb
 
 
@@ -56,7 +57,7 @@ def darken(values: Tensor, fall: Tensor) -> Tensor:
     Exact but where light goes from the curve into its toe: there by half a level at a third of the light.
     """
     fall = fall.to(values.dtype)
-    root, straight = torch.exp(fall / -EXPONENT), torch.exp(-fall)
+    root, straight = exp(fall / -EXPONENT), exp(-fall)
     curved, straight = (values + OFFSET) * root - OFFSET, values * straight
     if bool((fall >= 0).all()):
         return torch.maximum(curved, straight)

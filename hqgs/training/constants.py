@@ -34,7 +34,8 @@ WARM, TIMED = 3, 7  # steps of each size before it: the first ones start threads
 
 # The frame of training, in which a scene has the size USUAL. Rounding of the files below 1e-10 of it crosses
 # a step of the grids once in many thousand points; 5e-7 of a turn are 1e-3 px at a focal length of 2,000 px.
-POSE_GRID, POINT_GRID = 2.0**-20, 2.0**-16
+# CAMERA_GRID is that of all poses in training: far above what two makes of BLAS differ by.
+POSE_GRID, POINT_GRID, CAMERA_GRID = 2.0**-20, 2.0**-16, 2.0**-30
 
 # The schedule.
 COARSE_PART, COARSE_MOST = 0.6, 1_500  # of the run, and iterations, at the smaller size, at most

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from hqgs import _rust
+from hqgs.base.elementary import exp
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
@@ -164,4 +165,4 @@ def quats_to_matrices(quats: Tensor) -> Tensor:
 
 
 def _largest_scale(gaussians: Gaussians) -> Tensor:
-    return gaussians.scales.detach().amax(dim=1).exp()
+    return exp(gaussians.scales.detach().amax(dim=1))

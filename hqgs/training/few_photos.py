@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hqgs.base.elementary import log
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.constants import DROPPED, OPAQUE
 
@@ -36,8 +37,8 @@ def with_dropout(gaussians: Gaussians, share: float, seed: int, iteration: int) 
     if not share:
         return gaussians
     drawn = np.random.default_rng([seed, iteration]).random(len(gaussians), np.float32)
-    opacities = gaussians.activated_opacities() / (1 - share)
-    kept = torch.logit(opacities.clamp(max=OPAQUE))
+    opacities = (gaussians.activated_opacities() / (1 - share)).clamp(max=OPAQUE)
+    kept = log(opacities / (1 - opacities))
     some = torch.where(torch.from_numpy(drawn) < share, DROPPED, kept)
     return gaussians.like(
         gaussians.named() | {"opacities": some}

@@ -20,7 +20,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene.constants import USUAL
 from hqgs.scene.scene import Scene, View
 from hqgs.scene.world import World, middle_and_size
-from hqgs.training.constants import POINT_GRID, POSE_GRID
+from hqgs.training.constants import CAMERA_GRID, POINT_GRID, POSE_GRID
 
 Array = NDArray[np.float64]
 
@@ -72,6 +72,22 @@ class Frame:
         u, _, vt = np.linalg.svd(np.round(R / POSE_GRID) * POSE_GRID)
         viewmat[:3, :3], viewmat[:3, 3] = u @ vt, np.round(t / POSE_GRID) * POSE_GRID
         return replace(view, camera=replace(view.camera, viewmat=viewmat))
+
+
+def on_grid(scene: Scene) -> Scene:
+    """The scene with poses, moved by less than 1e-9, that are alike on every make of CPU.
+
+    Each make has its own code in a BLAS, which rounds in its own way.
+    """
+    train, test = (
+        [replace(v, camera=replace(v.camera, viewmat=_rounded(v.camera.viewmat))) for v in views]
+        for views in (scene.train, scene.test)
+    )
+    return replace(scene, train=train, test=test)
+
+
+def _rounded(viewmat: Array) -> Array:
+    return np.round(viewmat / CAMERA_GRID) * CAMERA_GRID
 
 
 Trainable = Scene | Frame  # as its coordinates are, or in a frame of its own

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hqgs.base.elementary import exp
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
 from hqgs.photos.exposure import take_photo
@@ -151,7 +152,7 @@ class LearnedCameras:
         def develop(render: Tensor) -> Tensor:
             gains = torch.ones(3, dtype=torch.float64)
             if self._gains:
-                gains = self._gains[number].exp()
+                gains = exp(self._gains[number])
             full = None if near is None else _enlarged(near, size).to(render)
             taken = take_photo(render, size, full, warps, gains)
             if self._devices is not None:
