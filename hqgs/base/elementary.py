@@ -1,7 +1,8 @@
 """exp and log of tensors with the same bits on every make of CPU.
 
 torch takes them from MKL, which rounds otherwise for other makers: runs on two makes of CPU would split
-Gaussians in slightly different places. numpy's of float32 are its own.
+Gaussians in slightly different places. numpy's of float32 are its own; of float64 they go by the width of
+vectors, those of long doubles are the C library's.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -24,11 +26,15 @@ def log(x: Tensor) -> Tensor:
     return _Log.apply(x)
 
 
+def _by(function: np.ufunc, x: NDArray[Any]) -> NDArray[Any]:
+    return function(x) if x.dtype == np.float32 else function(x, dtype=np.longdouble).astype(x.dtype)
+
+
 class _Exp(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
         with np.errstate(all="ignore"):
-            found = torch.as_tensor(np.exp(x.numpy()))
+            found = torch.as_tensor(_by(np.exp, x.numpy()))
         ctx.save_for_backward(found)
         return found
 
@@ -44,7 +50,7 @@ class _Log(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
         with np.errstate(all="ignore"):
-            return torch.as_tensor(np.log(x.numpy()))
+            return torch.as_tensor(_by(np.log, x.numpy()))
 
     @staticmethod
     @once_differentiable
