@@ -45,8 +45,8 @@ def cases_in_ms(runs: DataFrame) -> str:
 def threads_words(runs: DataFrame) -> str:
     """How many times as fast two threads are."""
     many = runs.loc[runs["threads"] == 2]
-    words = [f"{line['case'].rsplit(', ', 1)[0]} {line['ratio']:.2f}" for line in records(many)]
-    return f"two are times as fast as one: {and_list(words)}" if words else "there was one"
+    words = [f"{line['ratio']:.2f} ({line['case']})" for line in records(many)]
+    return f"two are so many times as fast as one: {and_list(words)}" if words else "there was one"
 
 
 def power(speed: DataFrame, against: str) -> str:

@@ -87,7 +87,7 @@ def on_grid(scene: Scene) -> Scene:
 
 
 def _rounded(viewmat: Array) -> Array:
-    return np.round(viewmat / CAMERA_GRID) * CAMERA_GRID
+    return np.round(viewmat / CAMERA_GRID) * CAMERA_GRID + 0.0  # one zero, not two
 
 
 Trainable = Scene | Frame  # as its coordinates are, or in a frame of its own
