@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import re
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
@@ -159,9 +160,10 @@ def pairs_of(text: str) -> list[tuple[str, float]]:
 def facts() -> dict[str, Any]:
     """Where and when a line was measured."""
     machine = machine_facts()
+    cpu = re.sub(r"\(\w+\)|\b(CPU|Processor)\b", "", machine["cpu"])
     return {
         "threads": hqgs.get_num_threads(),
-        "machine": " ".join(filter(None, (machine["cpu"], machine["simd"]))),
+        "machine": " ".join(f"{cpu} {machine['simd']}".split()),
         "commit": short(version_facts()["git_commit"]),
         "date": datetime.now(timezone.utc).date().isoformat(),
     }
