@@ -1,4 +1,4 @@
-"""exp and log of tensors with the same bits on every make of CPU.
+"""exp, log and rounding with the same bits on every make of CPU.
 
 torch takes them from MKL, which rounds otherwise for other makers: runs on two makes of CPU would split
 Gaussians in slightly different places. numpy's of float32 are its own; of float64 they go by the width of
@@ -24,6 +24,11 @@ def exp(x: Tensor) -> Tensor:
 def log(x: Tensor) -> Tensor:
     """The natural logarithm of each element; gradients flow to `x`."""
     return _Log.apply(x)
+
+
+def on_grid(values: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Values rounded to multiples of `step`, with one zero: a BLAS, too, rounds as the CPU's maker has it."""
+    return np.round(values / step) * step + 0.0
 
 
 def _by(function: np.ufunc, x: NDArray[Any]) -> NDArray[Any]:

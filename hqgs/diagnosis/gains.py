@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, uniform_filter
 from scipy.special import logsumexp
 
+from hqgs.base.elementary import on_grid
 from hqgs.diagnosis.constants import (
     BRIGHT,
     GAINS_DARK,
@@ -139,5 +140,5 @@ def _apart(views: Sequence[View], gains: Floats) -> Floats:
         shared.append((np.exp(likely - total)[:, None] * means).sum(0))
     weights = np.exp(np.array(evidence) - logsumexp(evidence))
     rest = gains - np.tensordot(weights, shared, 1) @ OPPONENTS
-    rest = np.round(rest / GAINS_GRID) * GAINS_GRID  # a BLAS rounds as the CPU's maker has it
+    rest = on_grid(rest, GAINS_GRID)
     return rest - rest.mean(0)

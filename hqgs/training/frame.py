@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hqgs.base.elementary import on_grid
 from hqgs.model.formats.turned import mapped
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.constants import USUAL
@@ -46,7 +47,7 @@ class Frame:
     def scene(self) -> Scene:
         """The scene in this frame: what is trained."""
         points = _turned(self.given.points - self.middle, self.axes) / self.unit
-        rounded = (np.round(points / POINT_GRID) * POINT_GRID).astype(np.float32)
+        rounded = on_grid(points, POINT_GRID).astype(np.float32)
         train, test = ([self._into(view) for view in views] for views in (self.given.train, self.given.test))
         return replace(self.given, train=train, test=test, points=rounded, world=World())
 
@@ -69,25 +70,18 @@ class Frame:
         given, viewmat = view.camera.viewmat, np.eye(4)
         R = _turned(given[:3, :3], self.axes)
         t = (_turned(self.middle[None], given[:3, :3])[0] + given[:3, 3]) / self.unit
-        u, _, vt = np.linalg.svd(np.round(R / POSE_GRID) * POSE_GRID)
-        viewmat[:3, :3], viewmat[:3, 3] = u @ vt, np.round(t / POSE_GRID) * POSE_GRID
+        u, _, vt = np.linalg.svd(on_grid(R, POSE_GRID))
+        viewmat[:3, :3], viewmat[:3, 3] = u @ vt, on_grid(t, POSE_GRID)
         return replace(view, camera=replace(view.camera, viewmat=viewmat))
 
 
-def on_grid(scene: Scene) -> Scene:
-    """The scene with poses, moved by less than 1e-9, that are alike on every make of CPU.
-
-    Each make has its own code in a BLAS, which rounds in its own way.
-    """
+def with_rounded_poses(scene: Scene) -> Scene:
+    """The scene with poses, moved by less than 1e-9, that are alike on every make of CPU."""
     train, test = (
-        [replace(v, camera=replace(v.camera, viewmat=_rounded(v.camera.viewmat))) for v in views]
+        [replace(v, camera=replace(v.camera, viewmat=on_grid(v.camera.viewmat, CAMERA_GRID))) for v in views]
         for views in (scene.train, scene.test)
     )
     return replace(scene, train=train, test=test)
-
-
-def _rounded(viewmat: Array) -> Array:
-    return np.round(viewmat / CAMERA_GRID) * CAMERA_GRID + 0.0  # one zero, not two
 
 
 Trainable = Scene | Frame  # as its coordinates are, or in a frame of its own

@@ -20,7 +20,7 @@ from hqgs.model.shapes import as_discs
 from hqgs.scene.scene import Scene
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
 from hqgs.training.forward import TrainingViews
-from hqgs.training.frame import Frame, Trainable, on_grid
+from hqgs.training.frame import Frame, Trainable, with_rounded_poses
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.passersby import without_passersby
@@ -45,7 +45,7 @@ class Prepared:
         self._frame: Frame | None = scene if isinstance(scene, Frame) else None
         scene = scene.scene() if isinstance(scene, Frame) else scene
         scene.check_trainable()
-        scene = on_grid(scene)
+        scene = with_rounded_poses(scene)
         inspector = inspector or Inspector()
         unused = list[LeftOut]()
         if "photos" in asked.leave_out:
