@@ -32,11 +32,11 @@ from hqgs.training.trainer import Trainer
 N, STOP = 300, 200
 
 
-def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
-    """When a run of N steps gets another length, and which; each step takes `step` s."""
+def turned_at(seconds: float, step: float, most: int = 10**6, **changes: Any) -> tuple[int, int]:
+    """When a run of N steps gets another length, `most` at most, and which; each step takes `step` s."""
     config = tiny_config(N, densify=DensifyConfig(stop=STOP), seconds=seconds, **changes)
     views = tiny_scene().train
-    schedule = Schedule.of(replace(planned(config, views), follows_clock=True), len(views))
+    schedule = Schedule.of(replace(planned(config, views), clock_most=most), len(views))
     decisions, iteration = schedule.start(), 0
     while iteration < decisions.length:
         iteration += 1
@@ -48,11 +48,14 @@ def turned_at(seconds: float, step: float, **changes: Any) -> tuple[int, int]:
 
 def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
     at = STOP + 33  # a third of what is left
-    assert turned_at(seconds=30.0, step=0.1) == (at, 300)
+    assert turned_at(seconds=30.0, step=0.1) == (0, 300)  # as planned
     assert turned_at(seconds=35.0, step=0.1) == (at, 350)
     assert turned_at(seconds=27.0, step=0.1) == (at, 270)
     assert turned_at(seconds=1.0, step=0.1) == (at, at + 7)  # a tenth of what was planned is left
     assert turned_at(seconds=1e6, step=0.1) == (at, at + 268)  # four times as much
+    assert turned_at(seconds=1e6, step=0.1, most=320) == (at, 320)
+    assert turned_at(seconds=1e6, step=0.1, most=N) == (0, N)  # more do not pay
+    assert turned_at(seconds=27.0, step=0.1, most=N) == (at, 270)  # nor does it take longer than asked for
     assert turned_at(seconds=1.0, step=0.1, turn=(260, 280)) == (260, 280)  # a plan, not the clock
 
 
@@ -92,20 +95,18 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 30)
     monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
-    run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
+    run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=1e-3)
     plan = json.loads((tmp_path / "a" / PLAN).read_text())
     assert plan["iterations"] == 30
     at, length = plan["turn"]
-    assert (at, length) == (23, run.iterations)
+    assert (at, length) == (23, run.iterations) == (23, 24)
     assert run.report["config"]["turn"] == (at, length)
-    assert any("planned for 0.5 s" in note for note in run.report["notes"])
+    assert any("planned for 0.001 s" in note for note in run.report["notes"])
     again = hqgs.train(scene, out=tmp_path / "b", config=with_plan(config, tmp_path / "a"))
     assert again.iterations == run.iterations
     assert (tmp_path / "a" / PLY).read_bytes() == (tmp_path / "b" / PLY).read_bytes()
-    other = hqgs.train(scene, config=with_iterations(config, 30))
-    assert (other.iterations == run.iterations) == (length == 30)
     kept = json.loads((tmp_path / "a" / CONFIG).read_text())["train"]
-    assert (kept["iterations"], kept["seconds"]) == (500, 0.5)  # as it was asked for
+    assert (kept["iterations"], kept["seconds"]) == (500, 1e-3)  # as it was asked for
 
 
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,10 +205,10 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
         return trainer
 
     long = timed(1e6)
-    assert (long.config.iterations, long.plan.follows_clock) == (1_050, False)
+    assert long.config.iterations == long.plan.clock_most == 1_050
     assert any("more looks at the photos do not pay" in note for note in run_notes(long))
     short_of = timed(1e-3)
-    assert (short_of.config.iterations, short_of.plan.follows_clock) == (plan_length.FEWEST_ITERATIONS, True)
+    assert (short_of.config.iterations, short_of.plan.clock_most) == (plan_length.FEWEST_ITERATIONS, 1_050)
 
 
 def test_a_run_without_a_number_can_be_made_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

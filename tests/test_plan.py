@@ -126,8 +126,8 @@ def test_seconds_are_a_fact_of_the_machine() -> None:
     slow, fast = (plan_run(replace(facts, seconds=StepSeconds(s, s / 4)), None, config) for s in (0.1, 0.01))
     assert slow.settings.iterations == pytest.approx(60 / (0.1 * plan_length.SLOWER), rel=0.01)
     assert fast.settings.iterations == pytest.approx(60 / (0.01 * plan_length.SLOWER), rel=0.01)
-    assert slow.follows_clock
-    assert not planned(config, tiny_scene().train).follows_clock
+    assert slow.clock_most == plan_length.MOST_ITERATIONS
+    assert not planned(config, tiny_scene().train).clock_most
 
 
 def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_path: Path) -> None:

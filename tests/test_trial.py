@@ -60,7 +60,7 @@ class FakeRun:
     def __init__(self, scene: Scene, config: TrainConfig) -> None:
         self.scene, self.iteration, self.length = scene, 0, config.iterations
         self.method: Any = SimpleNamespace(state_dict=dict, load_state_dict=lambda state: None)
-        self.plan = RunPlan(config, FIRST, True, True, 0, 0, False)
+        self.plan = RunPlan(config, FIRST, True, True, 0, 0, 0)
 
     def begin(self, plan: RunPlan) -> None:
         self.plan, self.iteration = plan, 0
@@ -91,7 +91,7 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
         assert (config.opacity_decay, config.hqgs.formation) == (0.0, "none")
         return FakeRun(part, config)
 
-    plan = RunPlan(replace(ASKED, iterations=10**6, leave_out=("growth",)), FIRST, True, True, 0, 0, False)
+    plan = RunPlan(replace(ASKED, iterations=10**6, leave_out=("growth",)), FIRST, True, True, 0, 0, 0)
     found = trial.tried_growth(scene, plan, begin)  # type: ignore[arg-type]
     names = [view.name for view in scene.train]
     for part, offset in zip(seen, TRIAL_OFFSETS, strict=True):
@@ -106,7 +106,7 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
 
 def test_a_trial_takes_a_small_share_of_a_run_and_needs_photos_to_spare() -> None:
     scene = tiny_scene(12)
-    plan = RunPlan(replace(ASKED, iterations=10**6), FIRST, True, True, 0, 0, False)
+    plan = RunPlan(replace(ASKED, iterations=10**6), FIRST, True, True, 0, 0, 0)
     assert trial.calls_for_trial(scene, plan)
     assert not trial.calls_for_trial(scene, replace(plan, settings=ASKED))
     assert not trial.calls_for_trial(replace(scene, train=scene.train[:4]), plan)

@@ -22,12 +22,13 @@ def turned(
     at = schedule.turn_at(decisions)
     if config.turn is not None:
         length = config.turn[1]
-    elif schedule.run.follows_clock and config.seconds is not None:
+    elif schedule.run.clock_most and config.seconds is not None:
         rest = config.iterations - at
         left = (config.seconds - seconds) / step if step > 0 else rest
         length = at + round(min(max(left, CLOCK_LEAST * rest), CLOCK_MOST * rest))
+        length = min(length, schedule.run.clock_most)
     else:
         return decisions
-    if iteration != at or not at < min(length, config.iterations):
+    if iteration != at or not at < min(length, config.iterations) or length == decisions.length:
         return decisions
     return replace(decisions, length=length, turned=at)

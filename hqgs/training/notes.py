@@ -30,10 +30,10 @@ def run_notes(trainer: Trainer) -> list[str]:
         notes.append(fell)
     if (seconds := trainer.config.seconds) is not None:
         text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
-        if trainer.config.turn is None and not trainer.plan.follows_clock:
-            text += ", and more looks at the photos do not pay"
-        elif at := trainer.state.decisions.turned:
+        if at := trainer.state.decisions.turned:
             text += f"; after iteration {at}, {trainer.length} in all"
+        if trainer.length == trainer.plan.clock_most:
+            text += ", and more looks at the photos do not pay"
         notes.append(f"{text}. `--plan` with plan.json trains the same again, bit for bit")
     if trainer.lengthened is not None:
         notes.append(

@@ -93,7 +93,7 @@ class RunPlan:
     discs: bool  # the first ones are flat, as their neighbours lie; else round
     held_photos: int  # training photos that are held back at first
     half_size_until: int  # the last iteration at half the photos' sides; 0: there is none
-    follows_clock: bool  # the clock gives the run another length after growth
+    clock_most: int  # iterations that the clock may give the run after growth; 0: it does not look at it
     rows: tuple[PlanRow, ...] = field(default=(), repr=False)
 
     def values(self) -> dict[str, Any]:
@@ -173,7 +173,7 @@ class Rule:
 
 def plan_by(rules: Sequence[Rule], facts: Facts, diagnosis: Diagnosis | None, asked: TrainConfig) -> RunPlan:
     """What the rules make of a run, one after the other: each sees what those before it have decided."""
-    plan = RunPlan(asked, facts.points, False, False, 0, 0, False)
+    plan = RunPlan(asked, facts.points, False, False, 0, 0, 0)
     for rule in rules:
         name = f"{rule.decide.__name__}: {rule.source}"
         for choice in rule.decide(Draft(facts, diagnosis, asked, plan)):

@@ -29,6 +29,7 @@ from hqgs.training.constants import (
     LEAST_ENOUGH,
     MANY_PHOTOS,
     MOST_HELD,
+    MOST_ITERATIONS,
     PIXELS,
     SMALLEST_SIDE,
 )
@@ -224,14 +225,14 @@ def _timed(draft: Draft, step: StepSeconds, seconds: float, most: int | None) ->
     first = draft.plan.first_points / max(draft.facts.points, 1)
     halves = "resolution" in draft.settings.leave_out
     planned = fitting(seconds, step, first, lambda n: half_size_end(n) if halves else 0, most)
-    pays = planned != most
-    why = f"as many as fit into {seconds:g} s" if pays else "more looks at the photos do not pay"
+    fits = planned != most
+    why = f"as many as fit into {seconds:g} s" if fits else "more looks at the photos do not pay"
     half = f", {1e3 * step.half:.1f} ms at half size" if halves else ""
     return Choice(
         f"{planned:,} iterations",
-        why + ("; the clock corrects that after growth" if pays else ""),
+        f"{why}; the clock {'corrects that' if fits else 'may end it sooner'}, after growth",
         f"{1e3 * step.full:.1f} ms a step{half} at the start",
-        changes={"settings": with_iterations(draft.settings, planned), "follows_clock": pays},
+        changes={"settings": with_iterations(draft.settings, planned), "clock_most": most or MOST_ITERATIONS},
     )
 
 

@@ -299,7 +299,7 @@ class Trainer:
         state, before = self.state, self.state.decisions
         step = self.frugality.step_seconds
         decisions = turned(self.schedule, before, state.iteration, state.seconds, step)
-        if self.plan.follows_clock and self.ranks.count > 1:
+        if self.plan.clock_most and self.ranks.count > 1:
             decisions = Decisions(**self.ranks.tell(asdict(decisions))[0])
         if decisions != before:
             why = "as recorded" if self.config.turn else f"what fits into {self.config.seconds:g} s"
