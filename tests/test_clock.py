@@ -26,7 +26,7 @@ from hqgs.training.notes import run_notes
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import plan_values, with_iterations, with_plan
+from hqgs.training.settings import plan_values, with_plan
 from hqgs.training.trainer import Trainer
 
 N, STOP = 300, 200

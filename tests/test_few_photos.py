@@ -74,7 +74,9 @@ def facts(photos: int, agreed: float | None = None) -> Facts:
         (23, 0.72, DECAY, None),
         (23, None, DECAY, None),
         (17, 0.91, None, None),
-        (43, 0.7, None, None),
+        (62, 0.7, DECAY / 2, None),  # as much in a look at all photos as of 31
+        (62, 0.85, None, None),
+        (62, None, None, None),
     ],
 )
 def test_the_plan_asks_for_decay_and_dropout_where_photos_are_few(

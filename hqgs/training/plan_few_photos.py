@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hqgs.training.constants import DECAY, DEPTHS_AGREED, DROPOUT, DROPOUT_PHOTOS, FEW_PHOTOS, MANY_PHOTOS
+from hqgs.training.constants import (
+    DECAY,
+    DEPTHS_AGREED,
+    DROPOUT,
+    DROPOUT_PHOTOS,
+    FEW_PHOTOS,
+    MANY_AGREED,
+    MANY_PHOTOS,
+)
 from hqgs.training.plan import Choice, Draft, Facts
 
-WHERE = "where it pays: 25 sets of 3 to 43 photos"
+WHERE = "where it pays: 29 sets of 3 to 103 photos"
 
 
-def in_agreement(facts: Facts) -> bool:
+def in_agreement(facts: Facts, least: float = DEPTHS_AGREED) -> bool:
     """Whether the photos bear each other out: more than FEW_PHOTOS, which agree on where things are."""
-    return facts.photos > FEW_PHOTOS and facts.agreed is not None and facts.agreed >= DEPTHS_AGREED
+    return facts.photos > FEW_PHOTOS and facts.agreed is not None and facts.agreed >= least
 
 
 def opacity_decay(draft: Draft) -> Sequence[Choice]:
@@ -21,13 +29,15 @@ def opacity_decay(draft: Draft) -> Sequence[Choice]:
         return [] if asked is None else [Choice(f"{asked:g} of the opacities for each view", "asked for")]
     agreed = "" if facts.agreed is None else f", which agree on {facts.agreed:.0%} of the depths"
     evidence = f"{facts.photos} photos{agreed}"
-    if facts.photos > MANY_PHOTOS:
+    many = facts.photos > MANY_PHOTOS
+    if many and (draft.kinds or facts.agreed is None):
         return [Choice("none", "so many photos bear out what is there, and it would cost detail", evidence)]
-    if in_agreement(facts):
+    if in_agreement(facts, MANY_AGREED if many else DEPTHS_AGREED):
         return [Choice("none", "the photos agree on where things are, and it would cost detail", evidence)]
     why = "what few photos bear out would hang in the air between them"
+    share = DECAY * min(1.0, MANY_PHOTOS / facts.photos)
     return [
-        Choice(f"{DECAY:g} of the opacities for each view", why, evidence, changes={"opacity_decay": DECAY})
+        Choice(f"{share:.2g} of the opacities for each view", why, evidence, changes={"opacity_decay": share})
     ]
 
 

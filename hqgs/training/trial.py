@@ -23,6 +23,7 @@ from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
 from hqgs.training.constants import (
+    MANY_PHOTOS,
     TRIAL_EACH,
     TRIAL_OFFSETS,
     TRIAL_PIXELS,
@@ -81,7 +82,8 @@ def tried_growth(scene: Scene, plan: RunPlan, begin: Begin, on_stage: OnStage = 
     """
     on_stage(Stage("growth", 0, 0, "trying on photos held back whether growth pays"))
     side = _side(scene, plan.settings.iterations)
-    config, views = _settings(plan.settings), [shrunk(view, side) for view in scene.train]
+    config = _settings(plan.settings, len(scene.train))
+    views = [shrunk(view, side) for view in scene.train]
     found = list[NDArray[np.float64]]()
     for offset in TRIAL_OFFSETS:
         held = range(offset, len(views), TRIAL_EACH)
@@ -119,13 +121,17 @@ def _gains(trainer: ShortRun, pixels: int) -> NDArray[np.float64]:
     return found[1] - found[0]
 
 
-def _settings(settings: TrainConfig) -> TrainConfig:
-    """Of a short run: the run's, but that nothing more is decided; small photos show no shake."""
+def _settings(settings: TrainConfig, photos: int) -> TrainConfig:
+    """Of a short run: the run's, but that nothing more is decided; small photos show no shake.
+
+    Opacities of many photos decay over more looks than it has.
+    """
+    decay = (settings.opacity_decay or 0.0) if photos <= MANY_PHOTOS else 0.0
     exposed = any(step.kind == "exposure" for step in parse_formation(settings.hqgs.formation).steps)
     return replace(
         with_iterations(replace(settings, leave_out=(), seconds=None, turn=None), TRIAL_STEPS),
         hqgs=replace(settings.hqgs, formation="exposure" if exposed else NONE),
         batch=1,
-        opacity_decay=settings.opacity_decay or 0.0,
+        opacity_decay=decay,
         dropout=settings.dropout or 0.0,
     )
