@@ -26,7 +26,7 @@ from hqgs.training.notes import run_notes
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import plan_values, with_plan
+from hqgs.training.settings import plan_values, with_iterations, with_plan
 from hqgs.training.trainer import Trainer
 
 N, STOP = 300, 200
@@ -48,7 +48,7 @@ def turned_at(seconds: float, step: float, most: int = 10**6, **changes: Any) ->
 
 def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
     at = STOP + 33  # a third of what is left
-    assert turned_at(seconds=30.0, step=0.1) == (0, 300)  # as planned
+    assert turned_at(seconds=30.0, step=0.1) == (at, 300)
     assert turned_at(seconds=35.0, step=0.1) == (at, 350)
     assert turned_at(seconds=27.0, step=0.1) == (at, 270)
     assert turned_at(seconds=1.0, step=0.1) == (at, at + 7)  # a tenth of what was planned is left
@@ -95,18 +95,20 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 30)
     monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
-    run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=1e-3)
+    run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
     plan = json.loads((tmp_path / "a" / PLAN).read_text())
     assert plan["iterations"] == 30
     at, length = plan["turn"]
-    assert (at, length) == (23, run.iterations) == (23, 24)
+    assert (at, length) == (23, run.iterations)
     assert run.report["config"]["turn"] == (at, length)
-    assert any("planned for 0.001 s" in note for note in run.report["notes"])
+    assert any("planned for 0.5 s" in note for note in run.report["notes"])
     again = hqgs.train(scene, out=tmp_path / "b", config=with_plan(config, tmp_path / "a"))
     assert again.iterations == run.iterations
     assert (tmp_path / "a" / PLY).read_bytes() == (tmp_path / "b" / PLY).read_bytes()
+    other = hqgs.train(scene, config=with_iterations(config, 30))
+    assert (other.iterations == run.iterations) == (length == 30)
     kept = json.loads((tmp_path / "a" / CONFIG).read_text())["train"]
-    assert (kept["iterations"], kept["seconds"]) == (500, 1e-3)  # as it was asked for
+    assert (kept["iterations"], kept["seconds"]) == (500, 0.5)  # as it was asked for
 
 
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:

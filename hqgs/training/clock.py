@@ -19,16 +19,16 @@ def turned(
     config = schedule.config
     if decisions.turned:
         return decisions
-    at = schedule.turn_at(decisions)
+    at, most = schedule.turn_at(decisions), schedule.run.clock_most
     if config.turn is not None:
         length = config.turn[1]
-    elif schedule.run.clock_most and config.seconds is not None:
+    elif most and config.seconds is not None:
         rest = config.iterations - at
         left = (config.seconds - seconds) / step if step > 0 else rest
         length = at + round(min(max(left, CLOCK_LEAST * rest), CLOCK_MOST * rest))
-        length = min(length, schedule.run.clock_most)
+        length = min(length, most)
     else:
         return decisions
-    if iteration != at or not at < min(length, config.iterations) or length == decisions.length:
+    if iteration != at or not at < min(length, config.iterations) or length == decisions.length == most:
         return decisions
     return replace(decisions, length=length, turned=at)
