@@ -12,6 +12,7 @@ from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.passing import passing_picture
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.evaluation.verdict import overdone
+from hqgs.training.constants import MOST_ITERATIONS
 from hqgs.training.methods.cameras import LearnedCamera
 from hqgs.training.trainer import Trainer
 
@@ -32,7 +33,7 @@ def run_notes(trainer: Trainer) -> list[str]:
         text = f"{trainer.config.iterations} iterations were planned for {seconds:g} s of training"
         if at := trainer.state.decisions.turned:
             text += f"; after iteration {at}, {trainer.length} in all"
-        if trainer.length == trainer.plan.clock_most:
+        if trainer.length == trainer.plan.clock_most < MOST_ITERATIONS:
             text += ", and more looks at the photos do not pay"
         notes.append(f"{text}. `--plan` with plan.json trains the same again, bit for bit")
     if trainer.lengthened is not None:

@@ -1,4 +1,4 @@
-"""What keeps a scene of few photos from learning them by heart, and where it pays."""
+"""What keeps a scene from learning its photos by heart, and where it pays."""
 
 from __future__ import annotations
 
