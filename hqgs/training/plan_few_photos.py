@@ -12,6 +12,8 @@ from hqgs.training.constants import (
     FEW_PHOTOS,
     MANY_AGREED,
     MANY_PHOTOS,
+    PIXELS_EACH,
+    POINT_GAUSSIANS,
 )
 from hqgs.training.plan import Choice, Draft, Facts
 
@@ -51,3 +53,15 @@ def dropout(draft: Draft) -> Sequence[Choice]:
     why = "no Gaussian may explain a photo alone"
     value = f"up to {DROPOUT:.0%} of the Gaussians in a step"
     return [Choice(value, why, f"{photos} photos", changes={"dropout": DROPOUT})]
+
+
+def most_gaussians(draft: Draft) -> Sequence[Choice]:
+    """Where few photos agree on few points, growth explains each photo alone, without end."""
+    facts, most = draft.facts, draft.settings.densify.max_gaussians
+    few = draft.formed and facts.as_photographed and 0 < facts.photos <= MANY_PHOTOS and facts.points > 0
+    pixels = sum(height * width for height, width in facts.sizes)
+    if not few or (bound := max(POINT_GAUSSIANS * facts.points, pixels // PIXELS_EACH)) >= most:
+        return [Choice(f"{most:,} Gaussians at most", "it bounds the memory")]
+    why = "more explain each photo alone where so few points are borne out"
+    evidence = f"{facts.photos} photos of {pixels / 1e6:.1f} megapixels, {facts.points:,} points"
+    return [Choice(f"{bound:,} Gaussians at most", why, evidence, changes={"densify.max_gaussians": bound})]

@@ -41,7 +41,7 @@ from hqgs.training.plan_budget import (
     no_growth,
     sharp_pixels,
 )
-from hqgs.training.plan_few_photos import WHERE, dropout, opacity_decay
+from hqgs.training.plan_few_photos import WHERE, dropout, most_gaussians, opacity_decay
 from hqgs.training.plan_left_out import held_photos, needless
 from hqgs.training.plan_length import fitting, shown
 from hqgs.training.plan_photos import passersby, photos
@@ -249,7 +249,7 @@ def budget(draft: Draft) -> Sequence[Choice]:
     facts, settings = draft.facts, draft.settings
     growth = settings.densify
     if not draft.formed or draft.undegraded or not facts.sizes:
-        return [Choice(f"{growth.max_gaussians:,} Gaussians at most", "it bounds the memory")]
+        return most_gaussians(draft)
     degradation = draft.degradation
     wanted = max(gaussians_determined(facts, degradation, settings.hqgs.gaussians_per_pixel), facts.points)
     most = min(growth.max_gaussians, wanted)

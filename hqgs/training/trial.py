@@ -107,7 +107,7 @@ def _gains(trainer: ShortRun, pixels: int) -> NDArray[np.float64]:
     kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
     plan, found = trainer.plan, list[NDArray[np.float64]]()
     growth = plan.settings.densify
-    most = max(pixels // TRIAL_PIXELS, plan.first_points)
+    most = min(growth.max_gaussians, max(pixels // TRIAL_PIXELS, plan.first_points))
     for changes in ({"max_gaussians": most}, no_growth(growth)):
         trainer.begin(replace(plan, settings=replace(plan.settings, densify=replace(growth, **changes))))
         trainer.method.load_state_dict(kept)
