@@ -58,7 +58,7 @@ def dropout(draft: Draft) -> Sequence[Choice]:
 def most_gaussians(draft: Draft) -> Sequence[Choice]:
     """Where few photos agree on few points, growth explains each photo alone, without end."""
     facts, most = draft.facts, draft.settings.densify.max_gaussians
-    few = draft.formed and facts.as_photographed and 0 < facts.photos <= MANY_PHOTOS and facts.points > 0
+    few = draft.formed and facts.as_photographed and 0 < facts.photos <= FEW_PHOTOS and facts.points > 0
     pixels = sum(height * width for height, width in facts.sizes)
     if not few or (bound := max(POINT_GAUSSIANS * facts.points, pixels // PIXELS_EACH)) >= most:
         return [Choice(f"{most:,} Gaussians at most", "it bounds the memory")]
