@@ -99,7 +99,6 @@ def test_the_plan_asks_for_decay_and_dropout_where_photos_are_few(
     [
         (8, 400, 16_000),  # 40 for each point
         (8, 20, 8 * 10_000 // 50),  # or one for 50 pixels
-        (8, 0, None),  # photos without points tell nothing
         (12, 1_000_000, None),
         (13, 400, None),
     ],
@@ -108,10 +107,12 @@ def test_growth_of_few_photos_is_bounded_by_what_they_agree_on(
     photos: int, points: int, most: int | None
 ) -> None:
     asked = run_config(iterations=1000, method="hqgs", formation="none")
-    known = replace(facts(photos), points=points)
+    known = replace(facts(photos), points=points, found=True)
     given = asked.densify.max_gaussians
     plan = plan_run(known, None, asked)
     assert plan.settings.densify.max_gaussians == (most or given)
+    told = plan_run(replace(known, found=False), None, asked)  # by all photos of a capture, say
+    assert told.settings.densify.max_gaussians == given
     less = replace(asked, densify=replace(asked.densify, max_gaussians=500))
     assert plan_run(known, None, less).settings.densify.max_gaussians == 500
     plain = plan_run(known, None, run_config(iterations=1000, method="3dgs"))

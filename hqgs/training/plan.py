@@ -53,6 +53,7 @@ class Facts:
     passed: int | None = None  # photos in which somebody passes by; None: not looked at
     passing: float = 0.0  # share of all pixels that these cover
     tried: Tried | None = None  # whether growth pays; None: not tried
+    found: bool = False  # whether its cameras were found from the photos alone
     # What the method tells of the photos (`Method.facts`):
     as_photographed: bool = False  # renders are compared with photos as they are, of any size
     sizes: tuple[tuple[int, int], ...] = ()  # height and width of each photo as it was taken

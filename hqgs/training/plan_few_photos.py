@@ -56,12 +56,12 @@ def dropout(draft: Draft) -> Sequence[Choice]:
 
 
 def most_gaussians(draft: Draft) -> Sequence[Choice]:
-    """Where few photos agree on few points, growth explains each photo alone, without end."""
+    """Cameras that few photos found are a little off: growth then explains each photo alone, without end."""
     facts, most = draft.facts, draft.settings.densify.max_gaussians
-    few = draft.formed and facts.as_photographed and 0 < facts.photos <= FEW_PHOTOS and facts.points > 0
+    few = draft.formed and facts.as_photographed and facts.found and facts.photos <= FEW_PHOTOS
     pixels = sum(height * width for height, width in facts.sizes)
     if not few or (bound := max(POINT_GAUSSIANS * facts.points, pixels // PIXELS_EACH)) >= most:
         return [Choice(f"{most:,} Gaussians at most", "it bounds the memory")]
-    why = "more explain each photo alone where so few points are borne out"
+    why = "more explain each photo alone: cameras found from so few are a little off"
     evidence = f"{facts.photos} photos of {pixels / 1e6:.1f} megapixels, {facts.points:,} points"
     return [Choice(f"{bound:,} Gaussians at most", why, evidence, changes={"densify.max_gaussians": bound})]

@@ -140,6 +140,7 @@ def facts_of(scene: Scene, unused: list[LeftOut] | None = None) -> Facts:
         shortest_side=min(min(camera.width, camera.height) for camera in cameras),
         points=len(scene.points),
         linked=scene.seen is not None,
+        found=scene.sfm is not None,
         unused=tuple(unused or ()),
     )
 
