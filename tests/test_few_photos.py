@@ -107,7 +107,7 @@ def test_growth_of_few_photos_is_bounded_by_what_they_agree_on(
     photos: int, points: int, most: int | None
 ) -> None:
     asked = run_config(iterations=1000, method="hqgs", formation="none")
-    known = replace(facts(photos), points=points, found=True)
+    known = replace(facts(photos), pixels=photos * 10_000, points=points, found=True)
     given = asked.densify.max_gaussians
     plan = plan_run(known, None, asked)
     assert plan.settings.densify.max_gaussians == (most or given)

@@ -59,9 +59,8 @@ def most_gaussians(draft: Draft) -> Sequence[Choice]:
     """Cameras that few photos found are a little off: growth then explains each photo alone, without end."""
     facts, most = draft.facts, draft.settings.densify.max_gaussians
     few = draft.formed and facts.as_photographed and facts.found and facts.photos <= FEW_PHOTOS
-    pixels = sum(height * width for height, width in facts.sizes)
-    if not few or (bound := max(POINT_GAUSSIANS * facts.points, pixels // PIXELS_EACH)) >= most:
+    if not few or (bound := max(POINT_GAUSSIANS * facts.points, facts.pixels // PIXELS_EACH)) >= most:
         return [Choice(f"{most:,} Gaussians at most", "it bounds the memory")]
     why = "more explain each photo alone: cameras found from so few are a little off"
-    evidence = f"{facts.photos} photos of {pixels / 1e6:.1f} megapixels, {facts.points:,} points"
+    evidence = f"{facts.photos} photos of {facts.pixels / 1e6:.1f} megapixels, {facts.points:,} points"
     return [Choice(f"{bound:,} Gaussians at most", why, evidence, changes={"densify.max_gaussians": bound})]
