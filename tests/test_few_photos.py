@@ -111,6 +111,8 @@ def test_growth_of_few_photos_is_bounded_by_what_they_agree_on(
     given = asked.densify.max_gaussians
     plan = plan_run(known, None, asked)
     assert plan.settings.densify.max_gaussians == (most or given)
+    exposed = plan_run(known, None, run_config(iterations=1000, method="hqgs", formation="exposure"))
+    assert exposed.settings.densify.max_gaussians == (most or given)
     told = plan_run(replace(known, found=False), None, asked)  # by all photos of a capture, say
     assert told.settings.densify.max_gaussians == given
     less = replace(asked, densify=replace(asked.densify, max_gaussians=500))

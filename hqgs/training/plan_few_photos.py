@@ -58,7 +58,7 @@ def dropout(draft: Draft) -> Sequence[Choice]:
 def most_gaussians(draft: Draft) -> Sequence[Choice]:
     """Cameras that few photos found are a little off: growth then explains each photo alone, without end."""
     facts, most = draft.facts, draft.settings.densify.max_gaussians
-    few = draft.formed and facts.as_photographed and facts.found and facts.photos <= FEW_PHOTOS
+    few = draft.formed and draft.kinds <= {"exposure"} and facts.found and facts.photos <= FEW_PHOTOS
     if not few or (bound := max(POINT_GAUSSIANS * facts.points, facts.pixels // PIXELS_EACH)) >= most:
         return [Choice(f"{most:,} Gaussians at most", "it bounds the memory")]
     why = "more explain each photo alone: cameras found from so few are a little off"
