@@ -15,13 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.pages import write as pages
-from benchmarks.pages.sections import FIRST, OPENSPLAT
+from benchmarks.pages.sections import EXTERNAL
 from benchmarks.rows import KEYS, Table, facts
 from benchmarks.study import sources
 from hqgs.cli.progress import duration
 
 HELP = "run every study behind the pages that is not finished, then write the pages"
-EXTERNAL = (FIRST, OPENSPLAT)  # rows of other programs, which nothing here prints
 DONE = "studies.csv"
 
 

@@ -21,9 +21,11 @@ from benchmarks.pages.sections import (
     left_out,
     levels,
     like_mine,
+    ours,
     over_time,
     seeds_apart,
     then,
+    where,
 )  # fmt: skip
 from benchmarks.pages.write import RESULTS, STUDIES, pages
 from benchmarks.rows import KEYS, RUN, Table, pairs_of, text_of
@@ -157,9 +159,11 @@ def test_where_runs_are_from_is_said_once() -> None:
 def test_seconds_by_hand() -> None:
     times = frame(
         run_of("3dgs", 28.0, seconds=100.0, history="9:20|31:25|90:28"),
-        run_of("first commit", 24.0, seconds=90.0, history="20:22|40:24"),
+        run_of("first commit", 24.0, threads=2, seconds=90.0, history="20:22|40:24"),
         run_of("30 s", 26.0, seconds=29.0, history=""), run_of("60 s", 27.95, seconds=61.0, history=""),
     )  # fmt: skip
+    assert set(ours(times)["row"]) == {"3dgs", "30 s", "60 s"}
+    assert where(times, "first commit") == "2 cores of CPU, 2026-11-26"
     assert [then("9:20|31:25", seconds) for seconds in (5.0, 30.0, 31.0)] == [None, 20.0, 25.0]
     assert after(times, "a", "3dgs", 30.0) == 20.0
     assert over_time(times, ["a"], "first commit").splitlines()[-1] == "| a | +4.00 | +3.95 |"

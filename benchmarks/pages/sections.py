@@ -12,6 +12,18 @@ from benchmarks.rows import RUN, pairs_of
 
 SHORT = 0.1  # dB: a level is what 3DGS ends at, less this
 FIRST, OPENSPLAT, BASE = "first commit", "OpenSplat", "3dgs"
+EXTERNAL = (FIRST, OPENSPLAT)  # rows of other programs, which no command here prints
+
+
+def ours(times: DataFrame) -> DataFrame:
+    """The rows that a command of this commit prints."""
+    return times[~times["row"].isin(EXTERNAL)]
+
+
+def where(times: DataFrame, row: str) -> str:
+    """Machine and day of a row: `2 cores of AMD EPYC, 2026-11-23`."""
+    line = records(pick(times, row=row))[0]
+    return f"{line['threads']:.0f} cores of {line['machine']}, {line['date']}"
 
 
 def then(history: str, seconds: float) -> float | None:
