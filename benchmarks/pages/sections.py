@@ -17,7 +17,7 @@ EXTERNAL = (FIRST, OPENSPLAT)  # rows of other programs, which no command here p
 
 def ours(times: DataFrame) -> DataFrame:
     """The rows that a command of this commit prints."""
-    return times[~times["row"].isin(EXTERNAL)]
+    return times.loc[~times["row"].isin(EXTERNAL)]
 
 
 def where(times: DataFrame, row: str) -> str:
