@@ -12,7 +12,7 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.config import TrainConfig, run_config
-from hqgs.training.constants import DECAY, DROPOUT, DROPPED, OPAQUE
+from hqgs.training.constants import DECAY, DROPOUT, DROPPED, MANY_PHOTOS, OPAQUE
 from hqgs.training.few_photos import decay_opacities, with_dropout
 from hqgs.training.plan import Facts
 from hqgs.training.plan_rules import plan_run
@@ -92,6 +92,20 @@ def test_the_plan_asks_for_decay_and_dropout_where_photos_are_few(
     assert (off.settings.opacity_decay, off.settings.dropout) == (0.0, 0.0)
     plain = plan_run(facts(photos, agreed), None, run_config(iterations=1000, method="3dgs"))
     assert (plain.settings.opacity_decay, plain.settings.dropout) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("photos", "agreed", "decay"), [(3, None, DECAY), (23, 0.72, DECAY), (17, 0.91, None), (62, 0.7, None)]
+)
+def test_degraded_photos_are_kept_from_being_learned_by_heart_too(
+    photos: int, agreed: float | None, decay: float | None
+) -> None:
+    asked = run_config(iterations=1000, method="hqgs", formation="noise:12")
+    plan = plan_run(facts(photos, agreed), None, asked)
+    assert (plan.settings.opacity_decay, plan.settings.dropout) == (decay, None)
+    assert plan.found_back == (photos <= MANY_PHOTOS)
+    if decay is not None:
+        assert float(next(r.value for r in plan.rows if r.what == "opacity decay").split()[0]) == decay
 
 
 @pytest.mark.parametrize(

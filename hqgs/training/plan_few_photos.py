@@ -27,7 +27,7 @@ def in_agreement(facts: Facts, least: float = DEPTHS_AGREED) -> bool:
 
 def opacity_decay(draft: Draft) -> Sequence[Choice]:
     asked, facts = draft.asked.opacity_decay, draft.facts
-    if asked is not None or not draft.undegraded:
+    if asked is not None or not draft.formed:
         return [] if asked is None else [Choice(f"{asked:g} of the opacities for each view", "asked for")]
     agreed = "" if facts.agreed is None else f", which agree on {facts.agreed:.0%} of the depths"
     evidence = f"{facts.photos} photos{agreed}"

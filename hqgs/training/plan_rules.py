@@ -163,7 +163,7 @@ def first_points(draft: Draft) -> Sequence[Choice]:
     if facts.agreed == 0:
         return [Choice(own, "the photos agree on no more", left_out=what)]
     evidence = f"{facts.points:,} points of the reconstruction, {facts.pixels / 1e6:.1f} megapixels"
-    back = draft.undegraded and facts.photos <= MANY_PHOTOS
+    back = facts.photos <= MANY_PHOTOS
     where = "found back in each other by the photos" if back else "along the photos' edges"
     changes = {"first_points": wanted, "found_back": back}
     return [Choice(f"{wanted:,}, {where}", why, evidence, changes=changes)]
