@@ -16,12 +16,14 @@ from hqgs.scene.scene import Scene
 
 # Photos; what they are taken for; iterations; of the held-out views PSNR (dB): floor, lowest and highest of
 # seeds 0 to 3; SSIM: the same three; how far 3dgs stays below (dB): floor, lowest of the seeds.
+# Points as exact as this room's leave nothing for decay of the opacities to clear: blur and lowres lose 0.2 and
+# 0.1 dB by it here, and gain on captures (hqgs/training/constants.py).
 FLOORS = [
     ("none", "none", 100, (25.5, 25.95, 26.18), (0.910, 0.9168, 0.9201), None),
-    ("noise:25", "noise:26", 100, (24.3, 24.59, 24.76), (0.863, 0.8699, 0.8737), (0.9, 1.31)),
-    ("blur:1", "blur:1", 100, (23.4, 23.56, 23.58), (0.834, 0.8397, 0.8399), (0.8, 1.13)),
-    ("jpeg:20", "noise:17+jpeg:20", 100, (22.1, 22.39, 22.51), (0.777, 0.7845, 0.7883), None),
-    ("lowres:2", "lowres:2", 100, (22.9, 23.11, 23.14), (0.816, 0.8209, 0.8216), (0.2, 0.35)),
+    ("noise:25", "noise:26", 100, (24.3, 24.58, 24.65), (0.863, 0.8682, 0.8709), (0.8, 1.04)),
+    ("blur:1", "blur:1", 100, (23.2, 23.37, 23.38), (0.828, 0.8321, 0.8324), (0.7, 0.92)),
+    ("jpeg:20", "noise:17+jpeg:20", 100, (22.3, 22.53, 22.57), (0.782, 0.7897, 0.7907), None),
+    ("lowres:2", "lowres:2", 100, (22.8, 22.99, 23.00), (0.811, 0.8154, 0.8161), (0.05, 0.19)),
     ("shake:4", "shake", 200, (25.3, 25.78, 25.90), (0.896, 0.9052, 0.9090), (1.4, 1.91)),
 ]
 
