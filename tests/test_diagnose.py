@@ -94,7 +94,7 @@ TRUTH: dict[str, dict[str, tuple[float, float]]] = {  # what is found: kind, val
     "blur:2.5+jpeg:20": {"blur": (2.5, 0.6), "jpeg": (20, 0)},
     "noise:3+jpeg:10": {"jpeg": (10, 0)},  # too weak to come through
     "blur:3+lowres:2+jpeg:20": {"blur": (3, 0.8), "lowres": (2, 0), "jpeg": (20, 0)},
-    "blur:3+lowres:2+jpeg:50": {"blur": (3, 0.8), "lowres": (2, 0), "jpeg": (50, 0)},  # not of small photos
+    "blur:3+lowres:2+jpeg:50": {"blur": (3, 0.8), "lowres": (2, 0), "jpeg": (50, 0)},  # not with others
 }
 
 

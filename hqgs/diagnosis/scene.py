@@ -13,13 +13,13 @@ from hqgs.base.evenly import evenly
 from hqgs.base.left_out import LeftOut
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.diagnosis.constants import (
-    BAD_ENLARGED_QUALITY,
     BAD_QUALITY,
     COARSE_FILM,
     MOST_PHOTOS,
     PROBES,
     SCENE_WHITE,
     UNLIKE_NOISE,
+    VISIBLE_QUALITY,
 )
 from hqgs.diagnosis.devices import DeviceSigns, device_signs
 from hqgs.diagnosis.gains import log_gains, shared_colors
@@ -148,8 +148,9 @@ class Inspector:
         if unlike := [part.name for part in (shake, focus) if part.needed]:
             reason = f"each photo has its own, see {' and '.join(unlike)}"
             blur = replace(blur, needed=False, step=None, reason=reason)
-        lowres = _lowres(photos)
-        parts = (*own, blur, lowres, _noise(photos), _jpeg(photos, lowres.needed), film)
+        faults = blur, _lowres(photos), _noise(photos)
+        jpeg = _jpeg(photos, alone=not any(part.needed for part in (*faults, film)))
+        parts = (*own, *faults, jpeg, film)
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
         passed_over = _passed_over(len(scene.train), len(photos), taken)
         self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
@@ -198,14 +199,14 @@ def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:
     )
 
 
-def _jpeg(photos: Sequence[PhotoDiagnosis], enlarged: bool) -> Finding:
+def _jpeg(photos: Sequence[PhotoDiagnosis], alone: bool) -> Finding:
     qualities = [photo.jpeg.quality for photo in photos if photo.jpeg.quality is not None]
     of = f"{len(qualities)} of {len(photos)} photos show quantised coefficients"
     if 2 * len(qualities) <= len(photos):
         return Finding("jpeg", False, None, None, None, of)
     quality = float(np.median(qualities))
     spread = _spread_of(qualities)
-    limit = BAD_ENLARGED_QUALITY if enlarged else BAD_QUALITY
+    limit = BAD_QUALITY if alone else VISIBLE_QUALITY
     if quality >= limit:
         reason = f"quality {quality:.0f} is good enough to take the photos as they are (needed below {limit})"
         return Finding("jpeg", False, quality, spread, None, reason)
