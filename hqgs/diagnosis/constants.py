@@ -123,10 +123,10 @@ PROBES = 4  # photos searched for enlargement; if they agree, the others are tak
 UNLIKE_NOISE = 2.5  # times the noise of the quieter photos in the noisier ones: each has its own
 SCENE_WHITE = 0.2  # up to this correlation of neighbours, noise counts as white
 # JPEG is undone below the first quality, or below the second where blur, noise or an enlargement is undone.
-# What that gains (400 px, 1,000 iterations, held back; horns of 23, fox of 12, a cat of 6, fern of 14, a street
-# of 21, a wheel of 8 photos), dB: alone, quality 30 -.78 -.45 -1.31 -.01 -.08 -.56; 20 -.52 +.16 +.49 +.04 -.22
-# -.11. Qualities of 55 to 70, fox and cat: chat +.51 +.16, phone +.33 +.49, noise of 12 levels +.11 -.16, blur
-# -.05 +.58, shake -.04 +.23.
+# What that gains (400 px, 1,000 iterations, held back; horns of 23, fox of 12, a cat of 6, fern of 14, a
+# street of 21, a wheel of 8 photos), dB: alone, quality 30 -.78 -.45 -1.31 -.01 -.08 -.56; 20 -.52 +.16 +.49
+# +.04 -.22 -.11. Qualities of 55 to 70, fox and cat: chat +.51 +.16, phone +.33 +.49, noise of 12 levels +.11
+# -.16, blur -.05 +.58, shake -.04 +.23.
 BAD_QUALITY, VISIBLE_QUALITY = 25, 85
 # Of `fine_detail`; crf 36 leaves 0.15 to 0.25, crf 28 0.2 to 0.45, sharp photos have 0.3 to 0.5.
 COARSE_FILM = 0.24
