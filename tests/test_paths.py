@@ -111,6 +111,24 @@ def test_a_path_goes_through_its_cameras_at_an_even_speed() -> None:
         assert math.dist(project(camera, np.zeros((1, 3)))[0][0], (20, 15)) < 2  # still looks there
 
 
+def test_a_path_cuts_where_no_camera_stood() -> None:
+    """Two walks, 32 of their steps apart, and a camera alone in between."""
+    eyes = [(k + begin, 0.0, 0.0) for k in range(9) for begin in (0, 40)]
+    cameras = [hqgs.look_at(eye, (24, 99, 0), up=(0, 0, 1)) for eye in [*eyes, (24.2, 1.0, 0.0)]]
+    places = [
+        np.stack([c.center for c in hqgs.camera_path(cameras, 61, cuts=cuts)]) for cuts in (False, True)
+    ]
+    gaps = [((p[:, 0] > 8.01) & (p[:, 0] < 39.99)).sum() for p in places]
+    assert gaps[0] > 20
+    assert gaps[1] == 0
+    steps = np.linalg.norm(np.diff(places[1], axis=0), axis=1)
+    assert len(places[1]) == 61
+    assert (steps > 1).sum() == 1
+    assert np.delete(steps, steps.argmax()).max() < 1.1 * np.median(steps)
+    still = [cameras[0]] * 3
+    assert len(hqgs.camera_path(still, 4, cuts=True)) == 4
+
+
 def test_a_closed_path_ends_beside_its_start() -> None:
     centers = np.stack([camera.center for camera in hqgs.camera_path(ring(8), 100, closed=True)])
     step = np.linalg.norm(centers[1] - centers[0])

@@ -37,8 +37,8 @@ class Render:
     views: Annotated[str | None, tyro.conf.arg(metavar="WHICH", help_behavior_hint="")] = None
     """The run's own views in place of a path: train, test, all, or names with commas."""
     path: Annotated[str, tyro.conf.arg(metavar="KIND")] = PATHS[0]
-    """cameras (a smooth way through the training cameras), orbit, or the JSON file of a camera path, of the
-    viewer or of nerfstudio. A scene file without cameras gets an orbit."""
+    """cameras (a smooth way through the training cameras, cut where they leap), orbit, or the JSON file of a
+    camera path, of the viewer or of nerfstudio. A scene file without cameras gets an orbit."""
     frames: Number = None
     """Frames of a path that is made here (240)."""
     fps: Factor = None
@@ -135,7 +135,7 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     if known is None or not known.train:
         return None, orbit(gaussians, count, up=UP if options.up is None else options.up), FPS
     up = known.up if options.up is None else options.up
-    made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count)
+    made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count, cuts=True)
     return None, made, FPS
 
 

@@ -64,6 +64,7 @@ LEVEL_SHARE, LEVEL_THIN = 0.25, 0.01  # of the points; of their spread, to eithe
 # px (of photos of built-in rooms too), degrees, where nothing else is said.
 PATH_SIZE, PATH_FOV = (504, 378), 60.0
 MOST_WALKED, MOST_KEYS = 400, 24  # cameras that are put in order; that a path goes through: more shake it
+LEAP = 10.0  # median steps: south 26, from one side of a house to another; films and walks around up to 7
 TURN_EXTENT = 0.5  # of the cameras' extent: the way that counts as much as a turn of one radian
 
 # Photos that see more than a flat picture holds, and films.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hqgs.base.evenly import evenly
-from hqgs.scene.constants import MOST_KEYS, MOST_WALKED, PATH_FOV, PATH_SIZE, TURN_EXTENT
+from hqgs.scene.constants import LEAP, MOST_KEYS, MOST_WALKED, PATH_FOV, PATH_SIZE, TURN_EXTENT
 from hqgs.scene.scene import Camera, Scene
 
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
@@ -121,7 +123,9 @@ def focus(cameras: Sequence[Camera]) -> _Array:
     return point if ((point - centers) * forward).sum(axis=1).mean() > 0 else ahead
 
 
-def camera_path(cameras: Sequence[Camera], frames: int = 240, *, closed: bool = False) -> list[Camera]:
+def camera_path(
+    cameras: Sequence[Camera], frames: int = 240, *, closed: bool = False, cuts: bool = False
+) -> list[Camera]:
     """A smooth path through given cameras, at an even speed: cubic splines through places and rotations.
 
     Cameras in an order that jumps to and fro are put in the order of a short walk, and of many some are
@@ -131,17 +135,32 @@ def camera_path(cameras: Sequence[Camera], frames: int = 240, *, closed: bool = 
         cameras: at least 1, such as those of the training views.
         frames: how many, at least 1.
         closed: end where it began.
+        cuts: go on at the other side of a leap, LEAP times as long as the walk's usual step, in place of
+            flying where no camera stood: through walls and trees.
 
     Raises:
         ValueError: no camera, or no frame.
     """
+    _check(cameras, frames)
+    walk = _walk([*cameras])
+    pieces = _between_leaps(walk) if cuts else [walk]
+    ways = np.array([_lengths(piece).sum() for piece in pieces])
+    shares = ways / ways.sum() if len(pieces) > 1 else np.ones(1)
+    ends = [0, *(int(end) for end in np.rint(frames * np.cumsum(shares)))]
+    path: list[Camera] = []
+    for piece, share, (begin, end) in zip(pieces, shares, pairwise(ends), strict=True):
+        keys = [piece[k] for k in evenly(len(piece), max(2, round(MOST_KEYS * share)))]
+        path += _spline(keys, end - begin, closed) if end > begin else []
+    first = cameras[0]
+    return [Camera(first.width, first.height, first.K, camera.viewmat) for camera in path]
+
+
+def _spline(keys: list[Camera], frames: int, closed: bool) -> list[Camera]:
+    """At least one frame of a path through at least one camera, in their order."""
     from scipy.interpolate import CubicSpline, make_interp_spline  # here: only a path needs scipy
     from scipy.spatial.transform import Rotation
 
-    _check(cameras, frames)
-    keys = _keys([*cameras])
-    if closed and len(keys) > 1:
-        keys.append(keys[0])
+    keys = [*keys, keys[0]] if closed and len(keys) > 1 else keys
     centers = np.stack([camera.center for camera in keys])
     rotations = Rotation.from_matrix(np.stack([camera.viewmat[:3, :3] for camera in keys]))
     steps = _steps(centers, rotations.as_matrix())
@@ -167,9 +186,8 @@ def camera_path(cameras: Sequence[Camera], frames: int = 240, *, closed: bool = 
     )
     even = np.linspace(0, way[-1], frames + closed)[:frames] if frames > 1 else np.zeros(1)
     found = spline(np.interp(even, way, fine))
-    first = cameras[0]
     return [
-        Camera(first.width, first.height, first.K, view_matrix(R, center))
+        replace(keys[0], viewmat=view_matrix(R, center))
         for R, center in zip(Rotation.from_quat(found[:, 3:]).as_matrix(), found[:, :3], strict=True)
     ]
 
@@ -253,17 +271,25 @@ def _range(flat: _Array, up: _Array) -> float:
     return float(2 * math.pi - gaps.max())
 
 
-def _keys(cameras: list[Camera]) -> list[Camera]:
-    """The cameras in the order of a walk, every so manieth of many."""
-    cameras = [cameras[k] for k in evenly(len(cameras), MOST_WALKED)]
-    centers = np.stack([camera.center for camera in cameras])
-    tour, own = _short_walk(centers), [*range(len(cameras))]
-    length, own_length = (
-        np.linalg.norm(np.diff(centers[walk], axis=0), axis=1).sum() for walk in (tour, own)
-    )
-    order = own if own_length <= 1.5 * length else tour
-    chosen = evenly(len(order), MOST_KEYS)
-    return [cameras[order[k]] for k in chosen]
+def _walk(cameras: list[Camera]) -> list[Camera]:
+    """The cameras in the order of a walk; of very many, every so manieth."""
+    own = [cameras[k] for k in evenly(len(cameras), MOST_WALKED)]
+    tour = [own[k] for k in _short_walk(np.stack([camera.center for camera in own]))]
+    return own if _lengths(own).sum() <= 1.5 * _lengths(tour).sum() else tour
+
+
+def _lengths(walk: list[Camera]) -> _Array:
+    """From each camera to the next, [n - 1]."""
+    return np.linalg.norm(np.diff([camera.center for camera in walk], axis=0), axis=1)
+
+
+def _between_leaps(walk: list[Camera]) -> list[list[Camera]]:
+    """The pieces of a walk between leaps; cameras that stand alone there are left out."""
+    steps = _lengths(walk)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    ends = [0, *(int(k) + 1 for k in np.flatnonzero(steps > LEAP * usual)), len(walk)]
+    pieces = [walk[begin:end] for begin, end in pairwise(ends)]
+    return [piece for piece in pieces if _lengths(piece).sum() > 0] or [walk]
 
 
 def _short_walk(centers: _Array) -> list[int]:

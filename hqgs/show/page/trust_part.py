@@ -43,7 +43,7 @@ def trust_part(folder: Path, scene: Scene, gaussians: Gaussians, iterations: int
         why = "No photo was held out, so no number says how far renders of other places can be believed."
         return TrustPart([why], spots=spots)
     lines = [f"Trust: {measured}. Each photo is judged by a calibration on the others."]
-    path = predict_psnr(trust, camera_path(known.train, PATH_LOOKS), known.train)
+    path = predict_psnr(trust, camera_path(known.train, PATH_LOOKS, cuts=True), known.train)
     if path is not None:
         lines.append(f"Photos from the way through the training cameras would have a PSNR of {path}.")
     worst = min(range(len(trust.held)), key=lambda k: trust.held[k].psnr)
