@@ -64,7 +64,7 @@ TEXT = (
         "digest",
     ),
 )
-DIGITS = ".8g"
+DIGITS = ".7g"
 
 
 class Table:
