@@ -82,7 +82,7 @@ TRUTH: dict[str, dict[str, tuple[float, float]]] = {  # what is found: kind, val
     "noise:10": {"noise": (10, 1)},
     "noise:50": {"noise": (50, 3)},
     "jpeg:10": {"jpeg": (10, 0)},
-    "jpeg:50": {},  # good enough
+    "jpeg:50": {},  # good enough alone
     "lowres:2": {"lowres": (2, 0)},
     "lowres:4": {"lowres": (4, 0)},
     "blur:1.2": {"blur": (1.2, 0.3)},
@@ -94,7 +94,7 @@ TRUTH: dict[str, dict[str, tuple[float, float]]] = {  # what is found: kind, val
     "blur:2.5+jpeg:20": {"blur": (2.5, 0.6), "jpeg": (20, 0)},
     "noise:3+jpeg:10": {"jpeg": (10, 0)},  # too weak to come through
     "blur:3+lowres:2+jpeg:20": {"blur": (3, 0.8), "lowres": (2, 0), "jpeg": (20, 0)},
-    "blur:3+lowres:2+jpeg:50": {"blur": (3, 0.8), "lowres": (2, 0), "jpeg": (50, 0)},  # not with others
+    "blur:3+lowres:2+jpeg:50": {"blur": (3, 0.8), "lowres": (2, 0), "jpeg": (50, 0)},  # not with other faults
 }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -147,16 +146,16 @@ def camera_path(
     ways = np.array([_lengths(piece).sum() for piece in pieces])
     shares = ways / ways.sum() if len(pieces) > 1 else np.ones(1)
     ends = [0, *(int(end) for end in np.rint(frames * np.cumsum(shares)))]
-    path: list[Camera] = []
+    viewmats: list[_Array] = []
     for piece, share, (begin, end) in zip(pieces, shares, pairwise(ends), strict=True):
         keys = [piece[k] for k in evenly(len(piece), max(2, round(MOST_KEYS * share)))]
-        path += _spline(keys, end - begin, closed) if end > begin else []
+        viewmats += _spline(keys, end - begin, closed) if end > begin else []
     first = cameras[0]
-    return [Camera(first.width, first.height, first.K, camera.viewmat) for camera in path]
+    return [Camera(first.width, first.height, first.K, viewmat) for viewmat in viewmats]
 
 
-def _spline(keys: list[Camera], frames: int, closed: bool) -> list[Camera]:
-    """At least one frame of a path through at least one camera, in their order."""
+def _spline(keys: list[Camera], frames: int, closed: bool) -> list[_Array]:
+    """World to camera [4, 4], of at least one frame of a path through at least one camera, in their order."""
     from scipy.interpolate import CubicSpline, make_interp_spline  # here: only a path needs scipy
     from scipy.spatial.transform import Rotation
 
@@ -167,7 +166,7 @@ def _spline(keys: list[Camera], frames: int, closed: bool) -> list[Camera]:
     keep = np.concatenate([[True], steps > 1e-9])  # the same camera twice is one
     centers, steps = centers[keep], steps[steps > 1e-9]
     if len(centers) == 1:
-        return [keys[0]] * frames
+        return [keys[0].viewmat] * frames
     times = np.concatenate([[0.0], np.cumsum(steps)])
     # Quaternions of one sign, splined and normalised: neighbours on a path are far from opposite.
     quats = rotations.as_quat()[keep]
@@ -187,7 +186,7 @@ def _spline(keys: list[Camera], frames: int, closed: bool) -> list[Camera]:
     even = np.linspace(0, way[-1], frames + closed)[:frames] if frames > 1 else np.zeros(1)
     found = spline(np.interp(even, way, fine))
     return [
-        replace(keys[0], viewmat=view_matrix(R, center))
+        view_matrix(R, center)
         for R, center in zip(Rotation.from_quat(found[:, 3:]).as_matrix(), found[:, :3], strict=True)
     ]
 
