@@ -1,7 +1,7 @@
 """Cleaning of a scene that is there, of this or another program: fog and shards before other photos go.
 
 What hangs in the air between the photos is right in one of them. The scene is fitted on to the photos with
-opacities that decay and Gaussians that drop out (few_photos.py), so that what one photo alone holds up fades;
+opacities that decay and Gaussians that drop out (overfitting.py): what one photo alone holds up fades;
 nothing grows and nothing moves. Photos held out tell whether it pays.
 """
 
@@ -25,9 +25,9 @@ from hqgs.scene.scene import Scene
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
 from hqgs.training.constants import CLEANING_DECAY, CLEANING_STEPS, DROPOUT
-from hqgs.training.few_photos import decay_opacities, with_dropout
 from hqgs.training.guard import coming_gradient, gradient_fault
 from hqgs.training.methods.base import ThreeDGS
+from hqgs.training.overfitting import decay_opacities, with_dropout
 
 
 @dataclass(frozen=True)

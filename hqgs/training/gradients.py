@@ -12,9 +12,9 @@ from hqgs.base.ranks import Ranks
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
 from hqgs.training.batch import Part, Rest, descend, exchanged, note_views, part_of, to_rasterize
-from hqgs.training.few_photos import with_dropout
 from hqgs.training.forward import ForwardPass, TrainingViews
 from hqgs.training.guard import Fault
+from hqgs.training.overfitting import with_dropout
 from hqgs.training.schedule import StepPlan
 from hqgs.training.state import TrainState
 

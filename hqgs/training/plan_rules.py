@@ -41,9 +41,9 @@ from hqgs.training.plan_budget import (
     no_growth,
     sharp_pixels,
 )
-from hqgs.training.plan_few_photos import WHERE, dropout, most_gaussians, opacity_decay
 from hqgs.training.plan_left_out import held_photos, needless
 from hqgs.training.plan_length import fitting, shown
+from hqgs.training.plan_overfitting import WHERE, dropout, most_gaussians, opacity_decay
 from hqgs.training.plan_photos import passersby, photos
 from hqgs.training.schedule import half_size_end
 from hqgs.training.settings import with_iterations

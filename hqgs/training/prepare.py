@@ -25,7 +25,7 @@ from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.passersby import without_passersby
 from hqgs.training.plan import Draft, Facts, RunPlan, StepSeconds, plan_by
-from hqgs.training.plan_few_photos import in_agreement
+from hqgs.training.plan_overfitting import in_agreement
 from hqgs.training.plan_rules import RULES, plan_run
 from hqgs.training.trial import Begin, calls_for_trial, tried_growth
 

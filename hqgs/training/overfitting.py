@@ -1,4 +1,4 @@
-"""What keeps a scene of few photos from learning them by heart: opacities decay, and Gaussians drop out.
+"""What keeps a scene from learning its photos by heart: opacities decay, and Gaussians drop out.
 
 Between few photos much is undetermined: Gaussians that hang in the air, each right in one photo, explain them
 as well as surfaces do. Both parts here make what one photo alone holds up fade.

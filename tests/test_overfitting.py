@@ -13,7 +13,7 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.config import TrainConfig, run_config
 from hqgs.training.constants import DECAY, DROPOUT, DROPPED, MANY_PHOTOS, OPAQUE
-from hqgs.training.few_photos import decay_opacities, with_dropout
+from hqgs.training.overfitting import decay_opacities, with_dropout
 from hqgs.training.plan import Facts
 from hqgs.training.plan_rules import plan_run
 from hqgs.training.trainer import Trainer
