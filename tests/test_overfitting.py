@@ -13,6 +13,7 @@ from tiny_scene import tiny_config, tiny_scene
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.config import TrainConfig, run_config
 from hqgs.training.constants import DECAY, DROPOUT, DROPPED, MANY_PHOTOS, OPAQUE
+from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities, with_dropout
 from hqgs.training.plan import Facts
 from hqgs.training.plan_rules import plan_run
@@ -142,7 +143,13 @@ def test_a_share_out_of_range_is_refused() -> None:
         TrainConfig(dropout=-0.1)
 
 
-def test_a_step_decays_what_it_trains_once_for_each_view() -> None:
+@pytest.mark.parametrize("left", [1.0, 2.0**-9])
+def test_a_step_decays_what_it_trains_once_for_each_view_as_the_rates_do(
+    left: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise halves the rates of a long run to nearly nothing; its scene must not fade by decay."""
+    monkeypatch.setattr(Method, "rate_left", left)
+
     def after_a_step(decay: float, batch: int) -> torch.Tensor:
         config = replace(
             tiny_config(12, method="3dgs", batch=batch), lr_opacities=1e-12, opacity_decay=decay, dropout=0.0
@@ -153,7 +160,8 @@ def test_a_step_decays_what_it_trains_once_for_each_view() -> None:
 
     for batch in (1, 3):
         ratio = after_a_step(0.1, batch) / after_a_step(0.0, batch)
-        torch.testing.assert_close(ratio, torch.full_like(ratio, 0.9**batch), rtol=1e-5, atol=0)
+        wanted = (1 - 0.1 * left) ** batch
+        torch.testing.assert_close(ratio, torch.full_like(ratio, wanted), rtol=1e-5, atol=0)
 
 
 def test_more_iterations_end_better_where_photos_are_few() -> None:

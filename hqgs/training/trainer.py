@@ -266,7 +266,8 @@ class Trainer:
         step = Step(found.loss, found.photo, found.view)
         if self._sound([training.views[plan.view] for plan in plans], found.faults, step):
             found.apply(state)
-            if decay := self.config.opacity_decay:
+            # By rates that fell, a step gives less back: the same decay would make the whole scene fade.
+            if decay := self.method.rate_left * (self.config.opacity_decay or 0.0):
                 decay_opacities(state.gaussians.opacities, 1 - (1 - decay) ** len(plans))
         return step, found.measured
 
