@@ -110,6 +110,25 @@ def test_degraded_photos_are_kept_from_being_learned_by_heart_too(
 
 
 @pytest.mark.parametrize(
+    ("formation", "photos", "agreed", "decay"),
+    [
+        ("blur:2", 23, 0.86, None),  # what blur took away fades, as only few pixels hold it up
+        ("lowres:4+shake", 23, 0.86, None),
+        ("lowres:4", 23, 0.84, DECAY),
+        ("blur:2", 12, 0.88, DECAY),
+        ("blur:2+noise:12", 23, 0.86, DECAY),
+        ("lowres:2+jpeg:60", 23, 0.86, DECAY),
+        ("shake", 23, 0.86, DECAY),
+    ],
+)
+def test_fine_detail_that_all_photos_lost_decays_only_where_they_disagree(
+    formation: str, photos: int, agreed: float, decay: float | None
+) -> None:
+    asked = run_config(iterations=1000, method="hqgs", formation=formation)
+    assert plan_run(facts(photos, agreed), None, asked).settings.opacity_decay == decay
+
+
+@pytest.mark.parametrize(
     ("photos", "points", "most"),
     [
         (8, 400, 16_000),  # 40 for each point

@@ -15,7 +15,7 @@ from hqgs.base.text import aligned
 from hqgs.base.typed import build
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.records import PlanRowRecord
-from hqgs.photos.formula import NONE, Degradation, parse_formation, undegraded
+from hqgs.photos.formula import ERRORS, LINEAR, NONE, Degradation, parse_formation, undegraded
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
 
 
@@ -143,6 +143,11 @@ class Draft:
     def undegraded(self) -> bool:
         """Photos as photographed, or each with what its own camera did: they bear 3DGS's growth."""
         return self.formed and undegraded(self.kinds)
+
+    @property
+    def softened(self) -> bool:
+        """Whether all photos lost fine detail, and have no errors beside, of noise or a codec."""
+        return bool(self.kinds & LINEAR) and not self.kinds & ERRORS
 
     @property
     def dense(self) -> bool:

@@ -14,6 +14,7 @@ from hqgs.training.constants import (
     MANY_PHOTOS,
     PIXELS_EACH,
     POINT_GAUSSIANS,
+    SOFT_AGREED,
 )
 from hqgs.training.plan import Choice, Draft, Facts
 
@@ -34,7 +35,7 @@ def opacity_decay(draft: Draft) -> Sequence[Choice]:
     many = facts.photos > MANY_PHOTOS
     if many and (draft.kinds or facts.agreed is None):
         return [Choice("none", "so many photos bear out what is there, and it would cost detail", evidence)]
-    if in_agreement(facts, MANY_AGREED if many else DEPTHS_AGREED):
+    if in_agreement(facts, MANY_AGREED if many else SOFT_AGREED if draft.softened else DEPTHS_AGREED):
         return [Choice("none", "the photos agree on where things are, and it would cost detail", evidence)]
     why = "what few photos bear out would hang in the air between them"
     share = DECAY * min(1.0, MANY_PHOTOS / facts.photos)

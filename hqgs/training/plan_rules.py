@@ -13,7 +13,7 @@ from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.constants import SCATTER
-from hqgs.photos.formula import FILM, LEARNED, parse_formation
+from hqgs.photos.formula import FILM, LEARNED, LINEAR, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
     COARSE_FACTOR,
@@ -48,7 +48,6 @@ from hqgs.training.plan_photos import passersby, photos
 from hqgs.training.schedule import half_size_end
 from hqgs.training.settings import with_iterations
 
-LINEAR = ("blur", "defocus", "motion", "lowres")
 CHOSEN = "measured on held-back photos of fern, fox and horns at half size"
 
 
