@@ -57,7 +57,7 @@ DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  #
 LEARNED = tuple(name for name, kind in KINDS.items() if kind.own in ("photo", "camera"))
 OWN = tuple(name for name, kind in KINDS.items() if kind.own)  # of each photo its own
 LINEAR = frozenset({"blur", "defocus", "motion", "lowres"})  # they take fine detail of all photos alike
-ERRORS = frozenset({"noise", "grain", "jpeg", "video"})  # they make photos show what is not there
+ERRORS = frozenset({"noise", "jpeg"})  # all photos show what is not there
 FILM = frozenset({"video"})  # the kinds of a film of which its codec alone is told
 NOT_MADE = {
     "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "

@@ -146,7 +146,7 @@ class Draft:
 
     @property
     def softened(self) -> bool:
-        """Whether all photos lost fine detail, and have no errors beside, of noise or a codec."""
+        """Whether all photos lost fine detail, without noise or JPEG beside."""
         return bool(self.kinds & LINEAR) and not self.kinds & ERRORS
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from hqgs.photos.formula import ERRORS
 from hqgs.training.constants import (
     DECAY,
     DEPTHS_AGREED,
@@ -35,7 +36,8 @@ def opacity_decay(draft: Draft) -> Sequence[Choice]:
     many = facts.photos > MANY_PHOTOS
     if many and (draft.kinds or facts.agreed is None):
         return [Choice("none", "so many photos bear out what is there, and it would cost detail", evidence)]
-    if in_agreement(facts, MANY_AGREED if many else SOFT_AGREED if draft.softened else DEPTHS_AGREED):
+    least = MANY_AGREED if many else SOFT_AGREED if draft.softened else DEPTHS_AGREED
+    if in_agreement(facts, least) and not draft.kinds & ERRORS:
         return [Choice("none", "the photos agree on where things are, and it would cost detail", evidence)]
     why = "what few photos bear out would hang in the air between them"
     share = DECAY * min(1.0, MANY_PHOTOS / facts.photos)
