@@ -96,7 +96,8 @@ def test_the_plan_asks_for_decay_and_dropout_where_photos_are_few(
 
 
 @pytest.mark.parametrize(
-    ("photos", "agreed", "decay"), [(3, None, DECAY), (23, 0.72, DECAY), (17, 0.91, DECAY), (62, 0.7, None)]
+    ("photos", "agreed", "decay"),
+    [(3, None, DECAY), (23, 0.72, DECAY), (17, 0.91, DECAY), (62, 0.95, DECAY / 2)],
 )
 def test_degraded_photos_are_kept_from_being_learned_by_heart_too(
     photos: int, agreed: float | None, decay: float | None

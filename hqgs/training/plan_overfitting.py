@@ -33,13 +33,14 @@ def opacity_decay(draft: Draft) -> Sequence[Choice]:
         return [] if asked is None else [Choice(f"{asked:g} of the opacities for each view", "asked for")]
     agreed = "" if facts.agreed is None else f", which agree on {facts.agreed:.0%} of the depths"
     evidence = f"{facts.photos} photos{agreed}"
-    many = facts.photos > MANY_PHOTOS
-    if many and (draft.kinds or facts.agreed is None):
+    many, errors = facts.photos > MANY_PHOTOS, bool(draft.kinds & ERRORS)
+    if many and not errors and (draft.kinds or facts.agreed is None):
         return [Choice("none", "so many photos bear out what is there, and it would cost detail", evidence)]
     least = MANY_AGREED if many else SOFT_AGREED if draft.softened else DEPTHS_AGREED
-    if in_agreement(facts, least) and not draft.kinds & ERRORS:
+    if in_agreement(facts, least) and not errors:
         return [Choice("none", "the photos agree on where things are, and it would cost detail", evidence)]
-    why = "what few photos bear out would hang in the air between them"
+    asks = "the photos' errors ask for" if errors else "few photos bear out"
+    why = f"what {asks} would hang in the air between them"
     share = DECAY * min(1.0, MANY_PHOTOS / facts.photos)
     return [
         Choice(f"{share:.2g} of the opacities for each view", why, evidence, changes={"opacity_decay": share})
