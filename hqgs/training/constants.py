@@ -71,7 +71,7 @@ WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weigh
 # detail up: a cat of 6 +1.1; horns of 16 (agreed 0.88) -0.2, 0.0, foxes of 18 (0.86) -0.3, fern -0.1 (0.90),
 # -0.3 (0.89; 504 px, held-out photos), SSIM -0.010 to -0.023.
 # More than MANY_PHOTOS, share as above, 4,000: noise:25 +0.5, +0.2 (horns of 46, foxes of 36), chat +0.2 and
-# in 2,000 jpeg:10 +0.1 (foxes).
+# in 2,000 jpeg:10 +0.1 (foxes), +0.3 (horns).
 FEW_PHOTOS, MANY_PHOTOS, DEPTHS_AGREED, SOFT_AGREED, MANY_AGREED = 12, 31, 0.89, 0.85, 0.8
 DECAY = 0.005  # share of the opacities that each view takes away (Han et al. 2024: 0.995 of them stay)
 # FEW_PHOTOS at most, which found their own cameras, grow to so many Gaussians for each point that they agree
