@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -340,6 +342,19 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
     assert call("train", "embedded", "--out", tmp_path, "--method", "3dgs", "--iterations", "20") == 130
     assert json.loads((tmp_path / "report.json").read_text())["iterations"] == 6
     assert (tmp_path / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize("words", ["--help", "train --help", "plan embedded --downscale 9"])
+def test_output_that_nobody_reads_is_no_failure(words: str) -> None:
+    """As in `hqgs ... | head`, which has read enough."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hqgs", *words.split()], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    _, said = process.communicate()
+    assert process.returncode == 141
+    assert b"Traceback" not in said and b"BrokenPipe" not in said
 
 
 def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(

@@ -2,15 +2,18 @@
 
 Exit codes: 0 done; 1 the run failed (a full disk, no Gaussians left); 2 bad input; 130 stopped by Ctrl-C or
 SIGTERM. Then a training run has written everything, unless Ctrl-C was pressed twice, and degrading nothing.
+141: nobody reads the output any more (`hqgs ... | head`), as with other programs.
 """
 
 from __future__ import annotations
 
+import os
+import select
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 from hqgs import __version__
 from hqgs.cli.errors import fail
@@ -46,6 +49,29 @@ COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code. SIGTERM counts as Ctrl-C."""
+    try:
+        try:
+            return command(argv)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        if not any([unread(stream) for stream in (sys.stdout, sys.stderr)]):
+            raise
+        return 141
+
+
+def unread(stream: TextIO) -> bool:
+    """Whether nobody reads the stream any more; then what it still holds goes nowhere."""
+    poll = select.poll()
+    poll.register(stream, select.POLLOUT)
+    gone = any(event & select.POLLERR for _, event in poll.poll(0))
+    if gone:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return gone
+
+
+def command(argv: Sequence[str] | None) -> int:
+    """The exit code of the command that `argv` names; of what was typed where it is None."""
     name, *rest = [*(sys.argv[1:] if argv is None else argv)] or ["--help"]
     if name in ("-h", "--help", "help"):
         print(overview())
