@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source as scene_source
 from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
+from hqgs.training import cleaning
 from hqgs.training.cleaning import Cleaned, clean
 from hqgs.training.trainer import Trainer
 
@@ -82,21 +84,78 @@ def test_a_gain_must_exceed_its_scatter() -> None:
     assert not done(2.0, -1.5, 0.1).pays
     assert not done(1.0).pays  # one photo tells no scatter
     assert not done(-0.2, -0.3).pays
+    masked = Cleaned(foggy(), 0, (20.0, None, 21.0, 20.0), (20.5, 30.0, None, 20.6))
+    assert masked.pairs == [(20.0, 20.5), (20.0, 20.6)]
+    assert masked.gain == pytest.approx(0.55)
+    nothing = Cleaned(foggy(), 0, (None, None), (None, 20.0))
+    assert (nothing.gain, nothing.pays) == (0.0, False)
+
+
+def test_an_opacity_of_nothing_spoils_no_step() -> None:
+    """Other programs write it as a logit of -400, whose sigmoid has no logarithm."""
+    named = {name: tensor.clone() for name, tensor in foggy().named().items()}
+    named["opacities"][0] = -400.0
+    done = clean(foggy().like(named), scene(), steps=200)
+    assert done.pays
+    assert len(done.gaussians) > len(foggy()) // 2
+
+
+def test_a_scene_in_another_frame_is_refused() -> None:
+    moved = foggy().like(foggy().named() | {"means": foggy().means + 100.0})
+    with pytest.raises(ValueError, match="6 of 6 renders are farther from their training photo than one"):
+        clean(moved, scene(), steps=1)
+
+
+def test_nothing_is_written_where_the_file_does_not_gain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a run: on its own photos, before its own background; a lossy file counts as it is read."""
+    foggy().save(tmp_path / "scene.ply")
+    (tmp_path / "config.json").write_text('{"train": {"background": [1.0, 0.5, 0.0]}}')
+    monkeypatch.setattr(scene_source, "load_again", lambda *_, **__: scene())
+    asked, gains = [], [-1.0, 0.5]
+
+    def cleaned(gaussians: Gaussians, _: Scene, *rest: object) -> Cleaned:
+        asked.append(rest[:2])
+        gain = gains[len(asked) - 1]
+        return Cleaned(gaussians, 0, (80.0, 80.0), (80.0 + gain, 80.0 + gain))
+
+    monkeypatch.setattr(cleaning, "clean", cleaned)
+    for name, words in (("new.ply", "does not pay, and"), ("new.splat", "does not pay as a .splat file")):
+        assert main(["clean", str(tmp_path), "--out", str(tmp_path / name), "--steps", "9"]) == 1
+        said = capsys.readouterr().err
+        assert words in said
+        assert "nothing is written: 80.00 -> " in said
+        assert not (tmp_path / name).exists()
+    assert asked == [(9, (1.0, 0.5, 0.0))] * 2
+    assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
 
 
 def test_bad_input_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for count in (0, 1):
         with pytest.raises(ValueError, match=f"tiny has {count} held-out photos, wanted at least 2"):
             clean(foggy(), replace(scene(), test=scene().test[:count]))
+    hidden = replace(scene().test[1], mask=np.zeros(scene().test[1].image.shape[:2], bool))
+    with pytest.raises(ValueError, match="tiny has 1 held-out photos, wanted at least 2"):
+        clean(foggy(), replace(scene(), test=[scene().test[0], hidden]))
     with pytest.raises(ValueError, match="steps is 0, wanted at least 1"):
         clean(foggy(), scene(), steps=0)
     file = tmp_path / "scene.ply"
+    (tmp_path / "folder.ply").mkdir()
     foggy().save(file)
     for options, message in (
         ([str(file), "--out", str(tmp_path / "new.ply")], "--photos names the photos"),
         ([str(file), "--out", str(file), "--photos", "embedded"], "what is removed would be lost"),
         ([str(file), "--out", str(tmp_path / "new.obj"), "--photos", "embedded"], "new.obj"),
         ([str(tmp_path / "no.ply"), "--out", str(tmp_path / "new.ply")], "no.ply"),
+        (
+            [str(file), "--out", str(tmp_path / "folder.ply"), "--photos", "embedded"],
+            "folder.ply is a folder",
+        ),
+        (
+            [str(file), "--out", str(tmp_path / "new.ply"), "--photos", "embedded", "--steps", "0"],
+            "steps is 0, wanted at least 1",
+        ),
     ):
         assert main(["clean", *options]) == 2
         assert message in capsys.readouterr().err

@@ -358,6 +358,13 @@ def test_output_that_nobody_reads_is_no_failure(words: str) -> None:
     assert b"BrokenPipe" not in said
 
 
+@pytest.mark.parametrize(("words", "code"), [("--version", 0), ("nothing", 2), ("train --help", 0)])
+def test_closed_output_is_no_failure(words: str, code: int) -> None:
+    """As in `hqgs ... >&- 2>&-`."""
+    line = f"{sys.executable} -m hqgs {words} >&- 2>&-"
+    assert subprocess.run(["bash", "-c", line], check=False).returncode == code
+
+
 def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

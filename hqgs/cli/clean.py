@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.judge import check_source, read_photos
+from hqgs.cli.judge import background_of, check_source, read_photos
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, tell_read
 from hqgs.model.formats.files import FORMATS, format_of
+
+if TYPE_CHECKING:
+    from hqgs.model.gaussians import Gaussians
+    from hqgs.training.cleaning import Cleaned
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +32,8 @@ class Clean:
     """The photos with their cameras, in the frame of the scene file (those that the run was trained on)."""
     downscale: Factor = None
     """Divide the sides of the photos of --photos by F."""
+    test_every: Number = None
+    """Hold out every N-th photo of --photos (8, unless the scene has a split)."""
     steps: Number = None
     """Training views to see (600)."""
 
@@ -37,37 +44,63 @@ OPTIONS = Clean
 def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
     try:
-        source = check_source(options.source, options.photos)
         format = format_of(options.out, written=True)
+        source = check_source(options.source, options.photos)
         if options.out.exists() and options.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is removed would be lost")
         from hqgs.model.gaussians import Gaussians  # here: they load torch
-        from hqgs.training.cleaning import clean
+        from hqgs.training.cleaning import check_steps, clean, held_out_psnrs
         from hqgs.training.constants import CLEANING_STEPS
 
+        steps = CLEANING_STEPS if options.steps is None else options.steps
+        check_steps(steps)
+        background = background_of(options.source)
         with LoadingScreen() as screen:
-            scene = read_photos(options.source, options.photos, options.downscale, None, screen)
+            scene = read_photos(options.source, options.photos, options.downscale, options.test_every, screen)
             gaussians = Gaussians.load(source)
-            done = clean(
-                gaussians.in_world(scene.world), scene, options.steps or CLEANING_STEPS, on_stage=screen.stage
-            )
-        kept = len(done.gaussians)
-        words = (
-            f"{sum(done.before) / len(done.before):.2f} -> {sum(done.after) / len(done.after):.2f} dB on "
-            f"{len(done.after)} held-out photos ({done.gain:+.2f} ± {done.interval:.2f})"
-        )
-        if not done.pays:
+            done = clean(gaussians.in_world(scene.world), scene, steps, background, screen.stage)
+        cleaned = done.gaussians.in_world(gaussians.world)  # in the frame of the source
+        with TemporaryDirectory() as folder:  # what counts is the file: its format may hold less
+            cleaned.save(Path(folder, options.out.name))
+            back = Gaussians.load(Path(folder, options.out.name))
+        written = replace(done, after=held_out_psnrs(back.in_world(scene.world), scene, background))
+        words = gained(written)
+        if not written.pays:
+            lossy = f" as a .{format} file, which holds less of it" if done.pays else ""
             held = (
                 "" if options.photos is None else " (photos that the scene was trained on cannot show a gain)"
             )
-            return fail(1, f"{source}: cleaning does not pay, and nothing is written: {words}{held}")
-        done.gaussians.in_world(gaussians.world).save(options.out)  # in the frame of the source
+            return fail(1, f"{source}: cleaning does not pay{lossy}, and nothing is written: {words}{held}")
+        cleaned.save(options.out)
     except BAD_INPUT as error:
         return fail(2, error)
     except OSError as error:
         return fail(1, f"{options.out}: {error}")
     tell_read(gaussians)
-    if gaussians.antialiased and not FORMATS[format].antialiased:
-        print(f"left out: the antialias flag: a .{format} file has no place for it")
-    print(f"{options.out}: {words}; {done.removed:,} of {kept + done.removed:,} Gaussians faded and are gone")
+    for what in left_out(gaussians, cleaned, back, format):
+        print(f"left out: {what}")
+    print(f"{options.out}: {words}; {done.removed:,} of {len(gaussians):,} Gaussians faded and are gone")
     return 0
+
+
+def gained(done: Cleaned) -> str:
+    """What held-out photos say of it."""
+    if not done.pairs:
+        return "no held-out photo has a PSNR"
+    before, after = (sum(pair[k] for pair in done.pairs) / len(done.pairs) for k in (0, 1))
+    photos = f"{len(done.pairs)} held-out photos ({done.gain:+.2f} ± {done.interval:.2f})"
+    return f"{before:.2f} -> {after:.2f} dB on {photos}"
+
+
+def left_out(source: Gaussians, cleaned: Gaussians, back: Gaussians, format: str) -> list[str]:
+    """What the file does not hold of the source, but for what faded; `back` is the file as it is read."""
+    found = list[str]()
+    if source.antialiased and not FORMATS[format].antialiased:
+        found.append(f"the antialias flag: a .{format} file has no place for it")
+    if back.sh_degree < source.sh_degree:
+        found.append(f"harmonics above degree {back.sh_degree}: a .{format} file has no place for them")
+    if lost := len(cleaned) - len(back):
+        found.append(f"{lost:,} Gaussians that a .{format} file cannot hold")
+    if source.errors is not None:
+        found.append("the error of what each Gaussian shows: it was measured before")
+    return found

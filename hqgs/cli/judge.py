@@ -156,8 +156,7 @@ def check_source(source: Path, photos: str | None) -> Path:
             f"{source} is no folder of a run: --photos names the photos to measure it with, in a folder with "
             "their cameras (COLMAP, nerfstudio, ...)"
         )
-    if photos is not None:
-        ready(photos)
+    ready(str(source) if photos is None else photos)
     return file
 
 

@@ -141,7 +141,9 @@ def judge(
         again=measured(fitted),
         causes=found,
         render_seconds=median(seconds),
-        worse_than_flat=sum(_flat(view) > (one.psnr or 0.0) for view, one in zip(views, each, strict=True)),
+        worse_than_flat=sum(
+            flat_psnr(view) > (one.psnr or 0.0) for view, one in zip(views, each, strict=True)
+        ),
     )
 
 
@@ -176,7 +178,7 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _flat(view: View) -> float:
+def flat_psnr(view: View) -> float:
     """PSNR of the photo's mean colour, dB; -inf where its mask leaves no pixel."""
     pixels = as_floats(view.image)[view.mask if view.mask is not None else ...].reshape(-1, 3)
     return -10 * math.log10(max(float(pixels.var(0).mean()), 1e-10)) if len(pixels) else -math.inf

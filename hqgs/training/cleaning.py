@@ -8,7 +8,8 @@ nothing grows and nothing moves. Photos held out tell whether it pays.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,13 +19,22 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.held_out import held_out_renders
 from hqgs.evaluation.intervals import half_width
+from hqgs.evaluation.judge import flat_psnr
 from hqgs.evaluation.metrics import psnr
+from hqgs.model.formats.ply import MOST_LOGIT
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
-from hqgs.scene.scene import Scene
+from hqgs.scene.constants import BACKGROUND
+from hqgs.scene.scene import Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import CLEANING_DECAY, CLEANING_STEPS, DROPOUT
+from hqgs.training.constants import (
+    CLEANING_DECAY,
+    CLEANING_STEPS,
+    DROPOUT,
+    FRAME_PHOTOS,
+    MAX_SKIPPED_IN_A_ROW,
+)
 from hqgs.training.guard import coming_gradient, gradient_fault
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.overfitting import decay_opacities, with_dropout
@@ -36,18 +46,24 @@ class Cleaned:
 
     gaussians: Gaussians
     removed: int
-    before: tuple[float, ...]  # PSNR of each held-out photo, dB
-    after: tuple[float, ...]
+    before: tuple[float | None, ...]  # PSNR of each held-out photo, dB; None: masked whole, or the same bits
+    after: tuple[float | None, ...]
+
+    @property
+    def pairs(self) -> list[tuple[float, float]]:
+        """Before and after, of the held-out photos that have both."""
+        both = zip(self.before, self.after, strict=True)
+        return [(one, other) for one, other in both if one is not None and other is not None]
 
     @property
     def gain(self) -> float:
-        """dB, mean over the held-out photos."""
-        return float(np.mean(np.subtract(self.after, self.before)))
+        """dB, mean over the held-out photos; 0 where none has a PSNR."""
+        return float(np.mean([after - before for before, after in self.pairs] or [0.0]))
 
     @property
     def interval(self) -> float:
         """Half that of the gain, paired by photo, dB; infinite for one photo."""
-        half = half_width(np.subtract(self.after, self.before).tolist())
+        half = half_width([after - before for before, after in self.pairs])
         return math.inf if half is None else half
 
     @property
@@ -57,26 +73,40 @@ class Cleaned:
 
 
 def clean(
-    gaussians: Gaussians, scene: Scene, steps: int = CLEANING_STEPS, on_stage: OnStage = silent
+    gaussians: Gaussians,
+    scene: Scene,
+    steps: int = CLEANING_STEPS,
+    background: tuple[float, float, float] = BACKGROUND,
+    on_stage: OnStage = silent,
 ) -> Cleaned:
     """The Gaussians fitted on to the scene's training photos for so many steps.
 
-    Same bits for any number of threads. ValueError where the scene has fewer than 2 held-out
-    photos, or `steps` is below 1.
+    Same bits for any number of threads.
+
+    Args:
+        gaussians: in `scene.world`.
+        background: behind everything, R, G, B.
+
+    Raises:
+        ValueError: fewer than 2 held-out photos that a mask leaves something of; `steps` below 1; the
+            Gaussians do not show the training photos at all; or no step has a gradient.
     """
-    if len(scene.test) < 2:
-        held = f"{scene.name} has {len(scene.test)} held-out photos"
+    check_steps(steps)
+    counted = sum(view.mask is None or bool(view.mask.any()) for view in scene.test)
+    if counted < 2:
         raise ValueError(
-            f"{held}, wanted at least 2: the interval of their gains tells whether cleaning pays"
+            f"{scene.name} has {counted} held-out photos, wanted at least 2 (--photos SCENE --test-every N "
+            "holds out every N-th): the interval of their gains tells whether cleaning pays"
         )
-    if steps < 1:
-        raise ValueError(f"steps is {steps}, wanted at least 1")
-    before = _held_out(gaussians, scene)
+    check_frame(gaussians, scene, background)
+    before = held_out_psnrs(gaussians, scene, background)
     config, method, rng = TrainConfig(), ThreeDGS(), np.random.default_rng(0)
     rates = {
         name: getattr(config, f"lr_{name}") for name in ("scales", "quats", "opacities", "sh0", "shN")
     } | {"means": 0.0}
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in gaussians.named().items()}
+    with torch.no_grad():  # beyond, the sigmoid is 0 and has no logarithm: other programs write -400
+        leaves["opacities"].clamp_(-MOST_LOGIT, MOST_LOGIT)
     fitted = gaussians.like(leaves)
     fitted.errors = None  # they were of what it showed before
     optimizer = Adam(
@@ -85,27 +115,66 @@ def clean(
     )
     rounds = -(-steps // len(scene.train))
     order = np.concatenate([rng.permutation(len(scene.train)) for _ in range(rounds)])[:steps]
+    skipped = 0  # in a row
     with one_torch_thread():
         targets = [method.prepare(view) for view in scene.train]
         for k, number in enumerate(order.tolist()):
             some = with_dropout(fitted, DROPOUT, 0, k + 1)
             camera = scene.train[number].camera
-            render, _ = render_view(some, camera, fitted.sh_degree, config.background)
+            render, _ = render_view(some, camera, fitted.sh_degree, background)
             of_render = coming_gradient(render)
             optimizer.zero_grad()
             method.loss(render, targets[number]).backward()
-            if gradient_fault(fitted, optimizer, of_render) is None:
+            fault = gradient_fault(fitted, optimizer, of_render)
+            skipped = 0 if fault is None else skipped + 1
+            if fault is None:
                 optimizer.step()
-            decay_opacities(fitted.opacities, CLEANING_DECAY)
+                decay_opacities(fitted.opacities, CLEANING_DECAY)
+            elif skipped == MAX_SKIPPED_IN_A_ROW:
+                raise ValueError(
+                    f"the {fault.what} of {', '.join(fault.tensors)} was not finite in {skipped} steps in a "
+                    f"row, the last with photo {scene.train[number].name!r}"
+                )
             on_stage(Stage("steps of cleaning", k + 1, steps))
         fitted = fitted.detached()
         shown = fitted.activated_opacities() >= ALPHA_MIN
         fitted = fitted.rows(shown)
-    return Cleaned(fitted, int((~shown).sum()), before, _held_out(fitted, scene))
+    return Cleaned(fitted, int((~shown).sum()), before, held_out_psnrs(fitted, scene, background))
 
 
-@torch.no_grad()
-def _held_out(gaussians: Gaussians, scene: Scene) -> tuple[float, ...]:
-    """PSNR of each held-out photo, dB."""
-    values = [psnr(view.render, view.photo, view.mask) for view in held_out_renders(scene, gaussians)]
-    return tuple(value for value in values if value is not None)
+def check_steps(steps: int) -> None:
+    """ValueError where there are none."""
+    if steps < 1:
+        raise ValueError(f"steps is {steps}, wanted at least 1")
+
+
+def check_frame(gaussians: Gaussians, scene: Scene, background: tuple[float, float, float]) -> None:
+    """ValueError where the renders of most training photos are worse than one flat colour.
+
+    Fitting would give a scene in another frame the photos' colours, and call that a gain.
+    """
+    some = scene.train[:: -(-len(scene.train) // FRAME_PHOTOS)]
+    worse = sum(
+        psnr is not None and psnr < flat_psnr(view)
+        for psnr, view in zip(_psnrs(gaussians, scene, some, background), some, strict=True)
+    )
+    if 2 * worse > len(some):
+        raise ValueError(
+            f"{worse} of {len(some)} renders are farther from their training photo than one flat colour is: "
+            f"the scene file and the cameras of {scene.name} are of different captures, or in different "
+            "frames"
+        )
+
+
+def held_out_psnrs(
+    gaussians: Gaussians, scene: Scene, background: tuple[float, float, float] = BACKGROUND
+) -> tuple[float | None, ...]:
+    """PSNR of each held-out photo, dB; None where it has none."""
+    return _psnrs(gaussians, scene, scene.test, background)
+
+
+def _psnrs(
+    gaussians: Gaussians, scene: Scene, views: Sequence[View], background: tuple[float, float, float]
+) -> tuple[float | None, ...]:
+    renders = held_out_renders(replace(scene, test=[*views]), gaussians, background=background)
+    return tuple(psnr(view.render, view.photo, view.mask) for view in renders)

@@ -118,6 +118,7 @@ MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should n
 
 # Cleaning: 300 steps gain 1.0 dB on the room of 8 photos, 600 gain 1.2; half the decay takes twice the steps.
 CLEANING_STEPS, CLEANING_DECAY = 600, 0.01  # the share of the opacities that each step takes away
+FRAME_PHOTOS = 16  # training photos, at most, that tell whether scene and cameras are in the same frame
 
 # The loss under noise. Up to KNEE standard deviations differences count by their square (Huber), half as
 # steep there as L1 on average, and growth goes by the gradient: hence STEEPER.

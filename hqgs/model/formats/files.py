@@ -88,6 +88,8 @@ def format_of(path: Path, name: str | None = None, *, written: bool = False) -> 
     ValueError where there is none, or, of a file that is to be `written`, where it is only read.
     """
     known = WRITTEN if written else [*FORMATS]
+    if written and path.is_dir():
+        raise ValueError(f"{path} is a folder: name the file to write, with one of .{', .'.join(known)}")
     if name is not None:
         if name not in known:
             raise ValueError(f"format is {name!r}, wanted one of: {', '.join(known)}")
