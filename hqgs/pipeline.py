@@ -13,7 +13,9 @@ from hqgs import __version__
 from hqgs.base.files import (
     CHECKPOINT,
     CONFIG,
+    LEARNED,
     PAGE,
+    PASSERSBY,
     PLAN,
     PLY,
     atomic_path,
@@ -31,7 +33,7 @@ from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.passing import save_masks
 from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
-from hqgs.evaluation.report import RunResult, measure, write_report
+from hqgs.evaluation.report import REPORT, RunResult, measure, write_report
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.photo_files import strangers
@@ -153,6 +155,8 @@ def train(
         raise FileExistsError(f"{out} holds a run; resume=True goes on with it, overwrite=True begins anew")
     if out is not None and ranks.first and not taken:
         strangers(out)
+    if resume and overwrite:
+        raise ValueError("resume goes on with the run that is there, overwrite begins anew: give one of them")
     if seconds is not None and iterations is not None:
         raise ValueError("iterations and seconds: only one of them can be given")
     with open_run(scene, config or asked, out, resume, seconds, on_stage, ranks) as trainer:
@@ -175,7 +179,7 @@ def open_run(
     folder, and sends the others the checkpoint.
 
     Without a checkpoint `resume` starts fresh (the run may have been killed before its first one). A fresh
-    run removes an older checkpoint. See `train` for the errors.
+    run removes what an older one left. See `train` for the errors.
     """
     if seconds is not None:
         config = replace(config, seconds=seconds)
@@ -194,8 +198,9 @@ def open_run(
         if going_on:
             with _for_all(checkpoint, ranks) as path:
                 trainer.restore(path)
-        elif checkpoint is not None:
-            checkpoint.unlink(missing_ok=True)
+        elif checkpoint is not None and checkpoint.exists():  # another run's scene beside these cameras
+            for file in (REPORT, PAGE, PLY, PLAN, LEARNED, PASSERSBY, CHECKPOINT):
+                (checkpoint.parent / file).unlink(missing_ok=True)
         if ranks.count > 1:
             ranks.agree(scene_fingerprint(trainer.scene), "the scene")
             ranks.agree(trainer.plan, "the plan")
@@ -234,7 +239,7 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     ranks.count_anew()
     with deferred_interrupt() as interrupted:
         if out is not None:
-            save_cameras(out, trainer.prepared.given)
+            save_cameras(out, trainer.prepared.given, config.background)
             if trainer.prepared.passersby:
                 save_masks(out, trainer.prepared.given.train)
         while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):

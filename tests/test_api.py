@@ -97,7 +97,18 @@ def test_a_run_is_not_lost_by_a_second_call(tmp_path: Path) -> None:
         hqgs.train(tiny_scene(), config=tiny_config(10), out=out)
     assert (out / CHECKPOINT).read_bytes() == before
     assert hqgs.train(tiny_scene(), config=tiny_config(10), out=out, resume=True).iterations == 10
+    with pytest.raises(ValueError, match="resume goes on with the run that is there, overwrite begins anew"):
+        hqgs.train(tiny_scene(), config=tiny_config(10), out=out, resume=True, overwrite=True)
+    (out / "plan.json").write_text("{}")
+    with pytest.raises(KeyboardInterrupt):  # a run that is killed leaves no scene beside others' cameras
+        hqgs.train(tiny_scene(), config=tiny_config(11), out=out, overwrite=True, progress=_killed)
+    left = {"config.json", "cameras.json", "photos", "comparison"}
+    assert {path.name for path in out.iterdir() if not path.name.startswith(".")} <= left
     assert hqgs.train(tiny_scene(), config=tiny_config(11), out=out, overwrite=True).iterations == 11
+
+
+def _killed(_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_settings_beside_a_configuration_are_refused() -> None:

@@ -16,7 +16,8 @@ from hqgs.base.files import CHECKPOINT
 from hqgs.pipeline import open_run, train
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import OTHER, check_scene, load_checkpoint, save_checkpoint, scene_fingerprint
-from hqgs.training.config import DensifyConfig
+from hqgs.training.config import DensifyConfig, run_config
+from hqgs.training.pace import fit_to_seconds
 from hqgs.training.trainer import Trainer
 
 
@@ -87,9 +88,20 @@ def test_another_configuration_is_refused_by_field(tmp_path: Path, changes: dict
 
 def test_how_often_it_is_saved_may_change(tmp_path: Path) -> None:
     path = saved(tmp_path)
-    trainer = Trainer(tiny_scene(), replace(tiny_config(), checkpoint_every=7, eval_every=7))
+    trainer = Trainer(tiny_scene(), replace(tiny_config(), checkpoint_every=7, eval_every=9))
     trainer.restore(path)
     assert trainer.iteration == 1
+    assert (trainer.config.checkpoint_every, trainer.config.eval_every) == (7, 9)
+
+
+def test_how_often_a_run_of_seconds_is_saved_stays_as_it_was_planned(tmp_path: Path) -> None:
+    trainer = Trainer(tiny_scene(), replace(run_config(method="3dgs"), seconds=1e-3))
+    fit_to_seconds(trainer)
+    trainer.save(tmp_path / CHECKPOINT)
+    again = Trainer(tiny_scene(), trainer.asked)
+    assert again.config.eval_every != trainer.config.eval_every  # no step was timed
+    again.restore(tmp_path / CHECKPOINT)
+    assert again.config == trainer.config
 
 
 def test_another_scene_is_refused_by_field(tmp_path: Path) -> None:

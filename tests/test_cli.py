@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixtures_scenes import make_truth, write_transforms
 from tiny_scene import tiny_scene
 
 import hqgs
@@ -426,6 +427,47 @@ def test_the_last_lines_say_how_good_it_is_and_what_to_do(
     numbers = json.loads((tmp_path / "judged" / "judge.json").read_text())["scene"]
     assert numbers["fitted"]["mean"]["psnr"] >= numbers["mean"]["psnr"]
     assert set(numbers["fitted"]["views"]) == set(numbers["views"])
+
+
+def test_info_says_that_cameras_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_transforms(make_truth(), tmp_path / "scene")
+    assert call("info", tmp_path / "scene") == 0
+    told = capsys.readouterr().out
+    assert "poses: transforms.json" in told
+    assert "are not read" not in told
+    (tmp_path / "scene" / "transforms.json").rename(tmp_path / "scene" / "cameras.xml")
+    assert call("info", tmp_path / "scene") == 0
+    assert "those in cameras.xml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("report", ["{}", "[1]", "{", '{"metrics": {"mean": 1, "views": [], "reasons": {}}}'])
+def test_info_of_reports_that_are_none(
+    report: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "report.json").write_text(report)
+    assert call("info", tmp_path) == 2
+    assert "holds no photos, no run and no scene file" in one_line(capsys)
+    (tmp_path / "config.json").write_text("[1]")
+    (tmp_path / "checkpoint.safetensors").touch()
+    assert call("info", tmp_path) == 2
+    assert "report.json is damaged" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("config", "told"),
+    [
+        ('{"scene": {"path": "my photos"}}', "hqgs train 'my photos' --out {out} --resume goes on"),
+        ('{"scene": null}', "hqgs.train(..., resume=True) goes on"),
+        ("[1]", "hqgs.train(..., resume=True) goes on"),
+    ],
+)
+def test_info_of_a_run_that_was_killed(
+    config: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "config.json").write_text(config)
+    (tmp_path / "checkpoint.safetensors").touch()
+    assert call("info", tmp_path) == 0
+    assert f"a run that has not ended: {told.format(out=tmp_path)}" in capsys.readouterr().out
 
 
 def test_a_start_that_fails_leaves_no_folder(asked: list[dict[str, Any]], tmp_path: Path) -> None:

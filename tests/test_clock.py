@@ -15,11 +15,12 @@ from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from hqgs.base.files import CONFIG, PLAN, PLY
+from hqgs.base.files import CHECKPOINT, CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, plan_length
+from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config
 from hqgs.training.constants import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.notes import run_notes
@@ -89,6 +90,22 @@ def test_steps_that_are_timed_leave_nothing_behind(formation: str, tmp_path: Pat
         again.step()
     first, second = whole_state(trainer, tmp_path / "a"), whole_state(again, tmp_path / "b")
     assert_same((first[0], {}), (second[0], {}))
+
+
+def test_a_resumed_run_of_seconds_knows_how_long_its_steps_take(tmp_path: Path) -> None:
+    trainer = Trainer(tiny_scene(), replace(run_config(method="3dgs"), seconds=1e-3))
+    fit_to_seconds(trainer)
+    for _ in range(3):
+        trainer.step()
+    trainer.save(tmp_path / CHECKPOINT)
+    tensors, meta = load_checkpoint(tmp_path / CHECKPOINT)
+    del meta["frugality"]["steps"]  # as checkpoints were
+    save_checkpoint(tmp_path / "old", tensors, meta)
+    again = Trainer(tiny_scene(), trainer.asked)
+    for name, seconds in ((CHECKPOINT, trainer.frugality.step_seconds), ("old", 0.0)):
+        again.restore(tmp_path / name)
+        assert again.frugality.step_seconds == seconds
+    assert trainer.frugality.step_seconds > 0
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from fixtures_scenes import HEIGHT, WIDTH, make_truth, write_colmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.photos.files import decode
+from hqgs.photos.files import decode, glance
 from hqgs.photos.resize import area_downscale
 from hqgs.scene.load import load_scene
 
@@ -72,6 +72,15 @@ def test_half_tones_and_16_bits(tmp_path: Path) -> None:
     rgb, mask = decode(tmp_path / "a.png")
     assert mask is None
     np.testing.assert_array_equal(rgb, np.rint(grey16 / 257)[..., None].astype(np.uint8).repeat(3, -1))
+    Image.fromarray(grey16).save(tmp_path / "e.png", transparency=int(grey16[3, 4]))
+    shown, mask = decode(tmp_path / "e.png")
+    np.testing.assert_array_equal(shown, rgb)
+    assert mask is not None
+    assert np.argwhere(~mask).tolist() == [[3, 4]]
+    mixed = decode(tmp_path / "e.png", over=(0, 0, 0))[0]
+    assert mixed[3, 4].tolist() == [0, 0, 0, 255]
+    np.testing.assert_array_equal(mixed[4:, :, :3], rgb[4:])
+    assert not mixed[4:, :, 3].any()
     grey8 = (grey16 >> 8).astype(np.uint8)
     Image.fromarray(grey8).save(tmp_path / "b.png")
     np.testing.assert_array_equal(decode(tmp_path / "b.png")[0], grey8[..., None].repeat(3, -1))
@@ -168,3 +177,11 @@ def test_masks_by_the_names_that_people_give_them(tmp_path: Path, name: str) -> 
     mask = load_scene(tmp_path, test_every=0).train[0].mask
     assert mask is not None
     assert mask.mean() == 0.5
+
+
+@pytest.mark.parametrize("size", [(1, 1), (6, 40), (7, 7)])
+def test_a_glance_at_the_smallest_jpeg(tmp_path: Path, size: tuple[int, int]) -> None:
+    Image.new("L", size, 128).save(tmp_path / "a.jpg")
+    seen = glance(tmp_path / "a.jpg")
+    assert (seen.size, seen.format) == (size, "JPEG")
+    assert np.ptp(seen.small) == 0

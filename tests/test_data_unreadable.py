@@ -29,12 +29,15 @@ def names(root: Path, skip: bool = True) -> tuple[list[str], list[str]]:
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5])
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_training_photos_are_skipped_and_named(tmp_path: Path, share: float, suffix: str) -> None:
+@pytest.mark.parametrize("longest", [None, 32])
+def test_training_photos_are_skipped_and_named(
+    tmp_path: Path, share: float, suffix: str, longest: int | None
+) -> None:
     """The test views stay those of the whole folder: views 0 and 8 of 10, although 3 and 5 are gone."""
     truth = make_truth(10, suffix)
-    whole = load_scene(write_colmap(truth, tmp_path))
+    whole = load_scene(write_colmap(truth, tmp_path), longest=longest)
     spoil(tmp_path / f"images/view_03{suffix}", tmp_path / f"images/view_05{suffix}", share=share)
-    scene = load_scene(tmp_path, skip_unreadable=True)
+    scene = load_scene(tmp_path, skip_unreadable=True, longest=longest)
     gone = {f"view_03{suffix}", f"view_05{suffix}"}
     left = [view for view in whole.train if view.name not in gone]
     assert [view.name for view in scene.train] == [view.name for view in left]
@@ -42,13 +45,14 @@ def test_training_photos_are_skipped_and_named(tmp_path: Path, share: float, suf
     for view, before in zip(scene.train, left, strict=True):
         np.testing.assert_array_equal(view.image, before.image)
         np.testing.assert_array_equal(view.camera.viewmat, before.camera.viewmat)
-    assert scene.notes[:-1] == whole.notes
+    told = 0 if longest is None else 1  # how many photos are scaled down: of those that can be opened
+    assert scene.notes[told:-1] == whole.notes[told:]
     assert scene.notes[-1].startswith(
         f"2 of 8 training photos cannot be used and were left out: view_03{suffix}, view_05{suffix}; of the "
         "first: cannot read the photo "
     )
     with pytest.raises(ValueError, match=rf"cannot read the photo .*view_03\{suffix}"):
-        load_scene(tmp_path)
+        load_scene(tmp_path, longest=longest)
 
 
 def test_nothing_to_skip_changes_nothing(tmp_path: Path) -> None:
@@ -129,3 +133,17 @@ def test_small_photo(tmp_path: Path) -> None:
     assert train == [f"view_{k:02d}.png" for k in (1, 2, 3, 4, 7, 9)]
     with pytest.raises(ValueError, match=r"cannot read the photo .*view_06\.png"):
         load_scene(tmp_path / "low")
+
+
+def test_cut_out_photos_stay_cut_out(tmp_path: Path) -> None:
+    """A photo that cannot be opened does not make masks of the transparency of all others."""
+    truth = make_truth(5)
+    write_colmap(truth, tmp_path)
+    alpha = np.full((36, 48), 255, np.uint8)
+    alpha[:, :24] = 0
+    for name, photo in zip(truth.names, truth.photos, strict=True):
+        Image.fromarray(np.dstack([photo, alpha])).save(tmp_path / "images" / name)
+    (tmp_path / "images/view_02.png").write_bytes(b"")
+    scene = load_scene(tmp_path, test_every=0, skip_unreadable=True)
+    assert len(scene.train) == 4
+    assert all(view.mask is None and view.empty is not None for view in scene.train)

@@ -25,7 +25,7 @@ from hqgs.photos.look import Look, darken, falloff, respond, squared_radii
 from hqgs.scene.builtin.devices import draw_devices
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.constants import STEEPEST
-from hqgs.training.methods.devices import LearnedDevices
+from hqgs.training.methods.devices import KEPT, LearnedDevices
 
 Floats = NDArray[np.float64]
 K = np.array([[40.0, 0, 17.5], [0, 40.0, 11.0], [0, 0, 1]])
@@ -160,6 +160,22 @@ def test_responses_rise_and_keep_their_mean() -> None:
     np.testing.assert_array_equal(each[3], 0)
 
 
+def test_photos_that_each_have_a_camera_of_their_own_take_no_more_memory() -> None:
+    count = KEPT + 4
+    devices = LearnedDevices(
+        Devices(np.zeros(count, int), np.full((1, 2), 0.3), np.zeros((1, 2, 3))), True, False
+    )
+    clean = torch.full((24, 36, 3), 0.5)
+    for number in range(count):
+        own = K.copy()
+        own[:2, 2] += 0.1 * number
+        squares = torch.from_numpy(squared_radii(24, 36, own)).float()
+        wanted = darken(clean.permute(2, 0, 1), falloff(squares, torch.full((2,), 0.3)))
+        found = devices.develop(number, Camera(36, 24, own, np.eye(4)), clean).detach()
+        assert torch.equal(found, wanted.permute(1, 2, 0))
+    assert devices._squares.cache_info().currsize == KEPT
+
+
 def by_two() -> Scene:
     scene = tiny_scene()
     train = [replace(v, device=f"camera {k % 2}") for k, v in enumerate(scene.train)]
@@ -209,6 +225,10 @@ def test_a_new_view_in_the_look_of_a_photo(tmp_path: Path, capsys: pytest.Captur
     wrong = ["--show", "depth", "--look", "view1"]
     assert main(["render", str(out), "--out", str(tmp_path / "x.png"), *wrong]) == 2
     assert "--look is of colours, and --show is depth" in capsys.readouterr().err
+    for record in report["learned"]:
+        record |= {"gains": [1.0] * 3, "vignetting": [0.0] * 2, "response": [[0.1] * 3, [0.0] * 3]}
+    (out / "report.json").write_text(json.dumps(report))
+    assert look_of(out, "view1").response.any()  # alone
     (out / "report.json").unlink()
     assert main(["render", str(out), "--out", str(tmp_path / "x"), "--look", "view1"]) == 2
 

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fixtures_scenes import make_truth, photographed, write_colmap
 from reference import sh_basis
 from test_ply import random_gaussians
 from tiny_scene import tiny_scene
 
 from hqgs.cli import main as cli
+from hqgs.evaluation import held_out
 from hqgs.evaluation.held_out import held_out_psnr, held_out_renders
 from hqgs.model.formats.spz import encode_spz
 from hqgs.model.gaussians import Gaussians
@@ -225,6 +227,19 @@ def test_the_command_on_a_run_folder(
     assert "left out: 1 Gaussians: no pixel can show them" in text
     assert "left out: harmonics of degrees 1 to 3: at most 1 in 1,000 Gaussians needs them (0 of 39" in text
     assert "measured: renders of 4 cameras around the scene change by 0." in text
+
+
+def test_photos_are_held_out_as_the_run_did(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth, model = photographed(make_truth(9))
+    photos, run = write_colmap(truth, tmp_path / "photos", binary=False), tmp_path / "run"
+    model.save(run / "scene.ply")
+    (run / "config.json").write_text('{"scene": {"test_every": 3}}')
+    measured = []
+    monkeypatch.setattr(held_out, "held_out_psnr", lambda scene, _: measured.append(scene.test) or 1.0)
+    assert call(run, "--out", tmp_path / "a.ply", "--scene", photos) == 0
+    assert [len(test) for test in measured] == [3, 3]
 
 
 def test_what_a_file_changes_is_measured_in_the_cameras_of_its_run(tmp_path: Path) -> None:

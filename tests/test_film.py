@@ -41,11 +41,20 @@ def film(path: Path, frames: int) -> Path:
     return encoded(path, images, 10)
 
 
-def encoded(path: Path, images: list[NDArray[np.uint8]], crf: int, times: list[int] | None = None) -> Path:
-    """Pictures [H, W, 3] of one size as a film; `times`: when each is shown, ms, where the rate varies."""
+def encoded(
+    path: Path,
+    images: list[NDArray[np.uint8]],
+    crf: int,
+    times: list[int] | None = None,
+    wide: Fraction = Fraction(1),
+) -> Path:
+    """Pictures [H, W, 3] of one size as a film; `times`: when each is shown, ms, where the rate varies;
+    `wide`: a pixel, of its height."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=RATE)
         stream.height, stream.width = images[0].shape[:2]
+        if wide != 1:
+            stream.codec_context.sample_aspect_ratio = wide
         stream.pix_fmt, stream.options = "yuv420p", {"crf": str(crf)}
         if times is not None:
             stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
@@ -104,6 +113,39 @@ def test_a_film_held_upright_is_shown_upright(tmp_path: Path) -> None:
         shown = np.asarray(Image.open(frame)).astype(int)
         assert shown.shape == (128, 96, 3)
         assert shown[100:, :, 0].min() > 200 > 60 > shown[:90, :, 0].max()
+
+
+@pytest.mark.parametrize(
+    ("wide", "width"), [(Fraction(4, 3), 171), (Fraction(1, 2), 64), (Fraction(1000), 128)]
+)
+def test_pixels_that_are_no_squares_become_squares(tmp_path: Path, wide: Fraction, width: int) -> None:
+    """As a player shows them; a width that none can have says nothing."""
+    picture = np.zeros((96, 128, 3), np.uint8)
+    picture[:, 96:, 0] = 250
+    path = encoded(tmp_path / "anamorphic.mkv", [picture] * 4, 12, wide=wide)
+    folder, _ = film_frames(path, tmp_path / "frames", 3)
+    for frame in folder.glob("*.jpg"):
+        shown = np.asarray(Image.open(frame)).astype(int)
+        assert shown.shape == (96, width, 3)
+        edge = round(0.75 * width)
+        assert shown[:, edge + 4 :, 0].min() > 200 > 60 > shown[:, : edge - 4, 0].max()
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "avi"])
+def test_a_title_that_is_no_text_is_passed_by(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"titled.{suffix}"
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = "Schoene AAAA"
+        stream = container.add_stream("mpeg4", rate=RATE)
+        stream.height, stream.width, stream.pix_fmt = 96, 128, "yuv420p"
+        for packet in (*stream.encode(av.VideoFrame(128, 96, "yuv420p")), *stream.encode()):
+            container.mux(packet)
+    content = path.read_bytes()
+    assert b"Schoene AAAA" in content
+    path.write_bytes(content.replace(b"Schoene AAAA", b"Sch\xf6\xf6ne AAAA"))
+    folder, note = film_frames(path, tmp_path / "frames", 3)
+    assert len(list(folder.glob("*.jpg"))) == 1
+    assert "titled" in note
 
 
 def test_a_film_that_cannot_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

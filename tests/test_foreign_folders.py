@@ -11,6 +11,7 @@ from unicodedata import normalize
 import numpy as np
 import pytest
 from fixtures_scenes import Truth, frames, make_truth, write_colmap, write_photos, write_transforms
+from PIL import Image
 
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene
@@ -25,17 +26,19 @@ def same_views(scene: Scene, truth: Truth) -> None:
 
 
 SPACES = ["A DJI 0 (40).png", "A DJI 1 (7).png", "  b  c.png".strip(), "Ä ö 1.png"]
+THREE = [f"{k} of 4.png" for k in range(4)]  # as many words as a point has numbers
 
 
+@pytest.mark.parametrize("names", [SPACES, THREE])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_names_with_spaces_in_text_models(tmp_path: Path, end: str) -> None:
-    truth = replace(make_truth(4), names=SPACES)
+def test_names_with_spaces_in_text_models(tmp_path: Path, end: str, names: list[str]) -> None:
+    truth = replace(make_truth(4), names=names)
     write_colmap(truth, tmp_path, binary=False)
     path = tmp_path / "sparse/0/images.txt"
     text = "# Image list\n\n" + path.read_text(encoding="utf-8").replace("1.5 2.5 -1", "")
     path.write_bytes(text.replace("\n", end).encode())
     scene = load_scene(tmp_path, test_every=0)
-    assert [view.name for view in scene.train] == sorted(SPACES)
+    assert [view.name for view in scene.train] == sorted(names)
     same_views(scene, truth)
 
 
@@ -248,3 +251,99 @@ def test_names_in_a_text_model_are_text(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes().replace(b"view_\xe9", b"view_\x81"))
     with pytest.raises(ValueError, match=r"the name of image \d+ is no text in UTF-8"):
         load_scene(root)
+
+
+def maps(root: Path, truth: Truth) -> None:
+    """A grey picture for each photo, under its name."""
+    root.mkdir(parents=True)
+    for name in truth.names:
+        Image.fromarray(np.full((36, 48), 5000, np.uint16)).save(root / name)
+
+
+@pytest.mark.parametrize("folder", ["depth", "Normal_maps", "mask", "Masks"])
+def test_maps_are_not_taken_for_the_photos_of_a_model(tmp_path: Path, folder: str) -> None:
+    truth = make_truth(5)
+    write_colmap(truth, tmp_path, images="rgb")
+    maps(tmp_path / folder, truth)
+    scene = load_scene(tmp_path, test_every=0)
+    for view, photo in zip(scene.train, truth.photos, strict=True):
+        np.testing.assert_array_equal(view.image, photo)
+    (tmp_path / "rgb/view_03.png").unlink()  # then more maps than photos have the names
+    left = load_scene(tmp_path, test_every=0).train
+    assert [view.name for view in left] == ["view_00.png", "view_01.png", "view_02.png", "view_04.png"]
+    np.testing.assert_array_equal(left[3].image, truth.photos[4])
+
+
+def test_photos_in_a_folder_called_after_maps_are_found_where_there_are_no_others(tmp_path: Path) -> None:
+    truth = make_truth(4)
+    (tmp_path / "images").mkdir()
+    same_views(load_scene(write_colmap(truth, tmp_path, images="thumbnails"), test_every=0), truth)
+    entries = frames(truth, "D:/scene/thumbnails")
+    write_transforms(truth, tmp_path / "b", frames=entries)
+    (tmp_path / "b/images").rename(tmp_path / "b/thumbnails")
+    same_views(load_scene(tmp_path / "b", test_every=0), truth)
+
+
+@pytest.mark.parametrize("folder", ["depths", "normals", "mask", "masks"])
+def test_a_photo_that_is_gone_is_not_its_map(tmp_path: Path, folder: str) -> None:
+    truth = make_truth(5)
+    write_transforms(truth, tmp_path)
+    maps(tmp_path / folder, truth)
+    (tmp_path / "images/view_03.png").unlink()
+    scene = load_scene(tmp_path, test_every=0)
+    assert [view.name[7:] for view in scene.train] == [name for name in truth.names if "03" not in name]
+
+
+@pytest.mark.parametrize("files", ["one", "split", "and one that is not read"])
+def test_a_photo_that_is_gone_is_not_that_of_another_frame(tmp_path: Path, files: str) -> None:
+    """Two cameras of a rig, and the parts of a Blender set, give their photos the same names."""
+    truth = make_truth(8)
+    names = [f"view_{k:02d}.png" for k in range(4)]
+    halves = [replace(truth, names=names, photos=truth.photos[k::2]) for k in range(2)]
+    entries = []
+    for k, (folder, half) in enumerate(zip(("train", "test"), halves, strict=True)):
+        write_photos(half, tmp_path / folder)
+        entries += frames(replace(half, viewmats=truth.viewmats[k::2]), folder)
+    meta = {"fl_x": 40.0, "w": 48, "h": 36}
+    (tmp_path / "train/view_02.png").unlink()
+    if files == "one":
+        (tmp_path / "transforms.json").write_text(json.dumps(meta | {"frames": entries}))
+    else:
+        for name, part in (("train", entries[:4]), ("test", entries[4:])):
+            (tmp_path / f"transforms_{name}.json").write_text(json.dumps(meta | {"frames": part}))
+        if files != "split":
+            write_photos(halves[1], tmp_path / "val")
+            part = [entry | {"file_path": entry["file_path"].replace("test", "val")} for entry in entries[4:]]
+            (tmp_path / "transforms_val.json").write_text(json.dumps(meta | {"frames": part}))
+    scene = load_scene(tmp_path, test_every=0)
+    assert sorted(v.name for v in scene.train if "train" in v.name) == [
+        f"train/view_{k:02d}.png" for k in (0, 1, 3)
+    ]
+    assert len(scene.train + scene.test) == 7
+    assert any("no photo any more and were left out: train/view_02.png" in note for note in scene.notes)
+
+
+def test_a_photo_that_is_gone_with_its_mask_is_left_out(tmp_path: Path) -> None:
+    truth = make_truth(5)
+    entries = frames(truth)
+    for entry, name in zip(entries, truth.names, strict=True):
+        entry["mask_path"] = f"masks/{name}"
+    write_transforms(truth, tmp_path, frames=entries)
+    (tmp_path / "masks").mkdir()
+    for name in truth.names:
+        Image.new("L", (48, 36), 255).save(tmp_path / "masks" / name)
+    (tmp_path / "masks/view_03.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"view_03.*mask_path 'masks/view_03\.png' names no file"):
+        load_scene(tmp_path)
+    (tmp_path / "images/view_03.png").unlink()
+    assert len(load_scene(tmp_path, test_every=0).train) == 4
+
+
+@pytest.mark.parametrize("content", ["my notes\n", ""])
+def test_a_text_that_names_no_photo_is_no_split(tmp_path: Path, content: str) -> None:
+    write_colmap(make_truth(6), tmp_path)
+    own = load_scene(tmp_path)
+    (tmp_path / "test.txt").write_text(content)
+    scene = load_scene(tmp_path)
+    assert split_of(scene) == split_of(own)
+    assert "test.txt names none of the photos: it is not taken for a split" in scene.notes

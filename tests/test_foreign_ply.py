@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import hqgs
+from hqgs.base.ply import read_vertices
 
 POSITION = ["x", "y", "z"]
 NORMAL = ["nx", "ny", "nz"]
@@ -180,3 +181,15 @@ def test_shares_and_lengths_are_told_from_logits_and_logarithms(tmp_path: Path, 
         row["opacity"] = 9 * row["opacity"] - 3
     logits = hqgs.Gaussians.load(write(tmp_path / "logits.ply", rows, names)).opacities
     assert float(logits.max()) > 5  # as they stand
+
+
+@pytest.mark.parametrize("code", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_comments_in_any_letters(kind: str, code: str, tmp_path: Path) -> None:
+    names, _ = layout("gsplat", 1)
+    rows = values(names)
+    data = write(tmp_path / "a.ply", rows, names, ["see end_header of X"], kind).read_bytes()
+    (tmp_path / "b.ply").write_bytes(data.replace(b"X", "Schön: Küche".encode(code), 1))
+    check(hqgs.Gaussians.load(tmp_path / "b.ply"), rows, 1)
+    mapped = isinstance(read_vertices(tmp_path / "b.ply"), np.memmap)  # else large files take minutes
+    assert mapped == (kind != "ascii")

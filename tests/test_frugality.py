@@ -159,6 +159,23 @@ def test_a_run_that_stops_improving_is_shortened(monkeypatch: pytest.MonkeyPatch
     assert trainer.frugality.left_out()[0].what == f"iterations {state.length + 1} to 3000"
 
 
+def test_photos_of_which_masks_leave_nothing_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CHECKS", 5)
+    monkeypatch.setattr(module, "PATIENCE", 10)
+    scene, config = tiny_scene(VIEWS), tiny_config(30, leave_out=("iterations",), densify=STILL)
+    nothing = np.zeros((HEIGHT, WIDTH), bool)
+    (held,) = Trainer(scene, config).schedule.held
+    views = [replace(view, mask=nothing) if k == held else view for k, view in enumerate(scene.train)]
+    trainer = Trainer(replace(scene, train=views), config)
+    shown, others = trainer.shown(), [k for k in range(len(views)) if k != held]
+    assert trainer._psnr(shown, range(len(views))) == trainer._psnr(shown, others)
+    assert np.isnan(trainer._psnr(shown, [held]))
+    while trainer.iteration < trainer.length:
+        trainer.step()
+    assert trainer.length == 30
+    assert trainer.frugality.left_out() == []
+
+
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plan_rules, "SMALLEST_SIDE", 8)
     items = ("growth", "weight", "resolution")

@@ -17,9 +17,11 @@ from scipy.ndimage import gaussian_filter
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
+from hqgs.cli.judge import background_of
 from hqgs.cli.main import main
 from hqgs.evaluation.causes import PARTS, Maps, causes, pixel_maps, shares, shown_by
 from hqgs.evaluation.held_out import RenderedView
+from hqgs.evaluation.judge import flat_psnr
 from hqgs.evaluation.metrics import METRICS
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source as scene_source
@@ -85,6 +87,10 @@ def test_two_scenes_are_compared_photo_by_photo(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     worse = Gaussians.load(run)
+    (tmp_path / "other").mkdir()
+    replace(worse, sh0=worse.sh0 * 0.8).save(tmp_path / "other" / "scene.ply")
+    assert judge(run, "--against", tmp_path / "other" / "scene.ply", "--out", tmp_path / "named") == 0
+    assert f"| against {tmp_path / 'other' / 'scene.ply'} " in capsys.readouterr().out  # both are scene.ply
     replace(worse, sh0=worse.sh0 * 0.9).save(tmp_path / "worse.spz")
     assert judge(run, "--against", tmp_path / "worse.spz", "--out", tmp_path / "both") == 0
     told = capsys.readouterr().out
@@ -101,6 +107,20 @@ def test_two_scenes_are_compared_photo_by_photo(
     same = json.loads((tmp_path / "same" / "judge.json").read_text())["difference"]
     assert same["psnr"] == {"mean": 0.0, "interval": 0.0, "sure": False}
     assert "(not sure)" in capsys.readouterr().out
+
+
+def test_a_run_is_judged_before_its_own_background(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"train": {"background": [1.0, 0.5, 0.0]}}')
+    for source in (tmp_path, tmp_path / "scene.ply"):
+        assert background_of(source) == (1.0, 0.5, 0.0)
+    assert background_of(tmp_path / "other.ply") == (0.0, 0.0, 0.0)
+
+
+def test_a_bright_photo_of_many_pixels_is_flat_to_all_digits() -> None:
+    view, rng = tiny_scene().test[0], np.random.default_rng(0)
+    values = rng.integers(240, 252, (1500, 1000, 3)).astype(np.uint8)
+    wanted = -10 * np.log10((values / 255.0).reshape(-1, 3).var(0).mean())
+    assert flat_psnr(replace(view, image=values)) == pytest.approx(wanted, abs=1e-3)
 
 
 def with_wrong_poses() -> Scene:
@@ -273,3 +293,5 @@ def test_fog_and_the_edge_of_the_capture_are_found() -> None:
     assert maps.fog[:, 40:].max() < 0.01
     assert maps.photos[2, 50] == pytest.approx(3, abs=0.1)
     assert maps.photos[60, 50] == pytest.approx(0, abs=0.1)
+    many = shown_by(made, [Camera(SIZE, SIZE, K, upper)] * 1000)  # not all of them are asked
+    assert float(many.max()) == 1000

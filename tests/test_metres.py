@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fixtures_scenes import make_truth, write_colmap
+from fixtures_scenes import make_truth, write_colmap, write_transforms
 from PIL import Image
 from plyfile import PlyData
 from test_world import placed
@@ -163,3 +163,20 @@ def test_a_run_is_written_in_metres_and_goes_on_so(
     assert main([*call, "--iterations", "6", "--resume"]) == 0
     assert json.loads((out / "report.json").read_text())["world"] == first
     assert Gaussians.load(out / "scene.ply").world == World(first["unit"], (0, 0, 0), first["metres"])
+
+
+def test_photos_of_all_around_have_their_own_names(tmp_path: Path) -> None:
+    """As before COLMAP has worked; the names of their faces mean the same."""
+    truth = make_truth()
+    root = write_transforms(truth, tmp_path, camera_model="EQUIRECTANGULAR")
+    centers = [-v[:3, :3].T @ v[:3, 3] for v in truth.viewmats]
+    metres = 7.5 / np.linalg.norm(centers[1] - centers[6])
+    for a, b in ((A, "VIEW_06"), (f"images/{A}", "view_06.up.png"), ("view_01.back", B)):
+        scene = hqgs.load(root, distance=(a, b, 7.5))
+        assert scene.world.metres == pytest.approx(metres, rel=1e-6)
+    assert any(
+        "the camera of images/view_01.back.png and the camera of images/view_06.png are" in note
+        for note in scene.notes
+    )
+    with pytest.raises(ValueError, match=r"view_01\.png and .*view_01\.back\.png are in one place"):
+        hqgs.load(root, distance=(A, "view_01.back", 7.5))

@@ -65,6 +65,22 @@ MISTAKES = {
     "export a.ply --out a.ply": "is the source a.ply itself; what is left out would be lost",
     "export a.ply --out a.obj": "the suffix says no format; wanted .ply, ",
     "export half.ply --out b.ply": "half.ply: not a PLY file",
+    "export a.ply --out b.ply --downscale 2": "--downscale divides the photos of --scene, and there is no",
+    "export a.ply --out b.ply --sh-bits 6 3": "--sh-bits is for spz, and --out b.ply says ply",
+    "export a.ply --out b --format glb --spz-version 4": "--spz-version is for spz, and --format says glb",
+    "export a.ply --out b.ply --scene photos": "photos has no cameras: those that would be found anew are in",
+    "render a.ply --out b.png --views all --frames 3": "--frames is of paths, and --views has the run's own",
+    "render a.ply --out b.png --views all --path orbit": "--path is of paths, and --views has the run's own",
+    "render a.ply --out b.png --views all --up 0 0 1": "--up is of paths, and --views has the run's own",
+    "render a.ply --out b.png --background 255 0 0": "--background is 255 0 0, wanted three numbers in 0..1",
+    "render a.ply --out b.png --background nan 0 0": "--background is nan 0 0, wanted three numbers in 0..1",
+    "render a.ply --out b.png --up 0 0 0": "up is [0.0, 0.0, 0.0], wanted a direction",
+    "render a.ply --out notes.txt/a.gif": "--out notes.txt/a.gif lies below {root}/notes.txt, which",
+    "judge a.ply --photos scene --background nan 0 0": "--background is nan 0 0, wanted three numbers in",
+    "judge a.ply --photos nowhere --out notes.txt": "--out notes.txt is a file: name a folder",
+    "judge a.ply --photos nowhere --out notes.txt/a": "--out notes.txt/a lies below {root}/notes.txt",
+    "diagnose nowhere --out empty": "--out empty is a folder: name the file to write",
+    "plan photos --out nowhere": "--out nowhere: there is no run; without --out",
     "clean a.ply --out b.ply": "--photos names the photos to measure it with",
     "degrade scene --kind noise:25 --out photos": "photos exists and is not an empty folder",
     "diagnose nowhere": "there is no scene folder {root}/nowhere",
@@ -105,13 +121,18 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(
     command: str, told: str, root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(root)
-    before = sorted(root.rglob("*"))
+    before = held(root)
     try:
         code = main(command.split())
     except SystemExit as end:
         code = end.code
-    line = capsys.readouterr().err.splitlines()[-1]  # COLMAP's photos are counted before it
+    *earlier, line = capsys.readouterr().err.splitlines()
     assert code == 2
+    assert all(said.endswith("no camera in EXIF") for said in earlier)  # of photos that were counted
     assert line.startswith("hqgs: ")
     assert told.format(root=root) in line
-    assert sorted(root.rglob("*")) == before
+    assert held(root) == before
+
+
+def held(root: Path) -> dict[Path, bytes | None]:
+    return {path: path.read_bytes() if path.is_file() else None for path in root.rglob("*")}

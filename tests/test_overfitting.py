@@ -57,6 +57,16 @@ def test_dropout_leaves_out_a_share_and_keeps_the_mean_opacity() -> None:
     assert float(opaque.activated_opacities().max()) == pytest.approx(OPAQUE, rel=1e-5)
 
 
+def test_dropout_of_what_has_decayed_to_nothing_has_gradients() -> None:
+    made = gaussians(7)
+    opacities = torch.tensor([-50.0, -87.0, -88.0, -95.0, -103.0, -104.0, -110.0], requires_grad=True)
+    some = with_dropout(replace(made, opacities=opacities), 0.2, 0, 7)
+    assert torch.isfinite(some.opacities).all()
+    some.opacities.sum().backward()
+    assert opacities.grad is not None
+    assert torch.isfinite(opacities.grad).all()
+
+
 def test_dropout_leaves_open_how_the_rest_is_seen() -> None:
     made = gaussians(40)
     made.antialiased = True

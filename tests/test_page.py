@@ -79,6 +79,10 @@ def test_a_page_without_scene_views_or_history(run: hqgs.Run) -> None:
     assert "<canvas" not in text
     assert text.count("not measured while it trained") == 4
     assert told_verdict(report) == "Quality: not measured. No photo was held out: look at the scene."
+    mean = {**run.report["metrics"]["mean"], "psnr": None}
+    reasons = {"psnr": "1 of 3 views: the mask leaves no pixel"}
+    report["metrics"] = {**run.report["metrics"], "mean": mean, "reasons": reasons}
+    assert told_verdict(report) == "Quality: not measured. PSNR: 1 of 3 views: the mask leaves no pixel."
 
 
 def test_the_diagnosis_is_told(run: hqgs.Run) -> None:
@@ -109,6 +113,7 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
             "focus": 2.0,
             "trajectory_px": [[0.0, 0.0]] * 9,
             "gains": [1.0, 1.0, 1.0],
+            "response": [[0.1, 0.0, 0.0], [0.0, 0.0, 0.0]],
         },
     ]
     report: Any = {**run.report, "learned": learned}
@@ -118,7 +123,9 @@ def test_what_was_learned_of_the_cameras_is_told(run: hqgs.Run) -> None:
         f"<td>{cell}</td>"
         for cell in ("a&lt;b&gt;.png", "4.0 px", "sharp", "+0.33", "+0.67", "+0.67", "-1.33")
     )
-    assert cells in text
+    assert cells + "<td></td></tr>" in text
+    assert "<th>B</th><th>slope of its curve</th></tr>" in text
+    assert "<td>up to 10% off the mean</td></tr>" in text
     assert "<td>c.png</td><td>still</td><td>1.5 px, sharp at 2 of the median depth</td><td>+0.00</td>" in text
     assert text.count("data:image/jpeg;base64,") == 2 * len(run.views) + 1
 

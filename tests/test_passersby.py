@@ -138,6 +138,23 @@ def test_what_cannot_be_told_is_left_as_it_is(crowd: WildRoom) -> None:
         assert not found
 
 
+def test_how_large_the_scene_is_is_asked_once(crowd: WildRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes a look at all points in all photos."""
+    asked = list[str]()
+    reach = Scene.reach.fget
+    assert reach is not None
+
+    def counted(scene: Scene) -> float:
+        asked.append(scene.name)
+        return reach(scene)
+
+    monkeypatch.setattr(Scene, "reach", property(counted))
+    monkeypatch.setattr(passersby, "SCOUT_STEPS", 3)
+    monkeypatch.setattr(passersby, "SCOUT_STEPS_EACH", 0)
+    without_passersby(crowd.scene, 0)
+    assert len(asked) == 1
+
+
 def test_the_run_goes_by_the_masks_and_tells(crowd: WildRoom, tmp_path: Path) -> None:
     asked = tiny_config(4, leave_out=("passersby",))
     run = hqgs.train(crowd.scene, config=asked, out=tmp_path / "run")

@@ -111,6 +111,14 @@ def test_a_path_goes_through_its_cameras_at_an_even_speed() -> None:
         assert math.dist(project(camera, np.zeros((1, 3)))[0][0], (20, 15)) < 2  # still looks there
 
 
+def test_a_path_keeps_an_order_that_was_given() -> None:
+    """There and back, through more cameras than a path of photos takes."""
+    eyes = [(x, 0.0, 0.0) for x in (*range(40), *range(38, -1, -1))]
+    cameras = [hqgs.look_at(eye, (20, 99, 0), up=(0, 0, 1)) for eye in eyes]
+    path = hqgs.camera_path(cameras, 79, sort=False)
+    np.testing.assert_allclose([camera.center[0] for camera in path], [eye[0] for eye in eyes], atol=0.2)
+
+
 def test_a_path_cuts_where_no_camera_stood() -> None:
     """Two walks, 32 of their steps apart, and a camera alone in between."""
     eyes = [(k + begin, 0.0, 0.0) for k in range(9) for begin in (0, 40)]
@@ -205,6 +213,9 @@ def test_the_cameras_of_a_run_come_back(tmp_path: Path) -> None:
         assert np.array_equal(found.camera.viewmat, view.camera.viewmat)
         assert found.photo is not None
         assert found.photo.is_file()
+        assert found.mask is None
+        found.photo.unlink()
+    assert {view.photo for view in load_cameras(tmp_path).views} == {None}
     np.testing.assert_allclose(known.up, [0, -1, 0], atol=1e-9)
 
 

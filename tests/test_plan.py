@@ -15,7 +15,7 @@ from test_diagnose import degraded_scene
 from test_learned_cameras import textured_scene
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.base.files import CHECKPOINT, PAGE
+from hqgs.base.files import CHECKPOINT, PAGE, PLAN
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import open_run
@@ -27,8 +27,9 @@ from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, plan_b
 from hqgs.training.plan_budget import first_points_wanted
 from hqgs.training.plan_rules import RULES, plan_run
 from hqgs.training.prepare import Prepared, facts_of
-from hqgs.training.settings import PRESETS
+from hqgs.training.settings import PRESETS, plan_values, with_iterations, with_plan
 from hqgs.training.trainer import Trainer
+from hqgs.training.trial import _settings
 
 
 def value(plan: RunPlan, what: str) -> str:
@@ -88,6 +89,21 @@ def test_a_run_of_few_steps_starts_from_twice_as_many_points_that_photos_agree_o
         assert plan.first_points == times * facts.pixels // PIXELS, (agreed, asked.iterations)
     fewer = replace(config, start_points=usual // 4)
     assert first_points_wanted(replace(facts, agreed=0.9), fewer) == 2 * (usual // 4)
+
+
+def test_a_repeat_of_seconds_starts_from_as_many_points(tmp_path: Path) -> None:
+    """A run of seconds does not start from more where few steps fit into them."""
+    asked = run_config(method="hqgs", formation="none")
+    facts = replace(Prepared(textured_scene(8, 64), asked).facts, points=10, agreed=0.9)
+    timed = replace(facts, seconds=StepSeconds(1.0, 0.25))
+    run = plan_run(timed, None, replace(asked, seconds=1.0))
+    assert run.settings.iterations < FEW_STEPS * facts.photos
+    (tmp_path / PLAN).write_text(json.dumps(plan_values(run.settings, [])))
+    again = plan_run(facts, None, with_plan(asked, tmp_path))
+    assert (again.settings.iterations, again.first_points) == (run.settings.iterations, run.first_points)
+    assert _settings(again.settings, facts.photos) == _settings(run.settings, facts.photos)  # of its trial
+    other = plan_run(facts, None, with_iterations(asked, run.settings.iterations))
+    assert other.first_points > 1.9 * run.first_points
 
 
 @pytest.mark.parametrize("left", ["passersby", "photos", ""])

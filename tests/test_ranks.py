@@ -30,13 +30,15 @@ from hqgs.base.ranks import ALONE, RankError, joined
 from hqgs.cli.main import main
 from hqgs.training.adam import Adam
 from hqgs.training.batch import Part, Rest, give_harmonics, give_others, part_of, to_rasterize
-from hqgs.training.config import TrainConfig
+from hqgs.training.config import DensifyConfig, TrainConfig
+from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.forward import TrainingViews
 from hqgs.training.guard import Fault
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
+STILL = DensifyConfig(start=10_000, reset_every=10_000)
 CASES: dict[str, dict[str, Any]] = {
     "3dgs": {"leave_out": ("growth", "weight")},
     "tinted": {"method": "tinted"},  # a tensor of its own, and harmonics of which all is sent
@@ -287,9 +289,20 @@ def test_rates_and_moments_follow_the_number_of_views() -> None:
     np.testing.assert_allclose(params[0].detach(), params[1].detach(), rtol=1e-6)
 
 
+def spoil_next(trainer: Trainer, row: int) -> None:
+    """The next gradient of this Gaussian is not finite."""
+    trained = trainer.gaussians.opacities
+
+    def spoiled(gradient: torch.Tensor) -> torch.Tensor:
+        hook.remove()
+        return gradient.index_fill(0, torch.tensor([row]), math.nan)
+
+    hook = trained.register_hook(spoiled)
+
+
 def test_bad_photos_and_gradients_leave_their_view_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other views of the step are trained; where a Gaussian is at fault, none of them."""
-    trainer = Trainer(tiny_scene(), config_of("3dgs"))
+    trainer = Trainer(tiny_scene(9), replace(config_of("3dgs"), densify=STILL))
     loss, names = trainer.method.loss, []
 
     def spoiled(image: torch.Tensor, target: Any) -> torch.Tensor:
@@ -302,13 +315,19 @@ def test_bad_photos_and_gradients_leave_their_view_out(monkeypatch: pytest.Monke
     assert (trainer.guard.skipped, trainer.guard.skipped_in_a_row) == (1, 0)
     assert trainer.guard.events[0]["what"] == "loss"
     assert not torch.equal(trainer.gaussians.means.detach(), before)
-    with torch.no_grad():
-        trainer.gaussians.scales[3] = math.nan
-    count, before = len(trainer.gaussians), trainer.gaussians.sh0.detach().clone()
-    skipped = len(trainer.schedule.batch(trainer.iteration + 1, trainer.state.decisions))
+    spoil_next(trainer, 3)
+    before = trainer.gaussians.sh0.detach().clone()
     trainer.step()
-    assert len(trainer.gaussians) <= count - 1
-    assert trainer.guard.skipped == 1 + skipped or trainer.guard.culled
+    assert torch.equal(trainer.gaussians.sh0.detach(), torch.cat([before[:3], before[4:]]))
+    assert (trainer.guard.skipped, trainer.guard.culled) == (1 + 4, 1)
+
+
+def test_a_bad_gaussian_ends_no_run_of_large_steps() -> None:
+    batch = MAX_SKIPPED_IN_A_ROW + 4
+    trainer = Trainer(tiny_scene(batch + 2), replace(config_of("3dgs", batch), densify=STILL))
+    spoil_next(trainer, 3)
+    trainer.step()
+    assert (trainer.guard.skipped, trainer.guard.skipped_in_a_row) == (batch, 1)
 
 
 def test_a_batch_below_one_is_refused() -> None:

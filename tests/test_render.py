@@ -16,6 +16,7 @@ from hqgs.cli import main as cli
 from hqgs.model.formats.rows import curve_order
 from hqgs.scene.camera_files import load_cameras, save_path
 from hqgs.scene.paths import with_size
+from hqgs.show import frames, trust
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +131,13 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
         (["--show", "normals"], "--show is normals, wanted one of: 'color', 'depth', 'alpha'"),
         (["--size", "7"], "--size is 7, wanted two whole numbers"),
         (["--size", "0", "4"], "the size is 0 x 4, wanted at least 1 x 1"),
-        (["--out", "/dev/null/x.gif"], "/dev/null is there already: choose another name"),
+        (["--out", "/dev/null/x.gif"], "--out /dev/null/x.gif lies below /dev/null, which is a file"),
+        (["--out", "film.txt"], "film.txt is no folder"),
+        (["--out", "folder.gif"], "folder.gif is a folder: name a file, or a folder without .gif"),
+        (["--out", "a.mp4"], "no PyAV"),
+        (["--out", "a.mp4", "--size", "1", "8"], "a film has sides of at least 2 px, these are 1 x 8"),
+        (["--look", "nobody"], "{folder}: no gains, vignetting or response of photos were learned"),
+        (["--look", "view0", "--show", "depth"], "--look is of colours, and --show is depth"),
         (["--views", "train", "--out", "x.png"], "x.png holds one picture, and there are 5"),
     ],
 )
@@ -142,10 +149,19 @@ def test_bad_input_is_one_line(
     arguments: list[str],
     message: str,
 ) -> None:
+    def early(*_: object) -> None:
+        raise AssertionError("the photos were measured first")
+
+    def missing(_: str) -> None:
+        raise ValueError("no PyAV")
+
+    monkeypatch.setattr(trust, "trust_of", early)
+    monkeypatch.setattr(frames, "pyav", missing)
     monkeypatch.chdir(tmp_path)
-    assert render(folder, "--out", tmp_path / "out", *arguments) in (1, 2)
+    (tmp_path / "folder.gif").mkdir()
+    assert render(folder, "--out", tmp_path / "out", *arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"hqgs: {message}")
+    assert line.startswith(f"hqgs: {message.format(folder=folder)}")
     assert list(tmp_path.glob("*.png")) == []
 
 

@@ -212,6 +212,7 @@ def test_failure_midway_leaves_the_old_report_and_no_scraps(
     assert not list(tmp_path.glob(".report.*"))
 
     (tmp_path / ".report.killed").mkdir()  # what a killed process leaves goes with the next report
+    (tmp_path / ".report.killed.html").write_text("<html>")
     monkeypatch.undo()
     write_report(tmp_path, result_of(view_of("a", 0.2), seed=9))
     assert not list(tmp_path.glob(".report.*"))

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from tiny_scene import tiny_config, tiny_scene
 
+from hqgs.base.files import CHECKPOINT, CONFIG
 from hqgs.cli.main import COMMANDS, main
 from hqgs.cli.train import Train, Whole, config_of, read
 from hqgs.evaluation.verdict import verdict
@@ -77,6 +78,18 @@ def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: 
     assert config_of(options("--config", file, "--iterations", "900")) == run_config(iterations=900, seed=5)
     assert config_of(options("--config", file, "--leave-out", "none")) == replace(wanted, leave_out=())
     assert config_of(options("--leave-out", "photos,growth")) == run_config(leave_out="photos,growth")
+
+
+@pytest.mark.parametrize("seconds", [None, 60.0])
+def test_the_most_that_a_run_might_have_had_can_be_asked_for(tmp_path: Path, seconds: float | None) -> None:
+    """config.json has that number although nobody asked for it."""
+    file, wanted = tmp_path / CONFIG, run_config(iterations=TrainConfig.iterations)
+    file.write_text(json.dumps(config_values(replace(run_config(), seconds=seconds))))
+    assert config_of(options("--config", file, "--iterations", str(wanted.iterations))) == wanted
+    (tmp_path / CHECKPOINT).touch()
+    resumed = Train(scene="photos", out=tmp_path, resume=True, iterations=wanted.iterations)
+    assert config_of(resumed) == wanted
+    assert config_of(replace(resumed, iterations=None)).seconds == seconds
 
 
 def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:

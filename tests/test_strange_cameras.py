@@ -268,3 +268,45 @@ def test_panoramas_with_poses(tmp_path: Path) -> None:
     assert len(scene.train) == 9 * 6
     front = next(view for view in scene.train if view.name == "images/view_03.front.png")
     np.testing.assert_allclose(front.camera.viewmat, TRUTH.viewmats[3], atol=1e-9)
+
+
+def frame_of(**own: Any) -> Change:
+    """What the first frame says of its camera."""
+    return frames(lambda fs: [fs[0] | own, *fs[1:]])
+
+
+@pytest.mark.parametrize(
+    ("change", "focal"),
+    [
+        (frame_of(camera_angle_x=0.8), (48 / 2 / np.tan(0.4),) * 2),
+        (frame_of(camera_angle_x=0.8, fl_y=50), (FX, 50)),
+        (frame_of(fl_x=None, camera_model=None, w=None, mask_path=""), (FX, FY)),
+        (values(camera_model=None, fl_x=None, fx=FX, cx="25"), (FX, FY)),
+    ],
+)
+def test_what_a_frame_says_wins_and_null_says_nothing(
+    change: Change, focal: tuple[float, float], tmp_path: Path
+) -> None:
+    write_transforms(TRUTH, tmp_path)
+    change(tmp_path)
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    nothing = dict.fromkeys({"fl_x", "camera_model"} - set(meta))
+    (tmp_path / "transforms.json").write_text(json.dumps(meta | nothing))
+    view = load_scene(tmp_path, test_every=0).train[0]
+    assert (view.camera.K[0, 0], view.camera.K[1, 1]) == pytest.approx(focal)
+
+
+@pytest.mark.parametrize(("spread", "left"), [(1, 8), (10, 9)])
+def test_a_panorama_far_off_is_left_out_as_a_whole(spread: float, left: int, tmp_path: Path) -> None:
+    """Where none of its faces shows points of the scene."""
+    write_transforms(TRUTH, tmp_path, camera_model="EQUIRECTANGULAR", ply_file_path="points.ply")
+    kinds = [(name, "f4") for name in "xyz"]
+    rows = np.array([tuple(spread * p) for p in TRUTH.points], dtype=kinds)
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "points.ply"))
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    meta["frames"][4]["transform_matrix"][0][3] = 150.0
+    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    scene = load_scene(tmp_path, test_every=0)
+    assert len(scene.train) == left * 6
+    told = any(note.startswith("6 of 54 cameras lie far from all others") for note in scene.notes)
+    assert told == (left == 8)

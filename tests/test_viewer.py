@@ -40,7 +40,7 @@ from hqgs.show.viewer import guard
 from hqgs.show.viewer.guard import allowed, start_server
 from hqgs.show.viewer.pictures import Pose, beside, same_view
 from hqgs.show.viewer.splats import browser_splats
-from hqgs.show.viewer.viewer import BROWSER, RASTERIZER, Viewer
+from hqgs.show.viewer.viewer import BROWSER, RASTERIZER, Viewer, _table
 
 
 @pytest.fixture(scope="module")
@@ -372,6 +372,15 @@ def test_the_page_says_what_the_report_says_of_a_photo(folder: Path) -> None:
         until(lambda: viewer._of_photo.content.endswith("|---|---|\n| PSNR | 25.500 |"))
 
 
+def test_a_strangers_report_is_text_in_the_page() -> None:
+    told = _table([("a|b", "<iframe srcdoc='x'>\n"), ("noise", "7 levels")])
+    assert "<iframe" not in told
+    assert told.splitlines()[2:] == [
+        "| a&#124;b | &lt;iframe srcdoc=&#x27;x&#x27;&gt;  |",
+        "| noise | 7 levels |",
+    ]
+
+
 def test_a_report_says_what_its_photos_suffer_from(tmp_path: Path) -> None:
     run = hqgs.train(tiny_scene(), out=tmp_path, iterations=3)
     facts = facts_of_photos(read_report(tmp_path / "report.json"))
@@ -391,6 +400,9 @@ def test_a_path_that_was_made_in_the_page_is_rendered(folder: Path, tmp_path: Pa
         viewer._length.value = 1
         viewer._save(None)
         assert "2 views. Saved." in viewer._told.content
+        assert (
+            f"`hqgs render {folder} --path {folder}/camera_path.json --out path.mp4`" in viewer._told.content
+        )
     cameras, fps = load_path(folder / "camera_path.json")
     assert (len(cameras), fps, cameras[0].height) == (30, 30, 720)
     np.testing.assert_allclose([cameras[0].center[0], cameras[-1].center[0]], [0, 0.2], atol=1e-6)
@@ -410,12 +422,22 @@ def test_a_path_that_was_made_in_the_page_is_rendered(folder: Path, tmp_path: Pa
 
 
 def test_view_ends_by_itself_and_says_where_to_look(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert view.run(view.ViewOptions(source=folder, port=0), seconds=0.1) == 0
     assert "look at http://127.0.0.1:" in capsys.readouterr().out
-    hqgs.Gaussians.load(folder).save(tmp_path / "bare.ply")
-    assert view.run(view.ViewOptions(source=tmp_path / "bare.ply", port=0), seconds=0.1) == 0
+    bare = tmp_path / "a b" / "bare.ply"
+    hqgs.Gaussians.load(folder).save(bare)
+
+    def save(page: Viewer, _: float | None = None) -> None:
+        page._add_key(SimpleNamespace(client=SimpleNamespace(camera=handle(image_width=48, image_height=32))))
+        page._save(None)
+        told.append(page._told.content)
+
+    told: list[str] = []
+    monkeypatch.setattr(Viewer, "serve", save)
+    assert view.run(view.ViewOptions(source=bare, port=0)) == 0
+    assert f"`hqgs render '{bare}' --path '{bare.parent}/camera_path.json' --out path.mp4`" in told[0]
     assert cli.main(["view", str(tmp_path / "nothing")]) == 2
     assert "there is no" in capsys.readouterr().err
 
@@ -436,8 +458,11 @@ def test_without_viser_the_extra_is_named_before_anything_is_done(
 def test_train_shows_its_page_and_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def end(_: Viewer, seconds: float | None = None) -> None:
+    def end(page: Viewer, seconds: float | None = None) -> None:
+        shown.append(page._scene is not None)
         raise KeyboardInterrupt
+
+    shown: list[bool] = []
 
     monkeypatch.setattr(source, "room", lambda *_: tiny_scene())
     monkeypatch.setattr(Viewer, "serve", end)
@@ -446,6 +471,8 @@ def test_train_shows_its_page_and_stays(
     told = capsys.readouterr().out
     assert told.count("look at http://127.0.0.1:") == 2
     assert "now look at it" not in told
+    assert cli.main([*command, "--resume"]) == 0  # without a step
+    assert shown == [True, True]
 
 
 def test_looking_on_does_not_change_a_run(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +33,33 @@ def read_vertices(path: str | Path) -> np.ndarray[Any, np.dtype[np.void]]:
 def read_elements(path: str | Path) -> dict[str, np.ndarray[Any, np.dtype[np.void]]]:
     """All elements by name; see `read_vertices`."""
     path = Path(path)
-    _check_header(path)
+    head = _check_header(path)
     try:
-        ply = PlyData.read(str(path))
+        if head.isascii():
+            ply = PlyData.read(str(path))
+        else:
+            with _Plain(path, len(head)) as stream:
+                ply = PlyData.read(stream)
     except (PlyParseError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"{path}: not a readable PLY file: {error}") from error
     return {element.name: element.data for element in ply.elements}
 
 
-def _check_header(path: Path) -> None:
+class _Plain(io.BufferedReader):
+    """A PLY file whose header reads as ASCII, which plyfile wants: a comment may be a name in any letters."""
+
+    def __init__(self, path: Path, head: int) -> None:
+        super().__init__(io.FileIO(path))
+        self._head = head  # bytes
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        rest = max(0, self._head - self.tell())
+        found = super().read(size)
+        return found[:rest].decode("latin-1").encode("ascii", "replace") + found[rest:]
+
+
+def _check_header(path: Path) -> bytes:
+    """The header, of a file that can hold what that promises. ValueError that names the file."""
     with path.open("rb") as f:
         head = f.read(MAX_HEADER_BYTES)
     size = path.stat().st_size
@@ -60,6 +80,8 @@ def _check_header(path: Path) -> None:
         raise ValueError(
             f"{path}: the header promises {max(promised, most)} values, the file has {size} bytes"
         )
+    last = re.search(rb"[\r\n]end_header", head)  # a comment may have the word, too
+    return head[: last.end()] if last else b""
 
 
 def header_of(path: Path) -> tuple[list[str], int]:

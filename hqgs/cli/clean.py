@@ -11,6 +11,7 @@ import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.judge import background_of, check_source, read_photos
+from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Factor, Number, tell_read
 from hqgs.model.formats.files import FORMATS, format_of
@@ -45,6 +46,7 @@ def run(options: Clean) -> int:
     """Clean and say what it gained; return the exit code (0 done, 1 no gain or failed, 2 bad input)."""
     try:
         format = format_of(options.out, written=True)
+        check_above(options.out)
         source = check_source(options.source, options.photos)
         if options.out.exists() and options.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is removed would be lost")

@@ -11,6 +11,7 @@ import tyro
 import hqgs
 from hqgs.base.files import write_json
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.out_folder import check_out_file
 from hqgs.cli.scenes import Photos, ready
 
 
@@ -28,6 +29,8 @@ OPTIONS = Diagnose
 def run(options: Diagnose) -> int:
     """Print the diagnosis; return the exit code (0 done, 1 failed, 2 bad input)."""
     try:
+        if options.out is not None:
+            check_out_file(options.out)
         ready(options.scene)
         from hqgs.scene.source import pictures  # here: it loads torch
 

@@ -11,13 +11,17 @@ import tyro
 from hqgs.base.files import PLY
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.judge import background_of, read_photos
+from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Flag, Photos, cameras_beside, load, ready, tell_read
+from hqgs.cli.scenes import Factor, Flag, Photos, cameras_beside, config_part, load, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
+from hqgs.scene.names import is_room
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
+    from hqgs.scene.scene import Scene
     from hqgs.show.export import Export
 
 DEFAULTS = ExportOptions("ply")
@@ -64,7 +68,9 @@ def run(args: ExportScene) -> int:
             sh_bits=args.sh_bits,
             spz_version=args.spz_version,
         )
+        _check_together(args, options.format)
         source = scene_file(args.source)
+        check_above(args.out)
         if args.out.exists() and args.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is left out would be lost")
         if args.trust and not FORMATS[options.format].errors:
@@ -76,19 +82,22 @@ def run(args: ExportScene) -> int:
         from hqgs.show.export_change import measure
 
         gaussians = Gaussians.load(source)
+        scene = None if args.scene is None else _held_out_photos(args.source, args.scene, args.downscale)
         if args.trust:
             from hqgs.show.trust import trust_of
 
             gaussians.errors = trust_of(gaussians, cameras_beside(args.source)).errors.clamp(max=1)
-        scene = None
-        if args.scene is not None:
-            ready(args.scene)
-            with LoadingScreen() as screen:
-                scene = load(Photos(scene=args.scene, downscale=args.downscale), screen)
-        before = None if scene is None else held_out_psnr(scene, held_out_renders(scene, gaussians))
+
+        def held_out(shown: Gaussians) -> float | None:
+            if scene is None:
+                return None
+            renders = held_out_renders(scene, shown, background=background_of(args.source))
+            return held_out_psnr(scene, renders)
+
+        before = held_out(gaussians)
         written = export(gaussians, args.out, options)
         back = Gaussians.load(args.out, options.format)
-        after = None if scene is None else held_out_psnr(scene, held_out_renders(scene, back))
+        after = held_out(back)
         try:
             changed = f"measured: {measure(gaussians, back, source.parent if source.name == PLY else None)}"
         except ValueError as error:
@@ -107,6 +116,26 @@ def run(args: ExportScene) -> int:
     for name, count in written.clipped.items():
         print(f"outside the range of spz, set to its end: {count:,} values of {name}")
     return 0
+
+
+def _check_together(args: ExportScene, format: str) -> None:
+    """ValueError for options that another one leaves without effect."""
+    if args.downscale is not None and args.scene is None:
+        raise ValueError("--downscale divides the photos of --scene, and there is no --scene")
+    for name in ("sh_bits", "spz_version"):
+        if format != "spz" and getattr(args, name) != getattr(DEFAULTS, name):
+            asked = f"--out {args.out}" if args.format is None else "--format"
+            raise ValueError(f"--{name.replace('_', '-')} is for spz, and {asked} says {format}")
+
+
+def _held_out_photos(source: Path, photos: str, downscale: float | None) -> Scene:
+    """The photos of `--scene` in the frame of the scene file, those held out that its run held out."""
+    ready(photos)
+    with LoadingScreen() as screen:
+        if is_room(photos):
+            return load(Photos(scene=photos, downscale=downscale), screen)
+        asked = config_part(source if source.is_dir() else source.parent, "scene")
+        return read_photos(source, photos, downscale, asked.get("test_every"), screen)
 
 
 def _table(

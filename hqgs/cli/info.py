@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,11 +10,13 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from hqgs.base.files import CONFIG
+from hqgs.base.files import CONFIG, PLY
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
+from hqgs.cli.scenes import config_part
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import FORMATS, has_format, scene_file
+from hqgs.scene.photo_files import is_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +36,12 @@ def run(options: Info) -> int:
     try:
         if path.is_file() and has_format(path):
             lines = _file(path)
-        elif (path / "report.json").is_file():
-            lines = _run(path)
-        elif (path / "meta.json").is_file():
+        elif (found := _run(path)) is not None:
+            lines = found
+        elif (path / "meta.json").is_file() or (is_run(path) and (path / PLY).is_file()):
             lines = _file(scene_file(path))
+        elif is_run(path):
+            lines = [_not_ended(path)]
         else:
             lines = _photos(path)
     except BAD_INPUT as error:
@@ -64,10 +68,30 @@ def _file(path: Path) -> list[str]:
     ]
 
 
-def _run(path: Path) -> list[str]:
-    report: dict[str, Any] = json.loads((path / "report.json").read_text(encoding="utf-8"))
+def _run(path: Path) -> list[str] | None:
+    """Of a run that has ended; None where the folder has no report, or another program's report.json."""
+    from hqgs.evaluation.report import REPORT, report_in  # here: it loads torch
+
+    try:
+        report: Any = report_in(path)
+        return None if report is None else _told(path, report)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        if is_run(path):
+            raise ValueError(f"{path / REPORT} is damaged: {error!r}") from error
+        return None
+
+
+def _not_ended(path: Path) -> str:
+    origin = config_part(path, "scene").get("path")
+    if origin is None:
+        return f"{path}: a run that has not ended: hqgs.train(..., resume=True) goes on"
+    command = shlex.join(["hqgs", "train", str(origin), "--out", str(path), "--resume"])
+    return f"{path}: a run that has not ended: {command} goes on"
+
+
+def _told(path: Path, report: Any) -> list[str]:
     mean, steps = report["metrics"]["mean"], f"{report['iterations']:,} of {report['length']:,} iterations"
-    word, why = verdict(judged_by(report)[0])
+    word, why = verdict(judged_by(report)[0], report["metrics"])
     numbers = ", ".join(f"{name} {value:.4g}" for name, value in mean.items() if value is not None)
     lines = [
         f"{path}: {report['scene']}, {report['method']}, {steps} in {duration(report['seconds'])}, "
@@ -76,8 +100,7 @@ def _run(path: Path) -> list[str]:
     ]
     lines += [f"  {note}" for note in report["notes"]]
     if (path / CONFIG).is_file():
-        origin = json.loads((path / CONFIG).read_text(encoding="utf-8"))["scene"]
-        lines.append(f"trained on {'a scene made in Python' if origin is None else origin['path']}")
+        lines.append(f"trained on {config_part(path, 'scene').get('path', 'a scene made in Python')}")
     lines.append(f"the scene: {scene_file(path)}; the configuration: {path / CONFIG}")
     return lines
 
@@ -85,6 +108,7 @@ def _run(path: Path) -> list[str]:
 def _photos(path: Path) -> list[str]:
     from hqgs.scene.load import formats_of, scene_folder  # here: they load torch
     from hqgs.scene.sfm.bare_photos import bare_photos, readable
+    from hqgs.scene.sfm.front_door import cameras_beside
 
     root, inside = scene_folder(path)
     formats = formats_of(root, 1.0)
@@ -103,6 +127,7 @@ def _photos(path: Path) -> list[str]:
         f"{sum(exif.quarter_turns > 0 for exif in photos.exif)} lie on their side",
         f"poses: {poses}",
     ]
-    lines += [*inside, *photos.notes]
+    others = cameras_beside(root, photos.folder) if formats else []  # they are read
+    lines += [*inside, *(note for note in photos.notes if note not in others)]
     lines += [f"cannot be read: {name} ({why})" for name, why in photos.unreadable.items()]
     return lines

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs import __version__
-from hqgs.base.files import CONFIG, write_json
+from hqgs.base.files import CONFIG, PLY, write_json
 from hqgs.cli.errors import BAD_INPUT, fail
+from hqgs.cli.out_folder import check_out_folder
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Number, ready
+from hqgs.cli.scenes import Factor, Number, check_background, config_part, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.evaluation.verdict import judged_by
 from hqgs.model.formats.files import format_of, scene_file
@@ -71,6 +71,10 @@ def run(options: Judge) -> int:
     try:
         if options.source is None:
             raise ValueError("missing: SOURCE, a scene file or the folder of a run (hqgs judge --help)")
+        if options.background is not None:
+            check_background(options.background)
+        if options.out is not None:
+            check_out_folder(options.out)
         source, other, known = check_source(options.source, options.photos), None, None
         from hqgs.evaluation.judge import compared
         from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
@@ -196,12 +200,11 @@ def read_photos(
 
 
 def background_of(source: Path) -> tuple[float, float, float]:
-    """What a run was trained on, or black."""
+    """What a run, named by its folder or its scene, was trained on, or black."""
     from hqgs.scene.constants import BACKGROUND
 
-    path = source / CONFIG
-    asked = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return tuple(asked.get("train", {}).get("background", BACKGROUND))
+    trained = config_part(source.parent if source.name == PLY else source, "train")
+    return tuple(trained.get("background", BACKGROUND))
 
 
 def judge_file(

@@ -1,4 +1,4 @@
-"""The folder of a new run: what lies in it already, before anything is written."""
+"""What `--out` names, the folder of a new run above all: what lies there, before anything is written."""
 
 from __future__ import annotations
 
@@ -29,3 +29,24 @@ def check_out(out: Path, scene: str, resume: bool, overwrite: bool) -> list[str]
     if others := strangers(out):
         lines.append(f"--out {out} holds other files too ({some(others)}): those of the run go beside them")
     return lines
+
+
+def check_out_file(out: Path) -> None:
+    """ValueError where `--out` cannot be a file: before the work, or its result would be lost."""
+    if out.is_dir():
+        raise ValueError(f"--out {out} is a folder: name the file to write")
+    check_above(out)
+
+
+def check_out_folder(out: Path) -> None:
+    """ValueError where `--out` cannot be a folder, new or not."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"--out {out} is a file: name a folder")
+    check_above(out)
+
+
+def check_above(out: Path) -> None:
+    """ValueError where `--out` would lie below a file."""
+    above = next(path for path in out.absolute().parents if path.exists())
+    if not above.is_dir():
+        raise ValueError(f"--out {out} lies below {above}, which is a file")

@@ -12,6 +12,7 @@ from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
 from hqgs.cli.scenes import Number, Photos, ready
 from hqgs.scene.names import KEPT
+from hqgs.scene.photo_files import is_run
 from hqgs.training.config import AUTO, FORMATION, METHODS, run_config
 from hqgs.training.settings import longest_side
 
@@ -50,6 +51,11 @@ def run(options: PlanOptions) -> int:
             guidance=options.guidance,
             formation=options.formation,
         )
+        posed = options.out is not None and (options.out / KEPT).exists()
+        if options.out is not None and not posed and not is_run(options.out):
+            raise ValueError(
+                f"--out {options.out}: there is no run; without --out the plan is that of a new one"
+            )
         ready(options.scene)
         from hqgs.scene.source import load, pictures  # here: they load torch
         from hqgs.training.frame import Frame
@@ -58,7 +64,6 @@ def run(options: PlanOptions) -> int:
 
         downscale = 1.0 if options.downscale is None else options.downscale
         longest = longest_side("standard", options.downscale)
-        posed = options.out is not None and (options.out / KEPT).exists()
         with LoadingScreen() as screen:
             if posed:
                 scene = load(

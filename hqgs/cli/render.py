@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import Factor, Number, cameras_beside, tell_read
+from hqgs.cli.out_folder import check_above
+from hqgs.cli.scenes import Factor, Number, cameras_beside, check_background, tell_read
 from hqgs.model.formats.files import scene_file
 
 if TYPE_CHECKING:
@@ -65,10 +66,11 @@ def run(options: Render) -> int:
     """Render, and say what was written; return the exit code (0 done, 1 failed, 2 bad input)."""
     source, out, size = options.source, options.out, options.size
     try:
+        _check(options)
         file = scene_file(source)
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.paths import with_size
-        from hqgs.show.frames import render_frames  # here: they load torch
+        from hqgs.show.frames import check_frames, render_frames  # here: they load torch
 
         gaussians = Gaussians.load(file)
         tell_read(gaussians)
@@ -77,17 +79,17 @@ def run(options: Render) -> int:
             cameras = [with_size(camera, *size) for camera in cameras]
         if out.suffix.lower() == ".png" and options.views is None:
             cameras = cameras[:1]
-        trust = _trust(options, gaussians) if options.show == "trust" else None
-        predicted = _predicted(options, gaussians, cameras, trust)
-        if options.look is not None and options.show != "color":
-            raise ValueError(f"--look is of colours, and --show is {options.show}")
+        fps = rate if options.fps is None else options.fps
+        check_frames(cameras, out, fps, options.show)
         look = None if options.look is None else _look(source, options.look)
+        trust = _trust(options, gaussians) if options.show == "trust" else None  # it may take minutes
+        predicted = _predicted(options, gaussians, cameras, trust)
         started = time.perf_counter()
         render_frames(
             gaussians,
             cameras,
             out,
-            fps=rate if options.fps is None else options.fps,
+            fps=fps,
             show=options.show,
             background=options.background,
             names=names,
@@ -107,6 +109,18 @@ def run(options: Render) -> int:
     if predicted is not None:
         print(f"photos from this path would differ from it by a PSNR of {predicted}")
     return 0
+
+
+def _check(options: Render) -> None:
+    """What the options alone tell. ValueError."""
+    of_paths = {"path": options.path != PATHS[0], "frames": options.frames, "up": options.up}
+    for name, given in of_paths.items():
+        if options.views is not None and given not in (None, False):
+            raise ValueError(f"--{name} is of paths, and --views has the run's own cameras: give one of them")
+    if options.look is not None and options.show != "color":
+        raise ValueError(f"--look is of colours, and --show is {options.show}")
+    check_background(options.background)
+    check_above(options.out)
 
 
 def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:

@@ -7,13 +7,15 @@ import signal
 import sys
 import threading
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from hqgs.base.files import CONFIG, read_json
 from hqgs.cli.errors import fail
 from hqgs.photos.formula import grammar
 from hqgs.scene.names import existing_folder, is_room
@@ -101,6 +103,21 @@ def cameras_beside(source: Path) -> RunCameras | None:
 
     folder = source if source.is_dir() else source.parent
     return load_cameras(folder) if (folder / CAMERAS).is_file() else None
+
+
+def config_part(folder: Path, name: str) -> dict[str, Any]:
+    """A part of config.json in a run's folder; empty where none is, or it is another program's."""
+    path = folder / CONFIG
+    config = read_json(path) if path.is_file() else None
+    part = config.get(name) if isinstance(config, dict) else None
+    return part if isinstance(part, dict) else {}
+
+
+def check_background(background: Sequence[float]) -> None:
+    """ValueError for what is no colour, such as levels of 255."""
+    if not all(0 <= value <= 1 for value in background):
+        given = " ".join(f"{value:g}" for value in background)
+        raise ValueError(f"--background is {given}, wanted three numbers in 0..1; 1 is white")
 
 
 def load(photos: Photos, screen: LoadingScreen) -> Scene:

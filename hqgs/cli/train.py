@@ -184,8 +184,8 @@ def config_of(options: Train) -> TrainConfig:
                 f"iterations is {iterations}, and the run in {options.out} has {config.iterations}: --resume "
                 "can make it longer, not shorter"
             )
-        if iterations is not None and iterations != config.iterations:
-            config = replace(with_iterations(config, iterations), seconds=None, turn=None)
+        if iterations is not None and (iterations != config.iterations or not known):
+            config = replace(with_iterations(config, iterations), seconds=None, turn=None, timed=None)
     else:
         length = preset.iterations if iterations is None else iterations
         config = run_config(iterations=length, leave_out=options.leave_out or AUTO)
@@ -339,7 +339,7 @@ def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:
     if table := format_left_out(done.left_out):
         print(table)
     psnr, name = judged_by(done.report)
-    word, why = verdict(psnr)
+    word, why = verdict(psnr, done.report["metrics"])
     print(f"quality: {word} ({why})" + ("" if psnr in (None, last["psnr"]) else f"; {psnr:.2f} dB {name}"))
     if fell := overdone(done.history):
         print(fell)

@@ -56,7 +56,13 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         gaussians = Gaussians.load(file)
         folder = file.parent
         report = report_in(folder)
-        viewer = Viewer(cameras_beside(file), folder, port=options.port, title=folder.resolve().name)
+        viewer = Viewer(
+            cameras_beside(file),
+            folder,
+            port=options.port,
+            title=folder.resolve().name,
+            source=options.source,
+        )
     except BAD_INPUT as error:
         return fail(2, error)
     try:
@@ -66,6 +72,8 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         viewer.set_facts({} if report is None else facts_of_photos(report))
         _tell(viewer.url, options.open)
         viewer.serve(seconds)
+    except BAD_INPUT as error:
+        return fail(2, error)
     except KeyboardInterrupt:
         print()
     finally:
@@ -112,8 +120,13 @@ class LiveView:
         """Go on showing the trained scene, and what the report says of its photos, until Ctrl-C."""
         from hqgs.evaluation.photo_facts import facts_of_photos
         from hqgs.evaluation.report import report_in
+        from hqgs.model.gaussians import Gaussians
 
-        if (report := report_in(self._out)) is not None:
+        report = report_in(self._out)
+        if self._copied < 0:  # a run that had ended already makes no step
+            gaussians = Gaussians.load(self._out)
+            self.viewer.set_scene(gaussians, _numbers(report, len(gaussians)))
+        if report is not None:
             self.viewer.set_facts(facts_of_photos(report))
         _tell(self.viewer.url, open_browser=False)
         try:

@@ -59,12 +59,13 @@ class Maps:
 
 
 def shown_by(gaussians: Gaussians, cameras: Sequence[Camera]) -> torch.Tensor:
-    """How many of the cameras, of MOST_CAMERAS at most, have each Gaussian's centre in view, [N]."""
+    """How many of the cameras have each Gaussian's centre in view, [N], by MOST_CAMERAS of them at most."""
     means = gaussians.means.detach().double().numpy()
     counts = np.zeros(len(means), np.float32)
-    for k in evenly(len(cameras), MOST_CAMERAS):
+    asked = evenly(len(cameras), MOST_CAMERAS)
+    for k in asked:
         counts += in_frame(cameras[k], means)
-    return torch.from_numpy(counts)
+    return torch.from_numpy(counts * np.float32(len(cameras) / max(len(asked), 1)))
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
 
 from hqgs._rust import get_num_threads
@@ -142,7 +143,7 @@ def judge(
         causes=found,
         render_seconds=median(seconds),
         worse_than_flat=sum(
-            flat_psnr(view) > (one.psnr or 0.0) for view, one in zip(views, each, strict=True)
+            one.psnr is not None and flat_psnr(view) > one.psnr for view, one in zip(views, each, strict=True)
         ),
     )
 
@@ -181,7 +182,9 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 def flat_psnr(view: View) -> float:
     """PSNR of the photo's mean colour, dB; -inf where its mask leaves no pixel."""
     pixels = as_floats(view.image)[view.mask if view.mask is not None else ...].reshape(-1, 3)
-    return -10 * math.log10(max(float(pixels.var(0).mean()), 1e-10)) if len(pixels) else -math.inf
+    if not len(pixels):
+        return -math.inf
+    return -10 * math.log10(max(float(pixels.var(0, dtype=np.float64).mean()), 1e-10))
 
 
 def _seconds(gaussians: Gaussians, view: View, background: Background) -> float:

@@ -57,7 +57,7 @@ def told(found: dict[str, Any]) -> str:
 def quality(found: dict[str, Any]) -> str:
     """The verdict, by the report of the run where there is one."""
     psnr, name = found["judged_by"]["psnr"], found["judged_by"]["name"]
-    word, why = verdict(psnr)
+    word, why = verdict(psnr, found["scene"])
     plain = psnr == found["scene"]["mean"]["psnr"]
     return f"{word} ({why})" + ("" if plain else f"; {psnr:.2f} dB {name}")
 
@@ -70,10 +70,16 @@ def table_rows(found: dict[str, Any], shown: Sequence[str]) -> list[list[str]]:
         rows.append(["cameras fitted", *_cells(one["fitted"], shown)])
     if against is not None:
         rows += [
-            [f"against {Path(against['name']).name}", *_cells(against, shown)],
+            [f"against {short_names(one, against)[1]}", *_cells(against, shown)],
             difference_row(found, shown),
         ]
     return rows
+
+
+def short_names(one: dict[str, Any], other: dict[str, Any]) -> tuple[str, str]:
+    """The last parts of two scene files' names, or all of them where those are alike."""
+    last = Path(one["name"]).name, Path(other["name"]).name
+    return last if last[0] != last[1] else (one["name"], other["name"])
 
 
 def interval_words(one: dict[str, Any]) -> str:

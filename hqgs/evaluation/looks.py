@@ -25,7 +25,9 @@ def look_of(folder: Path, name: str) -> Look:
         )
         for record in read_report(folder / REPORT)["learned"]
     }
-    if all((look.gains == 1).all() and not look.vignetting.any() for look in looks.values()):
+    if not any(
+        (one.gains != 1).any() or one.vignetting.any() or one.response.any() for one in looks.values()
+    ):
         raise ValueError(
             f"{folder}: no gains, vignetting or response of photos were learned: the photos look alike"
         )

@@ -73,7 +73,7 @@ def _written(out_dir: Path, result: RunResult) -> Report:
     """`write_report` into a folder that is there."""
     files = _file_names(names_of(result.views))
     for leftover in out_dir.glob(".report.*"):  # of a run that was killed
-        shutil.rmtree(leftover)
+        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()  # a page is a file
     with tempfile.TemporaryDirectory(dir=out_dir, prefix=".report.") as name:
         stage = Path(name)
         (stage / PICTURES).mkdir()

@@ -21,8 +21,13 @@ _LEVELS = (
 _BEST = ("very good", "above 30 dB: hard to tell from the photo at a glance")
 
 
-def verdict(psnr: float | None) -> tuple[str, str]:
-    """A word, and why, for the mean PSNR of views that were held out, dB; None: nothing was measured."""
+def verdict(psnr: float | None, measured: Mapping[str, Any] | None = None) -> tuple[str, str]:
+    """A word, and why, for the mean PSNR of views that were held out, dB; None: it has no value.
+
+    `measured`: what the report holds of them, which says why not.
+    """
+    if psnr is None and measured is not None and measured["views"]:
+        return "not measured", f"PSNR: {measured['reasons']['psnr']}"
     if psnr is None:
         return "not measured", "no photo was held out: look at the scene"
     return next(((word, why) for limit, word, why in _LEVELS if psnr < limit), _BEST)

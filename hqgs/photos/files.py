@@ -99,7 +99,7 @@ def glance(path: Path) -> Glance:
             raise UnreadableError("0 bytes: not downloaded from a cloud, or not copied to its end")
         with open_photo(path) as photo:
             size = photo.size
-            photo.draft("L", (size[0] // 8, size[1] // 8))  # a JPEG is quickly read like this
+            photo.draft("L", (max(1, size[0] // 8), max(1, size[1] // 8)))  # a JPEG is quickly read like this
             small = photo.convert("L").resize((GRID, GRID), Image.Resampling.BOX)
             return Glance(size, photo.format or "", np.array(small))
     except UnidentifiedImageError as error:
@@ -122,13 +122,16 @@ def stored_size(path: Path, what: str = "photo") -> tuple[int, int]:
         raise UnreadableError(f"cannot read the {what} {path}: {e}") from e
 
 
-def is_cut_out(path: Path) -> bool:
-    """Whether a photo can be transparent: of an object that was cut out, or rendered before nothing."""
+def is_cut_out(path: Path) -> bool | None:
+    """Whether a photo can be transparent: of an object that was cut out, or rendered before nothing.
+
+    None: it cannot be opened.
+    """
     try:
         with open_photo(path) as photo:
             return photo.has_transparency_data
     except DECODE_ERRORS:
-        return False
+        return None
 
 
 def decode(
@@ -156,17 +159,20 @@ def decode(
                 grey = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
                 if grey.min() < 0 or grey.max() > 65535:
                     raise ValueError(f"pixel values {grey.min()}..{grey.max()} are not 16 bit")
-                return np.repeat(((grey + 128) // 257).astype(np.uint8)[..., None], 3, -1), None
-            if photo.has_transparency_data:
+                rgb = np.repeat(((grey + 128) // 257).astype(np.uint8)[..., None], 3, -1)
+                clear = grey == photo.info.get("transparency", -1)  # of PNG: one grey, which is none
+                rgba = np.dstack([rgb, np.where(clear, 0, 255).astype(np.uint8)])
+            elif photo.has_transparency_data:
                 rgba = np.array(photo.convert("RGBA"))
-                if over is not None:
-                    alpha = rgba[..., 3:] / 255
-                    mixed = alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(over)
-                    return np.rint(np.dstack([mixed, 255 - rgba[..., 3]])).astype(np.uint8), None
-                opaque = bool((rgba[..., 3] == 255).all())
-                return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
-            rgb = np.array(photo.convert("RGB"))
-            return (rgb if over is None else np.dstack([rgb, np.zeros_like(rgb[..., 0])])), None
+            else:
+                rgb = np.array(photo.convert("RGB"))
+                return (rgb if over is None else np.dstack([rgb, np.zeros_like(rgb[..., 0])])), None
+            if over is not None:
+                alpha = rgba[..., 3:] / 255
+                mixed = alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(over)
+                return np.rint(np.dstack([mixed, 255 - rgba[..., 3]])).astype(np.uint8), None
+            opaque = bool((rgba[..., 3] == 255).all())
+            return np.ascontiguousarray(rgba[..., :3]), None if opaque else rgba[..., 3] >= 128
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the photo {path}: {e}") from e
 

@@ -15,7 +15,7 @@ from PIL import Image
 from hqgs.base.files import atomic_path, read_json, write_json
 from hqgs.photos.constants import FPS, LARGEST
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.constants import KEPT_SIDE, MOST_FRAMES
+from hqgs.scene.constants import BACKGROUND, KEPT_SIDE, MOST_FRAMES
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene
 from hqgs.scene.world import World
@@ -32,6 +32,7 @@ class KnownCamera:
     camera: Camera
     held_out: bool
     photo: Path | None  # as it was trained on, at most 800 px wide and high; None: it is not there
+    mask: Path | None = None  # of the photo's size, white where it counts; None: everywhere
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class RunCameras:
 
     up: NDArray[np.float64]  # [3], unit, world
     views: list[KnownCamera]  # in the scene's order, held-out ones last
+    background: tuple[float, float, float] = BACKGROUND  # R, G, B behind everything
 
     @property
     def train(self) -> list[Camera]:
@@ -52,8 +54,10 @@ class RunCameras:
         return [view.camera for view in self.views if view.held_out]
 
 
-def save_cameras(folder: str | Path, scene: Scene) -> None:
-    """Write cameras.json and photos/*.jpg of a scene's views, each atomically."""
+def save_cameras(
+    folder: str | Path, scene: Scene, background: tuple[float, float, float] = BACKGROUND
+) -> None:
+    """Write cameras.json, photos/*.jpg of a scene's views and *.mask.png of their masks, each atomically."""
     folder, entries = Path(folder), list[dict[str, Any]]()
     for number, (view, held_out) in enumerate(
         [*((view, False) for view in scene.train), *((view, True) for view in scene.test)]
@@ -63,6 +67,12 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
             picture = Image.fromarray(to_uint8(as_floats(view.image)))
             picture.thumbnail((KEPT_SIDE, KEPT_SIDE), Image.Resampling.LANCZOS)
             picture.save(tmp, quality=88)
+        masked = {}
+        if view.mask is not None:
+            masked["mask"] = f"{PHOTOS}/{number:05}.mask.png"
+            with atomic_path(folder / masked["mask"]) as tmp:
+                shares = Image.fromarray(255 * view.mask.astype(np.uint8))
+                shares.resize(picture.size, Image.Resampling.BOX).point(whole).save(tmp)
         entries.append(
             {
                 "name": view.name,
@@ -72,12 +82,20 @@ def save_cameras(folder: str | Path, scene: Scene) -> None:
                 "K": view.camera.K.tolist(),
                 "world_to_camera": scene.world.viewmat_out(view.camera.viewmat).tolist(),
                 "photo": photo,
+                **masked,
             }
         )
     up = scene_up(scene)
     frame = "OpenCV: x right, y down, z forward; pixels; world units are those of the scene"
-    content = {"frame": frame, "up": up.tolist(), "views": entries}
-    write_json(folder / CAMERAS, content | ({} if scene.world == World() else {"world": scene.world.json()}))
+    content: dict[str, Any] = {"frame": frame, "up": up.tolist(), "views": entries}
+    content |= {} if scene.world == World() else {"world": scene.world.json()}
+    content |= {} if background == BACKGROUND else {"background": background}
+    write_json(folder / CAMERAS, content)
+
+
+def whole(level: int) -> int:
+    """A pixel of a smaller mask: white where all counts that is in it."""
+    return 255 if level == 255 else 0
 
 
 def load_cameras(folder: str | Path) -> RunCameras:
@@ -94,11 +112,14 @@ def load_cameras(folder: str | Path) -> RunCameras:
         up = np.array(value["up"], np.float64)
         world = World.of_json(value["world"]) if "world" in value else World()
         views = [_known(path, folder, entry, world) for entry in value["views"]]
+        background = tuple(float(channel) for channel in value.get("background", BACKGROUND))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: no cameras of a run: {error!r}") from error
+    if len(background) != 3 or not np.isfinite(background).all():
+        raise ValueError(f"{path}: background is no colour: {value['background']!r:.60}")
     if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
         raise ValueError(f"{path}: up is no direction: {value['up']!r:.60}")
-    return RunCameras(up / np.linalg.norm(up), views)
+    return RunCameras(up / np.linalg.norm(up), views, background)
 
 
 class _HasName(Protocol):
@@ -140,17 +161,22 @@ def first_camera(folder: Path) -> Camera | None:
 
 
 def _known(path: Path, folder: Path, entry: Any, world: World) -> KnownCamera:
-    name, photo = entry["name"], entry["photo"]
+    name = entry["name"]
     if not isinstance(name, str):
         raise ValueError(f"a name is {name!r:.60}")
-    file = None
-    if photo is not None:
-        parts = PurePosixPath(photo)
-        if parts.is_absolute() or ".." in parts.parts or "\0" in photo:
-            raise ValueError(f"photo {photo!r:.60} leaves the folder")
-        file = folder / parts
+    photo, mask = _file(folder, entry["photo"]), _file(folder, entry.get("mask"))
     camera = checked_camera(entry["width"], entry["height"], entry["K"], entry["world_to_camera"])
-    return KnownCamera(name, moved(camera, world), bool(entry["held_out"]), file)
+    return KnownCamera(name, moved(camera, world), bool(entry["held_out"]), photo, mask)
+
+
+def _file(folder: Path, name: Any) -> Path | None:
+    """Where it is; None where there is none. ValueError where it leaves the folder."""
+    if name is None:
+        return None
+    parts = PurePosixPath(name)
+    if parts.is_absolute() or ".." in parts.parts or "\0" in name:
+        raise ValueError(f"photo {name!r:.60} leaves the folder")
+    return folder / parts if (folder / parts).is_file() else None
 
 
 def moved(camera: Camera, world: World) -> Camera:

@@ -56,6 +56,13 @@ def face_name(name: str, face: str) -> str:
     return str(path.with_name(f"{path.stem}.{face}{path.suffix}"))
 
 
+def photo_name(name: str, face: str) -> str:
+    """The photo whose face is called so: of `walk/7.front.jpg`, `walk/7.jpg`."""
+    path = PurePosixPath(name)
+    stem = path.stem.removesuffix(f".{face}")
+    return str(path.with_name(stem if stem == path.stem else stem + path.suffix))
+
+
 def faces_of(camera: pycolmap.Camera, finer: float = 1.0) -> tuple[Face, ...]:
     """The faces that a camera sees; none where a flat picture holds what it sees.
 

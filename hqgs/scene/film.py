@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from hqgs.scene.constants import COPY_SIDE, FRAMES_A_SECOND, FRAMES_FEWEST, FRAM
 from hqgs.scene.names import FRAMES, is_room
 from hqgs.scene.photo_files import film_at
 
+_WIDEST = 4  # times as wide as high are pixels of a film at most, or as high as wide
+
 
 def film_frames(
     path: Path, folder: Path, count: int | None = None, on_stage: OnStage = silent
@@ -43,7 +46,7 @@ def film_frames(
     around = _is_around(path)
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
-    name = f"6 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
+    name = f"7 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -129,12 +132,12 @@ def _sharpest(
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     """Number and pixels [H, W, 3] of the sharpest frame of each interval, as the film is to be shown."""
     try:
-        with av.open(str(path)) as film:
+        with av.open(str(path), metadata_errors="ignore") as film:
             if not film.streams.video:
                 raise ValueError(f"{path} holds no pictures, only sound")
             stream = film.streams.video[0]
             stream.thread_type = "AUTO"
-            curve = transfer(stream.codec_context)
+            curve, wide = transfer(stream.codec_context), stream.sample_aspect_ratio
             seconds = _seconds(film, stream)
             wanted = count or int(np.clip(round(FRAMES_A_SECOND * seconds), FRAMES_FEWEST, FRAMES_MOST))
             interval = seconds / wanted if seconds > 0 else 1 / FRAMES_A_SECOND
@@ -145,7 +148,7 @@ def _sharpest(
                 start = time if start is None else start
                 now = min(int((time - start) / interval), wanted - 1)
                 if now > at and best is not None:
-                    yield best[0], _upright(best[1], curve)
+                    yield best[0], _upright(best[1], curve, wide)
                     best, best_sharpness = None, -1.0
                 at = max(at, now)
                 if (sharpness := _sharpness(frame)) > best_sharpness:
@@ -158,18 +161,25 @@ def _sharpest(
         raise ValueError(f"the film {path} cannot be read: {why}") from error
     if best is None:
         raise ValueError(f"the film {path} holds no frame that can be read")
-    yield best[0], _upright(best[1], curve)
+    yield best[0], _upright(best[1], curve, wide)
 
 
-def _upright(frame: Any, curve: int) -> NDArray[np.uint8]:
-    """A frame of a film with this transfer function as it is to be shown, [H, W, 3]."""
+def _upright(frame: Any, curve: int, wide: Fraction | None) -> NDArray[np.uint8]:
+    """A frame of a film with this transfer function as it is to be shown, [H, W, 3].
+
+    `wide`: how wide a pixel is, of its height; None or 0, where the film does not tell, and what no camera
+    writes count as 1.
+    """
+    photo = as_photo(frame, curve)
+    if wide and 1 / _WIDEST <= wide <= _WIDEST and (width := round(frame.width * wide)) != frame.width:
+        photo = np.asarray(Image.fromarray(photo).resize((width, frame.height), Image.Resampling.LANCZOS))
     turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
-    return np.ascontiguousarray(np.rot90(as_photo(frame, curve), turns))
+    return np.ascontiguousarray(np.rot90(photo, turns))
 
 
 def _transfer(av: Any, path: Path) -> int:
     """The number of the film's transfer function."""
-    with av.open(str(path)) as film:
+    with av.open(str(path), metadata_errors="ignore") as film:
         return transfer(film.streams.video[0].codec_context)
 
 

@@ -259,7 +259,7 @@ def bound(sizes: list[tuple[int, int]], downscale: float, longest: int) -> float
 
 def bounded(capture: Capture, longest: int) -> Capture:
     """The capture with its photos scaled down until no side is longer, and all of them fit into memory."""
-    sizes = [_size(photo) for photo in capture.photos if photo.path.is_file()]
+    sizes = [size for photo in capture.photos if photo.path.is_file() and (size := _size(photo))]
     if not sizes:
         return capture
     largest, downscale = max(sizes, key=max), bound(sizes, capture.downscale, longest)
@@ -281,9 +281,15 @@ def bounded(capture: Capture, longest: int) -> Capture:
     return replace(capture, downscale=downscale, notes=[*capture.notes, note])
 
 
-def _size(photo: Photo) -> tuple[int, int]:
-    """Width and height of a photo as it is stored; of the face of one, what it shows of that."""
-    width, height = stored_size(photo.path)
+def _size(photo: Photo) -> tuple[int, int] | None:
+    """Width and height of a photo as it is stored; of the face of one, what it shows of that.
+
+    None: it cannot be opened; `load_views` meets the same error, and names it.
+    """
+    try:
+        width, height = stored_size(photo.path)
+    except UnreadableError:
+        return None
     if (face := photo.face) is None:
         return width, height
     return round(face.width * width / photo.camera.width), round(face.height * height / photo.camera.height)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.text import some
+from hqgs.scene.faces import photo_name
 from hqgs.scene.scene import Scene
 from hqgs.scene.world import World
 
@@ -88,12 +89,17 @@ def in_metres(scene: Scene, distance: Distance) -> Scene:
     are in one place.
     """
     views = [*scene.train, *scene.test]
+    by_name = {view.name: view for view in views}
+    for view in views:  # what is meant may also be the photo that faces are of: they share its centre
+        if view.face:
+            by_name.setdefault(photo_name(view.name, view.face), view)
+    names = [*by_name]
     world, ends, called = scene.world, list[NDArray[np.floating]](), list[str]()
-    for written, k in zip(distance[:2], named_photos([v.name for v in views], distance), strict=True):
-        point = point_of(written) if k is None else world.out(views[k].camera.center)
+    for written, k in zip(distance[:2], named_photos(names, distance), strict=True):
+        point = point_of(written) if k is None else world.out(by_name[names[k]].camera.center)
         assert point is not None
         ends.append(point)
-        called.append(f"the point {written.strip()}" if k is None else f"the camera of {views[k].name}")
+        called.append(f"the point {written.strip()}" if k is None else f"the camera of {names[k]}")
     apart = float(np.linalg.norm(ends[0] - ends[1]))
     if not apart > 1e-6 * world.unit * scene.extent:
         raise ValueError(f"distance: {called[0]} and {called[1]} are in one place")

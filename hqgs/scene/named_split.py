@@ -25,6 +25,11 @@ class Split:
     test: Sequence[str] | None = None
     val: Sequence[str] | None = None
 
+    def names_any(self, known: Mapping[str, str]) -> bool:
+        """Whether a list has a photo; `known`: names of photos by what files call them."""
+        listed = [*(self.train or []), *(self.test or []), *(self.val or [])]
+        return any(_photo(name, known) is not None for name in listed)
+
 
 def listed_split(folders: Sequence[Path], root: Path) -> Split | None:
     """The split that a file beside a COLMAP model names, in the first folder that has one; else None.
@@ -68,14 +73,8 @@ def held_out(
     Raises ValueError where the lists leave no photo to train on, or one is in both.
     """
 
-    def photo(name: str) -> str | None:
-        plain = unquote(name).replace("\\", "/").strip()
-        last = plain.rsplit("/", 1)[-1]
-        options = (name, plain, last, last.rsplit(".", 1)[0])
-        return next((known[option] for option in options if option in known), None)
-
     def of(listed: Sequence[str] | None) -> set[str]:
-        return {found for name in listed or [] if (found := photo(name)) is not None}
+        return {found for name in listed or [] if (found := _photo(name, known)) is not None}
 
     train, test, val = of(split.train), of(split.test), of(split.val)
     kind = TEST if split.test else VAL if split.val else TRAIN
@@ -93,9 +92,17 @@ def held_out(
     if rest:
         notes.append(f"{len(rest)} photos are in no list of {split.source} that counts: {some(rest)}")
     listed = [*(split.train or []), *(split.test or []), *(split.val or [])]
-    if missing := [name for name in listed if photo(name) is None]:
+    if missing := [name for name in listed if _photo(name, known) is None]:
         notes.append(f"{len(missing)} names in {split.source} are no photo of the scene: {some(missing)}")
     return frozenset(chosen), frozenset(held)
+
+
+def _photo(name: str, known: Mapping[str, str]) -> str | None:
+    """The photo that a list calls so; None: there is none."""
+    plain = unquote(name).replace("\\", "/").strip()
+    last = plain.rsplit("/", 1)[-1]
+    options = (name, plain, last, last.rsplit(".", 1)[0])
+    return next((known[option] for option in options if option in known), None)
 
 
 def names_by_any(names: Sequence[str]) -> dict[str, str]:

@@ -123,7 +123,12 @@ def focus(cameras: Sequence[Camera]) -> _Array:
 
 
 def camera_path(
-    cameras: Sequence[Camera], frames: int = 240, *, closed: bool = False, cuts: bool = False
+    cameras: Sequence[Camera],
+    frames: int = 240,
+    *,
+    closed: bool = False,
+    cuts: bool = False,
+    sort: bool = True,
 ) -> list[Camera]:
     """A smooth path through given cameras, at an even speed: cubic splines through places and rotations.
 
@@ -136,19 +141,20 @@ def camera_path(
         closed: end where it began.
         cuts: go on at the other side of a leap, LEAP times as long as the walk's usual step, in place of
             flying where no camera stood: through walls and trees.
+        sort: False: through all of them, in the order given.
 
     Raises:
         ValueError: no camera, or no frame.
     """
     _check(cameras, frames)
-    walk = _walk([*cameras])
+    walk = _walk([*cameras]) if sort else [*cameras]
     pieces = _between_leaps(walk) if cuts else [walk]
     ways = np.array([_lengths(piece).sum() for piece in pieces])
     shares = ways / ways.sum() if len(pieces) > 1 else np.ones(1)
     ends = [0, *(int(end) for end in np.rint(frames * np.cumsum(shares)))]
     viewmats: list[_Array] = []
     for piece, share, (begin, end) in zip(pieces, shares, pairwise(ends), strict=True):
-        keys = [piece[k] for k in evenly(len(piece), max(2, round(MOST_KEYS * share)))]
+        keys = [piece[k] for k in evenly(len(piece), max(2, round(MOST_KEYS * share)))] if sort else piece
         viewmats += _spline(keys, end - begin, closed) if end > begin else []
     first = cameras[0]
     return [Camera(first.width, first.height, first.K, viewmat) for viewmat in viewmats]
@@ -180,9 +186,8 @@ def _spline(keys: list[Camera], frames: int, closed: bool) -> list[_Array]:
         spline = make_interp_spline(times, values, k=min(3, len(times) - 1))
     fine = np.linspace(0, times[-1], 20 * len(times) + 1)
     dense = spline(fine)
-    way = np.concatenate(
-        [[0.0], np.cumsum(_steps(dense[:, :3], Rotation.from_quat(dense[:, 3:]).as_matrix()))]
-    )
+    turned = Rotation.from_quat(dense[:, 3:]).as_matrix()
+    way = np.concatenate([[0.0], np.cumsum(_steps(dense[:, :3], turned))])
     even = np.linspace(0, way[-1], frames + closed)[:frames] if frames > 1 else np.zeros(1)
     found = spline(np.interp(even, way, fine))
     return [
@@ -214,8 +219,7 @@ def circle(
         raise ValueError(f"frames is {frames}, wanted at least 1")
     if not 0 < radius < math.inf:
         raise ValueError(f"radius is {radius}, wanted a number above 0")
-    middle, axis = _vector("center", center), _vector("up", up)
-    axis = axis / np.linalg.norm(axis)
+    middle, axis = _vector("center", center), _unit("up", up)
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     other = np.cross(axis, side)

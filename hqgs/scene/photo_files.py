@@ -8,6 +8,7 @@ lies in the scene's folder all the same: such names are looked up in a list of i
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +22,10 @@ from hqgs.scene.names import FILM_SUFFIXES, KEPT, is_room
 
 MASKS = "masks"
 MASK_FOLDERS = (MASKS, "mask", "Masks", "Mask", "MASKS")  # as people spell it
+_NO_PHOTOS = re.compile(
+    r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
+    re.IGNORECASE,
+)
 _FILES = (CHECKPOINT, CONFIG, PAGE, PLAN, PLY, "report.json", "cameras.json", "learned.png")
 _FOLDERS = ("photos", "comparison")  # a run writes pictures into them
 _Key = tuple[str, ...]
@@ -30,6 +35,11 @@ def is_run(folder: Path) -> bool:
     """Whether a folder is one that `hqgs train` writes or wrote: its pictures are no photos."""
     wrote = (folder / CONFIG).is_file() and any((folder / name).exists() for name in (PLY, CHECKPOINT))
     return wrote or (folder / LOCK).is_file()
+
+
+def of_maps(folder: str) -> bool:
+    """Whether a folder is called after depth maps, masks or thumbnails, which have the names of photos."""
+    return _NO_PHOTOS.fullmatch(folder) is not None
 
 
 def strangers(out: Path) -> list[str]:
@@ -85,15 +95,15 @@ class Named:
         files: dict[str, list[tuple[_Key, Path]]] = {}
         for path in below(self._root, self._suffixes):
             key = _parts(path.relative_to(self._root).as_posix())
-            if MASKS not in key[:-1]:
-                files.setdefault(_bare(key[-1], self._suffixes), []).append((key, path))
+            files.setdefault(_bare(key[-1], self._suffixes), []).append((key, path))
         return files
 
     def find(self, written: str, taken: Callable[[Path], bool] = lambda _: False) -> Path | None:
         """The one file that the name can mean and that is not taken; None where there is none, or several.
 
         The more of the written folders a file's own agree with, from the last one up, the better it fits;
-        of those that fit alike the name with the same suffix is taken, and the one in `images`.
+        of those that fit alike the name with the same suffix is taken, and the one in `images`. A map or mask
+        is meant only by a name with its folder: it has that of its photo, which may be gone.
         """
         for name in dict.fromkeys((written, unquote(written))):
             key = _parts(name)
@@ -103,7 +113,7 @@ class Named:
                 (_fit(key, own), own, path)
                 for stem in dict.fromkeys((_bare(key[-1], self._suffixes), key[-1]))
                 for own, path in self._files.get(stem, [])
-                if not taken(path)
+                if not taken(path) and not any(map(of_maps, own[: len(own) - 1 - _fit(key, own)[0]]))
             ]
             if not fitting:
                 continue

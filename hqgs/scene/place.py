@@ -75,11 +75,9 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
         return capture
     points = capture.points[:: max(1, len(capture.points) // LOOKED_AT)].astype(np.float64)
     far = strays(_centers(capture), FAR_OFF)
-    gone = {
-        photo.name
-        for photo, away in zip(capture.photos, far, strict=True)
-        if away and not _shows(photo, points)
-    }
+    away = [photo for photo, off in zip(capture.photos, far, strict=True) if off]
+    sure = {photo.path for photo in away if _shows(photo, points)}  # all faces of a photo stay, or none
+    gone = {photo.name for photo in away if photo.path not in sure}
     if gone:
         notes.append(
             f"{len(gone)} of {len(capture.photos)} cameras lie far from all others, show none of the points "
@@ -103,11 +101,12 @@ def cut_outs(capture: Capture) -> bool:
     """Whether the photos are of cut-out objects, so that what is transparent is empty.
 
     They are where each of them can be transparent and none has a mask file. In other sets alpha is a mask.
+    Photos that cannot be opened have no say.
     """
     photos = [photo for photo in capture.photos if photo.path.is_file()]
     if not photos or any(photo.mask_path is not None for photo in photos):
         return False
-    return all(is_cut_out(photo.path) for photo in photos)
+    return all(is_cut_out(photo.path) is not False for photo in photos)
 
 
 def placed(capture: Capture, notes: list[str]) -> Capture:
@@ -153,7 +152,9 @@ def _shows(photo: Photo, points: NDArray[np.float64]) -> bool:
     rows = rows[rows[:, 2] > 0]
     if not len(rows):
         return False
-    pixels = rows @ photo.camera.calibration_matrix().T
-    shares = pixels[:, :2] / pixels[:, 2:] / (photo.camera.width, photo.camera.height)
+    K = photo.camera.calibration_matrix() if photo.face is None else photo.face.K
+    part = photo.face or photo.camera
+    pixels = rows @ K.T
+    shares = pixels[:, :2] / pixels[:, 2:] / (part.width, part.height)
     inside = shares[((shares >= 0) & (shares <= 1)).all(1)]
     return len(inside) > 0 and float(np.ptp(inside, axis=0).max()) > SHOWN

@@ -189,7 +189,7 @@ def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = 
             source = path if film is None else film_frames(film, Path(name))[0]
             if (scene := load_pictures(source, downscale, longest=longest)) is not None:
                 return scene if film is None else replace(scene, name=film.stem)
-    return load(path, downscale=downscale, longest=longest, skip_unreadable=False, points=False)
+    return load(path, downscale=downscale, longest=longest, points=False)
 
 
 def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:

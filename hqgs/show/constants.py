@@ -19,6 +19,7 @@ FLOOR = 0.002  # keeps ratios of errors finite: half a level
 POWER, SCALE = 0.70, 0.52  # from what is carried to what SHARE of new pixels stay below: of three scenes
 SHARE = 0.9  # of the pixels: what a bound promises
 GOOD, LEAST_GOOD = 20.0, 0.005  # levels of 255: a pixel with such a bound is good; share of them that tells
+NONE_GOOD = 1.00001  # of the factor at which the surest pixel is still called good: none is
 CALIBRATORS, TRUST_TRAINED = 40, 8  # held-out photos that calibrate, and training photos beside them, at most
 SEEN = 0.5  # pixels' weight that a Gaussian has in a photo that sees it
 PATH_LOOKS = 32  # cameras of a path that are looked at, at most

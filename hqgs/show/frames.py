@@ -80,39 +80,51 @@ def render_frames(
         OSError: a file cannot be written; what was there before stays.
     """
     out = Path(out)
+    check_frames(cameras, out, fps, show)
+    pictures = _counted(frames(gaussians, cameras, show, background, trust, look), len(cameras), progress)
+    suffix = out.suffix.lower()
+    if suffix == ".mp4":
+        with atomic_path(out) as tmp:
+            _write_mp4(_pyav(), tmp, pictures, fps)
+    elif suffix == ".gif":
+        with atomic_path(out) as tmp:
+            _write_gif(tmp, pictures, fps)
+    elif suffix == ".png":
+        with atomic_path(out) as tmp:
+            Image.fromarray(next(pictures)).save(tmp)
+    else:
+        places = [f"{k:05}" for k in range(len(cameras))] if names is None else names
+        for name, picture in zip(places, pictures, strict=True):
+            with atomic_path(out / f"{name}.png") as tmp:
+                Image.fromarray(picture).save(tmp, compress_level=3)
+    return out
+
+
+def check_frames(cameras: Sequence[Camera], out: Path, fps: float, show: str) -> None:
+    """What `render_frames` raises of these, for who has work to do before it."""
     if not cameras:
         raise ValueError("there is no camera to render")
     if show not in SHOWN:
         raise ValueError(f"show is {show!r}, wanted one of: {', '.join(SHOWN)}")
     if not 0 < fps <= 1000:
         raise ValueError(f"fps is {fps}, wanted a number above 0 and at most 1000")
-    pictures = _counted(frames(gaussians, cameras, show, background, trust, look), len(cameras), progress)
     suffix = out.suffix.lower()
     if suffix in FILMS:
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
         if len(sizes) > 1:
             each = " and ".join(f"{w} x {h}" for w, h in sizes[:2])
             raise ValueError(f"{out}: a film has frames of one size, these cameras have {each} px")
-        av = pyav(".mp4 (.gif does not)") if suffix == ".mp4" else None
-        with atomic_path(out) as tmp:
-            if av is None:
-                _write_gif(tmp, pictures, fps)
-            else:
-                _write_mp4(av, tmp, pictures, fps)
-    elif suffix == ".png":
-        if len(cameras) > 1:
-            raise ValueError(f"{out} holds one picture, and there are {len(cameras)}: give a folder")
-        with atomic_path(out) as tmp:
-            Image.fromarray(next(pictures)).save(tmp)
-    else:
-        known = suffix[1:].isalpha() or suffix in OTHERS
-        if (known or out.exists()) and not out.is_dir():
-            raise ValueError(f"{out} is no folder; films are .mp4 or .gif, a single picture is .png")
-        places = [f"{k:05}" for k in range(len(cameras))] if names is None else names
-        for name, picture in zip(places, pictures, strict=True):
-            with atomic_path(out / f"{name}.png") as tmp:
-                Image.fromarray(picture).save(tmp, compress_level=3)
-    return out
+        if suffix == ".mp4" and min(sizes[0]) < 2:
+            raise ValueError(f"a film has sides of at least 2 px, these are {sizes[0][0]} x {sizes[0][1]}")
+        if suffix == ".mp4":
+            _pyav()
+    elif suffix == ".png" and len(cameras) > 1:
+        raise ValueError(f"{out} holds one picture, and there are {len(cameras)}: give a folder")
+    if suffix in (*FILMS, ".png"):
+        if out.is_dir():
+            raise ValueError(f"{out} is a folder: name a file, or a folder without {suffix}")
+    elif (suffix[1:].isalpha() or suffix in OTHERS or out.exists()) and not out.is_dir():
+        raise ValueError(f"{out} is no folder; films are .mp4 or .gif, a single picture is .png")
 
 
 def frames(
@@ -255,11 +267,13 @@ def _counted(pictures: Iterator[Picture], total: int, progress: OnFrame | None) 
             progress(done, total)
 
 
+def _pyav() -> Any:
+    return pyav(".mp4 (.gif does not)")
+
+
 def _write_mp4(av: Any, path: Path, pictures: Iterator[Picture], fps: float) -> None:
     first = next(pictures)
     height, width = (side - side % 2 for side in first.shape[:2])
-    if not (height and width):
-        raise ValueError(f"a film has sides of at least 2 px, these are {first.shape[1]} x {first.shape[0]}")
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as film:
         stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

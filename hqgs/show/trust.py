@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,7 @@ from hqgs.show.constants import (
     FLOOR,
     GOOD,
     LEAST_GOOD,
+    NONE_GOOD,
     POWER,
     PRIOR,
     SCALE,
@@ -57,6 +58,11 @@ class Held:
     carried: Array  # before calibration
     alpha: Array
     seen: Array  # training photos
+    counts: NDArray[np.bool_]  # by the photo's mask
+
+    def flat(self, values: Array) -> Array:
+        """Those of the pixels that count."""
+        return values[self.counts]
 
     def needed(self) -> NDArray[np.floating]:
         """The factor on what is carried at which each pixel's bound meets its error, flat."""
@@ -68,7 +74,7 @@ class Held:
         return self._factor(np.minimum(GOOD / 255, (GOOD / 255 / SCALE) ** (1 / POWER) - FLOOR))
 
     def _factor(self, known: NDArray[np.floating] | float) -> NDArray[np.floating]:
-        return ((known - EMPTY * (1 - self.alpha)) / np.maximum(self.carried, 1e-6)).ravel()
+        return ((known - EMPTY * (1 - self.alpha)) / np.maximum(self.carried, 1e-6))[self.counts]
 
 
 @dataclass(frozen=True)
@@ -111,15 +117,17 @@ def calibrated(held: Sequence[Held]) -> float:
     needed = np.concatenate([one.needed() for one in held])
     below = np.concatenate([one.good_below() for one in held])
     factor = max(float(np.quantile(needed, SHARE)), 0.0)
-    right = np.concatenate([h.error.ravel() for h in held]) <= GOOD / 255
+    right = np.concatenate([one.flat(one.error) for one in held]) <= GOOD / 255
     order = np.argsort(-below, kind="stable")
     shares = np.cumsum(right[order]) / np.arange(1, len(order) + 1)
     called = int((below >= factor).sum())
     if called <= LEAST_GOOD * len(order) or shares[called - 1] >= SHARE:
         return factor
-    enough = np.flatnonzero(shares[:called] >= SHARE)
-    last = int(enough[-1]) if len(enough) and enough[-1] >= LEAST_GOOD * len(order) else 0
-    return float(max(factor, below[order[last]]))
+    ends = np.append(np.diff(below[order]) < 0, True)[:called]  # pixels that are alike are good together
+    enough = np.flatnonzero(ends & (shares[:called] >= SHARE))
+    if len(enough) and enough[-1] >= LEAST_GOOD * len(order):
+        return float(max(factor, below[order[enough[-1]]]))
+    return float(max(factor, NONE_GOOD * below[order[0]]))
 
 
 class LazyTrust:
@@ -134,7 +142,7 @@ class LazyTrust:
         if gaussians.errors is not None:
             return True
         views = [] if self._known is None else self._known.views
-        return any(view.photo is not None for view in views if not view.held_out)
+        return any(shows(view) for view in views if not view.held_out)
 
     def of(self, gaussians: Gaussians) -> Trust:
         """ValueError where it is not possible."""
@@ -145,7 +153,7 @@ class LazyTrust:
 
 def trust_of(gaussians: Gaussians, known: RunCameras | None) -> Trust:
     """Of a run's photos; or without them, what the file of the Gaussians says. ValueError without either."""
-    photos = known is not None and any(v.photo is not None for v in known.views if not v.held_out)
+    photos = known is not None and any(shows(view) for view in known.views if not view.held_out)
     if gaussians.errors is not None and not photos:
         return Trust(gaussians, gaussians.errors, torch.zeros(len(gaussians)))
     return learn_trust(gaussians, known or RunCameras(np.zeros(3), []))
@@ -157,76 +165,109 @@ def learn_trust(gaussians: Gaussians, known: RunCameras, photos: int = TRUST_PHO
     The errors are those of at most `photos` training photos, the factor is that of the held-out ones.
     ValueError where the run has no training photo.
     """
-    views = [view for view in known.views if not view.held_out and view.photo is not None]
+    views = [view for view in known.views if not view.held_out and shows(view)]
     if not views:
         raise ValueError("trust needs the photos of a run: give its folder, with cameras.json and photos/")
     chosen, n = [views[k] for k in evenly(len(views), photos)], len(gaussians)
-    looks = list[tuple[Camera, Tensor]]()
+    looks = list[Off]()
     sums, seen = torch.zeros(n, 2), torch.zeros(n)  # sums of weights, and of weights times errors
 
     with one_torch_thread():
         for view in chosen:
-            camera, error, _ = error_of(gaussians, view)
-            looks.append((camera, error))
-            both = _back(
-                gaussians, camera, torch.zeros(n, 2), torch.stack([torch.ones_like(error), error], -1)
-            )
+            off = error_of(gaussians, view, known.background)
+            looks.append(off)
+            pixels = torch.stack([off.counts.float(), off.error], -1)
+            both = _back(gaussians, off.camera, torch.zeros(n, 2), pixels)
             sums += both
             seen += both[:, 0] > SEEN
         weights = sums[:, 0] + 1
         errors = (sums[:, 1] + PRIOR) / weights
         for _ in range(TRUST_ROUNDS):
             found = torch.zeros(n)
-            for camera, error in looks:
-                found += _back(gaussians, camera, errors[:, None], error[..., None], ratio=True)[:, 0]
+            for off in looks:
+                found += _back(gaussians, off.camera, errors[:, None], off.error[..., None], off.counts)[:, 0]
             errors = (errors * found + PRIOR) / weights
     carried = Trust(gaussians, errors, seen)
 
     def look(view: KnownCamera) -> Held:
-        camera, error, psnr = error_of(gaussians, view, psnr=True)
-        shown = *carried.shown(camera, errors), carried.shown(camera, seen)[0]
-        return Held(view.name, camera, psnr, error.numpy(), *shown)
+        off = error_of(gaussians, view, known.background, psnr=True)
+        shown = *carried.shown(off.camera, errors), carried.shown(off.camera, seen)[0]
+        return Held(view.name, off.camera, off.psnr, off.error.numpy(), *shown, off.counts.numpy())
 
-    out = [view for view in known.views if view.held_out and view.photo is not None]
-    held = tuple(look(out[k]) for k in evenly(len(out), CALIBRATORS))
+    out = [view for view in known.views if view.held_out and shows(view)]
+    held = tuple(one for k in evenly(len(out), CALIBRATORS) if (one := look(out[k])).counts.any())
     trained = tuple(look(chosen[k]) for k in evenly(len(chosen), TRUST_TRAINED)) if held else ()
     factor = calibrated(held)
     return Trust(gaussians, factor * errors, seen, factor, held, trained)
 
 
 def _back(
-    gaussians: Gaussians, camera: Camera, values: Tensor, pixels: Tensor, ratio: bool = False
+    gaussians: Gaussians, camera: Camera, values: Tensor, pixels: Tensor, counts: Tensor | None = None
 ) -> Tensor:
-    """For each Gaussian [N, D] the sum over pixels [H, W, D] of its weight times the pixel; or, by `ratio`,
-    times the pixel over what the values [N, D] render to there."""
+    """For each Gaussian [N, D] the sum over pixels [H, W, D] of its weight times the pixel; or, where the
+    pixels of `counts` [H, W] alone count, times the pixel over what the values [N, D] render to there."""
     values = values.clone().requires_grad_()
     render = gaussians.rasterize(camera, values, near_plane=gaussians.near_plane())[0][0]
-    render.backward((pixels + FLOOR) / (render.detach() + FLOOR) if ratio else pixels)
+    over = (pixels + FLOOR) / (render.detach() + FLOOR)
+    render.backward(pixels if counts is None else over * counts[..., None])
     assert values.grad is not None
     return values.grad
 
 
-def error_of(gaussians: Gaussians, view: KnownCamera, psnr: bool = False) -> tuple[Camera, Tensor, float]:
-    """A smaller camera of a view, the error of its render there, mean of the channels, [H, W], and the PSNR,
-    dB; with `psnr` at the size that the photo was kept in."""
+@dataclass(frozen=True)
+class Off:
+    """A photo against its render, small."""
+
+    camera: Camera
+    error: Tensor  # [H, W], mean of the channels, white is 1; 0 where it does not count
+    counts: Tensor  # [H, W], bool, by its mask
+    psnr: float  # dB
+
+
+def error_of(
+    gaussians: Gaussians, view: KnownCamera, background: tuple[float, float, float], psnr: bool = False
+) -> Off:
+    """The error of a view's render; with `psnr` that of the size that the photo was kept in, else at the
+    smaller size of the error."""
     assert view.photo is not None
     with Image.open(view.photo) as file:
         picture = file.convert("RGB")
-    large = (
-        psnr_of(_off(gaussians, view.camera, picture)[1]) if psnr and max(picture.size) > TRUST_SIDE else None
-    )
+    large = None
+    if psnr and max(picture.size) > TRUST_SIDE:
+        large = _off(gaussians, view, picture, background).psnr
     picture.thumbnail((TRUST_SIDE, TRUST_SIDE), Image.Resampling.LANCZOS)
-    camera, off = _off(gaussians, view.camera, picture)
-    return camera, off.abs().mean(-1), psnr_of(off) if large is None else large
+    off = _off(gaussians, view, picture, background)
+    return off if large is None else replace(off, psnr=large)
 
 
 @torch.no_grad()
-def _off(gaussians: Gaussians, camera: Camera, picture: Image.Image) -> tuple[Camera, Tensor]:
-    """The camera of a photo of another size, and render less photo, [H, W, 3]."""
-    camera = resized_camera(camera, picture.width, picture.height)
-    return camera, gaussians.render(camera).clamp(0, 1) - torch.from_numpy(np.array(picture)).float() / 255
+def _off(
+    gaussians: Gaussians, view: KnownCamera, picture: Image.Image, background: tuple[float, float, float]
+) -> Off:
+    """Of the photo at this size."""
+    camera = resized_camera(view.camera, picture.width, picture.height)
+    counts = torch.from_numpy(counted(view, picture.size))
+    render = gaussians.render(camera, background=background).clamp(0, 1)
+    off = (render - torch.from_numpy(np.array(picture)).float() / 255) * counts[..., None]
+    return Off(camera, off.abs().mean(-1), counts, psnr_of(off[counts]))
+
+
+def shows(view: KnownCamera) -> bool:
+    """Whether its photo is there, and its mask leaves something of it."""
+    if view.photo is None or view.mask is None:
+        return view.photo is not None
+    with Image.open(view.mask) as file:
+        return bool(counted(view, file.size).any())
+
+
+def counted(view: KnownCamera, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where the photo counts, at a size (width, height), [H, W]."""
+    if view.mask is None:
+        return np.ones(size[::-1], bool)
+    with Image.open(view.mask) as file:
+        return np.array(file.convert("L").resize(size, Image.Resampling.BOX)) == 255
 
 
 def psnr_of(off: Tensor) -> float:
     """dB, of differences where white is 1; 100 where there are none."""
-    return -10 * math.log10(max(float(off.square().mean()), 1e-10))
+    return -10 * math.log10(max(float(off.square().mean()), 1e-10)) if off.numel() else 100.0

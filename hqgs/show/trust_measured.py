@@ -58,13 +58,13 @@ def measure_trust(trust: Trust) -> Measured | None:
     areas = list[tuple[float, float]]()
     for k, one in enumerate(held):
         factor = calibrated([*held[:k], *held[k + 1 :]])
-        bound, error = bound_of(factor * one.carried, one.alpha), 255 * one.error
+        bound, error = one.flat(bound_of(factor * one.carried, one.alpha)), 255 * one.flat(one.error)
         called = bound <= GOOD
         pixels += error.size
         below += int((error <= bound).sum())
         good += int(called.sum())
         right += int((called & (error <= GOOD)).sum())
-        areas.append((_ause(bound.ravel(), error.ravel()), _ause(-one.seen.ravel(), error.ravel())))
+        areas.append((_ause(bound, error), _ause(-one.flat(one.seen), error)))
     ause, by_photos = np.mean(areas, axis=0).tolist()
     return Measured(len(held), below / pixels, good / pixels, right / max(good, 1), ause, by_photos)
 
@@ -100,7 +100,9 @@ def predict_psnr(trust: Trust, cameras: Sequence[Camera], taken: Sequence[Camera
     from scipy.special import stdtrit  # here: the command line waits for no scipy
 
     (psnr, said), (own, own_said) = (
-        np.array([[one.psnr, said_of(one.carried, one.alpha)] for one in of]).reshape(-1, 2).T
+        np.array([[one.psnr, said_of(one.flat(one.carried), one.flat(one.alpha))] for one in of])
+        .reshape(-1, 2)
+        .T
         for of in (trust.held, trust.trained)
     )
     chosen = [cameras[k] for k in evenly(len(cameras), PATH_LOOKS)]
@@ -153,7 +155,7 @@ def _ause(doubt: Array, error: Array) -> float:
 
     def curve(key: Array) -> NDArray[np.float64]:
         sums = error[np.argsort(key, kind="stable")].cumsum(dtype=np.float64)
-        ends = np.linspace(0, len(error), 50 + 1)[1:].astype(int)
+        ends = np.linspace(0, len(error), 50 + 1)[1:].astype(int).clip(1)
         return sums[ends - 1] / ends
 
     return float((curve(doubt) - curve(error)).mean() / max(float(error.mean()), 1e-9))

@@ -22,7 +22,17 @@ from hqgs.scene.scene import Scene
 FORMAT = 7  # raised when a newer reader could not use an older file
 FREE_FIELDS = ("eval_every", "checkpoint_every")  # may differ on resume: they do not change the result
 # In a longer run too.
-LENGTH_FIELDS = ("iterations", "sh_interval", "start", "stop", "every", "leave_out", "seconds", "turn")
+LENGTH_FIELDS = (
+    "iterations",
+    "sh_interval",
+    "start",
+    "stop",
+    "every",
+    "leave_out",
+    "seconds",
+    "turn",
+    "timed",
+)
 
 
 def save_checkpoint(path: str | Path, tensors: dict[str, Tensor], meta: dict[str, Any]) -> None:
@@ -108,6 +118,11 @@ def check_same(
 def other_length(saved: dict[str, Any], here: dict[str, Any]) -> bool:
     """Whether another length is asked for."""
     return any(saved.get(name) != here.get(name) for name in ("iterations", "leave_out", "seconds"))
+
+
+def freed(saved: dict[str, Any], here: dict[str, Any]) -> list[str]:
+    """Of FREE_FIELDS, those for which something else is asked now."""
+    return [name for name in FREE_FIELDS if saved.get(name) != here.get(name)]
 
 
 def check_scene(path: str | Path, saved: object, scene: Scene) -> None:

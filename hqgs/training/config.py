@@ -212,6 +212,7 @@ class TrainConfig:
     seed: int = 0  # of everything random
     seconds: float | None = None  # of training that the number of iterations was chosen for
     turn: tuple[int, int] | None = None  # the iteration after which the run gets another length, and that
+    timed: bool | None = None  # whether the length is what a number of seconds came to in another run
     batch: int = 1  # views in a step, at most
     sh_degree: int = MAX_SH_DEGREE  # of the spherical harmonics, at most
     sh_interval: int = 1_000  # iterations until the next SH degree is trained

@@ -91,9 +91,10 @@ class TrainingViews:
         self, gaussians: Gaussians, numbers: Sequence[int], degree: int, coarse: bool, ranks: Ranks
     ) -> float:
         """Of training photos of these numbers as the method compares them, of `gaussians` to rasterize, up to
-        a degree; known noise does not count."""
+        a degree; known noise does not count, nor do photos whose masks leave nothing. NaN where all are such.
+        """
 
-        def error(number: int) -> float:
+        def error(number: int) -> float | None:
             view, target = self.target(number, coarse)
             shot = self.method.shot(view, target)
             render, _ = render_view(gaussians, shot.camera, degree, self.background, low_pass(coarse))
@@ -101,7 +102,9 @@ class TrainingViews:
             difference = (image - floats(target.photo)).square()
             if target.mask is not None:
                 difference = difference[target.mask]
-            return float(difference.double().mean())
+            return float(difference.double().mean()) if len(difference) else None
 
-        errors = ranks.divide(numbers, error)
+        errors = [found for found in ranks.divide(numbers, error) if found is not None]
+        if not errors:
+            return math.nan
         return -10 * math.log10(max(float(np.mean(errors)) - self.method.noise**2, 1e-10))

@@ -128,10 +128,14 @@ class Frugality:
         return found
 
     def state_dict(self) -> dict[str, Any]:
-        return asdict(self.memory)
+        """As JSON values; of a run whose length the clock will tell, the seconds of its last steps too."""
+        timed = {"steps": list(self._seconds)} if self.schedule.run.clock_most else {}
+        return asdict(self.memory) | timed
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.memory = Memory(**state)
+        memory = dict(state)
+        self._seconds = deque(memory.pop("steps", ()), self._seconds.maxlen)
+        self.memory = Memory(**memory)
 
     def forget_end(self) -> None:
         """The run goes on after its end: no iterations are left out."""
@@ -155,6 +159,8 @@ class Frugality:
         """Of the run, where the held-back photos have stopped improving; None: they have not."""
         memory, iteration, total = self.memory, state.iteration, self.schedule.config.iterations
         now = self._psnr(shown, self.schedule.held)
+        if math.isnan(now):  # their masks leave nothing: they tell nothing
+            return None
         if now > memory.best + BETTER:
             memory.best, memory.best_at = now, iteration
         if iteration - memory.best_at < PATIENCE:

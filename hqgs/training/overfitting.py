@@ -37,7 +37,9 @@ def with_dropout(gaussians: Gaussians, share: float, seed: int, iteration: int) 
     if not share:
         return gaussians
     drawn = np.random.default_rng([seed, iteration]).random(len(gaussians), np.float32)
-    opacities = (gaussians.activated_opacities() / (1 - share)).clamp(max=OPAQUE)
+    opacities = gaussians.activated_opacities() / (1 - share)
+    # Decay without end makes 0 of them, whose logarithm has no gradient.
+    opacities = opacities.clamp(torch.finfo(opacities.dtype).tiny, OPAQUE)
     kept = log(opacities / (1 - opacities))
     some = torch.where(torch.from_numpy(drawn) < share, DROPPED, kept)
     return gaussians.like(

@@ -93,13 +93,13 @@ def _trained(scene: Scene, views: Sequence[View], agreement: Agreement, seed: in
     config = TrainConfig(iterations=steps, faster_rates=True)
     optimizer = Adam(groups, lr=0.0, eps=config.adam_eps)
     targets, rng = [photo_tensors(view) for view in views], np.random.default_rng(seed)
-    order = list[int]()
+    order, extent, reach = list[int](), scene.extent, scene.reach  # these two look at all points and photos
     with one_torch_thread():
         for step in range(steps):
             if not order:
                 order = rng.permutation(len(views)).tolist()
             k = order.pop()
-            rates = learning_rates(config, scene.extent, step / steps, scene.reach)
+            rates = learning_rates(config, extent, step / steps, reach)
             for group in optimizer.param_groups:
                 group["lr"] = rates[group["name"]]
             image, _ = render_view(gaussians, views[k].camera, SCOUT_DEGREE, BACKGROUND)

@@ -24,7 +24,8 @@ def first_points_wanted(facts: Facts, settings: TrainConfig) -> int:
     More than the scene's own always: those lie at corners alone, and a run from points all over the photos
     costs less. Twice as many where few steps are to come, in which little grows, and the photos agree.
     """
-    few = settings.seconds is None and settings.iterations < FEW_STEPS * facts.photos
+    timed = settings.seconds is not None or settings.timed  # a repeat starts as what it repeats
+    few = not timed and settings.iterations < FEW_STEPS * facts.photos
     times = 2 if few and (facts.agreed or 0) >= POINTS_AGREED else 1
     most = min(times * settings.start_points, settings.densify.max_gaussians)
     return min(most, max(times * facts.pixels // PIXELS, int(TIMES_OWN_POINTS * facts.points)))

@@ -97,6 +97,6 @@ def with_plan(config: TrainConfig, path: str | Path) -> TrainConfig:
         plan = json.loads(path.read_text(encoding="utf-8"))
         iterations, turn = plan["iterations"], plan["turn"]
         turn = None if turn is None else (int(turn[0]), int(turn[1]))
-        return replace(with_iterations(config, int(iterations)), seconds=None, turn=turn)
+        return replace(with_iterations(config, int(iterations)), seconds=None, turn=turn, timed=True)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         raise ValueError(f"{path} is no plan: {error!r}") from error

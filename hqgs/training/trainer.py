@@ -224,7 +224,8 @@ class Trainer:
                 self.begin(self.prepared.plan())
                 meta["decisions"] = decisions | {"length": more, "released": decisions["released"] or done}
             else:
-                self.begin(saved)
+                new = {name: getattr(self.config, name) for name in checkpoint.freed(meta["asked"], asked)}
+                self.begin(replace(saved, settings=replace(saved.settings, **new)))
             state = self.state.restored(path, tensors, meta, self._optimizer)
             self.frugality.load_state_dict(meta["frugality"])
             if longer:
@@ -331,7 +332,7 @@ class Trainer:
             guard.culled += int(bad.sum())
         skipped = len(views) if removes else len(found)
         guard.skipped += skipped
-        guard.skipped_in_a_row = guard.skipped_in_a_row + skipped if skipped == len(views) else 0
+        guard.skipped_in_a_row = guard.skipped_in_a_row + 1 if skipped == len(views) else 0
         if guard.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
             raise TrainingError(
                 f"the loss or a gradient was not finite in {guard.skipped_in_a_row} steps in a row, up to "

@@ -129,7 +129,7 @@ def _settings(settings: TrainConfig, photos: int) -> TrainConfig:
     decay = (settings.opacity_decay or 0.0) if photos <= MANY_PHOTOS else 0.0
     exposed = any(step.kind == "exposure" for step in parse_formation(settings.hqgs.formation).steps)
     return replace(
-        with_iterations(replace(settings, leave_out=(), seconds=None, turn=None), TRIAL_STEPS),
+        with_iterations(replace(settings, leave_out=(), seconds=None, turn=None, timed=None), TRIAL_STEPS),
         hqgs=replace(settings.hqgs, formation="exposure" if exposed else NONE),
         batch=1,
         opacity_decay=decay,

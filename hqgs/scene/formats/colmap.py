@@ -147,8 +147,11 @@ def read_colmap(root: Path, downscale: float) -> Capture:
     if unused:
         notes.append(f"{len(unused)} photos have no camera (COLMAP did not register them): {some(unused)}")
     test_names = None
-    if (split := listed_split([path, root], root)) is not None:
-        kept, test_names = held_out(split, names, names_by_any(names), notes)
+    split, known = listed_split([path, root], root), names_by_any(names)
+    if split is not None and not split.names_any(known):
+        notes.append(f"{split.source} names none of the photos: it is not taken for a split")
+    elif split is not None:
+        kept, test_names = held_out(split, names, known, notes)
         photos = [photo for photo in photos if photo.name in kept | test_names]
     points, colors = keep_finite(*(model_points(model) if model.points3D else _points(path, notes)), notes)
     tracks = _tracks(model, path)

@@ -102,7 +102,7 @@ def _is_photo(line: str) -> bool:
     words = line.strip().split(None, HEAD)
     if len(words) <= HEAD or not words[0].isdigit():
         return False
-    return len(line.split()) % 3 != 0 or not _is_number(words[HEAD].split()[0])
+    return len(line.split()) % 3 != 0 or not all(map(_is_number, words[HEAD].split()))
 
 
 def _is_number(word: str) -> bool:

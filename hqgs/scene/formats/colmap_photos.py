@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hqgs.base.text import some
 from hqgs.scene.capture import found_inside, inside, list_photos, perhaps, photo_folder
-from hqgs.scene.photo_files import MASKS, Named, is_run
+from hqgs.scene.photo_files import MASK_FOLDERS, Named, is_run, of_maps
 
 INPUT = "input"  # 3DGS's convert.py: photos as they were before they were undistorted
 
@@ -18,7 +18,8 @@ def photos_of(
     """The folder of photos, the downscale left to do, and the file of each name that has one.
 
     The folder is that of `photo_folder`, where it has any of the photos; else the one that has most: those
-    beside the model, `images` or `input` beside it, the scene's folder, any folder in it.
+    beside the model, `images` or `input` beside it, the scene's folder, any folder in it; one that is called
+    after maps only where no other has any.
 
     Raises ValueError without photos, FileNotFoundError where none of the names has one.
     """
@@ -31,22 +32,31 @@ def photos_of(
     base = model.parent.parent if model.parent.name == "sparse" else model.parent
     beside = [place / name for place in (base, model, root) for name in (INPUT, "images")]
     inner = [p for p in sorted(root.iterdir()) if p.is_dir() and p.name[0] != "." and not is_run(p)]
-    options = [*beside, model, base, root, *(p for p in inner if p.name != MASKS)]
+    maps = [p for p in inner if of_maps(p.name)]
+    options = [*beside, model, base, root, *(p for p in inner if p not in maps)]
     options = [p for p in dict.fromkeys(options) if p.is_dir() and p.is_relative_to(root)]
-    counts = {folder: sum(_named(folder, name) for name in names) for folder in options}
-    best = max(options, key=lambda folder: counts[folder])
-    if not counts[best]:
-        best = root if found is None else found[0]
-    if not (list_photos(best) if best != root else list_photos(root)):
+    best = _fullest(options, names) or (root if found is None else found[0])
+    files = match_some(names, root, best, notes) if list_photos(best) else {}
+    called = _fullest([p for p in maps if p.name not in MASK_FOLDERS], names)
+    if not files and called is not None:  # photos after all
+        best, files = called, match_some(names, root, called, notes)
+    if not files and not list_photos(best):
         raise ValueError(
             f"{root} has a COLMAP model but no photos: looked for images, images_{downscale:g}, and in "
             f"{some([p.relative_to(root).as_posix() for p in options])}{perhaps(root)}"
         )
-    if files := match_some(names, root, best, notes):
+    if files:
         if best != (root / "images"):
             notes.append(f"the photos are those in {best.relative_to(root).as_posix()}")
         return best, downscale, files
     raise FileNotFoundError(f"{len(names)} cameras have no photo in {best}: {some(names)}")
+
+
+def _fullest(folders: list[Path], names: list[str]) -> Path | None:
+    """The first of the folders that have most of the photos; None where none has any."""
+    counts = {folder: sum(_named(folder, name) for name in names) for folder in folders}
+    most = max(counts.values(), default=0)
+    return next((folder for folder in folders if counts[folder] == most), None) if most else None
 
 
 def _named(folder: Path, name: str) -> bool:

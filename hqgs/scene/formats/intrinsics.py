@@ -17,6 +17,7 @@ _KEYS = {  # nerfstudio's, and what others call them
 }
 _DISTORTIONS = ("dist_coeffs", "distortion_coefficients", "distortion")
 _OF_OPENCV, _OF_FISHEYE = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
+_FOCALS, _ANGLES = ("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y")
 _SKEW = 1e-3  # of the focal length: less is none
 
 
@@ -50,6 +51,13 @@ def with_matrix(values: dict[str, Any], fisheye: bool, where: str) -> dict[str, 
     if any(numbers[len(order) :]):
         raise ValueError(f"{where}: distortion must be {' '.join(order)}, got {listed!r:.80}")
     return found | dict(zip(order, numbers, strict=False))
+
+
+def under(of_file: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """The values of a file with a frame's own over them: its angles of view count, not the file's lengths."""
+    if any(key in own for key in _ANGLES) and not any(key in own for key in _FOCALS):
+        of_file = {k: v for k, v in of_file.items() if k not in (*_FOCALS, *_ANGLES)}
+    return of_file | own
 
 
 def _of_matrix(value: object, what: str) -> dict[str, float]:

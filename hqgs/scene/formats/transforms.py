@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from hqgs.scene.capture import (
 )
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around
-from hqgs.scene.formats.intrinsics import MATRICES, with_matrix
+from hqgs.scene.formats.intrinsics import MATRICES, under, with_matrix
 from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named, below
@@ -62,15 +63,15 @@ def read_transforms(root: Path, downscale: float) -> Capture:
     Raises ValueError, FileNotFoundError for a mask that is missing; both name the file.
     """
     notes: list[str] = []
-    files = Named(root)
+    files, listed = Named(root), cache(partial(_listed, root))
     present = [name for name in (TRAIN, TEST, VAL) if (root / name).is_file()]
     main = SINGLE if (root / SINGLE).is_file() and (TRAIN not in present or len(present) < 2) else TRAIN
     meta = _read(root / main)
-    photos, called = _read_frames(root, main, meta, files)
+    photos, called = _read_frames(root, main, meta, files, listed)
     test_names = None
     split_file = TEST if TEST in present else VAL if VAL in present else None
     if split_file is not None:
-        test, _ = _read_frames(root, split_file, _read(root / split_file), files)
+        test, _ = _read_frames(root, split_file, _read(root / split_file), files, listed)
         test_names = frozenset(p.name for p in test)
         if main == SINGLE:
             photos = [p for p in photos if p.name not in test_names]
@@ -132,7 +133,7 @@ def _pose(frame: dict[str, Any], where: str) -> NDArray[np.float64]:
 
 
 def _read_frames(
-    root: Path, file: str, meta: dict[str, Any], files: Named
+    root: Path, file: str, meta: dict[str, Any], files: Named, listed: Callable[[], frozenset[Path]]
 ) -> tuple[list[Photo], dict[str, str]]:
     """The photos of a file, and their names by what the file calls them."""
     photos, called = list[Photo](), dict[str, str]()
@@ -141,7 +142,7 @@ def _read_frames(
         if not isinstance(frame, dict):
             raise ValueError(f"{where}: expected an object, got {frame!r:.80}")
         written = _text(_told(frame, _FILE), "file_path", where)
-        path = _photo_path(root, written, files)
+        path = _photo_path(root, written, files, listed)
         name = path.relative_to(root).as_posix()
         called[written] = name
         where = f"{where} ({name})"
@@ -150,9 +151,9 @@ def _read_frames(
         viewmat = viewmat_from_pose(c2w, name, camera_to_world=True)
         mask = frame.get("mask_path")
         mask_path = find_mask(root, name.removeprefix("images/"))
-        if mask is not None:
+        if mask not in (None, ""):
             mask_path = _mask_path(root, _text(mask, "mask_path", where))
-            if mask_path is None:
+            if mask_path is None and os.path.lexists(path):
                 raise FileNotFoundError(f"{where}: mask_path {mask!r} names no file")
         try:
             camera = _camera(_by_our_names(meta, frame, where), path, where)
@@ -163,10 +164,11 @@ def _read_frames(
 
 
 def _by_our_names(meta: dict[str, Any], frame: dict[str, Any], where: str) -> dict[str, Any]:
-    """What a file and a frame say of the camera; the frame wins, by whatever names."""
+    """What a file and a frame say of the camera; the frame wins, by whatever names. null says nothing."""
+    meta, frame = ({k: v for k, v in said.items() if v is not None} for said in (meta, frame))
     told = meta | frame
     fisheye = bool(told.get("is_fisheye")) or str(told.get("camera_model")).upper() in _FISHEYE
-    return with_matrix(meta, fisheye, where) | with_matrix(frame, fisheye, where)
+    return under(with_matrix(meta, fisheye, where), with_matrix(frame, fisheye, where))
 
 
 def _once(root: Path, photos: list[Photo]) -> list[Photo]:
@@ -179,8 +181,25 @@ def _once(root: Path, photos: list[Photo]) -> list[Photo]:
     return [*found.values()]
 
 
-def _photo_path(root: Path, file_path: str, files: Named) -> Path:
-    """The photo of `file_path`, which may lack its suffix (Blender sets); its place, if it is gone."""
+def _photo_path(root: Path, file_path: str, files: Named, listed: Callable[[], frozenset[Path]]) -> Path:
+    """The photo of `file_path`, which may lack its suffix (Blender sets); its place, if it is gone.
+
+    That of another frame, which lies where it should, is not taken for it: rigs and splits repeat names.
+    """
+    if (there := _written_photo(root, file_path)) is not None:
+        return there
+    if (found := files.find(file_path, lambda path: path in listed())) is not None:
+        return found
+    try:
+        return inside(root, file_path.replace("\\", "/"), "file_path")
+    except ValueError:
+        if (found := files.find(file_path)) is None:  # else the same photo, written otherwise
+            raise
+        return found
+
+
+def _written_photo(root: Path, file_path: str) -> Path | None:
+    """The file where `file_path` says that it is; None: there is none."""
     written = file_path.replace("\\", "/")
     for name in dict.fromkeys((file_path, written)):
         try:
@@ -190,7 +209,18 @@ def _photo_path(root: Path, file_path: str, files: Named) -> Path:
         for option in (path, *(path.with_name(path.name + s) for s in PHOTO_SUFFIXES)):
             if os.path.lexists(option) and not option.is_dir():
                 return option
-    return files.find(file_path) or inside(root, written, "file_path")
+    return None
+
+
+def _listed(root: Path) -> frozenset[Path]:
+    """The photos of all files of frames that lie where those say."""
+    metas = list[dict[str, Any]]()
+    for name in (SINGLE, TRAIN, TEST, VAL):
+        with suppress(OSError, ValueError):  # of one that is not there, or is not read
+            metas.append(_read(root / name))
+    frames = [frame for meta in metas for frame in meta["frames"] if isinstance(frame, dict)]
+    written = {text for frame in frames if isinstance(text := _told(frame, _FILE), str)}
+    return frozenset(path for text in written if (path := _written_photo(root, text)) is not None)
 
 
 def _mask_path(root: Path, written: str) -> Path | None:

@@ -16,6 +16,7 @@ from hqgs.base.text import some
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode, open_photo
 from hqgs.scene.names import FILM_SUFFIXES
+from hqgs.scene.photo_files import of_maps
 
 _BURST = re.compile(r"(.*?)BURST(\d{8,})?", re.IGNORECASE)  # with the time of a burst, or its photos' numbers
 _CAMERAS = {  # files of other programs, by what they are called
@@ -36,10 +37,6 @@ _CAMERAS = {  # files of other programs, by what they are called
         re.IGNORECASE,
     ),
 }
-_NO_PHOTOS = re.compile(
-    r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
-    re.IGNORECASE,
-)
 _NOT_HERE = (".icloud", ".crdownload", ".part", ".partial", ".download")
 _ALIKE = 4  # of 255, in every cell: what a JPEG read at an eighth of its sides may differ by
 _VERSIONS, _SIDE = 0.98, 32  # correlation of versions of one photo, at so many px
@@ -238,7 +235,7 @@ def not_here(folder: Path) -> list[str]:
 
 def photos_and_maps(below: dict[str, list[str]]) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Folders of photos, and those of depth maps, masks or thumbnails by their names, if others are there."""
-    maps = {k: v for k, v in below.items() if _NO_PHOTOS.fullmatch(k.rsplit("/", 1)[-1])}
+    maps = {k: v for k, v in below.items() if of_maps(k.rsplit("/", 1)[-1])}
     return (
         ({k: v for k, v in below.items() if k not in maps}, maps) if len(maps) < len(below) else (below, {})
     )

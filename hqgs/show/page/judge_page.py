@@ -22,6 +22,7 @@ from hqgs.evaluation.judge_words import (
     not_measured,
     quality,
     scene_words,
+    short_names,
     table_rows,
     wrong_frame,
 )
@@ -67,8 +68,8 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         ],
         patch=PATCH,
         white=int(WORST_SHOWN),
-        one=Path(one["name"]).name,
-        other=None if against is None else Path(against["name"]).name,
+        one=Path(one["name"]).name if against is None else short_names(one, against)[0],
+        other=None if against is None else short_names(one, against)[1],
         pairs=[_pair(judged, number, one["views"], against) for number in chosen],
         pairs_left=len(order) - len(chosen),
         photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "the error comes from"],

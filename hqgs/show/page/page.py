@@ -61,7 +61,7 @@ class Page:
 def told_verdict(report: Report) -> str:
     """What came out, in words, with the number that it goes by."""
     psnr, name = judged_by(report)
-    word, why = verdict(psnr)
+    word, why = verdict(psnr, report["metrics"])
     text = f"Quality: {word}. {why[0].upper()}{why[1:]}."
     if psnr is None:
         return text
@@ -103,6 +103,7 @@ def page_text(page: Page) -> str:
         for name, unit, key, color in CHARTS
     ]
     measured_some = [h["views"] for h in history if "views" in h]
+    learned = [learned_words(record) for record in report["learned"]]
     diagnosis, spots, trust = page.diagnosis, next_photos(page.scene), None
     if page.folder is not None and page.gaussians is not None and len(page.gaussians):
         trust = trust_part(page.folder, page.scene, page.gaussians, report["iterations"])
@@ -123,7 +124,11 @@ def page_text(page: Page) -> str:
         photos=[]
         if diagnosis is None
         else [_row(p.name, photo_words(photo_record(p))) for p in diagnosis.photos],
-        learned=[_row(record["name"], learned_words(record)) for record in report["learned"]],
+        learned=[
+            words | {"photo": record["name"]}
+            for record, words in zip(report["learned"], learned, strict=True)
+        ],
+        learned_heads=["photo", *dict.fromkeys(head for words in learned for head in words)],
         pictures={Path(name).stem: jpeg(picture, SHEET_SIDE) for name, picture in page.pictures.items()},
         left_out=[_left_out(item) for item in report["left_out"] if not _correction(item)],
         plan=[_plan_row(row) for row in report.get("plan", []) if not _correction(row)],

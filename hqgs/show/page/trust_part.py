@@ -38,16 +38,21 @@ def trust_part(folder: Path, scene: Scene, gaussians: Gaussians, iterations: int
     some = min(max(round(TRUST_PASSES * iterations / (TRUST_ROUNDS + 1)), TRUST_LEAST), TRUST_PHOTOS)
     trust = learn_trust(gaussians, known, photos=some)
     measured = measure_trust(trust)
-    spots = doubtful_spots(trust, [view for view in known.views if not view.held_out])
+    turns = {view.name: view.quarter_turns for view in [*scene.train, *scene.test]}
+    spots = doubtful_spots(trust, [view for view in known.views if not view.held_out], turns)
     if measured is None:
         why = "No photo was held out, so no number says how far renders of other places can be believed."
         return TrustPart([why], spots=spots)
-    lines = [f"Trust: {measured}. Each photo is judged by a calibration on the others."]
+    by = (
+        "Each photo is judged by a calibration on the others"
+        if measured.photos > 1
+        else "It is not calibrated"
+    )
+    lines = [f"Trust: {measured}. {by}."]
     path = predict_psnr(trust, camera_path(known.train, PATH_LOOKS, cuts=True), known.train)
     if path is not None:
         lines.append(f"Photos from the way through the training cameras would have a PSNR of {path}.")
     worst = min(range(len(trust.held)), key=lambda k: trust.held[k].psnr)
-    turns = {view.name: view.quarter_turns for view in scene.test}
     one = trust.held[worst]
     return TrustPart(lines, one.name, _pictures(one, gaussians, trust.bound(one.camera), turns), spots)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import io
+import shlex
 import threading
 import time
 import warnings
@@ -42,11 +44,17 @@ class Viewer:
     """A page at `url`. Call `pump` often: it renders for whoever looks, and returns if nobody waits."""
 
     def __init__(
-        self, known: RunCameras | None, folder: Path | None, *, port: int = PORT, title: str = "hqgs"
+        self,
+        known: RunCameras | None,
+        folder: Path | None,
+        *,
+        port: int = PORT,
+        title: str = "hqgs",
+        source: Path | None = None,
     ) -> None:
-        """`folder`: where the camera path is written; None: nowhere. See `start_server` for the errors."""
+        """`folder`: for the camera path; `source`: what was opened, if not that. Errors: `start_server`'s."""
         self._lock = threading.RLock()
-        self._known, self._folder = known, folder
+        self._known, self._folder, self._source = known, folder, source or folder
         self._views: dict[str, KnownCamera] = {} if known is None else {v.name: v for v in known.views}
         self._trust = LazyTrust(known)
         self._gaussians: Gaussians | None = None
@@ -160,9 +168,8 @@ class Viewer:
             self._reach = max(float(start.viewmat[2, :3] @ (middle - start.center)), 1e-6)
         else:
             start = orbit(gaussians, 1, up=self._up)[0]
-            self._reach = float(
-                np.linalg.norm(start.center - content(gaussians.means, gaussians.opacities)[0])
-            )
+            middle = content(gaussians.means, gaussians.opacities)[0]
+            self._reach = float(np.linalg.norm(start.center - middle))
         first = self._server.initial_camera
         first.position = start.center
         first.look_at = start.center + self._reach * start.viewmat[2, :3]
@@ -308,7 +315,7 @@ class Viewer:
 
     def _path(self) -> list[Camera]:
         """Of 30 frames per second and one size, with even sides, as films need."""
-        frames = camera_path(self._keys, 30 * int(self._length.value))
+        frames = camera_path(self._keys, 30 * int(self._length.value), sort=False)
         return [Camera(c.width - c.width % 2, c.height, c.K, c.viewmat) for c in frames]
 
     def _play(self, event: Any) -> None:
@@ -328,7 +335,8 @@ class Viewer:
         else:
             path = self._folder / PATH_FILE
             save_path(path, self._path(), world=None if self._gaussians is None else self._gaussians.world)
-            self._tell(f"Saved. `hqgs render {self._folder} --path {path} --out path.mp4`")
+            command = ["hqgs", "render", str(self._source), "--path", str(path), "--out", "path.mp4"]
+            self._tell(f"Saved. `{shlex.join(command)}`")
 
     def _tell(self, text: str = "") -> None:
         views = f"{len(self._keys)} view{'' if len(self._keys) == 1 else 's'}."
@@ -336,6 +344,7 @@ class Viewer:
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:
-    """Markdown; names of files may hold what its tables mean otherwise."""
-    lines = (f"| {name} | {value} |".replace("\n", " ") for name, value in rows)
+    """Markdown; names of files, and reports of others' runs, may hold what it takes for HTML or a table."""
+    cells = ([html.escape(cell).replace("|", "&#124;").replace("\n", " ") for cell in row] for row in rows)
+    lines = (f"| {name} | {value} |" for name, value in cells)
     return "\n".join(["| | |", "|---|---|", *lines])

@@ -7,6 +7,7 @@ photos cannot tell it. A scene is shown as that mean camera would, without its v
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from hqgs.photos.look import darken, falloff, respond, squared_radii
 from hqgs.scene.scene import Camera
 from hqgs.training.constants import STEEPEST
 
+KEPT = 8  # maps of squared radii; photos may each have a camera of their own
+
 
 class LearnedDevices:
     """The cameras of a scene's training photos."""
@@ -30,7 +33,7 @@ class LearnedDevices:
         self._response = _trained(first.response if response else [])
         counts = np.bincount(first.of_photo[first.of_photo >= 0], minlength=len(first))
         self._shares = torch.from_numpy(counts / max(counts.sum(), 1))
-        self._squares: dict[tuple[int, int, float, float], Tensor] = {}
+        self._squares = lru_cache(KEPT)(_squares)
         self.center()
 
     def develop(self, number: int, camera: Camera, taken: Tensor) -> Tensor:
@@ -41,10 +44,9 @@ class LearnedDevices:
         planes = taken.permute(2, 0, 1).contiguous()  # a factor of a channel, or of a pixel, is quicker so
         if self._vignetting:
             height, width = taken.shape[:2]
-            key = height, width, float(camera.K[0, 2]), float(camera.K[1, 2])
-            if key not in self._squares:
-                self._squares[key] = torch.from_numpy(squared_radii(height, width, camera.K)).to(taken.dtype)
-            planes = darken(planes, falloff(self._squares[key], self._vignetting[device].to(taken.dtype)))
+            center = float(camera.K[0, 2]), float(camera.K[1, 2])
+            squares = self._squares(height, width, center, taken.dtype)
+            planes = darken(planes, falloff(squares, self._vignetting[device].to(taken.dtype)))
         if self._response:
             planes = respond(planes, self._response[device])
         return planes.permute(1, 2, 0).contiguous()
@@ -81,6 +83,13 @@ class LearnedDevices:
 
     def _named(self) -> dict[str, list[Tensor]]:
         return {"vignetting": self._vignetting, "response": self._response}
+
+
+def _squares(height: int, width: int, center: tuple[float, float], dtype: torch.dtype) -> Tensor:
+    """r^2 of each pixel of photos with this principal point, [H, W]."""
+    K = np.eye(3)
+    K[:2, 2] = center
+    return torch.from_numpy(squared_radii(height, width, K)).to(dtype)
 
 
 def groups_of(named: Mapping[str, list[Tensor]]) -> list[dict[str, Any]]:
