@@ -208,8 +208,9 @@ def _back(
     pixels of `counts` [H, W] alone count, times the pixel over what the values [N, D] render to there."""
     values = values.clone().requires_grad_()
     render = gaussians.rasterize(camera, values, near_plane=gaussians.near_plane())[0][0]
-    over = (pixels + FLOOR) / (render.detach() + FLOOR)
-    render.backward(pixels if counts is None else over * counts[..., None])
+    if counts is not None:
+        pixels = (pixels + FLOOR) / (render.detach() + FLOOR) * counts[..., None]
+    render.backward(pixels)
     assert values.grad is not None
     return values.grad
 

@@ -45,6 +45,7 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
     shown = [name for name in LABELS if one["mean"][name] is not None]
     order = sorted(one["views"], key=lambda name: one["views"][name]["psnr"] or np.inf)
     chosen = [judged[0].names.index(name) for name in order[:SHEET_PHOTOS]]
+    names = (Path(one["name"]).name, None) if against is None else short_names(one, against)
     return filled(
         "judge.html.j2",
         title=f"{Path(one['name']).name} on {protocol['photos']} photos",
@@ -68,8 +69,8 @@ def judge_page(found: dict[str, Any], judged: Sequence[Judged]) -> str:
         ],
         patch=PATCH,
         white=int(WORST_SHOWN),
-        one=Path(one["name"]).name if against is None else short_names(one, against)[0],
-        other=None if against is None else short_names(one, against)[1],
+        one=names[0],
+        other=names[1],
         pairs=[_pair(judged, number, one["views"], against) for number in chosen],
         pairs_left=len(order) - len(chosen),
         photo_heads=["photo", *(LABELS[name] for name in shown), "fine contrast", "the error comes from"],
