@@ -62,3 +62,21 @@ def test_photos_that_know_no_points_and_masks_are_left_alone() -> None:
     strangers = [replace(view, name=f"{view.name}?") for view in SCENE.train]
     assert found(strangers)[0].shape == (0, 3)
     assert len(found(SCENE.train, 0)[0]) == 0
+
+
+def test_photos_from_one_place_tell_no_depth() -> None:
+    assert SCENE.seen is not None
+    copies = [(k, view) for view in SCENE.train for k in range(3)]  # a burst at each place
+    views = [replace(view, name=f"{k} {view.name}") for k, view in copies]
+    seen = {f"{k} {view.name}": SCENE.seen[view.name] for k, view in copies}
+    agreement = Agreement(views, seen)
+    for most in (4, 8):
+        assert 3 not in {k // 3 for k in agreement.asked(9, most)}
+    assert len({k // 3 for k in agreement.asked(9)}) == 4
+    points, _, _ = points_found_back(views, SCENE.points, seen, 1600, 0, agreement)
+    assert len(points) > 1000
+    assert np.mean(off_the_plane(points) < 0.02) > 0.97  # 0.56 where copies are asked
+
+    still = {str(k): seen[views[0].name] for k in range(6)}
+    one_place = [replace(views[0], name=name) for name in still]
+    assert not len(points_found_back(one_place, SCENE.points, still, 800, 0, Agreement(one_place, still))[0])

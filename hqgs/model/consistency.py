@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
+from scipy.spatial.distance import cdist
 
 from hqgs import _rust
-from hqgs.model.constants import AGREE_LONGEST, AGREE_SMOOTH, AGREED, AGREEING, ASKED
+from hqgs.model.constants import AGREE_LONGEST, AGREE_SMOOTH, AGREED, AGREEING, APART, ASKED
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Camera, View
@@ -42,7 +43,8 @@ class Agreement:
     """The training photos as they are asked."""
 
     def __init__(self, views: Sequence[View], seen: Mapping[str, NDArray[np.intp]]) -> None:
-        """`seen`: by the view's name, which points it sees. Views that share most are asked first."""
+        """`seen`: by the view's name, which points it sees. Views that share most are asked first, but of
+        those from one place, as of a burst, one."""
         self.looks: list[SmallPhoto] = [SmallPhoto.of(view) for view in views]
         rows = [np.unique(seen.get(view.name, np.zeros(0, np.intp))) for view in views]
         ends = np.cumsum([0, *map(len, rows)])
@@ -50,11 +52,20 @@ class Agreement:
         sees = csr_array((np.ones(ends[-1], np.intp), np.concatenate(rows), ends), (len(views), points))
         self._shared: NDArray[np.intp] = (sees @ sees.T).toarray()
         np.fill_diagonal(self._shared, -1)
+        centers = np.stack([view.camera.center for view in views])
+        far = cdist(centers, centers)
+        self._apart: NDArray[np.bool_] = far > APART * np.median(far)
 
     def asked(self, number: int, most: int = ASKED) -> list[int]:
-        """Numbers of the photos that share most points with a view, at most so many."""
-        order = np.argsort(-self._shared[number], kind="stable")
-        return [int(k) for k in order[: min(most, len(order) - 1)]]
+        """Numbers of the photos that share most points with a view, at most so many, and apart from it."""
+        order = [int(k) for k in np.argsort(-self._shared[number], kind="stable") if self._apart[number, k]]
+        first = list[int]()
+        for k in order:
+            if len(first) == most:
+                break
+            if self._apart[k, first].all():
+                first.append(k)
+        return (first + [k for k in order if k not in first])[:most]
 
     def depths(
         self,

@@ -19,6 +19,7 @@ AROUND, WIDENED, LEAST_AROUND = 6, 1.6, 3
 STRAY = 0.01  # share of the nearest and of the farthest points of a view that do not bound its depths
 AGREE_LONGEST, AGREE_SMOOTH = 800, 1.0  # px: of a smaller copy; of noise there is less then
 ASKED, AGREEING, AGREED = 4, 2, 0.6  # photos that are asked, that must agree, and the correlation of patches
+APART = 0.01  # of the median distance between cameras: photos nearer than that are from one place
 # Points that are found back: px of the small copies, within which; photos that are asked in the second look;
 # the correlation that one alone must have; and what widens a range between known depths.
 FOUND_BACK, ASKED_AGAIN, ALONE, AROUND_KNOWN = 1.0, 8, 0.8, 1.15
