@@ -74,6 +74,7 @@ MISTAKES = {
     "render a.ply --out b.png --views all --up 0 0 1": "--up is of paths, and --views has the run's own",
     "render a.ply --out b.png --background 255 0 0": "--background is 255 0 0, wanted three numbers in 0..1",
     "render a.ply --out b.png --background nan 0 0": "--background is nan 0 0, wanted three numbers in 0..1",
+    "render a.ply --out b.mp4 --path path.json --up 0 0 1": "--up is of an orbit; a path file has its own",
     "render a.ply --out b.png --up 0 0 0": "up is [0.0, 0.0, 0.0], wanted a direction",
     "render a.ply --out notes.txt/a.gif": "--out notes.txt/a.gif lies below {root}/notes.txt, which",
     "judge a.ply --photos scene --background nan 0 0": "--background is nan 0 0, wanted three numbers in",

@@ -21,12 +21,14 @@ from hqgs.scene.scene import Scene
 from hqgs.show.page.page import Page, write_page
 
 SIZE = (120, 80)
+BEHIND = (0.1, 0.5, 0.8)
 
 
 @pytest.fixture(scope="module")
 def trained() -> tuple[hqgs.Run, Scene]:
     scene = tiny_scene()
-    run = hqgs.train(scene, iterations=300, method="3dgs", leave_out="none")
+    config = hqgs.TrainConfig(iterations=300, method="3dgs", leave_out=(), background=BEHIND)
+    run = hqgs.train(scene, config=config)
     model = run.model
     rng = torch.Generator().manual_seed(1)
     kinds = 0.15 * torch.randn((5, *model.shN.shape[1:]), generator=rng)  # so that every harmonic matters
@@ -53,7 +55,7 @@ def test_the_page(trained: tuple[hqgs.Run, Scene], tmp_path: Path) -> None:
             )
             camera = with_size(view.camera, *SIZE)
             with torch.no_grad():
-                ours = 255 * run.model.render(camera).clamp(0, 1).numpy()
+                ours = 255 * run.model.render(camera, background=BEHIND).clamp(0, 1).numpy()
             assert shown.shape == ours.shape
             assert ours.std() > 20
             error = float(np.mean((shown - ours) ** 2))

@@ -125,6 +125,7 @@ def test_a_bare_file_gets_an_orbit(folder: Path, tmp_path: Path) -> None:
     [
         (["--views", "nobody"], "--views: the run has no photo 'nobody'; there are: train, test, all, view0"),
         (["--path", "no.json"], "--path is 'no.json': no such file, and none of: cameras, orbit"),
+        (["--up", "0", "0", "1"], "--up is of an orbit (--path orbit); a way through the cameras looks"),
         (["--frames", "0"], "frames is 0, wanted at least 1"),
         (["--fps", "fast"], "--fps is fast, wanted a number"),
         (["--fps", "0"], "fps is 0.0, wanted a number above 0"),

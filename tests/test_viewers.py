@@ -229,6 +229,7 @@ def test_the_kit_and_its_judge(
         (["--viewer", shots], "--viewer needs --kit DIR"),
         (["--kit", kit], "exists and is not an empty folder"),
         ([kit / "plain.ply", "--kit", tmp_path / "k2"], "take no scene of your own"),
+        (["--kit", tmp_path / "k2", "--out", tmp_path / "o"], "--kit takes no other option than --viewer"),
     ]
     for arguments, words in cases:
         assert main(["judge", *map(str, arguments)]) == 2

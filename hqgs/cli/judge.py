@@ -130,6 +130,8 @@ def viewers(options: Judge) -> int:
             raise ValueError(f"--kit and --viewer take no scene of your own, got {options.source}")
         if folder is None:
             raise ValueError("--viewer needs --kit DIR, the kit that the viewer has shown")
+        if options != Judge(kit=folder, viewer=shots):
+            raise ValueError("--kit takes no other option than --viewer")
         from hqgs.evaluation.viewers.faults import Imitations
         from hqgs.evaluation.viewers.kit import kit_file, read_screenshot, screenshots, write_kit
         from hqgs.scene.camera_files import load_cameras

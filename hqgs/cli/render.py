@@ -56,7 +56,7 @@ class Render:
     up: Annotated[
         tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")
     ] = None
-    """Where up is in a scene file without cameras (0 -1 0)."""
+    """Where up is, of an orbit (that of the cameras; 0 -1 0 in a scene file without)."""
 
 
 OPTIONS = Render
@@ -142,12 +142,16 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     if path not in PATHS:
         if frames is not None:
             raise ValueError("--frames is for paths that are made here; a path file has its own")
+        if options.up is not None:
+            raise ValueError("--up is of an orbit; a path file has its own directions")
         if not Path(path).is_file():
             raise FileNotFoundError(f"--path is {path!r}: no such file, and none of: {', '.join(PATHS)}")
         own, rate = load_path(path)
         return None, [moved(camera, gaussians.world) for camera in own], rate
     if known is None or not known.train:
         return None, orbit(gaussians, count, up=UP if options.up is None else options.up), FPS
+    if options.up is not None and path != "orbit":
+        raise ValueError("--up is of an orbit (--path orbit); a way through the cameras looks as they do")
     up = known.up if options.up is None else options.up
     made = orbit(known.train, count, up=up) if path == "orbit" else camera_path(known.train, count, cuts=True)
     return None, made, FPS

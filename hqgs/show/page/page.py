@@ -114,7 +114,9 @@ def page_text(page: Page) -> str:
         verdict=told_verdict(report),
         facts=_facts(report, page.scene),
         report=report,
-        scene=None if page.gaussians is None else _scene(page.scene, page.gaussians),
+        scene=None
+        if page.gaussians is None
+        else _scene(page.scene, page.gaussians, report["config"]["background"]),
         splats=Markup("\n".join((TEMPLATES / name).read_text(encoding="utf-8") for name in SCRIPTS)),
         pairs=[pair(view, measured.get(view.name)) for view in chosen],
         pairs_left=len(page.views) - len(chosen),
@@ -171,7 +173,7 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
     return facts
 
 
-def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
+def _scene(scene: Scene, gaussians: Gaussians, background: Sequence[float]) -> dict[str, Any]:
     packed = pack_scene(gaussians)
     views = [*scene.test, *scene.train]
     views = [views[k] for k in evenly(len(views), MOST_CAMERAS)]
@@ -185,7 +187,7 @@ def _scene(scene: Scene, gaussians: Gaussians) -> dict[str, Any]:
     first = cameras[0]
     return {
         "data": packed.data,
-        "head": packed.head,
+        "head": {**packed.head, "background": background},
         "views": [{"name": v.name, **_view(v.camera, middle)} for v in views],
         "up": scene_up(scene).tolist(),
         "aspect": f"{first.width} / {first.height}",

@@ -95,7 +95,7 @@ class SplatViewer {
     gl.vertexAttribDivisor(0, 1);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.clearColor(0, 0, 0, 1);
+    gl.clearColor(...this.head.background, 1);
   }
 
   startSorting() {
