@@ -22,7 +22,7 @@ from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.constants import MOST_CAMERAS
 from hqgs.evaluation.held_out import RenderedView, names_of
 from hqgs.evaluation.photo_facts import learned_words, photo_record, photo_words
-from hqgs.evaluation.records import HistoryEntry, PlanRowRecord, Report, ViewMetricValues, alike
+from hqgs.evaluation.records import HistoryEntry, Json, PlanRowRecord, Report, ViewMetricValues, alike
 from hqgs.evaluation.verdict import judged_by, told, verdict
 from hqgs.model.gaussians import Gaussians
 from hqgs.photos.pixels import as_floats, to_uint8, upright
@@ -173,7 +173,7 @@ def _facts(report: Report, scene: Scene) -> list[tuple[str, str]]:
     return facts
 
 
-def _scene(scene: Scene, gaussians: Gaussians, background: Sequence[float]) -> dict[str, Any]:
+def _scene(scene: Scene, gaussians: Gaussians, background: Json) -> dict[str, Any]:
     packed = pack_scene(gaussians)
     views = [*scene.test, *scene.train]
     views = [views[k] for k in evenly(len(views), MOST_CAMERAS)]
