@@ -102,7 +102,7 @@ def test_an_opacity_of_nothing_spoils_no_step() -> None:
 
 def test_a_scene_in_another_frame_is_refused() -> None:
     moved = foggy().like(foggy().named() | {"means": foggy().means + 100.0})
-    with pytest.raises(ValueError, match="6 of 6 renders are farther from their training photo than one"):
+    with pytest.raises(ValueError, match="6 of 6 renders are farther from their photo than one"):
         clean(moved, scene(), steps=1)
 
 

@@ -91,13 +91,18 @@ def interval_words(one: dict[str, Any]) -> str:
 
 def wrong_frame(one: dict[str, Any]) -> list[str]:
     """That the scene and the cameras do not fit, where renders show nothing of the photos."""
-    count, photos = one.get("worse_than_flat", 0), len(one["views"])
-    if 2 * count <= photos:
-        return []
-    return [
-        f"{count} of {photos} renders are farther from their photo than one flat colour is: the scene file "
-        "and the photos' cameras are of different captures, or in different frames"
-    ]
+    words = apart(one.get("worse_than_flat", 0), len(one["views"]))
+    return [] if words is None else [words]
+
+
+def apart(worse: int, photos: int) -> str | None:
+    """What it means that so many of the renders are worse than one flat colour; None of at most half."""
+    if 2 * worse <= photos:
+        return None
+    return (
+        f"{worse} of {photos} renders are farther from their photo than one flat colour is: the scene "
+        "file and the photos' cameras are of different captures, or in different frames"
+    )
 
 
 def not_measured(one: dict[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.evaluation.held_out import held_out_renders
 from hqgs.evaluation.intervals import half_width
 from hqgs.evaluation.judge import flat_psnr
+from hqgs.evaluation.judge_words import apart
 from hqgs.evaluation.metrics import psnr
 from hqgs.model.formats.ply import MOST_LOGIT
 from hqgs.model.gaussians import Gaussians
@@ -158,12 +159,8 @@ def check_frame(gaussians: Gaussians, scene: Scene, background: tuple[float, flo
         psnr is not None and psnr < flat_psnr(view)
         for psnr, view in zip(_psnrs(gaussians, scene, some, background), some, strict=True)
     )
-    if 2 * worse > len(some):
-        raise ValueError(
-            f"{worse} of {len(some)} renders are farther from their training photo than one flat colour is: "
-            f"the scene file and the cameras of {scene.name} are of different captures, or in different "
-            "frames"
-        )
+    if words := apart(worse, len(some)):
+        raise ValueError(f"{scene.name}: {words}")
 
 
 def held_out_psnrs(
