@@ -29,7 +29,7 @@ def test_the_rows() -> None:
     assert config("auto", 3).leave_out == ("photos", "passersby", "growth", "weight")
     assert config("auto", 3).seed == 3
     assert all(config(label) == TrainConfig(
-        2_000, "3dgs", leave_out=config(label).leave_out).scaled() for label in protocol.labels)  # fmt: skip
+        2_000, AUTO, leave_out=config(label).leave_out).scaled() for label in protocol.labels)  # fmt: skip
 
 
 def test_a_quick_run_is_written_and_kept(

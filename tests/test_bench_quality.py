@@ -344,10 +344,10 @@ def test_protocols() -> None:
         )  # spelled as the parser does
     scene = tiny_scene()
     standard = grid(PROTOCOLS["standard"], [scene, replace(scene, name="b")])
-    assert len(standard) == 2 * 6 * 2 * 4
-    assert [cell.row.label for cell in standard[:4]] == ["3dgs", "srgs", "paper", "hqgs"]
-    assert len({cell.group for cell in standard[:4]}) == 1
-    assert {cell.seed for cell in standard[:48]} == {0}
+    assert len(standard) == 2 * 6 * 2 * 5
+    assert [cell.row.label for cell in standard[:5]] == ["3dgs", "srgs", "paper", "hqgs", "no formation"]
+    assert len({cell.group for cell in standard[:5]}) == 1
+    assert {cell.seed for cell in standard[:60]} == {0}
     assert PROTOCOLS["ablation"].labels == [*(f"V{k}" for k in range(1, 7)), "l1", "paper"]
     for cell in grid(PROTOCOLS["ablation"], [scene]):
         assert cell.config.hqgs.guidance == "paper"
@@ -356,7 +356,9 @@ def test_protocols() -> None:
     assert [cell.config.batch for cell in grid(PROTOCOLS["ranks"], [scene])] == [1, 2, 4, 8]
     assert TrainConfig(50_000).scaled().densify.stop == 15_000
     for cell in standard:
-        if not cell.row.paper:
+        if cell.row.label == "no formation":
+            assert cell.config.hqgs.formation == "none"
+        elif not cell.row.paper:
             config = TrainConfig(2_000, cell.row.label, cell.seed, leave_out=()).scaled()
             assert cell.config == config
 

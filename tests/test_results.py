@@ -158,18 +158,20 @@ def test_where_runs_are_from_is_said_once() -> None:
 
 def test_seconds_by_hand() -> None:
     times = frame(
-        run_of("3dgs", 28.0, seconds=100.0, history="9:20|31:25|90:28"),
-        run_of("first commit", 24.0, threads=2, seconds=90.0, history="20:22|40:24"),
-        run_of("30 s", 26.0, seconds=29.0, history=""), run_of("60 s", 27.95, seconds=61.0, history=""),
+        run_of("3dgs", 28.0, seconds=100.0, setup_seconds=2, history="9:20|31:25|90:28"),
+        run_of("OpenSplat", 24.0, threads=2, seconds=90.0, history="20:22|40:24"),
+        run_of("30 s", 26.0, seconds=29.0, setup_seconds=2, history=""),
+        run_of("60 s", 27.95, seconds=61.0, setup_seconds=2, history=""),
     )  # fmt: skip
     assert set(ours(times)["row"]) == {"3dgs", "30 s", "60 s"}
-    assert where(times, "first commit") == "2 cores of CPU, 2026-11-26"
+    assert where(times, "OpenSplat") == "2 cores of CPU, 2026-11-26"
     assert [then("9:20|31:25", seconds) for seconds in (5.0, 30.0, 31.0)] == [None, 20.0, 25.0]
     assert after(times, "a", "3dgs", 30.0) == 20.0
-    assert over_time(times, ["a"], "first commit").splitlines()[-1] == "| a | +4.00 | +3.95 |"
-    assert lead(times, "30 s").mean == pytest.approx(4.0)
-    assert levels(times, ["a"]).splitlines()[-1] == "| a | 27.90 | 61 | 100 |"
-    assert levels(times.iloc[:3], ["a"]).splitlines()[-1] == "| a | 27.90 | – | 100 |"
+    assert over_time(times, ["a"], "OpenSplat").splitlines()[-1] == "| a | +4.00 | +3.95 |"
+    assert lead(times, "30 s", ["a"], "OpenSplat").mean == pytest.approx(4.0)
+    assert lead(times, "60 s", ["a"]).mean == pytest.approx(2.95)
+    assert levels(times, ["a"]).splitlines()[-1] == "| a | 27.90 | 63 | 92 |"
+    assert levels(times.iloc[:3], ["a"]).splitlines()[-1] == "| a | 27.90 | – | 92 |"
 
 
 def test_what_leaving_out_saves_and_what_poses_cost() -> None:

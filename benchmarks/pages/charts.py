@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from benchmarks.pages.figures import gain, pick, records, unbeaten
-from benchmarks.pages.sections import FIRST, OPENSPLAT, asked
+from benchmarks.pages.sections import OPENSPLAT, asked
 from benchmarks.rows import pairs_of
 
 BLUE, ORANGE, GREEN, GREY = "#1f6fb2", "#c2571a", "#3a8f3a", "#6b6b6b"
@@ -84,7 +84,7 @@ def against_seconds(times: DataFrame) -> Figure:
     scenes = list(dict.fromkeys(pick(times, row="3dgs")["scene"]))
     figure, grid = panels(4 * len(scenes), 4, 1, len(scenes))
     for axes, scene in zip(grid, scenes, strict=True):
-        for row, shade in ((FIRST, GREEN), (OPENSPLAT, ORANGE), ("3dgs", GREY)):
+        for row, shade in ((OPENSPLAT, ORANGE), ("3dgs", GREY)):
             for line in records(pick(times, scene=scene, row=row)):
                 points = [(float(at), psnr) for at, psnr in pairs_of(line["history"])]
                 axes.plot(*zip(*points, strict=True), color=shade, label=row)

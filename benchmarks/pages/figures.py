@@ -1,11 +1,13 @@
 """What the pages compute of the tables: means, gains with their scatter, tables, where runs are from.
 
 A gain is the mean of differences between two rows in runs that share scene, photos, seed and length. Its
-scatter is half its interval (`hqgs.evaluation.intervals`); a difference within it is not called a gain.
+scatter is half its interval (`hqgs.evaluation.intervals`) over captures, whose runs go together; over runs
+where there is one capture. A difference within it is not called a gain.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -58,8 +60,9 @@ class Gain:
 
     @cached_property
     def error(self) -> float | None:
-        """Half the interval of the mean over runs; None of a single run."""
-        return half_width(self.runs["gain"].tolist())
+        """Half the interval of the mean over captures, or of one over its runs; None of a single run."""
+        captures = self.runs.groupby(self.runs["scene"].map(capture))["gain"].mean()
+        return half_width((captures if len(captures) > 1 else self.runs["gain"]).tolist())
 
     @property
     def sure(self) -> bool:
@@ -82,6 +85,11 @@ class Gain:
             return f"does not differ from `{self.base}` beyond scatter ({self.text('+' + form)} {unit})"
         verb, to = ("gains", "over") if self.mean > 0 else ("loses", "to")
         return f"{verb} {abs(self.mean):{form}} ± {self.error:{form}} {unit} {to} `{self.base}`"
+
+
+def capture(scene: str) -> str:
+    """What a scene is of: `fern` of `fern-3`, `beyond` of `beyond:8`."""
+    return re.sub(r"[-:][0-9]+$", "", scene)
 
 
 def gain(
