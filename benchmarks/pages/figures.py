@@ -61,8 +61,11 @@ class Gain:
     @cached_property
     def error(self) -> float | None:
         """Half the interval of the mean over captures, or of one over its runs; None of a single run."""
-        captures = self.runs.groupby(self.runs["scene"].map(capture))["gain"].mean()
-        return half_width((captures if len(captures) > 1 else self.runs["gain"]).tolist())
+        gains: dict[str, list[float]] = {}
+        for scene, value in zip(self.runs["scene"], self.runs["gain"], strict=True):
+            gains.setdefault(capture(scene), []).append(float(value))
+        means = [sum(values) / len(values) for values in gains.values()]
+        return half_width(means if len(means) > 1 else [one for values in gains.values() for one in values])
 
     @property
     def sure(self) -> bool:
