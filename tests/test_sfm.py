@@ -230,12 +230,14 @@ def test_masked_pixels_give_no_points(cards: Scene) -> None:
 
 
 def test_all_code_that_a_reconstruction_depends_on_is_in_its_key() -> None:
+    hqgs = colmap_run.PROGRAM.parents[2]
     waiting, found = [colmap_run.PROGRAM], set[Path]()
     while waiting:
         path = waiting.pop()
         found.add(path)
-        names = re.findall(r"^from hqgs\.scene\.sfm\.(\w+) import", path.read_text(), re.MULTILINE)
-        waiting += [other for name in names if (other := path.with_name(f"{name}.py")) not in found]
+        names = re.findall(r"^from hqgs\.(scene\.sfm|photos)\.(\w+) import", path.read_text(), re.MULTILINE)
+        files = [hqgs.joinpath(*of.split("."), f"{name}.py") for of, name in names]
+        waiting += [other for other in files if other not in found]
     assert found == set(colmap_run.PARTS)
 
 

@@ -12,7 +12,8 @@ from typing import Any
 from hqgs.photos.files import DECODE_ERRORS, open_photo
 
 _ORIENTATION, _MAKE, _MODEL, _MORE = 274, 271, 272, 0x8769  # tags; the last one is a table of its own:
-_FOCAL, _FOCAL_35MM, _WIDTH, _X_RESOLUTION, _RESOLUTION_UNIT = 37386, 41989, 40962, 41486, 41488
+_FOCAL, _FOCAL_35MM, _WIDTH, _HEIGHT = 37386, 41989, 40962, 40963
+_X_RESOLUTION, _RESOLUTION_UNIT = 41486, 41488
 _XMP = ("xmp", "XML:com.adobe.xmp")  # what Pillow calls it in JPEG, WebP and HEIC, and in PNG
 _PANORAMA = re.compile(rb"GPano:ProjectionType\W{1,3}equirectangular\b")  # an attribute, or an element
 _TAKEN = 36867  # in that table too
@@ -77,7 +78,8 @@ def _focal(more: dict[int, Any], width: int, height: int) -> float:
     """In px; 0 where it is not told."""
     if (equivalent := _number(more, _FOCAL_35MM)) > 0:
         return equivalent / _DIAGONAL * math.hypot(width, height)
-    stored = _number(more, _WIDTH) or max(width, height)  # the sensor's side, if the photo was shrunk since
+    # The sensor's longer side, if the photo was shrunk, or turned, since.
+    stored = max(_number(more, _WIDTH), _number(more, _HEIGHT)) or max(width, height)
     per_mm = _number(more, _X_RESOLUTION) / _MM.get(int(_number(more, _RESOLUTION_UNIT)), 25.4)
     return _number(more, _FOCAL) * per_mm * max(width, height) / stored
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from hqgs.photos.constants import LARGEST
+from hqgs.photos.eight_bits import grey
 
 HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
 JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe")
@@ -20,6 +21,7 @@ RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", 
 DECODE_ERRORS = (
     *(OSError, SyntaxError, ValueError, EOFError, struct.error, Image.DecompressionBombError),
     MemoryError,  # Pillow reads as many bytes as a chunk says it has
+    RuntimeError,  # of the decoders of AVIF and HEIC
 )
 
 
@@ -28,6 +30,8 @@ _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b
 _registering = Lock()
 _LOSSY = ("JPEG", "MPO", "HEIF", "JPEG2000", "AVIF")  # formats that change values around an edge
 GRID = 4  # cells of a glance's small picture, each way
+_FLOATS = "floating-point pixels have no agreed white: save it with 8 or 16 bits"
+_NOT_RGB = ("P", "CMYK", "LAB", "YCbCr", "HSV")  # modes whose channels are no brightness
 _HALF = 128  # of 8 bits: from here on a pixel of a lossy mask counts
 
 
@@ -98,9 +102,11 @@ def glance(path: Path) -> Glance:
         if not path.stat().st_size:
             raise UnreadableError("0 bytes: not downloaded from a cloud, or not copied to its end")
         with open_photo(path) as photo:
+            if photo.mode == "F":
+                raise UnreadableError(_FLOATS)
             size = photo.size
             photo.draft("L", (max(1, size[0] // 8), max(1, size[1] // 8)))  # a JPEG is quickly read like this
-            small = photo.convert("L").resize((GRID, GRID), Image.Resampling.BOX)
+            small = grey(photo).resize((GRID, GRID), Image.Resampling.BOX)
             return Glance(size, photo.format or "", np.array(small))
     except UnidentifiedImageError as error:
         raise UnreadableError("no picture") from error
@@ -154,7 +160,7 @@ def decode(
             if least is not None:
                 photo.draft(None, least)  # pyright: ignore[reportArgumentType]  (None keeps the mode)
             if photo.mode == "F":
-                raise ValueError("floating-point pixels have no agreed white: save it with 8 or 16 bits")
+                raise ValueError(_FLOATS)
             if photo.mode.startswith("I"):
                 grey = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
                 if grey.min() < 0 or grey.max() > 65535:
@@ -200,7 +206,7 @@ def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     try:
         with open_photo(path) as file:
             lossy = file.format in _LOSSY or (file.format == "WEBP" and _is_lossy_webp(path))
-            pixels = np.asarray(file.convert("RGB") if file.mode == "P" else file)
+            pixels = np.asarray(file.convert("RGB") if file.mode in _NOT_RGB else file)
     except DECODE_ERRORS as e:
         raise UnreadableError(f"cannot read the mask {path}: {e}") from e
     alpha = pixels[..., -1] if pixels.ndim == 3 and pixels.shape[2] in (2, 4) else None

@@ -57,7 +57,9 @@ def face_name(name: str, face: str) -> str:
 
 
 def photo_name(name: str, face: str) -> str:
-    """The photo whose face is called so: of `walk/7.front.jpg`, `walk/7.jpg`."""
+    """The photo whose face is called so: of `walk/7.front.jpg`, `walk/7.jpg`; of no face, the name itself."""
+    if not face:
+        return name
     path = PurePosixPath(name)
     stem = path.stem.removesuffix(f".{face}")
     return str(path.with_name(stem if stem == path.stem else stem + path.suffix))

@@ -46,7 +46,7 @@ def film_frames(
     around = _is_around(path)
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
-    name = f"7 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
+    name = f"8 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
     target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
@@ -138,7 +138,7 @@ def _sharpest(
             stream = film.streams.video[0]
             stream.thread_type = "AUTO"
             curve, wide = transfer(stream.codec_context), stream.sample_aspect_ratio
-            seconds = _seconds(film, stream)
+            seconds = _seconds(film, stream) or _seconds_by_packets(av, path)
             wanted = count or int(np.clip(round(FRAMES_A_SECOND * seconds), FRAMES_FEWEST, FRAMES_MOST))
             interval = seconds / wanted if seconds > 0 else 1 / FRAMES_A_SECOND
             best, at, best_sharpness = None, 0, -1.0
@@ -188,6 +188,16 @@ def _seconds(film: Any, stream: Any) -> float:
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     return film.duration / 1e6 if film.duration else 0.0
+
+
+def _seconds_by_packets(av: Any, path: Path) -> float:
+    """Of a film that does not tell, as browsers record them: between its first picture and its last."""
+    with av.open(str(path), metadata_errors="ignore") as film:
+        stream = film.streams.video[0]
+        times = [
+            float(packet.pts * stream.time_base) for packet in film.demux(stream) if packet.pts is not None
+        ]
+    return max(times) - min(times) if times else 0.0
 
 
 def _sharpness(frame: Any) -> float:

@@ -70,6 +70,8 @@ def georeference(centers: Array, places: Sequence[Gps]) -> Georeference | None:
         gps, centers = gps[high], centers[high]
     if len(np.unique(gps, axis=0)) < GPS_LEAST:
         return None
+    if np.ptp(gps[:, 1]) > 180:  # on both sides of the date line
+        gps = np.column_stack([gps[:, 0], gps[:, 1] % 360, gps[:, 2]])
     start = np.median(gps, axis=0)
     target = _enu(gps, start)
     if len(target) < 3 * GPS_LEAST:  # so few that every one counts

@@ -40,7 +40,9 @@ def listed_split(folders: Sequence[Path], root: Path) -> Split | None:
     for folder in dict.fromkeys(folders):
         for name in LISTS:
             if (path := folder / name).is_file():
-                return _from_json(path, path.relative_to(root).as_posix())
+                split = _from_json(path, path.relative_to(root).as_posix())
+                if split is not None:
+                    return split
         found = {key: folder / f"{key}.txt" for key in (TRAIN, TEST, VAL)}
         lists = {key: _lines(path) for key, path in found.items() if path.is_file()}
         if TEST in lists or VAL in lists:
@@ -100,9 +102,17 @@ def held_out(
 def _photo(name: str, known: Mapping[str, str]) -> str | None:
     """The photo that a list calls so; None: there is none."""
     plain = unquote(name).replace("\\", "/").strip()
-    last = plain.rsplit("/", 1)[-1]
-    options = (name, plain, last, last.rsplit(".", 1)[0])
-    return next((known[option] for option in options if option in known), None)
+    folder, _, last = plain.rpartition("/")
+    for option in (name, plain, last, last.rsplit(".", 1)[0]):
+        if (found := known.get(option)) is not None:
+            other = found.rpartition("/")[0]
+            if option in (name, plain) or not (folder and other) or _last(folder) == _last(other):
+                return found
+    return None
+
+
+def _last(folder: str) -> str:
+    return folder.rsplit("/", 1)[-1]
 
 
 def names_by_any(names: Sequence[str]) -> dict[str, str]:

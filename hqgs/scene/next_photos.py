@@ -18,6 +18,7 @@ from hqgs.scene.constants import (
     NEXT_MOST,
     WIDER,
 )
+from hqgs.scene.faces import photo_name
 from hqgs.scene.paths import focus, scene_up
 from hqgs.scene.scene import Scene, View
 
@@ -38,10 +39,13 @@ def next_photos(scene: Scene) -> list[Spot]:
     views = sorted([*scene.train, *scene.test], key=lambda view: view.name)
     if len(views) < FEWEST_PHOTOS:
         return []
+    photos = {photo_name(view.name, view.face): view for view in reversed(views)}  # of its faces one
     centers = np.stack([view.camera.center for view in views])
-    return [*_gaps(scene, views, centers), *_loose(scene, views, centers), *_alone(scene, views, centers)][
-        :NEXT_MOST
-    ]
+    return [
+        *_gaps(scene, dict(sorted(photos.items()))),
+        *_loose(scene, photos),
+        *_alone(scene, views, centers),
+    ][:NEXT_MOST]
 
 
 def told_next(scene: Scene) -> list[str]:
@@ -59,8 +63,10 @@ def around(scene: Scene) -> tuple[Array, Array]:
     return focus([view.camera for view in scene.train]), plane
 
 
-def _gaps(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
+def _gaps(scene: Scene, photos: dict[str, View]) -> list[Spot]:
     """Between neighbours around the middle that stand much farther apart than others do."""
+    called, views = [*photos], [*photos.values()]
+    centers = np.stack([view.camera.center for view in views])
     middle, plane = around(scene)
     flat = (centers - middle) @ plane.T
     angles = np.arctan2(flat[:, 1], flat[:, 0])
@@ -74,14 +80,14 @@ def _gaps(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
         if steps[k] < max(GAP, WIDER * usual) or (k == widest and steps[k] > 180):
             continue
         a, b = order[k], order[(k + 1) % len(order)]
-        if _turn(views[a], views[b]) < steps[k] / 2:
+        if not views[a].face and _turn(views[a], views[b]) < steps[k] / 2:
             continue  # both look the same way: they walk by the middle, not around it
         half = angles[a] + np.radians(steps[k]) / 2
         far = np.linalg.norm(flat[[a, b]], axis=1).mean()
         height = (centers[[a, b]] - middle).mean(0)
         at = middle + far * (np.cos(half) * plane[0] + np.sin(half) * plane[1])
         at = at + height - plane.T @ (plane @ height)
-        names = sorted((views[a].name, views[b].name))
+        names = sorted((called[a], called[b]))
         told = f"between {names[0]} and {names[1]}, which are {steps[k]:.0f} degrees apart"
         found.append(Spot(at, told, (names[0], names[1])))
     return found
@@ -100,13 +106,12 @@ def loose_photos(scene: Scene) -> dict[str, float]:
     return dict(sorted(((name, px) for name, px in sure.items() if px > most), key=lambda item: -item[1]))
 
 
-def _loose(scene: Scene, views: list[View], centers: Array) -> list[Spot]:
+def _loose(scene: Scene, photos: dict[str, View]) -> list[Spot]:
     """Beside them."""
-    places = {view.name: center for view, center in zip(views, centers, strict=True)}
     return [
-        Spot(places[name], f"beside {name}, whose place is sure to {px:.1f} px only", (name,))
+        Spot(photos[name].camera.center, f"beside {name}, whose place is sure to {px:.1f} px only", (name,))
         for name, px in loose_photos(scene).items()
-        if name in places
+        if name in photos
     ]
 
 

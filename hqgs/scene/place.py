@@ -89,7 +89,8 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
 def masks_told(root: Path, capture: Capture) -> list[str]:
     """Which photos have no mask, in a sentence, where a folder of masks is there; else nothing."""
     bare = [photo.name for photo in capture.photos if photo.mask_path is None]
-    if not bare or (folder := mask_folder(root)) is None:
+    folder = mask_folder(root) or (capture.folder and mask_folder(capture.folder))
+    if not bare or folder is None:
         return []
     which = "none of them has the name of a photo, and none is used"
     if len(bare) < len(capture.photos):
@@ -122,18 +123,17 @@ def placed(capture: Capture, notes: list[str]) -> Capture:
 
 def located(capture: Capture) -> Georeference | None:
     """Where on Earth the frame of the capture's files is, by the GPS of its photos; None: nothing tells."""
-    found = [
-        (k, tags.gps, tags.above)
-        for k, tags in enumerate(read_exif(photo.path) for photo in capture.photos)
-        if tags.gps
-    ]
+    first = {photo.path: k for k, photo in reversed([*enumerate(capture.photos)])}  # of the faces of a photo
+    found = [(k, tags.gps, tags.above) for path, k in sorted(first.items(), key=lambda item: item[1])
+             if (tags := read_exif(path)).gps]  # fmt: skip
     if len(found) < GPS_LEAST:
         return None
     rows, gps, above = zip(*found, strict=True)
     centers = capture.world.out(_centers(capture))[[*rows]].astype(np.float64)
     places = np.array(gps)
-    if np.isfinite(above).all():  # a barometer tells heights better than GPS, but for where they begin
-        places[:, 2] = np.array(above) + np.median(places[:, 2] - above)
+    high = np.isfinite(places[:, 2])
+    if np.isfinite(above).all() and high.any():  # a barometer tells heights better, but for where they begin
+        places[:, 2] = np.array(above) + np.median((places[:, 2] - above)[high])
     return georeference(centers, [(north, east, up) for north, east, up in places.tolist()])
 
 

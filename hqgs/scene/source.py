@@ -135,7 +135,7 @@ def load(
                 folder = kept or Path(stack.enter_context(TemporaryDirectory(prefix="hqgs-film-")))
                 path, note = film_frames(film, folder / "frames", frames, on_stage)
                 notes.append(note)
-            elif apart is not None:
+            if apart is not None:
                 check_names(path, downscale, apart)
             scene = load_scene(
                 path,

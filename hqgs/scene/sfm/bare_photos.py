@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -59,11 +60,24 @@ class BarePhotos:
 
     @property
     def colmap_names(self) -> dict[str, str]:
-        """Each photo's name by the one that COLMAP sees; of panoramas by that of each face, "front" first."""
+        """Each photo's name by the one that COLMAP sees; of panoramas by that of each face, "front" first.
+
+        Those have no blanks: COLMAP reads lists of names word by word.
+        """
+        plain, taken = dict[str, str](), set[str]()
+        for name in self.names:
+            seen = re.sub(r"\s|^#", "_", name)
+            while seen in taken or (seen != name and seen in self.names):
+                seen = f"_{seen}"
+            taken.add(seen)
+            plain[name] = seen
         if self.around:
-            return {f"{face_name(name, face)}.jpg": name for name in self.names for face in CUBE}
-        read = {n: n.lower().endswith(FOR_COLMAP) and n not in self.others for n in self.names}
-        return {n if read[n] else f"{n}.jpg": n for n in self.names}
+            return {f"{face_name(seen, face)}.jpg": name for name, seen in plain.items() for face in CUBE}
+        return {seen if self.as_it_is(name) else f"{seen}.jpg": name for name, seen in plain.items()}
+
+    def as_it_is(self, name: str) -> bool:
+        """Whether COLMAP reads the photo's file."""
+        return name.lower().endswith(FOR_COLMAP) and name not in self.others
 
     def contents(self) -> Iterator[bytes]:
         """The files' bytes; of panoramas those of the other faces are empty."""
@@ -105,7 +119,7 @@ class BarePhotos:
         for target, name in self.colmap_names.items():
             path = folder / target
             path.parent.mkdir(parents=True, exist_ok=True)
-            if target != name:
+            if not self.as_it_is(name):
                 Image.fromarray(decode(self.folder / name)[0]).save(path, quality=JPEG_QUALITY, subsampling=0)
                 continue
             try:
@@ -250,6 +264,7 @@ def _photos_below(folder: Path, deepest: bool = False) -> dict[str, list[str]]:
         level = sorted(
             p for p in inner if p.name not in (*MASK_FOLDERS, KEPT) and p.name[0] != "." and not is_run(p)
         )
+        level = [p for p in level if os.access(p, os.R_OK | os.X_OK)]  # not a card's lost+found
         found |= {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}
         if found and not deepest:
             break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -68,8 +68,8 @@ def why_few(photos: int, passes: Sequence[Pass]) -> str:
     return f"{counts(photos, passes)}; {advice}"
 
 
-def why_lost(name: str, one: Pass) -> str:
-    """Why a pass found no place for a photo, in words with numbers."""
+def why_lost(name: str, one: Pass, placed: Container[str] = ()) -> str:
+    """Why a pass found no place for a photo, in words with numbers; `placed`: those that have one by now."""
     features, usual = one.features[name], float(np.median(list(one.features.values())))
     matches, inliers, with_placed = one.best[name]
     if features < max(FEW_FEATURES, POOR * usual):
@@ -78,8 +78,11 @@ def why_lost(name: str, one: Pass) -> str:
         return "alone: it matches no other photo"
     if inliers < MATCHES:
         return f"no two photos agree: {matches} matches at best, {inliers} of them bear each other out"
-    if group := next((group for group in one.apart if name in group), None):
-        return f"fits {len(group) - 1} photos that have no place either"
+    group = next((group for group in one.apart if name in group), [])
+    if others := sum(other not in placed for other in group if other != name):
+        return (
+            f"fits {others} photos that have no place either" if others > 1 else "fits one that has no place"
+        )
     if with_placed < MATCHES:
         return "fits only photos that have no place either"
     return f"few matches agree: {with_placed} with a photo that has a place"

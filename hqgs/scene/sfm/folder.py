@@ -18,7 +18,7 @@ from hqgs.scene.names import existing_folder
 from hqgs.scene.photo_files import film_at
 from hqgs.scene.refused import nothing
 from hqgs.scene.scene import SfmReport
-from hqgs.scene.sfm.bare_photos import FOR_COLMAP, bare_photos, readable
+from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, find_cameras
 from hqgs.scene.sfm.run import SIFT, check_features
 
@@ -61,14 +61,14 @@ def write_colmap_folder(
             target.parent.mkdir(parents=True, exist_ok=True)
             if original in details:
                 kept[image.name] = details[original]
-            if original.lower().endswith(FOR_COLMAP):
+            if found.photos.as_it_is(original):
                 shutil.copyfile(found.photos.folder / original, target)
             else:
                 pixels = decode(found.photos.folder / original)[0]
                 Image.fromarray(pixels).save(target, quality=JPEG_QUALITY, subsampling=0)
         if kept:
             write_details(images, kept)
-        (out / "sparse" / "0").mkdir(parents=True)
+        (out / "sparse" / "0").mkdir(parents=True, exist_ok=True)
         model: pycolmap.Reconstruction = found.model
         model.write_binary(out / "sparse" / "0")
         shutil.rmtree(work, ignore_errors=True)

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.text import some
+from hqgs.photos.eight_bits import grey
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode, open_photo
 from hqgs.scene.names import FILM_SUFFIXES
@@ -44,6 +45,7 @@ _VERSION = re.compile(
     r"(?<=IMG_)E(?=\d{4})|[ _-]*(\(\d+\)|copy|kopie|small|resized|thumb|edited|edit|bearbeitet|\d+x\d+)$",
     re.IGNORECASE,
 )
+_NUMBERED = re.compile(r"\(\d+\)$")
 _OF_ONE_CAMERA = 2 / 3  # of the photos, at least: others are strays then
 _LEAST = 3  # photos of that camera
 _PAUSE, _SCENES, _NEARLY = timedelta(hours=1), 4, 0.9  # between captures; of them; of the photos in one
@@ -69,9 +71,14 @@ def copies(folder: Path, looked: dict[str, Glance], exif: dict[str, Exif]) -> di
             if (np.abs(small - row).max(1) <= _ALIKE).sum() > 1:
                 alike.setdefault(_digest(folder / name), []).append(name)
     versions: dict[str, list[str]] = {}
-    for name in looked:
-        folder_of, _, file = name.rpartition("/")
-        versions.setdefault(f"{folder_of}/{_VERSION.sub('', file.rpartition('.')[0])}", []).append(name)
+    stems = {name: name.rpartition(".")[0] for name in looked}
+    for name, stem in stems.items():
+        folder_of, slash, file = stem.rpartition("/")
+        versions.setdefault(f"{folder_of}{slash}{_VERSION.sub('', file)}", []).append(name)
+    for key, names in versions.items():
+        numbered = [name for name in names if _NUMBERED.search(stems[name])]
+        if len(numbered) > 1 or key not in {stems[name] for name in names}:  # a series: vase (1), vase (2)
+            versions[key] = [name for name in names if name not in numbered]
     sets = [*alike.values(), *(names for names in versions.values() if _look_alike(folder, names))]
     found: dict[str, str] = {}
     for names in sets:
@@ -88,8 +95,8 @@ def _look_alike(folder: Path, names: list[str]) -> bool:
         with open_photo(folder / name) as photo:
             shapes.append(photo.width / photo.height)
             photo.draft("L", (4 * _SIDE, 4 * _SIDE))
-            grey = photo.convert("L").resize((_SIDE, _SIDE), Image.Resampling.BOX)
-        small.append(np.asarray(grey, float).ravel())
+            tiny = grey(photo).resize((_SIDE, _SIDE), Image.Resampling.BOX)
+        small.append(np.asarray(tiny, float).ravel())
     if not small or min(map(np.ptp, small)) < _ALIKE or max(shapes) > 1.02 * min(shapes):
         return False
     return float(np.corrcoef(small).min()) > _VERSIONS

@@ -20,6 +20,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from hqgs.photos.eight_bits import grey
 from hqgs.scene.sfm.constants import (
     COMPARED,
     MATCHES,
@@ -55,7 +56,8 @@ def look_learned(
 
     def look(name: str) -> dict[str, Any]:
         with Image.open(photos / name) as file:
-            pixels = torch.from_numpy(np.array(file.convert("RGB"))).permute(2, 0, 1).float() / 255
+            seen = grey(file) if file.mode.startswith("I") else file
+            pixels = torch.from_numpy(np.array(seen.convert("RGB"))).permute(2, 0, 1).float() / 255
         side = max(pixels.shape[1:])
         with torch.inference_mode():
             features = found.extract(pixels, resize=min(max(side, NETWORK_SMALL), NETWORK_LARGE))

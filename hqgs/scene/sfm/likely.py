@@ -25,7 +25,7 @@ def likely_pairs(db: pycolmap.Database, count: int) -> NDArray[np.int64]:
     """
     descriptors = [_largest(db, k + 1) for k in range(count)]
     scores = np.zeros((count, count), np.int64)
-    step = max(1, AT_ONCE // max(one.size for one in descriptors))  # photos at a time
+    step = max(1, AT_ONCE // max(1, *(one.size for one in descriptors)))  # photos at a time
     for start in range(0, count, step):
         block = descriptors[start : start + step]
         together = np.concatenate(block).T

@@ -40,7 +40,8 @@ def match(
     if pairs is not None:
         listed = pycolmap.ImportedPairingOptions()
         listed.match_list_path, listed.block_size = directory / "pairs.txt", -(-len(pairs) // BLOCKS**2)
-        listed.match_list_path.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist()))
+        text = "".join(f"{names[i]} {names[j]}\n" for i, j in pairs.tolist())
+        listed.match_list_path.write_text(text, encoding="utf-8")
         with watched("matches", len(pairs)):
             pycolmap.match_image_pairs(
                 database, matching_options=matching, pairing_options=listed, device=pycolmap.Device.cpu

@@ -16,6 +16,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hqgs.base.machine import AT_ONCE
+from hqgs.photos.eight_bits import grey
 from hqgs.scene.sfm.constants import (
     COARSER,
     FRONTAL,
@@ -38,7 +39,7 @@ from hqgs.scene.sfm.tracks import Floats, Tracks
 def read_photo(file: Path) -> NDArray[np.float32]:
     """A photo, gray and smoothed, its longest side at most PATCH_SIDE px."""
     with Image.open(file) as image:
-        gray = image.convert("L")
+        gray = grey(image)
         share = PATCH_SIDE / max(gray.size)
         if share < 1:
             size = max(1, round(gray.width * share)), max(1, round(gray.height * share))

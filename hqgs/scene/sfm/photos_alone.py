@@ -86,7 +86,7 @@ def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
     ValueError where COLMAP cannot make a model of half of the photos.
     """
     photos = readable(photos, search.on_stage)
-    masks = {name: find_mask(root, name) for name in photos.names}
+    masks = {name: find_mask(root, name) or find_mask(photos.folder, name) for name in photos.names}
     for name, size in zip(photos.names, photos.sizes, strict=True):
         if (mask := masks[name]) is not None:
             check_mask(mask, *size)

@@ -58,11 +58,12 @@ def triangulate(directory: Path) -> None:
     match(directory, photos, names, extraction, 1, database, wanted=lambda: given.get("pairs"))
     pycolmap.guided_geometric_verification(known, database, num_threads=1)
     (directory / "model").mkdir()
-    model = pycolmap.triangulate_points(
-        known, database, photos, directory / "model", options=pipeline_options()
-    )
+    options = pipeline_options()
+    options.triangulation.ignore_two_view_tracks = len(names) > 2
+    model = pycolmap.triangulate_points(known, database, photos, directory / "model", options=options)
     points = [model.points3D[k] for k in sorted(model.points3D)]
-    points = [p for p in points if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR]
+    least = min(MIN_TRACK, len(names))
+    points = [p for p in points if p.track.length() >= least and p.error <= MAX_ERROR]
     np.savez(
         directory / "points.npz",
         points=np.array([p.xyz for p in points], np.float32).reshape(-1, 3),
@@ -87,7 +88,7 @@ def reconstruct(directory: Path, threads: int) -> None:
         passes = _by_sift(directory, given, threads)
     best = max(passes, key=lambda one: (one.registered, -one.tolerant))
     best.sharpen()
-    facts = json.dumps({"passes": [one.facts() for one in passes]})
+    facts = json.dumps({"passes": [one.facts() for one in passes], "chosen": passes.index(best)})
     (directory / "facts.json").write_text(facts, encoding="utf-8")
     if best.model is not None:
         (directory / "model").mkdir(exist_ok=True)

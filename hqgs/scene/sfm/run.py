@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from hqgs._rust import get_num_threads
 from hqgs.base.files import keep_folder, lock_folder
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.photos import eight_bits
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
 from hqgs.scene.sfm import learned, likely
@@ -52,7 +53,7 @@ IMPORTED = (  # by PROGRAM, of this folder
     "agree attempt constants database facts home learned likely matching patches sharpen tracks versions "
     "weighted"
 )
-PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED.split())]
+PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED.split()), Path(eight_bits.__file__)]
 FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
 STAGES = {
     "features": "COLMAP: features",
@@ -84,6 +85,7 @@ class Model:
     found: pycolmap.Reconstruction
     passes: list[Pass]
     called: Mapping[str, str] = field(default_factory=dict)  # what the user calls photos, by COLMAP's names
+    chosen: int = 0  # the pass whose model it is
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """World-to-camera matrices [4, 4] by photo, sorted; ValueError where too few photos have one, or most
@@ -105,14 +107,13 @@ class Model:
 
     @property
     def _chosen(self) -> Pass:
-        """The pass whose model it is."""
-        return max(self.passes, key=lambda one: (one.registered, -one.tolerant))
+        return self.passes[self.chosen]
 
     def lost(self) -> dict[str, str]:
         """Photos that have no place, sorted, and why."""
         placed, one = registered(self.found), self._chosen
         rich = sorted(one.features, key=lambda name: one.features[name])  # of faces the last one tells
-        lost = {self._name(name): why_lost(name, one) for name in rich if name not in placed}
+        lost = {self._name(name): why_lost(name, one, placed) for name in rich if name not in placed}
         return dict(sorted(lost.items()))
 
     def advice(self) -> str | None:
@@ -228,9 +229,10 @@ def run_colmap(
         on_stage(Stage("COLMAP", 0, len(names), note))
     with _workplace(kept) as directory:
         photos = directory / "photos"
-        if not photos.is_dir():
+        if not all((photos / name).exists() for name in names):  # links to what is moved, or gone, are none
             new = directory / "new"
-            shutil.rmtree(new, ignore_errors=True)
+            for old in (new, photos, directory / "masks"):
+                shutil.rmtree(old, ignore_errors=True)
             (new / "photos").mkdir(parents=True)
             write(new / "photos")
             if (new / "masks").is_dir():
@@ -241,7 +243,7 @@ def run_colmap(
         _run_program(directory, on_stage)
         facts = directory / "facts.json"
         if not (directory / "model" / "images.bin").is_file():
-            raise ValueError(why_no_model(len(names), _passes(facts)))
+            raise ValueError(why_no_model(len(names), _passes(facts)[0]))
         if kept is not None:
             keep_folder(directory / "model", kept)
         return _read(directory / "model", called or {})
@@ -319,11 +321,13 @@ def _tell(file: Path, on_stage: OnStage) -> None:
 
 
 def _read(folder: Path, called: Mapping[str, str]) -> Model:
-    return Model(pycolmap.Reconstruction(folder), _passes(folder / "facts.json"), called)
+    passes, chosen = _passes(folder / "facts.json")
+    return Model(pycolmap.Reconstruction(folder), passes, called, chosen)
 
 
-def _passes(facts: Path) -> list[Pass]:
-    return [Pass(**one) for one in json.loads(facts.read_text(encoding="utf-8"))["passes"]]
+def _passes(facts: Path) -> tuple[list[Pass], int]:
+    told = json.loads(facts.read_text(encoding="utf-8"))
+    return [Pass(**one) for one in told["passes"]], told["chosen"]
 
 
 def key_of(what: str, pieces: Iterable[bytes]) -> str:

@@ -15,6 +15,7 @@ import pycolmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from hqgs.photos.eight_bits import grey
 from hqgs.scene.constants import JPEG_QUALITY
 
 
@@ -28,7 +29,7 @@ def smoothed_copies(photos: Path, out: Path, names: Sequence[str], sigma: float,
         target = new / name
         target.parent.mkdir(parents=True, exist_ok=True)
         with Image.open(photos / name) as image:
-            gray = np.asarray(image.convert("L"), np.float32)
+            gray = np.asarray(grey(image), np.float32)
         smooth = gaussian_filter(gray, sigma * max(1, max(gray.shape) / largest), mode="nearest")
         Image.fromarray(np.rint(smooth).astype(np.uint8)).save(target, quality=JPEG_QUALITY, compress_level=1)
     new.rename(out)

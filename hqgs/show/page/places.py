@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
+from hqgs.scene.faces import photo_name
 from hqgs.scene.next_photos import Spot, around, loose_photos
 from hqgs.scene.scene import Scene
 from hqgs.show.page.filled import filled
@@ -49,9 +50,10 @@ def places_chart(scene: Scene, spots: Sequence[Spot]) -> Markup | None:
         ahead = plane @ view.camera.viewmat[2, :3]
         length = float(np.linalg.norm(ahead))
         ahead = ahead / length * ARROW if length > 1e-6 else np.zeros(2)
-        px = sure.get(view.name)
+        photo = photo_name(view.name, view.face)
+        px = sure.get(photo)
         words = view.name if px is None else f"{view.name}: sure to {px:.2f} px"
-        name = view.name if view.name in named else ""
-        shown.append((*at(place), *at(place + ahead / scale), view.name in loose, words, name))
+        name = next((name for name in (view.name, photo) if name in named), "")
+        shown.append((*at(place), *at(place + ahead / scale), photo in loose, words, name))
     told = [(*at(place), spot.told) for spot, place in zip(spots, stars, strict=True)]
     return filled("places.svg.j2", points=[*map(at, points)], cameras=shown, spots=told)
