@@ -341,3 +341,25 @@ def test_photos_that_were_not_looked_at_are_told() -> None:
     assert taken.what == "the search for an enlargement in 1 of 5 photos"
     assert taken in said
     assert not inspector.diagnose(replace(scene, train=scene.train[:3])).passed_over
+
+
+def test_what_is_diagnosed_can_be_trained_with() -> None:
+    """Photos that were enlarged much and blurred: by more than a formation may say; small ones in any ratio."""
+    scene = degraded_scene("lowres:8+defocus:8", keep_low=False)
+    photos = Inspector().diagnose(scene).photos
+    assert photos[0].blur is not None
+    wide = [replace(photo, blur=replace(photos[0].blur, kind="gaussian", sigma=124.5)) for photo in photos]
+    step = module._blur(wide).step
+    assert step == "blur:50"
+    parse_formation(step)
+    for factor in (12, 16):
+        width, height = 200, 130  # a 16th of it, rounded up, is nearer to a 14th
+        views = []
+        for seed in range(PHOTOS):
+            clean = np.ascontiguousarray(clean_photo(seed)[:height, :width])
+            out = degrade_image(clean, parse_degradation(f"lowres:{factor}"), np.random.default_rng(seed))
+            camera = Camera(width, height, np.eye(3), np.eye(4))
+            views.append(View(f"{seed}.png", camera, out.image, low=out.low))
+        formation = find_formation(replace(scene, train=views), "auto", Inspector())
+        for view in views:
+            formation.target(view)

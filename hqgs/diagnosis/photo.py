@@ -23,6 +23,7 @@ from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
 from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
 from hqgs.photos.constants import MAX_BLOCKS
+from hqgs.photos.formula import small_side
 from hqgs.photos.pixels import Floats, to_levels
 
 Table = tuple[tuple[int, ...], ...]
@@ -103,7 +104,9 @@ def inspect_photo(
             raise ValueError(
                 f"the small photo of {name!r} is {w} x {h}, larger than its photo {width} x {height}"
             )
-        enlargement = Enlargement(max(1, round(height / h)), None, h, w)
+        near = max(1, round(height / h))  # sides were rounded up, which of small ones is much
+        fits = (f for f in (near, *range(1, 17)) if (small_side(height, f), small_side(width, f)) == (h, w))
+        enlargement = Enlargement(next(fits, near), None, h, w)
     else:
         enlargement = enlargement or find_enlargement(levels)
         if enlargement.factor > 1:

@@ -26,7 +26,7 @@ from hqgs.diagnosis.gains import log_gains, shared_colors
 from hqgs.diagnosis.own import Finding, device_findings, exposure_finding, focus_finding, shake_finding
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
-from hqgs.photos.formula import NONE, parse_formation
+from hqgs.photos.formula import KINDS, NONE, parse_formation
 from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
@@ -160,9 +160,10 @@ class Inspector:
 def diagnose_scene(scene: Scene, max_photos: int = 16) -> Diagnosis:
     """Diagnose up to `max_photos` training photos, spread over the scene, and sum them up by medians.
 
-    A part that less than half of the photos show, or that lies below its threshold, is left out of the
-    formation: when in doubt, "none". Under JPEG of visible quality noise and blur come from the coefficients
-    of all photos together. ValueError for `max_photos` below 1, or a bad photo, which is named.
+    A part that lies below its threshold, in the median of the photos that tell of it, or that most show
+    nothing of, is left out of the formation: when in doubt, "none". Under JPEG of visible quality noise and
+    blur come from the coefficients of all photos together. ValueError for `max_photos` below 1, or a bad
+    photo, which is named.
     """
     return Inspector().diagnose(scene, max_photos)
 
@@ -191,7 +192,8 @@ def _lowres(photos: Sequence[PhotoDiagnosis]) -> Finding:
     if factor == 1 or 2 * count <= len(photos):
         reason = f"{len(photos) - factors.count(1)} of {len(photos)} photos show the grid of an enlargement"
         return Finding("lowres", False, 1.0, _spread_of(factors), None, reason)
-    size = f"{photos[0].enlargement.width} x {photos[0].enlargement.height}"
+    small = next(photo.enlargement for photo in photos if photo.enlargement.factor == factor)
+    size = f"{small.width} x {small.height}"
     at_hand = f"the small photos of about {size} px are at hand"
     how = at_hand if known else f"{of} show the grid of smaller pixels"
     return Finding(
@@ -281,7 +283,8 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
         "defocus": ("defocus", "radius"),
         "motion": ("motion", "length"),
     }[kind]
-    step = f"{name}:{round(amount, 1):g}"
+    kind_of = KINDS[name]  # photos that were enlarged much may be blurred by more than is told of others
+    step = f"{name}:{min(max(round(amount, 1), kind_of.lowest), kind_of.highest):g}"
     return Finding(
         "blur", True, amount, spread, step, f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
     )

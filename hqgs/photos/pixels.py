@@ -44,7 +44,10 @@ def to_levels(image: NDArray[np.uint8] | NDArray[np.float32], what: str) -> Floa
         raise ValueError(f"{what} must be [H, W, 3] uint8 or float32, got {image.shape} {image.dtype}")
     if not np.isfinite(image).all():
         raise ValueError(f"{what} holds NaN or Inf")
-    return image.astype(np.float64) * (1 if image.dtype == np.uint8 else 255)
+    levels = image.astype(np.float64)
+    if image.dtype != np.uint8:
+        levels *= 255
+    return levels
 
 
 def luma(levels: Floats) -> Floats:

@@ -84,15 +84,20 @@ def film(images: Sequence[Float32], value: float, kind: str = "video") -> list[F
         for frame in back.decode(packet):
             frames[frame.pts] = frame.to_ndarray(), _FRAME_KINDS[int(frame.pict_type)]
 
-    for time, image in enumerate(images):
-        pixels = np.pad(to_uint8(image), ((0, odd_rows), (0, odd_columns), (0, 0)), mode="edge")
-        frame = av.VideoFrame.from_ndarray(_to_planes(pixels), format="yuv420p")
-        frame.pts, frame.time_base = time, out.time_base
-        for packet in out.encode(frame):
+    try:
+        for time, image in enumerate(images):
+            pixels = np.pad(to_uint8(image), ((0, odd_rows), (0, odd_columns), (0, 0)), mode="edge")
+            frame = av.VideoFrame.from_ndarray(_to_planes(pixels), format="yuv420p")
+            frame.pts, frame.time_base = time, out.time_base
+            for packet in out.encode(frame):
+                decode(packet)
+        for packet in out.encode(None):
             decode(packet)
-    for packet in out.encode(None):
-        decode(packet)
-    decode(None)
+        decode(None)
+    except av.error.FFmpegError as error:
+        raise ValueError(
+            f"{kind}:{value:g} of photos of {width} x {height} px: {encoder}: {error}"
+        ) from error
     return [
         FilmFrame(
             as_floats(_from_planes(planes, out.width)[:height, :width]), frame_kind, sizes_by_time[time]
