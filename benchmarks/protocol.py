@@ -279,7 +279,7 @@ def add_options(parser: argparse.ArgumentParser, protocols: Mapping[str, Protoco
     listed = ", ".join(protocol.labels).replace("%", "%%")
     add("--rows", nargs="+", metavar="ROW", help=f"only these of: {listed}")
     add("--seeds", nargs="+", type=int, metavar="S", help=f"({' '.join(map(str, protocol.seeds))})")
-    add("--iterations", type=int, metavar="N", help=f"training steps of each run ({protocol.iterations})")
+    add("--iterations", type=int, metavar="N", help=f"training views of each run ({protocol.iterations})")
     add("--downscale", type=float, metavar="F", help=f"divide the photos' sides ({protocol.downscale:g})")
     add(
         "--photos",

@@ -17,7 +17,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Degrade, diagnose, train, save, render.")
     parser.add_argument("scene", nargs="?", default="embedded", help="scene folder (the built-in scene)")
     parser.add_argument("--kind", default="noise:25", help="what happens to the photos (%(default)s)")
-    parser.add_argument("--iterations", type=int, default=1_000, help="training steps (%(default)s)")
+    parser.add_argument("--iterations", type=int, default=1_000, help="training views to see (%(default)s)")
     parser.add_argument("--downscale", type=float, default=2.0, help="divide the photos' sides by this")
     parser.add_argument("--out", type=Path, default=Path("outputs", "bad_photos"), help="(%(default)s)")
     args = parser.parse_args()

@@ -16,7 +16,7 @@ import hqgs
 def main() -> None:
     parser = argparse.ArgumentParser(description="Train a scene with 3D Gaussian Splatting on the CPU.")
     parser.add_argument("scene", nargs="?", default="embedded", help="scene folder (the built-in scene)")
-    parser.add_argument("--iterations", type=int, default=1_500, help="training steps (%(default)s)")
+    parser.add_argument("--iterations", type=int, default=1_500, help="training views to see (%(default)s)")
     parser.add_argument("--out", type=Path, help="(outputs/ and the scene's name)")
     parser.add_argument("--downscale", type=float, default=1.0, help="divide the photos' sides by this")
     parser.add_argument("--method", default="auto", help="auto, 3dgs, srgs or hqgs (%(default)s)")

@@ -58,8 +58,8 @@ class Run:
     report: Report  # what report.json holds
     history: list[HistoryEntry]  # the held-out means while it trained; the last entry is the final one
     left_out: list[LeftOut]  # what the run did without, and why
-    iterations: int  # steps done
-    length: int  # steps of the whole run
+    iterations: int  # training views seen
+    length: int  # of the whole run
     seconds: float  # of training, without loading and the report
     views: Sequence[RenderedView] = field(repr=False)  # the held-out views; large ones are rendered anew
     out: Path | None  # the folder with the files; None: nothing was written

@@ -344,7 +344,7 @@ def test_photos_that_were_not_looked_at_are_told() -> None:
 
 
 def test_what_is_diagnosed_can_be_trained_with() -> None:
-    """Photos that were enlarged much and blurred: by more than a formation may say; small ones in any ratio."""
+    """Photos that were enlarged and blurred by more than a formation may say; small ones in any ratio."""
     scene = degraded_scene("lowres:8+defocus:8", keep_low=False)
     photos = Inspector().diagnose(scene).photos
     assert photos[0].blur is not None

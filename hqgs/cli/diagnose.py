@@ -13,6 +13,7 @@ from hqgs.base.files import write_json
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_out_file
 from hqgs.cli.scenes import Photos, ready
+from hqgs.training.settings import longest_side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +35,11 @@ def run(options: Diagnose) -> int:
         ready(options.scene)
         from hqgs.scene.source import pictures  # here: it loads torch
 
-        scene = pictures(options.scene, downscale=1.0 if options.downscale is None else options.downscale)
+        scene = pictures(
+            options.scene,
+            downscale=1.0 if options.downscale is None else options.downscale,
+            longest=longest_side("standard", options.downscale),  # as a run sees them
+        )
         diagnosis = hqgs.diagnose(scene)
         if options.out is not None:
             write_json(options.out, asdict(diagnosis))

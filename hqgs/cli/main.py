@@ -38,7 +38,7 @@ COMMANDS = {
     "eval": Command("hqgs.cli.judge", "the same as judge"),
     "render": Command("hqgs.cli.render", "pictures and films of a trained scene"),
     "view": Command("hqgs.cli.view", "look at a scene in a browser (train --view: while it trains)"),
-    "export": Command("hqgs.cli.export", "write a scene file with what the scene needs alone"),
+    "export": Command("hqgs.cli.export", "write a smaller scene file, with what the scene needs"),
     "plan": Command("hqgs.cli.plan", "say what a run would be, and why, without training"),
     "clean": Command("hqgs.cli.clean", "remove fog and shards between the photos, of any scene file"),
     "diagnose": Command("hqgs.cli.diagnose", "say what degraded photos"),

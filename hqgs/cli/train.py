@@ -119,13 +119,13 @@ class Train(Photos):
             metavar="LIST",
             help_behavior_hint="",
             help=f"What the run may do without where the scene does not need it: {AUTO}, {NONE}, or some of "
-            f"{','.join(ITEMS)} ({AUTO}).",
+            f"{','.join(ITEMS)} ({AUTO}); a list without iterations trains all of them.",
         ),
     ] = None
     max_gaussians: Number = None
     """Bounds the memory (1,000,000)."""
     eval_every: Number = None
-    """Iterations between evaluations (a tenth of the run)."""
+    """Iterations between evaluations (a tenth of the run, 50 at least)."""
     view: Flag = False
     """Show the scene in a browser while it trains, and afterwards until Ctrl-C."""
     port: Port = PORT

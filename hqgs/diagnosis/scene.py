@@ -62,7 +62,7 @@ class Diagnosis:
         ]
         lines += ["", f"{self.scene}: {self.formation}"]
         for name, needed, reason in self.needs():
-            lines.append(f"  {name:9}{'needed   ' if needed else 'not seen '} {reason}")
+            lines.append(f"  {name:11}{'needed   ' if needed else 'not seen '} {reason}")
         lines += [f"  left out: {item.what}: {item.why}" for item in self.passed_over]
         return "\n".join(lines)
 

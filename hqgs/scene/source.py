@@ -1,6 +1,6 @@
 """Scenes as users name them: a folder, a film or the built-in room.
 
-The command line and `import hqgs` both call what is here, so that both have one set of defaults.
+The command line and `import hqgs` both call what is here; the former scales large photos down by default.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ def loss(draft: Draft) -> Sequence[Choice]:
     else:
         rows = [Choice(f"{1 - LAMBDA_DSSIM:g} L1 + {LAMBDA_DSSIM:g} D-SSIM", "as 3DGS has it")]
     if "grain" in has:
-        what = f"D-SSIM in the loss of {facts.noisy} {of}"
+        what = f"D-SSIM in the loss of {f'{facts.noisy} {of}' if facts.noisy else 'photos with noise'}"
         rows.append(
             Choice("as under noise", "it asks for the noise that they have", what=what, left_out=what)
         )
