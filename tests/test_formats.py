@@ -236,7 +236,7 @@ def change_gltf(path: Path, change: Any) -> None:
         (lambda c: c["nodes"][0].update(rotation=[0, 0, 0, "x"]), "no Gaussians that can be read"),
         (lambda c: c["nodes"][0].update(children=[0]), "no tree"),
         (lambda c: c["meshes"][0]["primitives"][0].pop("extensions"), "no primitive with KHR_gaussian"),
-        (lambda c: c["accessors"][1].update(componentType=5122), "accessor 1 is not float32 VEC4"),
+        (lambda c: c["accessors"][1].update(componentType=5122), "accessor 1 is not VEC4 of float32"),
         (lambda c: c["accessors"][0].update(count=10**12), "accessor 0 reaches beyond the data"),
         (lambda c: c["bufferViews"][0].update(byteOffset=-4), "accessor 0 reaches beyond the data"),
         (lambda c: c["bufferViews"][0].update(byteLength=10**12), "accessor 0 reaches beyond the data"),

@@ -30,6 +30,9 @@ def export(folder: Path, name: str = "splat.ply") -> Gaussians:
         shN=0.3 * torch.randn(n, 15, 3),
     )
     g.save(folder / name)
+    ours = (folder / name).read_bytes()
+    assert b"comment hqgs scene\n" in ours
+    (folder / name).write_bytes(ours.replace(b"comment hqgs scene\n", b""))
     rows = np.c_[TURN, SHIFT].tolist()
     (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": rows, "scale": SCALE}))
     return g

@@ -39,7 +39,7 @@ def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(9)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    expected = ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    expected = ["ply", "format binary_little_endian 1.0", "comment hqgs scene", "element vertex 2"]
     assert header.decode().split("\n")[:-1] == expected + [f"property float {name}" for name in names]
     rows = np.frombuffer(data, "<f4").reshape(2, len(names))
     for i, row in enumerate(rows):

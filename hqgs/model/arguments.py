@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
+MOST_PIXELS = 1 << 32  # of a picture: 64 GB and more
 # What gsplat's function takes beyond the above, with the value that asks for nothing.
 _NEUTRAL = {
     "distributed": (False,),
@@ -33,12 +35,31 @@ def refuse(unsupported: dict[str, object]) -> None:
         if name not in known:
             raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
         neutral = _NEUTRAL.get(name, (None,))
-        absent = not isinstance(value, Tensor) and (
-            value in neutral or getattr(value, "name", "") == "GLOBAL"
-        )
+        plain = isinstance(value, bool | int | float | str | None)
+        absent = (plain and value in neutral) or getattr(value, "name", "") == "GLOBAL"
         if not absent:
             why = _REASONS.get(name, "hqgs renders one image of a pinhole camera at a time")
             raise NotImplementedError(f"{name}: {why}, got {short(value)}")
+
+
+def check_numbers(width: object, height: object, tile_size: object, at_least_0: Mapping[str, object]) -> None:
+    """ValueError for sizes that are no integers of at least 1, and numbers below 0 or not finite."""
+    for name, value in (("width", width), ("height", height), ("tile_size", tile_size)):
+        if not (_number(value) >= 1 and _number(value).is_integer()):
+            raise ValueError(f"{name}: must be an integer of at least 1, got {short(value)}")
+    if (pixels := _number(width) * _number(height)) > MOST_PIXELS:
+        raise ValueError(f"width, height: at most {MOST_PIXELS:,} pixels, got {pixels:,.0f}")
+    for name, value in at_least_0.items():
+        if not (math.isfinite(_number(value)) and _number(value) >= 0):
+            raise ValueError(f"{name}: must be finite and not negative, got {short(value)}")
+
+
+def _number(value: Any) -> float:
+    """Of whatever is one; NaN of anything else."""
+    try:
+        return math.nan if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return math.nan
 
 
 def short(value: object) -> str:

@@ -230,8 +230,9 @@ class Gaussians:
         """Write a scene file atomically; return how many Gaussians were left out as NaN or Inf.
 
         Args:
-            path: ends in .ply (the layout of 3DGS, exact), .spz (a tenth as large), .compressed.ply
-                (SuperSplat), .splat (no harmonics) or .glb (glTF); docs/files.md states the errors.
+            path: ends in .ply (the layout of 3DGS, exact; .full.ply: all of its columns), .spz (a tenth as
+                large), .sog or .compressed.ply (SuperSplat), .splat (no harmonics) or .glb (glTF);
+                docs/files.md states the errors.
             format: that suffix without its first dot, for a file with another one.
 
         Raises:
@@ -246,7 +247,8 @@ class Gaussians:
         """Read a scene file, float32: ours, or one of 3DGS, gsplat, Brush, SuperSplat.
 
         Args:
-            path: a .ply (compressed or not), .spz, .splat or .glb file, or the folder of a run.
+            path: a .ply (compressed or not), .spz, .sog, .splat, .ksplat, .glb or .gltf file, or the folder
+                of a run, or of a SOG scene that was unpacked.
             format: as in `save`, for a file with another suffix.
 
         Raises:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypedDict, cast
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +13,7 @@ from hqgs.model.arguments import (
     as_backgrounds,
     batch_of,
     check_colors,
+    check_numbers,
     check_tensors,
     refuse,
     shape_of,
@@ -140,7 +140,10 @@ def rasterization(
             rolling shutter, distributed rendering, gradients of Ks, absgrad of a batch).
     """
     refuse({"distributed": distributed, "camera_model": camera_model, **unsupported})
-    colors, rest = colors if isinstance(colors, tuple) else (colors, None)
+    colors, rest = colors if isinstance(colors, tuple | list) and len(colors) == 2 else (colors, None)
+    for name, value in (("means", means), ("viewmats", viewmats)):
+        if not isinstance(value, Tensor):
+            raise ValueError(f"{name}: expected a torch tensor, got {short(value)}")
     upper = None if covars is None else upper_entries(covars, means)
     if upper is not None and activate:
         raise ValueError("activate: not with covars, which are no logarithms")
@@ -167,12 +170,8 @@ def rasterization(
         raise ValueError(f"render_mode: must be one of {RENDER_MODES}, got {render_mode!r}")
     if rasterize_mode not in RASTERIZE_MODES:
         raise ValueError(f"rasterize_mode: must be one of {RASTERIZE_MODES}, got {rasterize_mode!r}")
-    for name, value in (("width", width), ("height", height)):
-        if int(value) != value or value < 1:
-            raise ValueError(f"{name}: must be an integer of at least 1, got {short(value)}")
-    for name, value in (("eps2d", eps2d), ("near_plane", near_plane), ("radius_clip", radius_clip)):
-        if not (np.isfinite(value) and value >= 0):
-            raise ValueError(f"{name}: must be finite and not negative, got {short(value)}")
+    at_least_0 = {"eps2d": eps2d, "near_plane": near_plane, "radius_clip": radius_clip}
+    check_numbers(width, height, tile_size, at_least_0)
     if not far_plane > near_plane:
         raise ValueError(f"far_plane: must be larger than near_plane {near_plane!r}, got {far_plane!r}")
     check_colors(one["colors"], one.get("colors[1]"), n, c, sh_degree)

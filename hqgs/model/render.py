@@ -15,8 +15,8 @@ from hqgs.model.rasterization import RasterizationMeta
 from hqgs.scene.geometry import resized_camera
 from hqgs.scene.scene import Camera, View
 
-# As `render_view` renders: near, far, radius_clip, eps2d, antialiased; and not to be differentiated.
-OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D, False, False)
+# As `render_view` renders: near, far, radius_clip, eps2d.
+OPTIONS = (_rust.NEAR_PLANE, _rust.FAR_PLANE, 0.0, _rust.EPS2D)
 
 
 def render_view(
@@ -76,11 +76,12 @@ def _largest(gaussians: Gaussians, views: Iterable[tuple[Camera, NDArray[np.bool
     means, quats, scales, opacities = (tensor.contiguous().numpy() for tensor in tensors)
     no_colors = np.empty((len(gaussians), 0), means.dtype)
     largest = torch.zeros_like(gaussians.opacities)
+    options = (*OPTIONS, gaussians.antialiased, False)  # not to be differentiated
     for camera, mask in views:
         viewmat, K = (np.ascontiguousarray(m[None], np.float64) for m in (camera.viewmat, camera.K))
         size = camera.width, camera.height
         frame, *_ = _rust.project_forward(
-            means, quats, scales, opacities, no_colors, None, viewmat, K, *size, OPTIONS, None
+            means, quats, scales, opacities, no_colors, None, viewmat, K, *size, options, None
         )
         counted = None if mask is None else np.ascontiguousarray(mask[None], bool).view(np.uint8)
         weights = _rust.blending_weights(frame, counted, largest.dtype == torch.float64)

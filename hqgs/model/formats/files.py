@@ -61,7 +61,7 @@ FORMATS = {
     "ply": Format(_read_any_ply, write_ply, world=True, errors=True, antialiased=True),
     "spz": Format(read_spz, lambda path, arrays: write_spz(path, arrays).left_out, antialiased=True),
     "splat": Format(read_splat, write_splat),
-    "compressed.ply": Format(read_compressed_ply, write_compressed_ply, of="ply"),
+    "compressed.ply": Format(_read_any_ply, write_compressed_ply, of="ply"),
     "glb": Format(read_gltf, write_gltf, world=True, errors=True),
     "gltf": Format(read_gltf, world=True),
     "full.ply": Format(_read_any_ply, partial(write_ply, full=True), of="ply", antialiased=True),

@@ -1,10 +1,11 @@
 """glTF files with KHR_gaussian_splatting, the extension that Khronos has ratified.
 
-One mesh primitive of points, float32 throughout: POSITION, ROTATION (x y z w), SCALE (standard deviations,
-where drafts had logs), OPACITY (0..1), SH_DEGREE_l_COEF_n. glTF has y up and z towards the viewer, here y is
-down and z forward: y and z change their sign as in SPZ files, which is exact. Scales and opacities are
-rounded once by exp and the sigmoid; an opacity that float32 rounds to 0 or 1 is read a quarter of 2^-24
-inwards. Of a scene whose trust was learned, _HQGS_ERROR is the error of the pixels that a Gaussian shows in.
+One mesh primitive of points, float32 throughout (normalized integers of others are read): POSITION, ROTATION
+(x y z w), SCALE (standard deviations, where drafts had logs), OPACITY (0..1), SH_DEGREE_l_COEF_n.
+glTF has y up and z towards the viewer, here y is down and z forward: y and z change their sign as in SPZ
+files, which is exact. Scales and opacities are rounded once by exp and the sigmoid; an opacity that float32
+rounds to 0 or 1 is read a quarter of 2^-24 inwards. Of a scene whose trust was learned, _HQGS_ERROR is the
+error of the pixels that a Gaussian shows in.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 NAME = "KHR_gaussian_splatting"
 ERROR = "_HQGS_ERROR"  # glTF keeps names that begin so for applications
 FLOAT, POINTS = 5126, 0
+INTEGERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2"}  # which stand for shares where normalized
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
@@ -211,16 +213,24 @@ def _harmonic(k: int) -> str:
 def _values(content: Any, buffers: list[bytes], number: int, kind: str, count: int) -> NDArray[np.float32]:
     accessor = content["accessors"][number]
     view = content["bufferViews"][accessor["bufferView"]]
-    if (accessor["componentType"], accessor["type"]) != (FLOAT, kind) or "sparse" in accessor:
-        raise ValueError(f"accessor {number} is not float32 {kind}")
-    width, data = WIDTHS[kind], buffers[view["buffer"]]
-    if accessor["count"] != count or view.get("byteStride", 4 * width) != 4 * width:
-        raise ValueError(f"accessor {number} has another count or stride")
+    stored = "<f4" if accessor["componentType"] == FLOAT else None
+    if accessor.get("normalized") is True:
+        stored = INTEGERS.get(accessor["componentType"])
+    if stored is None or accessor["type"] != kind or "sparse" in accessor:
+        raise ValueError(f"accessor {number} is not {kind} of float32 or normalized integers")
+    width, data, size = WIDTHS[kind], buffers[view["buffer"]], np.dtype(stored).itemsize
+    stride = view.get("byteStride", size * width)
     start, offset, length = view.get("byteOffset", 0), accessor.get("byteOffset", 0), view["byteLength"]
-    sound = all(type(value) is int and value >= 0 for value in (start, offset, length))
-    if not sound or offset + 4 * width * count > length or start + length > len(data):
+    sound = all(type(value) is int and value >= 0 for value in (start, offset, length, stride))
+    if accessor["count"] != count or (sound and stride < size * width):
+        raise ValueError(f"accessor {number} has another count or stride")
+    end = offset + stride * (count - 1) + size * width if count else 0
+    if not sound or end > length or start + length > len(data):
         raise ValueError(f"accessor {number} reaches beyond the data")
-    values = np.frombuffer(data, "<f4", width * count, start + offset).reshape(count, width)
+    raw = np.ndarray((count, width), stored, data, start + offset, (stride, size))
+    values = raw.astype(np.float32)
+    if stored != "<f4":
+        values = np.maximum(values / np.float32(np.iinfo(stored).max), -1)
     if not np.isfinite(values).all():
         raise ValueError(f"accessor {number} holds NaN or Inf")
     return values

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hqgs.base.files import read_json
 from hqgs.base.ply import header_of
 from hqgs.model.formats.arrays import Arrays
+from hqgs.model.formats.ply import OURS
 from hqgs.model.formats.turned import mapped
 from hqgs.scene.world import World, world_for
 
@@ -32,7 +33,10 @@ def in_data_frame(path: Path, arrays: Arrays) -> Arrays:
     beside = path.with_name(BESIDE)
     if path.suffix.lower() != ".ply" or not beside.is_file():
         return arrays
-    if path.name != EXPORT and not any(line.startswith(COMMENT) for line in header_of(path)[0]):
+    comments = header_of(path)[0]
+    if path.name != EXPORT and not any(line.startswith(COMMENT) for line in comments):
+        return arrays
+    if any(line.startswith(OURS) for line in comments):  # an export that was read and written again
         return arrays
     said = _read(beside)
     matrix, scale = _matrix(beside, said, "transform"), _number(beside, said, "scale")

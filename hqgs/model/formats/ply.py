@@ -32,7 +32,8 @@ _COLORS = ["red", "green", "blue"]  # in place of _DC
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _ERROR = "hqgs_error"
-_WORLD, _ANTIALIASED = "hqgs world ", "hqgs antialiased"  # comments of the header
+OURS = "hqgs"  # how comments of the header begin that hqgs writes, one at least
+_SCENE, _WORLD, _ANTIALIASED = f"{OURS} scene", f"{OURS} world ", f"{OURS} antialiased"
 _TELLING = 100  # Gaussians that tell what opacities are
 MOST_LOGIT = 18.0  # of an opacity that is stored as infinite: float32 rounds its sigmoid to 1 or next to 0
 FLAT = math.log(1e-3)  # of the smaller radius of a disc: its thickness
@@ -84,7 +85,7 @@ def write_ply(path: str | Path, arrays: Arrays, *, full: bool = False) -> int:
             vertices[name] = means[finite, k] if name in _MEANS else rows[finite, k]
     else:
         vertices = np.ascontiguousarray(rows[finite]).view(kinds)[:, 0]
-    says = []
+    says = [_SCENE]
     if world != World():
         says.append(f"{_WORLD}{json.dumps(world.json())}")
     if arrays.get("antialiased"):
@@ -138,7 +139,7 @@ def read_ply(path: str | Path) -> Arrays:
     means = columns(_MEANS, np.float64) if wide or not world.ordinary else columns(_MEANS)
     opacities = columns(["opacity"])[:, 0]
     scales = columns(_SCALES[:2] if discs else _SCALES)
-    if _are_shares(opacities):
+    if _are_shares(opacities) and not any(line.startswith(OURS) for line in comments):
         opacities = to_logits(opacities, SHARE_STEP)
         notes.append("its opacities lie between 0 and 1: they were read as shares, not as logits")
         if (scales > 0).all():

@@ -45,7 +45,7 @@ def curve_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
         return np.zeros(0, np.intp)
     points = np.nan_to_num(means.astype(np.float64))
     low, high = np.quantile(points, [0.01, 0.99], axis=0)  # a few far ones must not make the cells large
-    cells = (points - low) / np.maximum(high - low, np.finfo(np.float64).tiny) * (2**CURVE_BITS - 1)
+    cells = (points - low) / np.where(high > low, high - low, 1) * (2**CURVE_BITS - 1)
     cells = cells.clip(0, 2**CURVE_BITS - 1).astype(np.int64)
     code = np.zeros(len(points), np.int64)
     for bit in range(CURVE_BITS):

@@ -102,7 +102,7 @@ def _read(file: Callable[[str], bytes]) -> Arrays:
         "sh0": sh0[:, None].astype(np.float32),
         "shN": _harmonics(meta.get("shN"), pixels, count).astype(np.float32),
     }
-    for name in ("means", "scales", "quats", "sh0", "shN"):
+    for name in ("means", "scales", "quats", "opacities", "sh0", "shN"):
         if not np.isfinite(found[name]).all():
             raise ValueError(f"{name} are not finite")
     if meta.get("antialias") is True:
@@ -118,7 +118,10 @@ def _between(part: dict[str, Any], shares: NDArray[np.float64]) -> NDArray[np.fl
 def _coded(part: dict[str, Any], values: Bytes) -> NDArray[np.float64]:
     """What bytes stand for: an entry of the codebook, or a place between the ends of the range."""
     if "codebook" in part:
-        return np.array(part["codebook"], np.float64)[values]
+        book = np.array(part["codebook"], np.float64)
+        if np.isnan(book[0]):  # as some writers leave it: of the rest, evenly
+            book[0] = book[1] + (book[1] - book[-1]) / (len(book) - 1)
+        return book[values]
     return _between(part, values / 255)
 
 

@@ -38,6 +38,8 @@ def write_sog(path: str | Path, arrays: Arrays) -> int:
     """
     finite = finite_rows(arrays)
     g = pick(arrays, finite)
+    if not finite.any():
+        raise ValueError(f"{path}: no Gaussian to write, and a .sog file has one at least")
     files = encode_sog(pick(g, curve_order(g["means"])), bool(arrays.get("antialiased")))
     with atomic_path(Path(path)) as tmp, zipfile.ZipFile(tmp, "w", zipfile.ZIP_STORED) as out:
         for name, content in files.items():  # a fixed date: the same scene, the same bytes

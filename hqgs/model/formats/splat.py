@@ -25,6 +25,8 @@ def write_splat(path: str | Path, arrays: Arrays) -> int:
     """Write atomically, without rows that hold NaN or Inf; return how many those were."""
     finite = finite_rows(arrays)
     g = pick(arrays, finite)
+    if not finite.any():
+        raise ValueError(f"{path}: no Gaussian to write, and a .splat file has one at least")
     opacities, logs = to_opacities(g["opacities"]), g["scales"].astype(np.float64)
     colors = 0.5 + SH_C0 * g["sh0"][:, 0].astype(np.float64)
     quats = g["quats"].astype(np.float64)
