@@ -212,6 +212,9 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     assert "asked for" in [row.why for row in trainer(iterations=4_000).rows if row.what == "length"]
     assert trainer(leave_out="none").config.iterations == 30_000
     assert trainer(method="3dgs").config.iterations == 30_000
+    noisy = Trainer(scene, run_config(formation="noise:20"))  # 7 photos, of which none can be held back
+    assert noisy.config.iterations == 7_000
+    assert "no photo can be held back to tell when to end" in [row.why for row in noisy.rows]
     for name in ("ENOUGH", "LEAST_ENOUGH"):
         monkeypatch.setattr(f"hqgs.training.plan_rules.{name}", 700)
     many = trainer()

@@ -20,6 +20,7 @@ from hqgs.training.constants import (
     COARSE_MOST,
     COARSE_PART,
     ENOUGH,
+    FEWEST_VIEWS,
     FOR_EACH_PHOTO,
     GROWS_FROM,
     HELD_PIXELS,
@@ -198,8 +199,8 @@ def half_size(draft: Draft) -> Sequence[Choice]:
 def length(draft: Draft) -> Sequence[Choice]:
     settings, facts, has = draft.settings, draft.facts, draft.kinds
     open_ended, enough, why = "iterations" in settings.leave_out, settings.iterations, ""
-    if has & set(LEARNED):
-        enough, why = ENOUGH, "no photo can be held back to tell when to end: its camera would not be learned"
+    if has & set(LEARNED) or (has and facts.photos < FEWEST_VIEWS):
+        enough, why = ENOUGH, "no photo can be held back to tell when to end"
     elif draft.formed and not has:
         enough, why = max(LEAST_ENOUGH, FOR_EACH_PHOTO * facts.photos), "more looks at the photos do not pay"
     most = enough if open_ended and enough < settings.iterations else None
