@@ -1,7 +1,8 @@
 """The numbers of training, each with its meaning, its unit and where it comes from.
 
 Where no source is named, the number was chosen on held-back training photos of fern, fox and horns at half
-size; test photos were looked at only where it says held-out. Those of 3DGS's densification are the defaults of `DensifyConfig`.
+size; test photos were looked at only where it says held-out. Those of 3DGS's densification are the defaults
+of `DensifyConfig`.
 """
 
 import math
