@@ -26,7 +26,7 @@ from hqgs.diagnosis.gains import log_gains, shared_colors
 from hqgs.diagnosis.own import Finding, device_findings, exposure_finding, focus_finding, shake_finding
 from hqgs.diagnosis.photo import Inspected, PhotoDiagnosis, conclude, inspect_photo
 from hqgs.diagnosis.resolution import Enlargement
-from hqgs.photos.formula import KINDS, NONE, parse_formation
+from hqgs.photos.formula import KINDS, NONE, parse_formation, within
 from hqgs.scene.scene import Scene, View
 
 _HEAD = ("photo", "size", "enlarged", "jpeg", "blocking", "noise", "blur")
@@ -283,8 +283,7 @@ def _blur(photos: Sequence[PhotoDiagnosis]) -> Finding:
         "defocus": ("defocus", "radius"),
         "motion": ("motion", "length"),
     }[kind]
-    kind_of = KINDS[name]  # photos that were enlarged much may be blurred by more than is told of others
-    step = f"{name}:{min(max(round(amount, 1), kind_of.lowest), kind_of.highest):g}"
+    step = f"{name}:{within(KINDS[name], round(amount, 1)):g}"  # enlarged ones may have more
     return Finding(
         "blur", True, amount, spread, step, f"the spectra fall as after {kind} blur of {unit} {amount:.1f} px"
     )

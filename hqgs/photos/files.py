@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from hqgs.photos.constants import LARGEST
-from hqgs.photos.eight_bits import grey
+from hqgs.photos.eight_bits import grey, of_16
 
 HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
 JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe")
@@ -162,11 +162,11 @@ def decode(
             if photo.mode == "F":
                 raise ValueError(_FLOATS)
             if photo.mode.startswith("I"):
-                grey = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
-                if grey.min() < 0 or grey.max() > 65535:
-                    raise ValueError(f"pixel values {grey.min()}..{grey.max()} are not 16 bit")
-                rgb = np.repeat(((grey + 128) // 257).astype(np.uint8)[..., None], 3, -1)
-                clear = grey == photo.info.get("transparency", -1)  # of PNG: one grey, which is none
+                levels = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
+                if levels.min() < 0 or levels.max() > 65535:
+                    raise ValueError(f"pixel values {levels.min()}..{levels.max()} are not 16 bit")
+                rgb = np.repeat(of_16(levels)[..., None], 3, -1)
+                clear = levels == photo.info.get("transparency", -1)  # of PNG: one grey, which is none
                 rgba = np.dstack([rgb, np.where(clear, 0, 255).astype(np.uint8)])
             elif photo.has_transparency_data:
                 rgba = np.array(photo.convert("RGBA"))

@@ -114,7 +114,7 @@ class DegradationStep:
         """The step with `factor` times its value, which it has, within the kind's range; for all photos."""
         if self.value is None:
             raise ValueError(f"{self} has no value that could be scaled")
-        return DegradationStep(self.kind, _within(KINDS[self.kind], self.value * factor))
+        return DegradationStep(self.kind, within(KINDS[self.kind], self.value * factor))
 
     def __str__(self) -> str:
         name = f"{SOME}:{self.kind}" if self.some else self.kind
@@ -141,7 +141,7 @@ class Degradation:
                 value = kind.default
                 if value is None:
                     value = (kind.at_504 or 0.0) * (longest if kind.longest else width) / 504
-                step = replace(step, value=_within(kind, value))
+                step = replace(step, value=within(kind, value))
             elif step.kind == "lowres":
                 width, longest = (small_side(side, int(step.value)) for side in (width, longest))
             steps.append(step)
@@ -235,7 +235,7 @@ def small_side(side: int, factor: int) -> int:
     return math.ceil(side / factor)
 
 
-def _within(kind: Kind, value: float) -> float:
+def within(kind: Kind, value: float) -> float:
     """The value in the kind's range, whole where the kind asks for it."""
     return min(max(float(round(value)) if kind.integer else value, kind.lowest), kind.highest)
 
