@@ -59,8 +59,10 @@ MISTAKES = {
     f"{TRAIN} --restore missing.pth": "there is no file of weights missing.pth",
     "view nowhere": "there is no nowhere: give the folder of a run, or a scene file",
     "view photos": "there is no photos/scene.ply: give the folder of a run, or a scene file",
+    "view unfinished": "unfinished holds a run that has not ended, and no scene yet: hqgs train PHOTOS --out",
     "view a.ply --port 99999": "port is 99999, wanted 0..65535",
     "render a.ply --out film.txt": "film.txt is no folder; films are .mp4 or .gif, a single picture is .png",
+    "render a.ply --out photos": "--out photos holds photos (view_00.png, view_01.png, ",
     "render a.ply --out b.png --path round": "no such file, and none of: cameras, orbit",
     "export a.ply --out a.ply": "is the source a.ply itself; what is left out would be lost",
     "export a.ply --out a.obj": "the suffix says no format; wanted .ply, ",
@@ -98,7 +100,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_colmap(make_truth(), root / "colmap")
     write_photos(make_truth(), root / "photos")
     write_photos(make_truth(2), root / "two")
-    for name in ("empty", "texts", "others", "raws", "films", "film"):
+    for name in ("empty", "texts", "others", "raws", "films", "film", "unfinished"):
         (root / name).mkdir()
     for name in (
         "texts/a.txt",
@@ -110,6 +112,8 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "films/a.mp4",
         "films/b.MOV",
         "film/a.mp4",
+        "unfinished/config.json",
+        "unfinished/checkpoint.safetensors",
     ):
         (root / name).write_text("ply")
     points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)

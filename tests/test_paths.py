@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tiny_scene import tiny_scene
 
 import hqgs
+from hqgs.photos.pixels import to_uint8
 from hqgs.scene.camera_files import load_cameras, load_path, save_cameras, save_path
 from hqgs.scene.geometry import project
 from hqgs.scene.paths import circle, focus, view_matrix, with_size, world_up
@@ -90,6 +93,31 @@ def test_up_follows_photos_that_were_held_on_their_side(tmp_path: Path) -> None:
     np.testing.assert_allclose(centers[:, 2], heights, atol=1e-9)
     with pytest.raises(ValueError, match=r"up is \[0.0, 0.0, 0.0\], wanted a direction"):
         hqgs.orbit(stored, 7, up=(0, 0, 0))
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3, 5])
+def test_a_turned_camera_sees_the_turned_picture(tmp_path: Path, turns: int) -> None:
+    """With the principal point off the middle, and other focal lengths across and along."""
+    K = np.array([[40.0, 0, 17], [0, 31, 9], [0, 0, 1]])
+    camera = replace(ring(5)[1], K=K, width=36, height=20)
+    rng = np.random.default_rng(0)
+    model = hqgs.Gaussians.from_points(rng.normal(size=(60, 3)), rng.integers(0, 255, (60, 3), np.uint8), 0)
+    with torch.no_grad():
+        stored, turned = (model.render(c).numpy() for c in (camera, camera.turned(turns)))
+    np.testing.assert_allclose(turned, np.rot90(stored, -turns), atol=2e-5)
+    assert stored.std() > 0.04
+    photo, mask = to_uint8(stored), np.zeros(stored.shape[:2], bool)
+    mask[:, :5] = True
+    views = [View("a.jpg", camera, photo, mask, quarter_turns=turns % 4)]
+    save_cameras(tmp_path, Scene("a", views, [], np.zeros((1, 3)), np.zeros((1, 3), np.uint8), "photos"))
+    (known,) = load_cameras(tmp_path).views
+    np.testing.assert_allclose(known.camera.K, camera.turned(turns).K)
+    np.testing.assert_allclose(known.camera.viewmat, camera.turned(turns).viewmat)
+    assert known.photo is not None
+    assert known.mask is not None
+    assert np.array_equal(np.asarray(Image.open(known.mask)) == 255, np.rot90(mask, -turns))
+    off = np.asarray(Image.open(known.photo)).astype(float) - np.rot90(photo, -turns)
+    assert np.sqrt(np.square(off).mean()) < 12  # JPEG
 
 
 def test_a_path_goes_through_its_cameras_at_an_even_speed() -> None:

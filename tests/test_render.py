@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import av
@@ -14,7 +16,7 @@ from tiny_scene import HEIGHT, WIDTH, tiny_config, tiny_scene
 import hqgs
 from hqgs.cli import main as cli
 from hqgs.model.formats.rows import curve_order
-from hqgs.scene.camera_files import load_cameras, save_path
+from hqgs.scene.camera_files import KnownCamera, load_cameras, picked, save_path
 from hqgs.scene.paths import with_size
 from hqgs.show import frames, trust
 
@@ -55,6 +57,8 @@ def test_given_views(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert render(folder, "--views", "view0.png", "--background", 1, 1, 0.5, "--out", tmp_path / "a.png") == 0
     assert np.array_equal(pixels(tmp_path / "a.png"), expected(folder, known.test[0], (1, 1, 0.5)))
     assert render(folder, "--views", "view3,view0", "--out", tmp_path / "two") == 0
+    assert len(list((tmp_path / "two").iterdir())) == 2
+    assert render(folder, "--views", "view3.png, view0", "--out", tmp_path / "two") == 0  # over them
     assert len(list((tmp_path / "two").iterdir())) == 2
 
 
@@ -172,6 +176,31 @@ def test_sources_without_cameras(tmp_path: Path, folder: Path, capsys: pytest.Ca
     hqgs.Gaussians.load(folder).save(tmp_path / "a.ply")
     assert render(tmp_path / "a.ply", "--views", "test", "--out", tmp_path / "x") == 2
     assert "has no cameras.json" in capsys.readouterr().err
+
+
+def test_names_with_commas_and_spaces() -> None:
+    camera = hqgs.look_at((0, 0, 0), (0, 0, 3))
+    names = ("a.jpg", "b, small.jpg", "c.jpg")
+    views = [KnownCamera(name, camera, held_out=False, photo=None) for name in names]
+    for which, found in (("b, small.jpg", [1]), ("b, small", [1]), ("c, a.jpg", [2, 0]), ("all", [0, 1, 2])):
+        assert picked(views, [], which, "the run") == [views[k] for k in found]
+    with pytest.raises(ValueError, match="has no photo 'b'"):
+        picked(views, [], "a,b", "the run")
+
+
+def test_pictures_do_not_go_among_the_photos_of_the_run(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, photos = shutil.copytree(folder, tmp_path / "run"), tmp_path / "photos"
+    photos.mkdir()
+    assert render(run, "--frames", 2, "--out", photos) == 0  # an empty folder, then one of pictures
+    assert render(run, "--frames", 2, "--out", photos) == 0
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(config | {"scene": {"path": str(photos.resolve())}}))
+    before = sorted(photos.iterdir())
+    assert render(run, "--frames", 3, "--out", photos) == 2
+    assert "holds photos (00000.png, 00001.png): name another" in capsys.readouterr().err
+    assert sorted(photos.iterdir()) == before
 
 
 def test_films_of_mixed_sizes_and_unknown_kinds(folder: Path, tmp_path: Path) -> None:

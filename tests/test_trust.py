@@ -278,7 +278,7 @@ def test_where_little_is_known_is_told(tmp_path: Path) -> None:
     scene = as_run(tmp_path, g, g.means[:, 0] > 0)
     photos = [view for view in load_cameras(tmp_path).views if not view.held_out]
     trust = Trust(g, torch.full((len(g),), 0.001), torch.zeros(len(g)))
-    found = doubtful_spots(trust, photos, {})
+    found = doubtful_spots(trust, photos)
     assert found
     for spot in found:
         name = next(view.name for view in scene.train if f" {view.name}: " in spot.told)
@@ -289,8 +289,8 @@ def test_where_little_is_known_is_told(tmp_path: Path) -> None:
         wanted = next(direction for words, direction in side.items() if spot.told.startswith(words))
         np.testing.assert_allclose(np.sign([x, y]) * (np.abs([x, y]) > 1e-6), wanted)
     same = Trust(g, torch.full((len(g),), EMPTY), torch.zeros(len(g)))
-    assert doubtful_spots(same, photos, {}) == []
-    assert doubtful_spots(trust, photos[:1], {}) == []
+    assert doubtful_spots(same, photos) == []
+    assert doubtful_spots(trust, photos[:1]) == []
 
 
 def test_another_reader_finds_the_column(tmp_path: Path) -> None:

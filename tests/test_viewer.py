@@ -6,6 +6,7 @@ import http.client
 import io
 import math
 import os
+import signal
 import socket
 import threading
 import time
@@ -425,6 +426,7 @@ def test_view_ends_by_itself_and_says_where_to_look(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert view.run(view.ViewOptions(source=folder, port=0), seconds=0.1) == 0
+    assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler  # pycolmap's prints a stack trace
     assert "look at http://127.0.0.1:" in capsys.readouterr().out
     bare = tmp_path / "a b" / "bare.ply"
     hqgs.Gaussians.load(folder).save(bare)

@@ -171,7 +171,8 @@ def read_photos(
 ) -> Scene:
     """The photos with their cameras: those of --photos, or those that the run was trained on."""
     from hqgs.scene.load import formats_of, scene_folder  # here: they load torch
-    from hqgs.scene.source import load, load_again
+    from hqgs.scene.same_run import check_same
+    from hqgs.scene.source import finding, load, load_again
 
     if photos is None:
         if downscale is not None or test_every is not None:
@@ -189,7 +190,7 @@ def read_photos(
             f"{photos} has no cameras: those that would be found anew are in another frame than {source}; "
             "give the COLMAP or nerfstudio folder that it was trained on"
         )
-    return load(
+    scene = load(
         photos,
         downscale=1.0 if downscale is None else downscale,
         longest=longest_side("standard", downscale),
@@ -198,7 +199,11 @@ def read_photos(
         points=False,
         cache=run,
         on_stage=screen.stage,
+        **(finding(run, photos) if bare and run is not None else {}),
     )
+    if bare and run is not None:
+        check_same(scene, run, split=False)
+    return scene
 
 
 def background_of(source: Path) -> tuple[float, float, float]:

@@ -57,7 +57,7 @@ def run(options: PlanOptions) -> int:
                 f"--out {options.out}: there is no run; without --out the plan is that of a new one"
             )
         ready(options.scene)
-        from hqgs.scene.source import load, pictures  # here: they load torch
+        from hqgs.scene.source import finding, load, pictures  # here: they load torch
         from hqgs.training.frame import Frame
         from hqgs.training.prepare import Prepared, plan_of_photos
         from hqgs.training.trainer import Trainer
@@ -65,13 +65,14 @@ def run(options: PlanOptions) -> int:
         downscale = 1.0 if options.downscale is None else options.downscale
         longest = longest_side("standard", options.downscale)
         with LoadingScreen() as screen:
-            if posed:
+            if posed and options.out is not None:
                 scene = load(
                     options.scene,
                     downscale=downscale,
                     longest=longest,
                     cache=options.out,
                     on_stage=screen.stage,
+                    **finding(options.out, options.scene),
                 )
             else:
                 scene = pictures(options.scene, downscale=downscale, longest=longest)

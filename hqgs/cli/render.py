@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from hqgs.base.text import some
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_above
-from hqgs.cli.scenes import Factor, Number, cameras_beside, check_background, tell_read
+from hqgs.cli.scenes import Factor, Number, cameras_beside, check_background, config_part, tell_read
 from hqgs.model.formats.files import scene_file
+from hqgs.photos.files import PHOTO_SUFFIXES
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 PATHS = ("cameras", "orbit")
 FRAMES = 240
+PICTURE = re.compile(r"\d{5}\.png|\d{3}_.*\.png")  # as they are named in a folder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +105,8 @@ def run(options: Render) -> int:
     except OSError as error:
         return fail(1, f"{out}: {error}")
     seconds = time.perf_counter() - started
-    kinds = sorted({(camera.width, camera.height) for camera in cameras})
+    odd = out.suffix.lower() == ".mp4"  # such a film has even sides
+    kinds = sorted({(c.width - odd * (c.width % 2), c.height - odd * (c.height % 2)) for c in cameras})
     px = f"{kinds[0][0]} x {kinds[0][1]} px" if len(kinds) == 1 else "several sizes"
     many = f"{len(cameras)} frames" if len(cameras) > 1 else "1 frame"
     print(f"{out}: {many}, {px}, {len(gaussians)} Gaussians, {len(cameras) / seconds:.1f} frames/s")
@@ -121,6 +125,18 @@ def _check(options: Render) -> None:
         raise ValueError(f"--look is of colours, and --show is {options.show}")
     check_background(options.background)
     check_above(options.out)
+    _check_folder(options.source, options.out)
+
+
+def _check_folder(source: Path, out: Path) -> None:
+    """ValueError where pictures would lie among photos: the next run on these would take them for some."""
+    if not out.is_dir():
+        return
+    held = sorted(path.name for path in out.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES)
+    path = config_part(source if source.is_dir() else source.parent, "scene").get("path")
+    own = path is not None and out.resolve() in (Path(path), Path(path, "images"))
+    if photos := [name for name in held if own or not PICTURE.fullmatch(name)]:
+        raise ValueError(f"--out {out} holds photos ({some(photos)}): name another folder for pictures")
 
 
 def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:

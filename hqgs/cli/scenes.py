@@ -67,9 +67,15 @@ def ready(scene: str) -> None:
         signal.signal(signal.SIGINT, _stop)  # packages that are half loaded take an exception for their own
     import_module("hqgs.pipeline")
     import_module("hqgs.scene.source")
+    heed_sigterm()
     if on_main:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # instead of pycolmap's, with a stack trace
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def heed_sigterm() -> None:
+    """From here on SIGTERM counts as Ctrl-C: pycolmap, once it is loaded, ends with a stack trace."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _stop(number: int, frame: object) -> None:

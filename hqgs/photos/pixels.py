@@ -31,7 +31,7 @@ def floats(photo: Tensor) -> Tensor:
 
 
 def upright(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
-    """[H, W, 3] after so many quarter turns clockwise; see `View.quarter_turns`."""
+    """[H, W, 3] or [H, W] after so many quarter turns clockwise; see `View.quarter_turns`."""
     return np.ascontiguousarray(np.rot90(image, -turn))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeVar
 
@@ -14,7 +14,7 @@ from PIL import Image
 
 from hqgs.base.files import atomic_path, read_json, write_json
 from hqgs.photos.constants import FPS, LARGEST
-from hqgs.photos.pixels import as_floats, to_uint8
+from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.constants import BACKGROUND, KEPT_SIDE, MOST_FRAMES
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene
@@ -26,7 +26,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to Ope
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """A camera of a run, with its photo."""
+    """A camera of a run, with its photo; both upright, as the photo's EXIF tells it."""
 
     name: str
     camera: Camera
@@ -42,6 +42,7 @@ class RunCameras:
     up: NDArray[np.float64]  # [3], unit, world
     views: list[KnownCamera]  # in the scene's order, held-out ones last
     background: tuple[float, float, float] = BACKGROUND  # R, G, B behind everything
+    world: World = field(default_factory=World)  # the frame that its cameras are in
 
     @property
     def train(self) -> list[Camera]:
@@ -57,30 +58,34 @@ class RunCameras:
 def save_cameras(
     folder: str | Path, scene: Scene, background: tuple[float, float, float] = BACKGROUND
 ) -> None:
-    """Write cameras.json, photos/*.jpg of a scene's views and *.mask.png of their masks, each atomically."""
+    """Write cameras.json, photos/*.jpg of a scene's views and *.mask.png of their masks, each atomically.
+
+    Photos that lie on their side are turned upright, and their cameras with them.
+    """
     folder, entries = Path(folder), list[dict[str, Any]]()
     for number, (view, held_out) in enumerate(
         [*((view, False) for view in scene.train), *((view, True) for view in scene.test)]
     ):
         photo = f"{PHOTOS}/{number:05}.jpg"
         with atomic_path(folder / photo) as tmp:
-            picture = Image.fromarray(to_uint8(as_floats(view.image)))
+            picture = Image.fromarray(upright(to_uint8(as_floats(view.image)), view.quarter_turns))
             picture.thumbnail((KEPT_SIDE, KEPT_SIDE), Image.Resampling.LANCZOS)
             picture.save(tmp, quality=88)
         masked = {}
         if view.mask is not None:
             masked["mask"] = f"{PHOTOS}/{number:05}.mask.png"
             with atomic_path(folder / masked["mask"]) as tmp:
-                shares = Image.fromarray(255 * view.mask.astype(np.uint8))
+                shares = Image.fromarray(upright(255 * view.mask.astype(np.uint8), view.quarter_turns))
                 shares.resize(picture.size, Image.Resampling.BOX).point(whole).save(tmp)
+        camera = view.upright_camera
         entries.append(
             {
                 "name": view.name,
                 "held_out": held_out,
-                "width": view.camera.width,
-                "height": view.camera.height,
-                "K": view.camera.K.tolist(),
-                "world_to_camera": scene.world.viewmat_out(view.camera.viewmat).tolist(),
+                "width": camera.width,
+                "height": camera.height,
+                "K": camera.K.tolist(),
+                "world_to_camera": scene.world.viewmat_out(camera.viewmat).tolist(),
                 "photo": photo,
                 **masked,
             }
@@ -119,7 +124,7 @@ def load_cameras(folder: str | Path) -> RunCameras:
         raise ValueError(f"{path}: background is no colour: {value['background']!r:.60}")
     if up.shape != (3,) or not np.isfinite(up).all() or not np.linalg.norm(up) > 0:
         raise ValueError(f"{path}: up is no direction: {value['up']!r:.60}")
-    return RunCameras(up / np.linalg.norm(up), views, background)
+    return RunCameras(up / np.linalg.norm(up), views, background, world)
 
 
 class _HasName(Protocol):
@@ -142,10 +147,11 @@ def picked(train: Sequence[N], test: Sequence[N], which: str, whose: str) -> lis
         return [*kinds[which]]
     named = {one.name: one for one in kinds["all"]}
     named |= {Path(name).stem: one for name, one in named.items() if Path(name).stem not in named}
-    if missing := [name for name in which.split(",") if name not in named]:
+    wanted = [which] if which in named else [name.strip() for name in which.split(",")]
+    if missing := [name for name in wanted if name not in named]:
         known = ", ".join(["train", "test", "all", *[*named][:3]])
         raise ValueError(f"--views: {whose} has no photo {missing[0]!r}; there are: {known}, ...")
-    return [named[name] for name in which.split(",")]
+    return [named[name] for name in wanted]
 
 
 def first_camera(folder: Path) -> Camera | None:

@@ -21,6 +21,7 @@ MOST_BYTES = 4e9  # of all photos, where `longest` bounds them; 1,000 of 1600 x 
 # px: small copies of photos and frames, which tell of axes and of sharpness; cameras for photos that are
 # scaled down to no more need not be finer than such photos tell.
 COPY_SIDE = 640
+SAME_POSE = 0.5  # px of a run's photos; COLMAP moves them by far more where one of them is gone
 
 # From photos on disk to views, and to photos that are stored for COLMAP.
 JPEG_QUALITY = 95

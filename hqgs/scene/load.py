@@ -56,6 +56,7 @@ def load_scene(
     on_stage: OnStage = silent,
     sfm: bool = False,
     features: str = SIFT,
+    coarse: bool | None = None,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
 
@@ -77,7 +78,8 @@ def load_scene(
     beside the photos is an error, unless `sfm` says that they are to be used alone.
 
     `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
-    where all of them would take more than MOST_BYTES of memory. Cameras for small photos are found coarsely.
+    where all of them would take more than MOST_BYTES of memory. `coarse`: whether cameras of photos alone
+    may be found coarsely (`run_colmap`); None: where `longest` makes the photos small.
 
     With `skip_unreadable` photos that cannot be decoded (or whose mask or small photo cannot), and those of
     another shape than their camera, are left out, as long as at least half of the training photos remain, and
@@ -90,7 +92,7 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    coarse = longest is not None and longest <= COPY_SIDE
+    coarse = longest is not None and longest <= COPY_SIDE if coarse is None else coarse
     capture = with_faces(_read(root, downscale, sfm, Search(keep_sfm, on_stage, coarse, features)))
     if longest is not None:
         capture = bounded(capture, longest)

@@ -30,6 +30,16 @@ class Camera:
         """Camera centre in world coordinates, [3]."""
         return np.asarray(-np.linalg.solve(self.viewmat[:3, :3], self.viewmat[:3, 3]), dtype=np.float64)
 
+    def turned(self, quarters: int) -> Camera:
+        """The camera whose picture is this one's after so many quarter turns clockwise."""
+        if quarters % 4 == 0:
+            return self
+        pixels = np.array([[0.0, -1, self.height], [1, 0, 0], [0, 0, 1]])
+        axes = np.eye(4)
+        axes[:2, :2] = pixels[:2, :2]
+        K = pixels @ self.K @ axes[:3, :3].T
+        return Camera(self.height, self.width, K, axes @ self.viewmat).turned(quarters - 1)
+
 
 @dataclass(frozen=True)
 class View:
@@ -49,6 +59,11 @@ class View:
     device: str = ""  # the camera that took it, and how it was zoomed; "": nothing tells
     face: str = ""  # of a wide photo, which `image` is; as `hqgs.scene.faces` calls it
     empty: NDArray[np.uint8] | None = None  # [H, W], of a cut-out photo: 255 where nothing is, and black
+
+    @property
+    def upright_camera(self) -> Camera:
+        """That of the photo as people see it: turned as its EXIF says."""
+        return self.camera.turned(self.quarter_turns)
 
 
 @dataclass(frozen=True)

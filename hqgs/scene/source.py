@@ -11,12 +11,13 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from hqgs.base.files import CONFIG
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
-from hqgs.scene.constants import TEST_EVERY
+from hqgs.scene.constants import COPY_SIDE, TEST_EVERY
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.known_points import with_points
@@ -25,6 +26,7 @@ from hqgs.scene.metres import distance_of, in_metres
 from hqgs.scene.names import KEPT, is_room
 from hqgs.scene.photo_files import film_at
 from hqgs.scene.restore import check_weights, restore_scene
+from hqgs.scene.same_run import check_same
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
 from hqgs.scene.sfm.run import SIFT, check_features
@@ -45,6 +47,7 @@ def load(
     skip_unreadable: bool = True,
     cache: str | Path | None = None,
     longest: int | None = None,
+    coarse: bool | None = None,
     frames: int | None = None,
     distance: Sequence[str | float] | None = None,
     tag_size: float | None = None,
@@ -75,6 +78,8 @@ def load(
             the embedded scene.
         longest: px; scale the photos down further where a side is longer, or where all photos together
             would take more than 4 GB of memory.
+        coarse: whether COLMAP may look at photos alone coarsely, which is faster, to find their cameras;
+            None: where `longest` is at most 640.
         frames: how many of a film; None: two a second, 30 to 90.
         distance: (A, B, metres) between the cameras of two photos, or points "x,y,z" in the frame of the
             files: what is written is in metres then.
@@ -104,6 +109,7 @@ def load(
         "restore": None if restore is None else str(Path(restore).resolve()),
         "skip_unreadable": skip_unreadable,
         "longest": longest,
+        "coarse": coarse,
         "frames": frames,
         "distance": None if distance is None else [*distance],
         "tag_size": tag_size,
@@ -147,6 +153,7 @@ def load(
                 on_stage=on_stage,
                 sfm=sfm,
                 features=features,
+                coarse=coarse,
             )
             scene = replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
     if degradation.steps:
@@ -166,16 +173,34 @@ def load(
 def load_again(run: str | Path, on_stage: OnStage = silent) -> Scene:
     """The scene that the run in a folder was trained on, from the photos, where they still lie.
 
-    ValueError where its config.json does not tell, FileNotFoundError where the photos are gone.
+    ValueError where its config.json does not tell, or the photos have changed since (`check_same`),
+    FileNotFoundError where they are gone.
     """
     path = Path(run) / CONFIG
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))["scene"]
-        return load(**origin, cache=run, on_stage=on_stage)
+        scene = load(**origin, cache=run, on_stage=on_stage)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"the photos of the run {run} are not known: {error}") from error
     except (KeyError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} does not tell which scene was trained: {error!r}") from error
+    check_same(scene, Path(run), split=True)
+    return scene
+
+
+def finding(run: str | Path, path: str | Path) -> dict[str, Any]:
+    """Options of `load` by which photos alone, or a film, get the cameras that the run in a folder has.
+
+    Empty where no config.json tells.
+    """
+    try:
+        origin = json.loads((Path(run) / CONFIG).read_text(encoding="utf-8"))["scene"]
+        longest, coarse = origin.get("longest"), origin.get("coarse")
+        found = {"features": origin.get("features", SIFT)}
+        found |= {} if film_at(path) is None else {"frames": origin.get("frames")}
+    except (OSError, KeyError, TypeError, AttributeError, json.JSONDecodeError):
+        return {}
+    return found | {"coarse": longest is not None and longest <= COPY_SIDE if coarse is None else coarse}
 
 
 def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = None) -> Scene:

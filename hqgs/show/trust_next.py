@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,14 +19,17 @@ from hqgs.show.trust import Trust
 from hqgs.show.trust_measured import said_of
 
 Array = np.ndarray
-SIDES = ("above", "right of", "below", "left of")  # clockwise
+SIDES = {
+    "above": (1, -1),
+    "right of": (0, 1),
+    "below": (1, 1),
+    "left of": (0, -1),
+}  # axis of the camera, sign
 
 
-def doubtful_spots(trust: Trust, photos: Sequence[KnownCamera], turns: Mapping[str, int]) -> list[Spot]:
+def doubtful_spots(trust: Trust, photos: Sequence[KnownCamera]) -> list[Spot]:
     """Places a step to the left, right, above or below a photo, and looking as it does, from where the
     pixels' trust is least; none where it is about that of the photos' own places.
-
-    `turns`: quarter turns clockwise that show a photo upright, by name.
     """
     if len(photos) < 2:
         return []
@@ -40,13 +43,12 @@ def doubtful_spots(trust: Trust, photos: Sequence[KnownCamera], turns: Mapping[s
     found = list[tuple[float, Spot]]()
     for photo in chosen:
         R, center = photo.camera.viewmat[:3, :3], photo.camera.center
-        for side, (axis, sign) in enumerate(((1, -1), (0, 1), (1, 1), (0, -1))):  # up, right, down, left
+        for where, (axis, sign) in SIDES.items():
             at = center + sign * SPOT_STEP * usual * R[axis]
             if np.linalg.norm(centers - at, axis=1).min() < SPOT_STEP / 2 * usual:
                 continue  # another photo is there
             said = _said(trust, replace(photo.camera, viewmat=view_matrix(R, at)))
             if said < own - SPOT_WORSE:
-                where = SIDES[(side + turns.get(photo.name, 0)) % len(SIDES)]
                 words = f"{where} {photo.name}: what is seen from there is {own - said:.0f} dB less sure"
                 found.append((said, Spot(at, words, (photo.name,))))
     spots = list[Spot]()

@@ -20,6 +20,7 @@ from hqgs.model.formats.sog_writer import write_sog
 from hqgs.model.formats.splat import read_splat, write_splat
 from hqgs.model.formats.spz import read_spz, write_spz
 from hqgs.model.formats.world_file import keep_world, read_world
+from hqgs.scene.photo_files import is_run
 from hqgs.scene.world import World
 
 
@@ -114,6 +115,11 @@ def scene_file(path: str | Path) -> Path:
     file = path / PLY if path.is_dir() else path
     if path.is_dir() and not file.is_file() and (path / "meta.json").is_file():
         file = path / "meta.json"
+    if not file.is_file() and path.is_dir() and is_run(path):
+        raise FileNotFoundError(
+            f"{path} holds a run that has not ended, and no scene yet: "
+            f"hqgs train PHOTOS --out {path} --resume goes on"
+        )
     if not file.is_file():
         raise FileNotFoundError(f"there is no {file}: give the folder of a run, or a scene file")
     return file

@@ -106,7 +106,7 @@ def page_text(page: Page) -> str:
     learned = [learned_words(record) for record in report["learned"]]
     diagnosis, spots, trust = page.diagnosis, next_photos(page.scene), None
     if page.folder is not None and page.gaussians is not None and len(page.gaussians):
-        trust = trust_part(page.folder, page.scene, page.gaussians, report["iterations"])
+        trust = trust_part(page.folder, page.gaussians, report["iterations"])
         spots = [*spots, *trust.spots]
     return filled(
         "report.html.j2",
