@@ -16,6 +16,7 @@ from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
 from hqgs.cli.main import main
+from hqgs.cli.scenes import config_part
 from hqgs.scene import load as loading
 from hqgs.scene.camera_files import load_cameras, save_cameras
 from hqgs.scene.same_run import check_same, moved_px
@@ -116,19 +117,23 @@ def test_photos_on_their_side_are_the_same_ones(tmp_path: Path) -> None:
 
 
 def test_cameras_are_found_as_for_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert finding(tmp_path, "photos") == {}
+    assert finding({}, tmp_path) == {"features": "sift", "coarse": False}  # as without a run
     folder = tmp_path / "photos"
     write_photos(make_truth(4), folder)
 
     def origin(**values: Any) -> dict[str, Any]:
         (tmp_path / "config.json").write_text(json.dumps({"scene": values}))
-        return finding(tmp_path, folder)
+        return finding(config_part(tmp_path, "scene"), folder)
 
     assert origin(longest=480, features="learned", frames=9) == {"features": "learned", "coarse": True}
     assert origin(longest=1600) == {"features": "sift", "coarse": False}
     assert origin(longest=None, coarse=True) == {"features": "sift", "coarse": True}
     (tmp_path / "film.mp4").write_bytes(b"")
-    assert finding(tmp_path, tmp_path / "film.mp4") == {"features": "sift", "coarse": True, "frames": None}
+    assert finding(config_part(tmp_path, "scene"), tmp_path / "film.mp4") == {
+        "features": "sift",
+        "coarse": True,
+        "frames": None,
+    }
 
     asked = list[Search]()
 

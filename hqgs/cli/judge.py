@@ -199,7 +199,7 @@ def read_photos(
         points=False,
         cache=run,
         on_stage=screen.stage,
-        **(finding(run, photos) if bare and run is not None else {}),
+        **(finding(config_part(run, "scene"), photos) if bare and run is not None else {}),
     )
     if bare and run is not None:
         check_same(scene, run, split=False)

@@ -10,7 +10,7 @@ import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Number, Photos, ready
+from hqgs.cli.scenes import Number, Photos, config_part, ready
 from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
 from hqgs.training.config import AUTO, FORMATION, METHODS, run_config
@@ -72,7 +72,7 @@ def run(options: PlanOptions) -> int:
                     longest=longest,
                     cache=options.out,
                     on_stage=screen.stage,
-                    **finding(options.out, options.scene),
+                    **finding(config_part(options.out, "scene"), options.scene),
                 )
             else:
                 scene = pictures(options.scene, downscale=downscale, longest=longest)

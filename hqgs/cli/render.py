@@ -73,7 +73,7 @@ def run(options: Render) -> int:
         file = scene_file(source)
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.paths import with_size
-        from hqgs.show.frames import check_frames, render_frames  # here: they load torch
+        from hqgs.show.frames import check_frames, render_frames, written_size  # here: they load torch
 
         gaussians = Gaussians.load(file)
         tell_read(gaussians)
@@ -105,8 +105,7 @@ def run(options: Render) -> int:
     except OSError as error:
         return fail(1, f"{out}: {error}")
     seconds = time.perf_counter() - started
-    odd = out.suffix.lower() == ".mp4"  # such a film has even sides
-    kinds = sorted({(c.width - odd * (c.width % 2), c.height - odd * (c.height % 2)) for c in cameras})
+    kinds = sorted({written_size(out, camera.width, camera.height) for camera in cameras})
     px = f"{kinds[0][0]} x {kinds[0][1]} px" if len(kinds) == 1 else "several sizes"
     many = f"{len(cameras)} frames" if len(cameras) > 1 else "1 frame"
     print(f"{out}: {many}, {px}, {len(gaussians)} Gaussians, {len(cameras) / seconds:.1f} frames/s")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from hqgs.base.files import CONFIG, read_json
+from hqgs.base.interrupt import ENDINGS
 from hqgs.cli.errors import fail
 from hqgs.photos.formula import grammar
 from hqgs.scene.names import existing_folder, is_room
@@ -62,20 +63,18 @@ def ready(scene: str) -> None:
     warnings.filterwarnings(
         "ignore", category=FutureWarning, message=".*torch.jit"
     )  # of libraries, not of us
-    on_main = threading.current_thread() is threading.main_thread()
-    if on_main:
+    if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, _stop)  # packages that are half loaded take an exception for their own
     import_module("hqgs.pipeline")
     import_module("hqgs.scene.source")
-    heed_sigterm()
-    if on_main:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    heed_endings()
 
 
-def heed_sigterm() -> None:
-    """From here on SIGTERM counts as Ctrl-C: pycolmap, once it is loaded, ends with a stack trace."""
+def heed_endings() -> None:
+    """From here on Ctrl-C and SIGTERM interrupt; at the latter pycolmap would print a stack trace."""
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for ending in ENDINGS:
+            signal.signal(ending, signal.default_int_handler)
 
 
 def _stop(number: int, frame: object) -> None:

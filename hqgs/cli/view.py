@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import cameras_beside, heed_sigterm, tell_read
+from hqgs.cli.scenes import cameras_beside, heed_endings, tell_read
 from hqgs.model.formats.files import scene_file
 from hqgs.show.constants import PORT
 from hqgs.show.viewer.guard import ELSEWHERE, check
@@ -53,7 +53,7 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         from hqgs.model.gaussians import Gaussians
         from hqgs.show.viewer.viewer import Viewer
 
-        heed_sigterm()
+        heed_endings()
         gaussians = Gaussians.load(file)
         folder = file.parent
         report = report_in(folder)

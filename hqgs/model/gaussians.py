@@ -111,9 +111,8 @@ class Gaussians:
         """The same scene, held in another frame, such as that of its photos' cameras (`Scene.world`)."""
         if self.world.frame == world.frame:
             return self
-        ratio = self.world.unlike(world)  # 1, unless one of them is in metres
-        means = world.into(ratio * self.world.out(self.means.detach().double().numpy()))
-        grown = math.log(ratio * self.world.unit / world.unit)
+        means = self.world.to(world, self.means.detach().double().numpy())
+        grown = math.log(self.world.unlike(world) * self.world.unit / world.unit)
         held = {"means": torch.from_numpy(means).to(self.means.dtype), "scales": self.scales + grown}
         made = self.like(self.named() | held)
         made.world, made.look = world, None

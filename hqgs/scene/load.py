@@ -92,8 +92,8 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    coarse = longest is not None and longest <= COPY_SIDE if coarse is None else coarse
-    capture = with_faces(_read(root, downscale, sfm, Search(keep_sfm, on_stage, coarse, features)))
+    search = Search(keep_sfm, on_stage, coarsely(longest, coarse), features)
+    capture = with_faces(_read(root, downscale, sfm, search))
     if longest is not None:
         capture = bounded(capture, longest)
     degraded = read_degraded_folder(root)
@@ -154,6 +154,11 @@ def load_scene(
         world=replace(capture.world, place=place),
         guessed=guessed,
     )
+
+
+def coarsely(longest: int | None, coarse: bool | None = None) -> bool:
+    """Whether cameras of photos alone are found coarsely: as asked, or where `longest` makes them small."""
+    return longest is not None and longest <= COPY_SIDE if coarse is None else coarse
 
 
 def load_pictures(

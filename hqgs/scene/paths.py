@@ -16,9 +16,6 @@ from hqgs.scene.scene import Camera, Scene
 UP = (0.0, -1.0, 0.0)  # of a scene that says nothing: COLMAP's first camera has y down
 AROUND = math.radians(150)  # cameras that see their focus from a wider range are walked around in a circle
 _Array = NDArray[np.float64]
-# What is right in a picture that is shown upright, by quarter turns clockwise, in the frame of its camera; up
-# is what is right one turn on.
-RIGHT = np.array([[1.0, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0]])
 
 
 def look_at(
@@ -76,17 +73,15 @@ def with_size(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, K, camera.viewmat)
 
 
-def world_up(cameras: Sequence[Camera], turns: Sequence[int] | None = None) -> _Array:
-    """The direction in the world that is up, unit [3], as most photographers hold their cameras.
+def world_up(cameras: Sequence[Camera]) -> _Array:
+    """The direction in the world that is up, unit [3], as most photographers hold their cameras; those here
+    have upright pictures (`View.upright_camera`).
 
     It is orthogonal to the upright pictures' x axes as far as that says anything (photos that look down do
-    not tilt it then), and the mean of their upward directions where not. `turns`: the quarter turns clockwise
-    that show each camera's picture upright (`View.quarter_turns`); None: they are upright.
+    not tilt it then), and the mean of their upward directions where not.
     """
     R = np.stack([camera.viewmat[:3, :3] for camera in cameras])
-    quarters = np.zeros(len(R), int) if turns is None else np.asarray(turns) % 4
-    right = np.einsum("nj,njk->nk", RIGHT[quarters], R)
-    mean = np.einsum("nj,njk->nk", RIGHT[(quarters + 1) % 4], R).mean(axis=0)
+    right, mean = R[:, 0], -R[:, 1].mean(axis=0)
     values, vectors = np.linalg.eigh(right.T @ right / len(R))
     level = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
     if values[1] > 0.1 and values[0] < 0.05 and level @ mean > 0.5:
@@ -99,7 +94,7 @@ def scene_up(scene: Scene) -> _Array:
     """Up in a scene, unit [3]: as was told of its world, else as its photos were held (`world_up`)."""
     if scene.world.up is not None:
         return np.array(scene.world.up)
-    return world_up([view.camera for view in scene.train], [view.quarter_turns for view in scene.train])
+    return world_up([view.upright_camera for view in scene.train])
 
 
 def sight_lines(cameras: Sequence[Camera]) -> tuple[_Array, _Array, _Array, _Array]:

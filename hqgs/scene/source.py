@@ -6,7 +6,7 @@ The command line and `import hqgs` both call what is here; the former scales lar
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +17,11 @@ from hqgs.base.files import CONFIG
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.builtin import room
-from hqgs.scene.constants import COPY_SIDE, TEST_EVERY
+from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
 from hqgs.scene.known_points import with_points
-from hqgs.scene.load import check_names, load_pictures, load_scene
+from hqgs.scene.load import check_names, coarsely, load_pictures, load_scene
 from hqgs.scene.metres import distance_of, in_metres
 from hqgs.scene.names import KEPT, is_room
 from hqgs.scene.photo_files import film_at
@@ -188,19 +188,14 @@ def load_again(run: str | Path, on_stage: OnStage = silent) -> Scene:
     return scene
 
 
-def finding(run: str | Path, path: str | Path) -> dict[str, Any]:
-    """Options of `load` by which photos alone, or a film, get the cameras that the run in a folder has.
+def finding(origin: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
+    """Options of `load` by which photos alone, or a film, get the cameras that a run has.
 
-    Empty where no config.json tells.
+    `origin`: `Scene.origin` of what it was trained on, as its config.json has it; empty: not known.
     """
-    try:
-        origin = json.loads((Path(run) / CONFIG).read_text(encoding="utf-8"))["scene"]
-        longest, coarse = origin.get("longest"), origin.get("coarse")
-        found = {"features": origin.get("features", SIFT)}
-        found |= {} if film_at(path) is None else {"frames": origin.get("frames")}
-    except (OSError, KeyError, TypeError, AttributeError, json.JSONDecodeError):
-        return {}
-    return found | {"coarse": longest is not None and longest <= COPY_SIDE if coarse is None else coarse}
+    found = {"features": origin.get("features", SIFT)}
+    found |= {} if film_at(path) is None else {"frames": origin.get("frames")}
+    return found | {"coarse": coarsely(origin.get("longest"), origin.get("coarse"))}
 
 
 def pictures(path: str | Path, *, downscale: float = 1.0, longest: int | None = None) -> Scene:

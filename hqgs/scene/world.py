@@ -57,6 +57,16 @@ class World:
         """What lengths of this frame's files are multiplied by in those of another one."""
         return (other.metres or 1.0) / (self.metres or 1.0)
 
+    def to(self, other: World, points: Array) -> Array:
+        """Points [..., 3] held in this frame, in another one of the same scene."""
+        return other.into(self.unlike(other) * self.out(points))
+
+    def viewmat_to(self, other: World, viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A world-to-camera matrix [4, 4] of this frame for another one of the same scene."""
+        moved = self.viewmat_out(viewmat).copy()
+        moved[:3, 3] *= self.unlike(other)
+        return other.viewmat_into(moved)
+
     def viewmat_out(self, viewmat: NDArray[np.float64]) -> NDArray[np.float64]:
         """A world-to-camera matrix [4, 4] for the frame of the files; its camera's units are theirs."""
         if self.ordinary:

@@ -271,9 +271,15 @@ def _pyav() -> Any:
     return pyav(".mp4 (.gif does not)")
 
 
+def written_size(out: Path, width: int, height: int) -> tuple[int, int]:
+    """Width and height of pictures of that size in a file: a film has even sides."""
+    odd = 1 if out.suffix.lower() == ".mp4" else 0
+    return width - odd * (width % 2), height - odd * (height % 2)
+
+
 def _write_mp4(av: Any, path: Path, pictures: Iterator[Picture], fps: float) -> None:
     first = next(pictures)
-    height, width = (side - side % 2 for side in first.shape[:2])
+    width, height = written_size(path, first.shape[1], first.shape[0])
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as film:
         stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

@@ -115,11 +115,11 @@ def scene_file(path: str | Path) -> Path:
     file = path / PLY if path.is_dir() else path
     if path.is_dir() and not file.is_file() and (path / "meta.json").is_file():
         file = path / "meta.json"
-    if not file.is_file() and path.is_dir() and is_run(path):
+    if file.is_file():
+        return file
+    if is_run(path):
         raise FileNotFoundError(
             f"{path} holds a run that has not ended, and no scene yet: "
             f"hqgs train PHOTOS --out {path} --resume goes on"
         )
-    if not file.is_file():
-        raise FileNotFoundError(f"there is no {file}: give the folder of a run, or a scene file")
-    return file
+    raise FileNotFoundError(f"there is no {file}: give the folder of a run, or a scene file")
