@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from pandas import DataFrame
 
 from benchmarks.pages.figures import gain, pick, records, unbeaten
-from benchmarks.pages.sections import OPENSPLAT, asked
+from benchmarks.pages.sections import asked
 from benchmarks.rows import pairs_of
 
 BLUE, ORANGE, GREEN, GREY = "#1f6fb2", "#c2571a", "#3a8f3a", "#6b6b6b"
@@ -84,10 +84,9 @@ def against_seconds(times: DataFrame) -> Figure:
     scenes = list(dict.fromkeys(pick(times, row="3dgs")["scene"]))
     figure, grid = panels(4 * len(scenes), 4, 1, len(scenes))
     for axes, scene in zip(grid, scenes, strict=True):
-        for row, shade in ((OPENSPLAT, ORANGE), ("3dgs", GREY)):
-            for line in records(pick(times, scene=scene, row=row)):
-                points = [(float(at), psnr) for at, psnr in pairs_of(line["history"])]
-                axes.plot(*zip(*points, strict=True), color=shade, label=row)
+        for line in records(pick(times, scene=scene, row="3dgs")):
+            points = [(float(at), psnr) for at, psnr in pairs_of(line["history"])]
+            axes.plot(*zip(*points, strict=True), color=GREY, label="3dgs")
         mine = pick(times, scene=scene, row=asked(times)).sort_values("seconds")
         axes.plot(mine["seconds"], mine["psnr"], "o-", color=BLUE, label="hqgs --seconds")
         axes.set(xscale="log", xlabel="training (s)", ylabel="held-out PSNR (dB)")
