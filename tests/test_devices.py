@@ -19,12 +19,12 @@ from hqgs.cli.main import main
 from hqgs.diagnosis.constants import PAYS
 from hqgs.diagnosis.devices import Devices, device_signs, grouped
 from hqgs.diagnosis.gains import SharedColors
+from hqgs.diagnosis.own import device_findings
 from hqgs.evaluation.looks import look_of
 from hqgs.photos.light import to_linear, to_srgb
-from hqgs.photos.look import Look, darken, falloff, respond, squared_radii
+from hqgs.photos.look import STEEPEST, Look, as_a_lens, darken, falloff, respond, squared_radii
 from hqgs.scene.builtin.devices import draw_devices
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.constants import STEEPEST
 from hqgs.training.methods.devices import KEPT, LearnedDevices
 
 Floats = NDArray[np.float64]
@@ -160,6 +160,41 @@ def test_responses_rise_and_keep_their_mean() -> None:
     np.testing.assert_array_equal(each[3], 0)
 
 
+@pytest.mark.parametrize(
+    ("found", "kept"),
+    [
+        ([0.5, 0.2], [0.5, 0.2]),
+        ([-1.14, 0.8], [0, 0.23]),  # brighter than on the axis nearly everywhere
+        ([-0.5, -0.5], [0, 0]),
+        ([1.0, -0.8], [1.0, -0.5]),  # it would rise again from r^2 = 0.625 on
+        ([4.0, 2.0], [8 / 6 * np.log(2), 4 / 6 * np.log(2)]),  # 8.7 stops in the corner
+    ],
+)
+def test_vignetting_is_what_a_lens_does(found: list[float], kept: list[float]) -> None:
+    """Of 1,001 radii: light falls from the axis to the corner, by two stops at most."""
+    lens = as_a_lens(np.array([found, [0.1, 0.0]]))
+    np.testing.assert_allclose(lens[0], kept, atol=1e-12)
+    fall = falloff(torch.linspace(0, 1, 1_001, dtype=torch.float64), torch.from_numpy(lens[0])).numpy()
+    assert (np.diff(fall) > -1e-12).all()
+    assert fall[-1] < 2 * np.log(2) + 1e-12
+    assert lens[1].tolist() == [0.1, 0.0]  # the bits of what is one
+    devices = LearnedDevices(Devices(np.zeros(1, int), np.array([found]), np.zeros((1, 2, 3))), True, False)
+    np.testing.assert_allclose(devices.learned(0)[0], kept, atol=1e-12)
+
+
+def test_what_no_camera_does_is_not_its_look() -> None:
+    """Light that goes with the photo, as a flash does: brighter towards the corners."""
+    rng = np.random.default_rng(7)
+    views = [view(k, "a") for k in range(12)]
+    bright = [Look(np.ones(3), np.array([-1.14, 0.8]), np.zeros((2, 3))) for _ in views]
+    signs = device_signs(views, colors(rng, bright, 0.05))
+    assert signs is not None
+    assert signs.unbounded[0] > 3 * PAYS["vignetting"]
+    finding, _ = device_findings(signs)
+    assert not finding.needed
+    assert "which no lens does" in finding.reason
+
+
 def test_photos_that_each_have_a_camera_of_their_own_take_no_more_memory() -> None:
     count = KEPT + 4
     devices = LearnedDevices(
@@ -195,7 +230,7 @@ def test_a_run_learns_them_bit_for_bit(formation: str, tmp_path: Path) -> None:
         hqgs.set_num_threads(before)
     assert_same(*runs)
     learned = runs[0].method.learned()
-    assert any(np.abs(photo.vignetting).max() > 1e-3 for photo in learned)
+    assert any(np.abs(photo.response).max() > 1e-3 for photo in learned)
     np.testing.assert_allclose(np.mean([photo.response for photo in learned], 0), 0, atol=1e-9)
 
 

@@ -24,6 +24,7 @@ from hqgs.diagnosis.constants import (
 )
 from hqgs.diagnosis.gains import SharedColors
 from hqgs.photos.light import EXPONENT, OFFSET, to_srgb
+from hqgs.photos.look import as_a_lens, as_responses
 from hqgs.scene.scene import View
 
 Floats = NDArray[np.float64]
@@ -44,11 +45,15 @@ class Devices:
 
 @dataclass(frozen=True)
 class DeviceSigns:
-    """What cameras explain of how far photos are off each other's colours."""
+    """What cameras explain of how far photos are off each other's colours.
+
+    Shares of the error of held-back photos: what each camera's vignetting takes, and its response beside it.
+    """
 
     devices: Devices
-    vignetting: float  # share of the error of held-back photos that each camera's vignetting takes
-    response: float  # and its response beside it
+    vignetting: float
+    response: float
+    unbounded: tuple[float, float]  # of both, where they may be what no lens and no sensor does
     corner: float  # the most that a lens keeps from a corner
 
 
@@ -80,20 +85,36 @@ def device_signs(views: Sequence[View], shared: SharedColors) -> DeviceSigns | N
     for device in range(-1, count):
         rows = np.flatnonzero(of_photo == device)
         place[rows] = np.arange(len(rows))
-    errors = {kind: 0.0 for kind in ("", *kinds)}
+    counts = np.bincount(of_photo[of_photo >= 0], minlength=count)
+    errors = {(kind, bound): 0.0 for kind in ("", *kinds) for bound in (True, False)}
     for part in (0, 1):
         held = (place % 2 == part)[table.photo]
-        for kind in errors:
-            errors[kind] += table.held_error(table.fit(~held, kind), held)
-    base = errors[""] or 1.0
-    found = table.fit(np.ones(len(table.photo), bool), kinds[-1])
-    response = found[:, 2:] - found[of_photo[of_photo >= 0], 2:].mean(0)
-    vignetting = (table.fit(np.ones(len(table.photo), bool), "v"))[:, :2].mean(2)
+        for kind in ("", *kinds):
+            found = table.fit(~held, kind)
+            for bound in (True, False):
+                looks = _as_cameras(found, counts) if bound else found
+                errors[kind, bound] += table.held_error(looks, held)
+    base, last = errors["", True] or 1.0, kinds[-1]
+    every = np.ones(len(table.photo), bool)
+    vignetting = as_a_lens(table.fit(every, "v")[:, :2].mean(2))
+    found = _as_cameras(table.fit(every, last), counts)
+    response = found[:, 2:] - (counts[:, None, None] * found[:, 2:]).sum(0) / counts.sum()
     corner = 1 - np.exp(-vignetting.sum(1)).min()
-    less = 1 - errors["v"] / base
-    return DeviceSigns(
-        Devices(of_photo, vignetting, response), less, (errors["v"] - errors[kinds[-1]]) / base, float(corner)
+    darker, bent = (
+        tuple((errors[one, bound] - errors[other, bound]) / base for bound in (True, False))
+        for one, other in (("", "v"), ("v", last))
     )
+    devices = Devices(of_photo, vignetting, response)
+    return DeviceSigns(devices, darker[0], bent[0], (darker[1], bent[1]), float(corner))
+
+
+def _as_cameras(found: Floats, counts: Numbers) -> Floats:
+    """Parameters [D, 4, 3] as lenses and sensors may have them: vignetting is of all colours; how far a
+    response is off the mean over photos, of which each camera took `counts`, keeps it rising."""
+    lens = as_a_lens(found[:, :2].mean(2))
+    mean = (counts[:, None, None] * found[:, 2:]).sum(0) / counts.sum()
+    response = mean + as_responses(found[:, 2:] - mean)
+    return np.concatenate([np.repeat(lens[..., None], 3, 2), response], 1)
 
 
 @dataclass(frozen=True)

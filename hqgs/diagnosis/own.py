@@ -16,6 +16,11 @@ from hqgs.diagnosis.photo import PhotoDiagnosis
 from hqgs.photos.formula import DEVICES
 from hqgs.scene.scene import Scene
 
+NO_CAMERA = {
+    "vignetting": "is brighter towards corners, or loses more than two stops there, which no lens does",
+    "response": "is no curve that rises, which no sensor does",
+}
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -50,10 +55,14 @@ def device_findings(signs: DeviceSigns | None) -> tuple[Finding, Finding]:
         vignetting, response = (Finding(name, False, None, None, None, why) for name in DEVICES)
         return vignetting, response
     found: list[Finding] = []
-    for name, less in zip(DEVICES, (signs.vignetting, signs.response), strict=True):
+    for name, less, more in zip(DEVICES, (signs.vignetting, signs.response), signs.unbounded, strict=True):
         needed = less >= PAYS[name]
         reason = f"with each camera's {name} photos that were held back agree better by {less:.1%}"
         reason += "" if needed else f" (needed from {PAYS[name]:.0%})"
+        if more >= PAYS[name] and less < more / 2:
+            needed = False
+            reason = f"what would let photos agree better by {more:.1%} {NO_CAMERA[name]}; it counts as light"
+            reason += " that changes, a flash or reflections"
         found.append(Finding(name, needed, less, None, name if needed else None, reason))
     return found[0], found[1]
 

@@ -5,7 +5,8 @@ R(s(g l exp(-k1 r^2 - k2 r^4))), where s is the curve of sRGB and R(v) = v + v (
 for red, green and blue each: black and white stay. With u = 1 - 2 v its slope is 1 + a P1(u) + b P2(u),
 Legendre's polynomials: it rises as long as |a| + |b| < 1. Beyond 0 and 1 it goes on straight.
 
-The parts are those of PPISP, in fewer numbers: too few to take over what the scene should explain.
+The parts are those of PPISP, in fewer numbers: too few to take over what the scene should explain. What no
+lens and no sensor does is none of them (`as_a_lens`, `as_responses`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ from torch import Tensor
 
 from hqgs.base.elementary import exp
 from hqgs.photos.light import EXPONENT, OFFSET, to_linear, to_srgb
+
+MOST_FALL = 2 * np.log(2)  # two stops, in a corner; wide lenses of phones lose 1 to 1.5
+STEEPEST = 0.9  # |a| + |b| of a response at most: below 1 it rises
+MOST_GAIN = 4 * np.log(2)  # of the logarithm of a gain, to either side: what `exposure:EV` takes
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,24 @@ def squared_radii(height: int, width: int, K: NDArray[np.float64]) -> NDArray[np
 def falloff(square: Tensor, vignetting: Tensor) -> Tensor:
     """The negative logarithm of what a lens lets through at these r^2; `vignetting` [2]."""
     return square * (vignetting[0] + square * vignetting[1])
+
+
+def as_a_lens(vignetting: NDArray[np.float64]) -> NDArray[np.float64]:
+    """k1 and k2 [..., 2] of a lens: from the axis to the corner light falls, and by MOST_FALL at most.
+
+    Bounded are the slopes of the fall over r^2 on the axis, k1, and in the corner, k1 + 2 k2.
+    """
+    slopes = np.stack([vignetting[..., 0], vignetting @ [1.0, 2.0]], -1)
+    bounded = slopes.clip(0)
+    bounded *= MOST_FALL / bounded.mean(-1, keepdims=True).clip(MOST_FALL)
+    changed = (bounded != slopes).any(-1, keepdims=True)
+    return np.where(changed, bounded @ [[1.0, -0.5], [0.0, 0.5]], vignetting)
+
+
+def as_responses(each: NDArray[np.float64]) -> NDArray[np.float64]:
+    """a and b [D, 2, 3] of cameras whose values rise: where one's would not, all are made smaller, so that
+    their mean over photos stays 0."""
+    return each * (STEEPEST / np.abs(each).sum(1, keepdims=True).clip(STEEPEST)).min(0)
 
 
 def darken(values: Tensor, fall: Tensor) -> Tensor:

@@ -136,7 +136,6 @@ SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle, and the widest disc: a
 FIRST_TRAJECTORY, FIRST_RADIUS = 1e-3, 0.0015
 TRAJECTORY_RATE, LENS_RATE, GAIN_RATE = 8e-4, 4e-4, 0.005  # of the photo's width, twice; of the log gains
 DEVICE_RATE = 0.001  # of vignetting and response, which each photo of a camera moves
-STEEPEST = 0.9  # |a| + |b| of a response at most: below 1 it rises
 NARROW = 200  # px: narrower photos count as that wide
 TRAJECTORY_POINTS = 9  # that stand for a trajectory
 WARP_SPACING, MOST_WARPS = 1.5, 17  # px of a trajectory between samples of the exposure; and samples

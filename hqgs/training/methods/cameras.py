@@ -21,6 +21,7 @@ from hqgs.base.elementary import exp
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
 from hqgs.photos.exposure import take_photo
+from hqgs.photos.look import MOST_GAIN
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.constants import (
@@ -285,10 +286,11 @@ def _trajectory_warps(path: Tensor, camera: Camera, count: int) -> Tensor:
 
 @torch.no_grad()
 def _center(tensors: Sequence[Tensor], wanted: Tensor) -> None:
-    """Give them this mean."""
+    """Give these log gains this mean; none is more than MOST_GAIN."""
     shift = torch.stack([*tensors]).mean(0) - wanted
     for tensor in tensors:
         tensor -= shift
+        tensor.clamp_(-MOST_GAIN, MOST_GAIN)
 
 
 def _middle(path: Tensor) -> Tensor:

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hqgs.diagnosis.devices import Devices
-from hqgs.photos.look import darken, falloff, respond, squared_radii
+from hqgs.photos.look import as_a_lens, as_responses, darken, falloff, respond, squared_radii
 from hqgs.scene.scene import Camera
-from hqgs.training.constants import STEEPEST
 
 KEPT = 8  # maps of squared radii; photos may each have a camera of their own
 
@@ -53,14 +52,15 @@ class LearnedDevices:
 
     @torch.no_grad()
     def center(self) -> None:
-        """What photos cannot tell stays, and responses rise: after each step."""
+        """What photos cannot tell stays, light falls towards corners, and responses rise: after each step."""
+        for vignetting in self._vignetting:
+            vignetting.copy_(torch.from_numpy(as_a_lens(vignetting.numpy())))
         if not self._response:
             return
         each = torch.stack([*self._response])
         each -= (self._shares[:, None, None] * each).sum(0)
-        each *= (STEEPEST / each.abs().sum(1, keepdim=True).clamp(min=STEEPEST)).amin(dim=0)
-        for response, value in zip(self._response, each, strict=True):
-            response.copy_(value)
+        for response, value in zip(self._response, as_responses(each.numpy()), strict=True):
+            response.copy_(torch.from_numpy(value))
 
     def learned(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Vignetting [2] and response [2, 3] of the photo's camera."""
