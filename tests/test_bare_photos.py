@@ -26,7 +26,7 @@ from hqgs.scene.sfm import attempt, program
 from hqgs.scene.sfm import run as colmap_run
 from hqgs.scene.sfm.align import rotation_angles
 from hqgs.scene.sfm.attempt import Attempt
-from hqgs.scene.sfm.bare_photos import bare_photos, readable
+from hqgs.scene.sfm.bare_photos import BarePhotos, bare_photos, readable
 from hqgs.scene.sfm.failure import Pass, what_to_take, why_few, why_lost, why_no_model
 from hqgs.scene.sfm.likely import film_pairs, likely_pairs
 from hqgs.scene.sfm.run import LARGEST, expected_time
@@ -121,6 +121,32 @@ def test_photos_one_level_down_are_found_and_others_are_named(tmp_path: Path) ->
         ValueError, match=r"7 of 11 photos cannot be read: cut.jpg \(.*notes.png \(no picture\)"
     ):
         readable(again)
+
+
+@pytest.mark.parametrize("around", [False, True])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["IMG_1.heic", "IMG_1.heic.jpg", "IMG_2.heic"],
+        ["a b.webp", "a_b.webp", "a_b.webp.jpg", "a\tb.webp.JPG"],
+        ["#1.png", "_1.png", "__1.png", "1.png"],
+        ["x.webp", "_x.webp.jpg", "x.webp.jpg", "__x.webp.jpg"],
+        ["a.jpg", "a.front.jpg", "a.jpg.webp"],
+    ],
+)
+def test_photos_have_names_of_their_own_for_colmap(names: list[str], around: bool, tmp_path: Path) -> None:
+    for k, name in enumerate(names):
+        Image.fromarray(np.full((64, 128, 3), 9 * k, np.uint8)).save(tmp_path / name, format="PNG")
+    photos = BarePhotos(tmp_path, 1.0, sorted(names), [(128, 64)] * len(names), around=around)
+    called = photos.colmap_names
+    assert len(called) == len(names) * (6 if around else 1)
+    assert list(called.values()) == [name for name in sorted(names) for _ in range(6 if around else 1)]
+    assert not any(" " in name or "\t" in name or name.startswith("#") for name in called)
+    (tmp_path / "out").mkdir()
+    photos.write(tmp_path / "out")
+    for name, photo in called.items():
+        with Image.open(tmp_path / "out" / name) as seen:
+            assert abs(int(np.asarray(seen).mean()) - 9 * names.index(photo)) <= 1
 
 
 def test_heic_photos_are_read_or_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,6 @@ MISTAKES = {
     f"{TRAIN} --tag-size 0": "tag_size: 0 m; it must be more than 0",
     f"{TRAIN} --up 0 0 0": "up is [0.0, 0.0, 0.0], wanted three numbers x, y, z that are not all 0",
     f"{TRAIN} --frames 9": "frames is for films, and scene is none: each of its photos is used",
-    f"{TRAIN} --features surf": "wanted one of: 'sift', 'learned'",
     f"{TRAIN} --test-every 1": "all 9 views are test views, none is left to train on",
     f"{TRAIN} --leave-out phtos": "there is no 'phtos'; there are: auto, none, or some of photos, ",
     f"{TRAIN} --config missing.json": "there is no configuration missing.json",

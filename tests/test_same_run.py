@@ -117,7 +117,7 @@ def test_photos_on_their_side_are_the_same_ones(tmp_path: Path) -> None:
 
 
 def test_cameras_are_found_as_for_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert finding({}, tmp_path) == {"features": "sift", "coarse": False}  # as without a run
+    assert finding({}, tmp_path) == {"coarse": False}  # as without a run
     folder = tmp_path / "photos"
     write_photos(make_truth(4), folder)
 
@@ -125,15 +125,11 @@ def test_cameras_are_found_as_for_the_run(tmp_path: Path, monkeypatch: pytest.Mo
         (tmp_path / "config.json").write_text(json.dumps({"scene": values}))
         return finding(config_part(tmp_path, "scene"), folder)
 
-    assert origin(longest=480, features="learned", frames=9) == {"features": "learned", "coarse": True}
-    assert origin(longest=1600) == {"features": "sift", "coarse": False}
-    assert origin(longest=None, coarse=True) == {"features": "sift", "coarse": True}
+    assert origin(longest=480, frames=9) == {"coarse": True}
+    assert origin(longest=1600) == {"coarse": False}
+    assert origin(longest=None, coarse=True) == {"coarse": True}
     (tmp_path / "film.mp4").write_bytes(b"")
-    assert finding(config_part(tmp_path, "scene"), tmp_path / "film.mp4") == {
-        "features": "sift",
-        "coarse": True,
-        "frames": None,
-    }
+    assert finding(config_part(tmp_path, "scene"), tmp_path / "film.mp4") == {"coarse": True, "frames": None}
 
     asked = list[Search]()
 

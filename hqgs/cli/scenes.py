@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -33,10 +33,6 @@ Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
 Factor = Annotated["float | None", tyro.conf.arg(metavar="F", help_behavior_hint="")]
 Number = Annotated["int | None", tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Apart = Annotated["tuple[str, str, float] | None", tyro.conf.arg(metavar="A B METRES", help_behavior_hint="")]
-Features = Annotated[
-    Literal["sift", "learned"],
-    tyro.conf.arg(help="Of photos, to find cameras; learned: by networks, of the extra hqgs[learned]."),
-]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 KINDS = (
     f"{grammar()}, some:KIND (half of the photos only), several joined by + in their order, mixed, or none"

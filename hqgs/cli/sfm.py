@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hqgs.base.files import check_new_folder
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen, duration
-from hqgs.cli.scenes import Features, Folder, Number, SceneName, ready
+from hqgs.cli.scenes import Folder, Number, SceneName, ready
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +18,6 @@ class Sfm:
     """A folder with photos, or a film."""
     out: Folder
     """Folder for the scene; missing or empty. It gets images and sparse/0, as COLMAP names them."""
-    features: Features = "sift"
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
 
@@ -37,7 +36,7 @@ def run(options: Sfm) -> int:
 
         with LoadingScreen() as screen:
             report = write_colmap_folder(
-                options.scene, options.out, options.out / WORK, options.frames, screen.stage, options.features
+                options.scene, options.out, options.out / WORK, options.frames, screen.stage
             )
     except KeyboardInterrupt:
         return fail(130, "stopped; the same command goes on with what COLMAP has found")

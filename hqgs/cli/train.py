@@ -22,7 +22,7 @@ from hqgs.cli.out_folder import check_out
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, Times, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
-from hqgs.cli.scenes import Apart, Factor, Features, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
 from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
@@ -46,18 +46,7 @@ if TYPE_CHECKING:
 
 EXPERT = "--config."
 # Options that shape the scene.
-LOADING = (
-    "downscale",
-    "test_every",
-    "sfm",
-    "degrade",
-    "restore",
-    "features",
-    "frames",
-    "distance",
-    "tag_size",
-    "up",
-)
+LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "distance", "tag_size", "up")
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
@@ -93,7 +82,6 @@ class Train(Photos):
     """Begin anew in a folder that holds a run."""
     sfm: Flag = False
     """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
-    features: Features = "sift"
     frames: Number = None
     """Frames to take from a film (two a second, 30 to 90)."""
     distance: Apart = None

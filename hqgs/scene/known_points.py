@@ -13,7 +13,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.scene.random_points import NO_POINTS
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.constants import TOO_SMALL
-from hqgs.scene.sfm.run import PROGRAM, key_of
+from hqgs.scene.sfm.run import key_of
 from hqgs.scene.sfm.triangulated import SparsePoints, triangulated
 
 
@@ -56,8 +56,7 @@ def with_points(scene: Scene, keep: Path | None = None, on_stage: OnStage = sile
 
 
 def _pieces(scene: Scene) -> Iterator[bytes]:
-    """The photos and cameras, and how points are found."""
-    yield PROGRAM.with_name("triangulated.py").read_bytes()
+    """The photos and cameras."""
     for view in scene.train:
         for array in (view.image, view.mask, view.camera.K, view.camera.viewmat):
             yield b"-" if array is None else np.ascontiguousarray(array).tobytes()

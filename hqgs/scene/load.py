@@ -39,7 +39,6 @@ from hqgs.scene.refused import above, beside, broken, nothing
 from hqgs.scene.scene import Scene, TrackStatistics, View
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, read_photos
-from hqgs.scene.sfm.run import SIFT
 from hqgs.scene.views import load_views
 from hqgs.scene.wide import with_faces
 
@@ -55,7 +54,6 @@ def load_scene(
     longest: int | None = None,
     on_stage: OnStage = silent,
     sfm: bool = False,
-    features: str = SIFT,
     coarse: bool | None = None,
 ) -> Scene:
     """Read a scene folder into memory: pinhole cameras, uint8 photos, starting points.
@@ -74,8 +72,7 @@ def load_scene(
 
     A folder that holds photos alone gets its cameras and points from them (`read_photos`). `keep_sfm` is
     a folder for that reconstruction, which the next call takes from there. `on_stage` hears what takes
-    long. `features`: of which kind those are that COLMAP goes by (`run_colmap`). Half a COLMAP model
-    beside the photos is an error, unless `sfm` says that they are to be used alone.
+    long. Half a COLMAP model beside the photos is an error, unless `sfm` says that they are to be used alone.
 
     `longest` bounds the longer side of the photos, px: they are scaled down further where it is larger, or
     where all of them would take more than MOST_BYTES of memory. `coarse`: whether cameras of photos alone
@@ -92,7 +89,7 @@ def load_scene(
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     if test_every < 0:
         raise ValueError(f"test_every must be at least 0, got {test_every}")
-    search = Search(keep_sfm, on_stage, coarsely(longest, coarse), features)
+    search = Search(keep_sfm, on_stage, coarsely(longest, coarse))
     capture = with_faces(_read(root, downscale, sfm, search))
     if longest is not None:
         capture = bounded(capture, longest)

@@ -178,7 +178,6 @@ class SfmReport:
     first_pass: int | None = None  # photos that the first pass registered, where it took a second one
     advice: str | None = None  # where photos are missing: what was found, and what to do
     lost: dict[str, str] = field(default_factory=dict)  # photos without a place, and why
-    learned: bool = False  # by features of networks, not SIFT
     sure_px: dict[str, float] = field(default_factory=dict)  # of each photo with a place; see `sureness`
     auc: dict[str, float] | None = None  # of pairs' pose errors up to "1", "3", "5" degrees; see `pose_auc`
 
@@ -188,8 +187,6 @@ class SfmReport:
             text += (
                 f"; a first pass had registered {self.first_pass}, a second and more tolerant one the rest"
             )
-        if self.learned:
-            text += "; by features of networks (ALIKED, LightGlue) in place of SIFT"
         if self.not_registered:
             names = [
                 f"{name} ({self.lost[name]})" if name in self.lost else name for name in self.not_registered

@@ -29,7 +29,6 @@ from hqgs.scene.restore import check_weights, restore_scene
 from hqgs.scene.same_run import check_same
 from hqgs.scene.scene import Scene
 from hqgs.scene.sfm.reconstruct import sfm_scene
-from hqgs.scene.sfm.run import SIFT, check_features
 from hqgs.scene.tags import by_tags, check_tag_size
 from hqgs.scene.upright import as_asked, direction_of, with_up
 
@@ -40,7 +39,6 @@ def load(
     downscale: float = 1.0,
     test_every: int = 8,
     sfm: bool = False,
-    features: str = SIFT,
     degrade: str = "none",
     seed: int = 0,
     restore: str | Path | None = None,
@@ -66,8 +64,6 @@ def load(
         test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
         sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
-        features: of photos, to find cameras: "sift"; "learned", which networks recognise under noise and
-            codecs (the extra `learned`).
         degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
         seed: of the degradation, and of what a built-in camera does.
         restore: weights of an image network that the training photos go through at last.
@@ -103,7 +99,6 @@ def load(
         "downscale": downscale,
         "test_every": test_every,
         "sfm": sfm,
-        "features": features,
         "degrade": degrade,
         "seed": seed,
         "restore": None if restore is None else str(Path(restore).resolve()),
@@ -119,7 +114,6 @@ def load(
     if tag_size is not None:
         check_tag_size(tag_size, distance)
     asked = None if up is None else direction_of(up)
-    check_features(features)
     degradation = parse_degradation(degrade)
     if restore is not None:
         check_weights(restore)
@@ -152,14 +146,13 @@ def load(
                 longest=longest,
                 on_stage=on_stage,
                 sfm=sfm,
-                features=features,
                 coarse=coarse,
             )
             scene = replace(scene, name=name or scene.name, notes=[*notes, *scene.notes])
     if degradation.steps:
         scene = degrade_scene(scene, degradation, seed)
     if sfm and (scene.source != "photos" or degradation.steps):
-        scene = sfm_scene(scene, models, on_stage, features)
+        scene = sfm_scene(scene, models, on_stage)
     scene = scene if restore is None else restore_scene(scene, restore)
     if points:
         scene = with_points(scene, models, on_stage)
@@ -179,6 +172,7 @@ def load_again(run: str | Path, on_stage: OnStage = silent) -> Scene:
     path = Path(run) / CONFIG
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))["scene"]
+        origin.pop("features", None)  # which older versions could choose
         scene = load(**origin, cache=run, on_stage=on_stage)
     except FileNotFoundError as error:
         raise FileNotFoundError(f"the photos of the run {run} are not known: {error}") from error
@@ -193,8 +187,7 @@ def finding(origin: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 
     `origin`: `Scene.origin` of what it was trained on, as its config.json has it; empty: not known.
     """
-    found = {"features": origin.get("features", SIFT)}
-    found |= {} if film_at(path) is None else {"frames": origin.get("frames")}
+    found = {} if film_at(path) is None else {"frames": origin.get("frames")}
     return found | {"coarse": coarsely(origin.get("longest"), origin.get("coarse"))}
 
 

@@ -6,7 +6,6 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import atomic_path, write_json
-from hqgs.photos import camera, light, shake, walkers
-from hqgs.scene import faces
-from hqgs.scene.sfm.run import PARTS
 
 POINTS = "points.npz"
+FORMAT = 1  # raised by hand where other photos or points are made, or kept otherwise
 
 
 class Kept(NamedTuple):
@@ -30,18 +27,10 @@ class Kept(NamedTuple):
     note: str
 
 
-@cache
-def source() -> str:
-    """A digest of the code that makes the built-in scenes: what it changes must be made anew."""
-    used = [*PARTS, *(Path(str(module.__file__)) for module in (camera, light, shake, walkers, faces))]
-    files = [*sorted(Path(__file__).parent.glob("*.py")), *used]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
-
-
 def write_kept(folder: Path, made: dict[str, Any], kept: Kept) -> None:
     """Photos and arrays first, the key with their checksums last, so that a key vouches for whole files.
 
-    `made` says, in JSON values, what they depend on beside the code.
+    `made` says, in JSON values, what they depend on beside FORMAT.
     """
     for name, photo in kept.photos.items():
         with atomic_path(folder / name) as tmp:
@@ -49,14 +38,14 @@ def write_kept(folder: Path, made: dict[str, Any], kept: Kept) -> None:
     with atomic_path(folder / POINTS) as tmp:
         np.savez(tmp, **kept.arrays)
     files = {name: _checksum(folder / name) for name in [*kept.photos, POINTS]}
-    write_json(folder / "key.json", {"made": {"source": source(), **made}, "files": files, "note": kept.note})
+    write_json(folder / "key.json", {"made": {"format": FORMAT, **made}, "files": files, "note": kept.note})
 
 
 def read_kept(folder: Path, made: dict[str, Any], names: Sequence[str]) -> Kept | None:
     """Photos of these names and arrays, or None if anything is missing, damaged or made in another way."""
     try:
         key = json.loads((folder / "key.json").read_text(encoding="utf-8"))
-        if key["made"] != {"source": source(), **made} or set(key["files"]) != {*names, POINTS}:
+        if key["made"] != {"format": FORMAT, **made} or set(key["files"]) != {*names, POINTS}:
             return None
         if any(_checksum(folder / name) != digest for name, digest in key["files"].items()):
             return None

@@ -38,7 +38,6 @@ from hqgs.scene.sfm.constants import (
 from hqgs.scene.sfm.database import known_cameras, new_cameras, rigs
 from hqgs.scene.sfm.facts import apart, borne_out, counts, placed_names
 from hqgs.scene.sfm.home import brought_home, without
-from hqgs.scene.sfm.learned import look_learned
 from hqgs.scene.sfm.likely import likely_pairs, pairs_of_faces
 from hqgs.scene.sfm.matching import extract, match, pipeline_options
 from hqgs.scene.sfm.sharpen import sharpened
@@ -52,8 +51,7 @@ class Attempt:
     """A pass from photos to a model.
 
     The tolerant one takes weaker features, and fewer matches as enough. `smoothed` 1 looks at smoothed
-    photos, 2 at all versions together, after 1 and the pass without, whose database is `plain`. The
-    `learned` one has its features and matches from networks.
+    photos, 2 at all versions together, after 1 and the pass without, whose database is `plain`.
     """
 
     def __init__(
@@ -65,7 +63,6 @@ class Attempt:
         coarse: bool = False,
         smoothed: int = 0,
         plain: Path | None = None,
-        learned: bool = False,
     ) -> None:
         self.directory: Path = directory
         self.given: dict[str, Any] = given
@@ -73,11 +70,9 @@ class Attempt:
         self.tolerant: bool = tolerant
         self.coarse: bool = coarse
         self.smoothed: int = smoothed
-        self.learned: bool = learned
         self.plain: Path = plain or directory / "colmap.db"
         self.versions: list[Path] = [directory / f"smoothed_{sigma}.db" for sigma in SIGMAS]
         names = {"tolerant.db": tolerant, "coarse.db": coarse, "joined.db": smoothed == len(SIGMAS)}
-        names["learned.db"] = learned
         named = [directory / name for name, on in names.items() if on]
         self.database: Path = [*named, self.versions[0] if smoothed else self.plain][0]
         self.names: list[str] = given["names"].tolist()
@@ -110,7 +105,7 @@ class Attempt:
             new.rename(database)
 
     def run(self) -> None:
-        if not (self.smoothed or self.learned):
+        if not self.smoothed:
             self._begin(self.database)
         extraction = pycolmap.FeatureExtractionOptions()
         extraction.num_threads, extraction.max_image_size = self.threads, LARGEST
@@ -119,9 +114,7 @@ class Attempt:
         photos = self.photos
         if self.coarse:
             self.coarse = self._probe(photos, extraction)
-        if self.learned:
-            self._look_learned(photos)
-        elif self.smoothed:
+        if self.smoothed:
             self._look_smoothed(photos, extraction)
         else:
             todo = self.directory, photos, self.names, extraction, self.threads, self.database
@@ -192,17 +185,6 @@ class Attempt:
         options.ceres.loss_function_scale = scale
         pycolmap.bundle_adjustment(model, options)
 
-    def _look_learned(self, photos: Path) -> None:
-        """Features and matches of networks."""
-        if self.database.exists():
-            return
-        new = self.directory / "learning.db"
-        new.unlink(missing_ok=True)
-        self._begin(new)
-        masks, pairs = self.directory / "masks", self.given.get("pairs")
-        look_learned(photos, self.names, masks, pairs, self.threads, new, self._tell)
-        new.rename(self.database)
-
     def _look_smoothed(self, photos: Path, extraction: pycolmap.FeatureExtractionOptions) -> None:
         """Features and matches of the smoothed photos; of all versions, they are joined."""
         if self.database in self.versions:
@@ -263,7 +245,7 @@ class Attempt:
     def facts(self) -> dict[str, Any]:
         """What `Pass` holds of it."""
         placed = set() if self.model is None else placed_names(self.model)
-        own = {"tolerant": self.tolerant, "registered": self.registered, "learned": self.learned}
+        own = {"tolerant": self.tolerant, "registered": self.registered}
         if self.model is not None and self.faces > 1:
             own["borne_out"] = borne_out(self.database, self.model)
         elif self.model is not None:
@@ -344,7 +326,7 @@ class Attempt:
     def _tell(self, stage: str, done: int, total: int = 0) -> None:
         """What is being done, for whoever waits."""
         now: dict[str, Any] = {"stage": stage, "done": done, "total": total}
-        now |= {name: getattr(self, name) for name in ("tolerant", "smoothed", "learned")}
+        now |= {name: getattr(self, name) for name in ("tolerant", "smoothed")}
         new = self.directory / "stage.new"
         new.write_text(json.dumps(now), encoding="utf-8")
         new.replace(self.directory / "stage.json")

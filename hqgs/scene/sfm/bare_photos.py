@@ -64,16 +64,19 @@ class BarePhotos:
 
         Those have no blanks: COLMAP reads lists of names word by word.
         """
-        plain, taken = dict[str, str](), set[str]()
+        found, own = dict[str, str](), {name.casefold() for name in self.names}
         for name in self.names:
-            seen = re.sub(r"\s|^#", "_", name)
-            while seen in taken or (seen != name and seen in self.names):
-                seen = f"_{seen}"
-            taken.add(seen)
-            plain[name] = seen
-        if self.around:
-            return {f"{face_name(seen, face)}.jpg": name for name, seen in plain.items() for face in CUBE}
-        return {seen if self.as_it_is(name) else f"{seen}.jpg": name for name, seen in plain.items()}
+            plain = re.sub(r"\s|^#", "_", name)
+            while True:
+                seen = [plain if self.as_it_is(name) else f"{plain}.jpg"]
+                if self.around:
+                    seen = [f"{face_name(plain, face)}.jpg" for face in CUBE]
+                others = own - {name.casefold()}  # a file system may take names of other case for one
+                if not any(one.casefold() in others for one in seen) and not found.keys() & {*seen}:
+                    break
+                plain = f"_{plain}"
+            found |= dict.fromkeys(seen, name)
+        return found
 
     def as_it_is(self, name: str) -> bool:
         """Whether COLMAP reads the photo's file."""

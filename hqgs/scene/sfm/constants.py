@@ -48,9 +48,6 @@ PARTNERS, NEXT = 20, 4  # of a photo: those that are most like it, and those tha
 FILM_NEAR, FILM_THIN = 10, 24  # frames of a film that are matched with the next ones, and each with each
 DESCRIPTOR = 512  # length of COLMAP's descriptors, whole numbers
 BLOCKS = 8  # of photos, squared: what matching tells its progress in, and goes on from when interrupted
-NETWORK_FEATURES = 1024  # of a photo
-NETWORK_SMALL, NETWORK_LARGE = 640, 1024  # px: photos are brought to a longest side between the two
-NETWORK_ALL, NETWORK_PARTNERS = 24, 12  # photos, of fewer each is matched with each; partners of one of more
 
 # Panoramas.
 PANORAMA_SEAM = 2.0  # times what neighbouring columns differ by: the last and the first of it are neighbours

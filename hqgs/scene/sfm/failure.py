@@ -24,7 +24,6 @@ class Pass:
     best: dict[str, list[int]] = field(default_factory=dict)  # of each photo's best pairs: matches, of them
     # those that a geometry bears out, and the same with a photo that has a place
     apart: list[list[str]] = field(default_factory=list)  # photos that fit each other, and no others
-    learned: bool = False  # by features of networks
     agree: dict[str, list[int]] = field(default_factory=dict)  # of photos with a place, where that was looked
     # at: points that they should show, those that show, and those that show where only chance puts them
     loose: list[tuple[list[str], int]] = field(default_factory=list)  # photos that share few points with the

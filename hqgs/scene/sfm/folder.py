@@ -20,16 +20,10 @@ from hqgs.scene.refused import nothing
 from hqgs.scene.scene import SfmReport
 from hqgs.scene.sfm.bare_photos import bare_photos, readable
 from hqgs.scene.sfm.photos_alone import Search, find_cameras
-from hqgs.scene.sfm.run import SIFT, check_features
 
 
 def write_colmap_folder(
-    source: str | Path,
-    out: Path,
-    work: Path,
-    frames: int | None = None,
-    on_stage: OnStage = silent,
-    features: str = SIFT,
+    source: str | Path, out: Path, work: Path, frames: int | None = None, on_stage: OnStage = silent
 ) -> SfmReport:
     """Write `images` and `sparse/0` of photos alone, or of a film, into the folder `out`.
 
@@ -38,7 +32,6 @@ def write_colmap_folder(
     goes on with if this one is stopped; it is removed at the end. ValueError where there are no photos, or
     COLMAP finds no scene in them.
     """
-    check_features(features)
     if frames is not None:
         check_film(source)
     with TemporaryDirectory(prefix="hqgs-film-") as name:
@@ -48,7 +41,7 @@ def write_colmap_folder(
         photos = bare_photos(root, 1.0)
         if photos is None:
             raise ValueError(nothing(root))
-        found = find_cameras(root, readable(photos, on_stage), Search(work, on_stage, features=features))
+        found = find_cameras(root, readable(photos, on_stage), Search(work, on_stage))
         images = out / "images"
         details = frame_details(found.photos.folder)
         kept: dict[str, float] = {}

@@ -22,7 +22,7 @@ from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
 from hqgs.scene.sfm.constants import LEAST_AGREED
 from hqgs.scene.sfm.front_door import tell_strays
-from hqgs.scene.sfm.run import SIFT, run_colmap
+from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.tracks import sureness
 
 
@@ -33,7 +33,6 @@ class Search:
     keep: Path | None = None
     on_stage: OnStage = silent
     coarse: bool = False
-    features: str = SIFT
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,6 @@ def find_cameras(root: Path, photos: BarePhotos, search: Search) -> FoundCameras
         first_pass=ran.first_pass,
         advice=ran.advice(),
         lost={name: why for name, why in ran.lost().items() if name not in poses},
-        learned=ran.learned,
         sure_px=_together(sureness(model), names),
     )
     return FoundCameras(photos, model, report)

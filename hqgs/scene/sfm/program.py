@@ -18,8 +18,7 @@ photos, where it has some; else all, or of many photos those that are alike. Whe
 rich in detail are looked at coarsely, and again finely where too few find a place. Where too few do then,
 smoothed versions of the photos are looked at, first one and then all together. Where few photos have a place
 yet, another, more tolerant pass follows, with every pair; the better of the two counts. Photos without a
-place are placed by weaker evidence where others bear that out. Where it has `learned`, networks look at the
-photos in place of all that.
+place are placed by weaker evidence where others bear that out.
 In the end observations are moved to where the photos agree. `facts.json` says what all came to,
 `stage.json` what is being done now, which is read from COLMAP's log: the caller sends the output to
 `log.txt`. A second call in the same DIRECTORY goes on with the features and matches that the first one left.
@@ -80,12 +79,7 @@ def reconstruct(directory: Path, threads: int) -> None:
     the order of numbers. Mapping has one thread and the seed 0.
     """
     given = _given(directory)
-    if "learned" in given:
-        passes = [Attempt(directory, given, threads, learned=True)]
-        passes[0].run()
-        passes[0].bring_home()
-    else:
-        passes = _by_sift(directory, given, threads)
+    passes = _by_sift(directory, given, threads)
     best = max(passes, key=lambda one: (one.registered, -one.tolerant))
     best.sharpen()
     facts = json.dumps({"passes": [one.facts() for one in passes], "chosen": passes.index(best)})

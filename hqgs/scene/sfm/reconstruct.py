@@ -14,14 +14,12 @@ from hqgs.photos.pixels import as_floats, to_uint8
 from hqgs.scene.formats.colmap import seen_points
 from hqgs.scene.scene import Scene, SfmReport, TrackStatistics, View
 from hqgs.scene.sfm.align import align, camera_centers, pose_auc, refine, rotation_angles
-from hqgs.scene.sfm.run import SIFT, run_colmap
+from hqgs.scene.sfm.run import run_colmap
 from hqgs.scene.sfm.tracks import read_tracks, sureness
 from hqgs.scene.sfm.triangulated import write_photos
 
 
-def sfm_scene(
-    scene: Scene, keep: Path | None = None, on_stage: OnStage = silent, features: str = SIFT
-) -> Scene:
+def sfm_scene(scene: Scene, keep: Path | None = None, on_stage: OnStage = silent) -> Scene:
     """The scene with poses and points from its training photos as they are, in its own frame.
 
     COLMAP (SIFT, matching, incremental mapping) sees the training photos alone, clipped and
@@ -30,7 +28,7 @@ def sfm_scene(
     held-out cameras, which are not touched, stay valid. Photos without a place in it are left out.
     `Scene.sfm` and `Scene.notes` compare the two. The same photos give the same bits, whatever the number of
     threads. `keep` is a folder for the reconstruction, which the next call with the same photos takes from
-    there; `on_stage` hears what is being done; `features`: of which kind (`run_colmap`).
+    there; `on_stage` hears what is being done.
 
     ValueError for fewer than 3 photos, or where less than half of them, or fewer than 3, are registered.
     """
@@ -45,7 +43,6 @@ def sfm_scene(
         keep,
         on_stage,
         called={file: view.name for file, view in views.items()},
-        features=features,
     )
     model = ran.found
     poses = ran.poses()
@@ -82,7 +79,6 @@ def sfm_scene(
         own_reprojection_error_px=None if scene.tracks is None else scene.tracks.error,
         first_pass=ran.first_pass,
         lost=ran.lost(),
-        learned=ran.learned,
         sure_px={views[file].name: px for file, px in sureness(model).items()},
         auc=dict(zip("135", pose_auc(viewmats, own, len(views)), strict=True)),
     )

@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from hqgs._rust import get_num_threads
 from hqgs.base.files import keep_folder, lock_folder
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.photos import eight_bits
 from hqgs.scene.formats.colmap import registered
 from hqgs.scene.scene import Camera
-from hqgs.scene.sfm import learned, likely
+from hqgs.scene.sfm import likely
 from hqgs.scene.sfm.constants import (
     AGAIN,
     LARGEST,
@@ -49,12 +48,7 @@ from hqgs.scene.sfm.failure import (
 )
 
 PROGRAM = Path(__file__).with_name("program.py")
-IMPORTED = (  # by PROGRAM, of this folder
-    "agree attempt constants database facts home learned likely matching patches sharpen tracks versions "
-    "weighted"
-)
-PARTS = [PROGRAM, *(PROGRAM.with_name(f"{name}.py") for name in IMPORTED.split()), Path(eight_bits.__file__)]
-FEATURES = (SIFT, LEARNED) = ("sift", "learned")  # what COLMAP sees of photos
+FORMAT = 1  # of what is kept: raised by hand where other poses or points would be found, or stored otherwise
 STAGES = {
     "features": "COLMAP: features",
     "matches": "COLMAP: pairs of photos matched",
@@ -101,11 +95,6 @@ class Model:
         return poses
 
     @property
-    def learned(self) -> bool:
-        """Whether features of networks made it."""
-        return self._chosen.learned
-
-    @property
     def _chosen(self) -> Pass:
         return self.passes[self.chosen]
 
@@ -119,8 +108,6 @@ class Model:
     def advice(self) -> str | None:
         """What to do about photos that have no place, or places in doubt; None: there are none."""
         told = self._to_take()
-        if told and not self.learned:
-            told += ". Networks may know more of them again: --features learned, of the extra hqgs[learned]"
         told = f"{counts(len(self.passes[0].features), self.passes)}. {told}" if told else ""
         return ". ".join(filter(None, (told, why_doubtful(self._chosen, self._name)))) or None
 
@@ -178,7 +165,6 @@ def run_colmap(
     on_stage: OnStage = silent,
     coarse: bool = False,
     called: Mapping[str, str] | None = None,
-    features: str = SIFT,
 ) -> Model:
     """COLMAP's largest model of photos.
 
@@ -188,13 +174,12 @@ def run_colmap(
         cameras: pinhole intrinsics that stay as they are, or what is known of cameras that COLMAP finds.
         write: puts the photos under their names into a folder that is there and empty, and below `masks`
             beside it either no mask, or `NAME.png` for every photo.
-        keep: a folder for models: COLMAP does not run again for the same photos, masks, cameras and version,
+        keep: a folder for models: COLMAP does not run again for the same photos, masks and cameras,
             and goes on with the features and matches of a call that was interrupted.
         on_stage: hears what is being done.
         coarse: photos rich in detail may be looked at coarsely, which is faster, as long as 95 % of them are
             placed.
         called: what the user calls the photos of those names.
-        features: "sift", or "learned": by networks (the extra `learned`); of panoramas it is always SIFT.
 
     Raises ValueError for fewer than 3 photos, where COLMAP fails, or where the photos do not match.
     """
@@ -217,9 +202,6 @@ def run_colmap(
         given["Ks"] = np.stack([camera.K for camera in cameras])
     if coarse:
         given["coarse"] = np.array(True)
-    check_features(features)
-    if features == LEARNED and "rotations" not in given:
-        given["learned"] = np.array(True)
     kept = None if keep is None else keep / key_of(str(sorted(given)), _pieces(names, contents, given))
     if kept is not None and kept.is_dir():
         return _read(kept, called or {})
@@ -249,14 +231,6 @@ def run_colmap(
         return _read(directory / "model", called or {})
 
 
-def check_features(features: str) -> None:
-    """ValueError for an unknown kind of features, or one whose extra is missing."""
-    if features not in FEATURES:
-        raise ValueError(f"features is {features!r}, wanted one of: {', '.join(FEATURES)}")
-    if features == LEARNED and not learned.is_there():
-        raise ValueError("learned features need the extra 'learned': pip install 'hqgs[learned]'")
-
-
 @contextmanager
 def _workplace(kept: Path | None) -> Iterator[Path]:
     """A folder for COLMAP's files: beside `kept`, where it stays until the work is done, or a new one."""
@@ -277,7 +251,7 @@ def _workplace(kept: Path | None) -> Iterator[Path]:
 
 
 def surroundings() -> dict[str, str]:
-    """The environment in which PROGRAM finds the other files of PARTS, whatever hqgs was started from, and
+    """The environment in which PROGRAM finds hqgs, whatever hqgs was started from, and
     sums of linear algebra have one order."""
     paths = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
     one = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1")
@@ -316,7 +290,6 @@ def _tell(file: Path, on_stage: OnStage) -> None:
         return
     again = ", second and more tolerant pass" if now["tolerant"] else ""
     again = ", with smoothed photos" if now["smoothed"] else again
-    again = ", learned" if now["learned"] else again
     on_stage(Stage(STAGES[now["stage"]] + again, now["done"], now["total"]))
 
 
@@ -331,10 +304,8 @@ def _passes(facts: Path) -> tuple[list[Pass], int]:
 
 
 def key_of(what: str, pieces: Iterable[bytes]) -> str:
-    """A name for what COLMAP makes of the pieces: another for another version of it, or of PARTS."""
-    digest = hashlib.sha256(f"{pycolmap.__version__} {what}".encode())
-    for part in PARTS:
-        digest.update(part.read_bytes())
+    """A name for what is made of the pieces: another for each FORMAT, but not for each version of COLMAP."""
+    digest = hashlib.sha256(f"{FORMAT} {what}".encode())
     for piece in pieces:
         digest.update(piece)
     return digest.hexdigest()[:16]
