@@ -20,11 +20,14 @@ from hqgs.diagnosis.constants import PAYS
 from hqgs.diagnosis.devices import Devices, device_signs, grouped
 from hqgs.diagnosis.gains import SharedColors
 from hqgs.diagnosis.own import device_findings
-from hqgs.evaluation.looks import look_of
+from hqgs.evaluation.held_out import HeldOutViews, measured
+from hqgs.evaluation.looks import look_of, looks_of_devices
+from hqgs.evaluation.metrics import psnr
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.look import STEEPEST, Look, as_a_lens, darken, falloff, respond, squared_radii
 from hqgs.scene.builtin.devices import draw_devices
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.training.methods.cameras import LearnedCameras
 from hqgs.training.methods.devices import KEPT, LearnedDevices
 
 Floats = NDArray[np.float64]
@@ -149,6 +152,51 @@ def test_they_are_learned() -> None:
     for number in (0, 1):
         for found, wanted in zip(devices.learned(number), truth.learned(number), strict=True):
             np.testing.assert_allclose(found, wanted, atol=0.05)
+
+
+def test_the_scene_is_as_bright_as_its_photos() -> None:
+    """Gains and lenses together leave the mean of log light, over photos and pixels, as it is."""
+    vignetting = np.array([[0.5, 0.2], [0.1, 0.0]])
+    devices = LearnedDevices(Devices(np.array([0, 1, 1, -1]), vignetting, np.zeros((2, 2, 3))), True, False)
+    squares = squared_radii(240, 320, np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]))
+    kept = [-(squares * (k1 + squares * k2)).mean() for k1, k2 in vignetting[[0, 1, 1]]]
+    assert float(devices.level().detach()) == pytest.approx(-np.sum(kept) / 4, rel=0.01)
+    scene = by_two()
+    cameras = LearnedCameras(scene, False, False, None, 0, LearnedDevices(
+        Devices(np.arange(len(scene.train)) % 2, vignetting, np.zeros((2, 2, 3))), True, False
+    ))  # fmt: skip
+    found = cameras.learned()
+    gains = np.unique([photo.gains for photo in found])
+    assert gains[0] == pytest.approx(np.exp((0.5 / 3 + 0.16 * 0.2 + 0.1 / 3) / 2), rel=1e-3)
+    assert gains[-1] == gains[0]
+    view = scene.train[0]
+    render = torch.from_numpy(np.random.default_rng(0).uniform(0, 0.6, view.image.shape))
+    taken = cameras.shot(view, torch.zeros(1, 1, 3)).develop(render).detach().numpy()
+    np.testing.assert_allclose(taken, found[0].look.of(render.numpy(), view.camera.K), atol=0.6 / 255)
+
+
+def test_held_out_photos_are_measured_in_the_look_of_their_camera() -> None:
+    scene = by_two()
+    looks = {f"camera {k}": Look(np.full(3, 1.1), np.array([0.3 * k, 0.1]), np.zeros((2, 3))) for k in (0, 1)}
+    of_photos = {view.name: looks[view.device] for view in scene.train}
+    found = looks_of_devices(scene.train, of_photos)
+    np.testing.assert_allclose(found["camera 1"].vignetting, [0.3, 0.1])
+    np.testing.assert_allclose(found["camera 1"].gains, 1.1)
+    plain = Look(np.ones(3), np.zeros(2), np.zeros((2, 3)))
+    assert looks_of_devices(scene.train, dict.fromkeys(of_photos, plain)) == {}
+    one = scene.test[0]
+    test = [replace(one, device="camera 1"), replace(one, name="other", device="unknown")]
+    gaussians = hqgs.Gaussians.from_points(scene.points, scene.point_colors)
+    views = HeldOutViews(test, gaussians, 0, looks=found)
+    seen, other = views
+    assert seen.shown is not None
+    taken = found["camera 1"].of(seen.shown.clip(0), one.camera.K)
+    np.testing.assert_allclose(seen.render, taken, atol=1e-6)
+    assert other.shown is other.render
+    each = measured(views)
+    assert each[0].psnr_shown == psnr(seen.shown, one.image) != each[0].psnr
+    assert each[1].psnr_shown == each[1].psnr
+    assert all(view.shown is None for view in HeldOutViews(test, gaussians, 0))
 
 
 def test_responses_rise_and_keep_their_mean() -> None:

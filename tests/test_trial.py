@@ -5,18 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from tiny_scene import tiny_scene
 
 from hqgs.base.files import CHECKPOINT
+from hqgs.diagnosis.own import Finding
+from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.scene.scene import Scene
 from hqgs.training import prepare, trial
 from hqgs.training.config import TrainConfig, run_config
-from hqgs.training.constants import TRIAL_EACH, TRIAL_OFFSETS, TRIAL_PIXELS, TRIAL_STEPS
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
 from hqgs.training.plan_rules import plan_run
 from hqgs.training.trainer import Trainer
@@ -69,7 +70,7 @@ class FakeRun:
         self.iteration += 1
 
     def held_out(self) -> list[RenderedView]:
-        assert self.iteration == self.length == TRIAL_STEPS
+        assert self.iteration == self.length == trial.STEPS
         growth = self.plan.settings.densify
         pixels = sum(view.camera.width * view.camera.height for view in self.scene.train)
         level = growth.max_gaussians / pixels if growth.start < growth.stop else 1 / GAUSSIAN
@@ -94,14 +95,82 @@ def test_short_runs_are_judged_by_photos_that_they_have_not_seen() -> None:
     plan = RunPlan(replace(ASKED, iterations=10**6, leave_out=("growth",)), FIRST, True, True, 0, 0, 0)
     found = trial.tried_growth(scene, plan, begin)  # type: ignore[arg-type]
     names = [view.name for view in scene.train]
-    for part, offset in zip(seen, TRIAL_OFFSETS, strict=True):
-        assert [view.name for view in part.test] == names[offset::TRIAL_EACH]
+    for part, offset in zip(seen, trial.OFFSETS, strict=True):
+        assert [view.name for view in part.test] == names[offset :: trial.EACH]
         assert sorted(view.name for view in (*part.train, *part.test)) == sorted(names)
     assert found is not None
     assert found.photos == sum(len(part.test) for part in seen)
-    assert found.gain == pytest.approx(20 * np.log10(GAUSSIAN / TRIAL_PIXELS), abs=0.3)  # as errors are
+    assert found.gain == pytest.approx(20 * np.log10(GAUSSIAN / trial.PIXELS), abs=0.3)  # as errors are
     assert found.error < 0.1
     assert found.sure > 1  # renders without growth are better by each measure
+
+
+class FakeLooks(FakeRun):
+    """A trainer whose renders are off the photos by what its formation leaves."""
+
+    off: ClassVar = {"none": 0.1, "exposure": 0.05, "exposure+vignetting": 0.06, "exposure+response": 0.04}
+
+    def held_out(self) -> list[RenderedView]:
+        self.tried = [*getattr(self, "tried", []), self.plan.settings.hqgs.formation]
+        rng, found = np.random.default_rng(0), []
+        for view in self.scene.test:
+            error = self.off[self.tried[-1]] * rng.choice([-1, 1], view.image.shape)
+            found.append(RenderedView(view.name, view.image, (view.image / 255 + error).astype(np.float32)))
+        return found
+
+
+def test_a_look_is_kept_where_photos_held_back_gain_by_it() -> None:
+    scene, runs = tiny_scene(12), list[FakeLooks]()
+    train = [replace(view, device="ab"[k % 4 == 1]) for k, view in enumerate(scene.train)]
+
+    def begin(part: Scene, config: TrainConfig) -> FakeLooks:
+        assert {view.device for view in part.train} == {view.device for view in part.test} == {"a", "b"}
+        runs.append(FakeLooks(part, config))
+        return runs[-1]
+
+    asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="exposure+vignetting+response+noise:12"))
+    found = trial.tried_looks(replace(scene, train=train), asked, begin)  # type: ignore[arg-type]
+    assert [run.tried for run in runs] == [[*FakeLooks.off]]
+    assert {name: tried.pays for name, tried in found.items()} == {
+        "exposure": True, "vignetting": False, "response": True,
+    }  # fmt: skip
+    assert found["exposure"].gain == pytest.approx(20 * np.log10(2), abs=0.6)
+    assert trial.tried_looks(scene, ASKED, begin) == {}  # type: ignore[arg-type]
+
+
+def found_of(*names: str) -> Diagnosis:
+    parts = tuple(Finding(name, True, 0.2, None, name, f"{name} is seen") for name in names)
+    return Diagnosis("room", "+".join(names), parts, (), ())
+
+
+def test_a_run_learns_no_look_that_does_not_pay() -> None:
+    looks = {"exposure": Tried(0.8, 0.2, 6, 4.0), "vignetting": Tried(-3.1, 0.4, 6, -7.0)}
+    asked = replace(ASKED, hqgs=replace(ASKED.hqgs, formation="auto"))
+    plan = plan_run(replace(facts(), looks=looks), found_of("exposure", "vignetting"), asked)
+    assert plan.settings.hqgs.formation == "exposure"
+    rows = {row.what: row for row in plan.rows}
+    assert "+0.80 ± 0.20 dB on 6 photos held back" in rows["formation"].evidence
+    left = rows["a learned vignetting"]
+    assert left.left_out is not None
+    assert left.evidence == "-3.10 ± 0.40 dB on 6 photos held back from short runs"
+
+
+def test_a_resumed_run_learns_the_looks_that_paid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tries, file = list[None](), tmp_path / CHECKPOINT
+    looks = {"exposure": Tried(0.8, 0.2, 6, 4.0), "vignetting": Tried(-3.1, 0.4, 6, -7.0)}
+    monkeypatch.setattr(prepare, "tried_looks", lambda *of: tries.append(None) or looks)
+    monkeypatch.setattr(Inspector, "diagnose", lambda *of: found_of("exposure", "vignetting"))
+    scene = tiny_scene(6, num_points=10)
+    config = run_config(iterations=2, method="hqgs", leave_out="weight")
+    for iterations in (2, 4):
+        trainer = Trainer(scene, replace(config, iterations=iterations), tries=not file.exists())
+        if file.exists():
+            trainer.restore(file)
+        while trainer.iteration < trainer.length:
+            trainer.step()
+        assert {group["name"] for group in trainer.method.param_groups()} == {"gains"}
+        trainer.save(file)
+    assert (trainer.iteration, len(tries)) == (4, 1)
 
 
 def test_a_trial_takes_a_small_share_of_a_run_and_needs_photos_to_spare() -> None:
@@ -115,8 +184,8 @@ def test_a_trial_takes_a_small_share_of_a_run_and_needs_photos_to_spare() -> Non
 
 
 def test_a_run_is_planned_by_its_trial_and_the_same_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trial, "TRIAL_STEPS", 20)
-    monkeypatch.setattr(trial, "TRIAL_SHARE", np.inf)
+    monkeypatch.setattr(trial, "STEPS", 20)
+    monkeypatch.setattr(trial, "SHARE", np.inf)
     scene = tiny_scene(12, num_points=10)
     seen = {view.name: np.arange(10) for view in scene.train}
     config = run_config(iterations=1000, method="hqgs", leave_out="growth", formation="none")

@@ -224,6 +224,7 @@ def judge_file(
 ) -> Judged:
     """A scene file, measured; what its reading left out is told."""
     from hqgs.evaluation.judge import judge
+    from hqgs.evaluation.looks import looks_beside
     from hqgs.model.gaussians import Gaussians
 
     gaussians = Gaussians.load(file)
@@ -231,4 +232,5 @@ def judge_file(
         screen.say(f"read: {note}")
     parts = [file] if file.name != META else [path for path in file.parent.iterdir() if path.is_file()]
     size, held = sum(path.stat().st_size for path in parts), gaussians.in_world(scene.world)
-    return judge(str(file), size, held, scene, views, background, fit, screen.stage)
+    looks = looks_beside(file, scene.train)
+    return judge(str(file), size, held, scene, views, background, fit, screen.stage, looks)

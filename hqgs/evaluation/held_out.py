@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, overload
 
 import numpy as np
@@ -21,6 +21,7 @@ from hqgs.evaluation.metrics import ViewMetrics, evaluate_view, psnr, ssim
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
+from hqgs.photos.look import Look
 from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.scene import Scene, View
 
@@ -31,10 +32,13 @@ class RenderedView:
 
     name: str
     photo: NDArray[np.uint8] | NDArray[np.float32]  # [H, W, 3]
-    render: NDArray[np.float32]  # [H, W, 3], clamped to [0, 1] by the report, never rounded for the metrics
+    # [H, W, 3], in the look of the photo's camera where that is known; clamped to [0, 1] by the report, never
+    # rounded for the metrics
+    render: NDArray[np.float32]
     mask: NDArray[np.bool_] | None = None  # [H, W], True where the photo counts
     culled: int | None = None  # Gaussians that this view does not show
     quarter_turns: int = 0  # clockwise, that show it upright
+    shown: NDArray[np.float32] | None = None  # [H, W, 3], as the scene is shown; None: as `render`
 
 
 class HeldOutViews(Sequence[RenderedView]):
@@ -50,7 +54,10 @@ class HeldOutViews(Sequence[RenderedView]):
         gaussians: Gaussians,
         sh_degree: int,
         background: tuple[float, float, float] = BACKGROUND,
+        looks: Mapping[str, Look] | None = None,
     ) -> None:
+        """`looks`: of cameras, by `View.device`."""
+        self._looks: Mapping[str, Look] = looks or {}
         self.names: list[str] = [view.name for view in views]
         self._views, self._gaussians = views, gaussians
         self._sh_degree, self._background = sh_degree, background
@@ -86,8 +93,17 @@ class HeldOutViews(Sequence[RenderedView]):
         with one_torch_thread(), torch.no_grad():
             render, meta = render_view(self._gaussians, view.camera, self._sh_degree, self._background)
             self._culled[number] = int((meta["radii"][0] == 0).any(dim=1).sum())
+        shown = render.numpy()
+        look = self._looks.get(view.device)
+        taken = shown if look is None else look.of(shown.clip(0), view.camera.K).astype(np.float32)
         return RenderedView(
-            view.name, view.image, render.numpy(), view.mask, self._culled[number], view.quarter_turns
+            view.name,
+            view.image,
+            taken,
+            view.mask,
+            self._culled[number],
+            view.quarter_turns,
+            shown if self._looks else None,
         )
 
 
@@ -96,13 +112,15 @@ def held_out_renders(
     gaussians: Gaussians,
     sh_degree: int | None = None,
     background: tuple[float, float, float] = BACKGROUND,
+    looks: Mapping[str, Look] | None = None,
 ) -> HeldOutViews:
-    """The scene's held-out views; `sh_degree` None: the Gaussians' own."""
+    """The scene's held-out views; `sh_degree` None: the Gaussians' own. `looks` as in `HeldOutViews`."""
     return HeldOutViews(
         scene.test,
         gaussians.in_world(scene.world),
         gaussians.sh_degree if sh_degree is None else sh_degree,
         background,
+        looks,
     )
 
 
@@ -137,6 +155,8 @@ def measured(
     def one(number: int, view: RenderedView) -> ViewMetrics:
         try:
             metrics = evaluate_view(view.render, view.photo, view.mask)
+            if view.shown is not None:
+                metrics = replace(metrics, psnr_shown=psnr(view.shown, view.photo, view.mask))
         except ValueError as error:
             raise ValueError(f"view {view.name!r}: {error}") from error
         if then is not None:

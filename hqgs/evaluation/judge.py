@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from statistics import median
 from typing import Any
@@ -23,6 +23,7 @@ from hqgs.evaluation.intervals import difference, half_widths
 from hqgs.evaluation.metrics import METRICS, ViewMetrics, mean_metrics
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
+from hqgs.photos.look import Look
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.scene import Scene, View
@@ -88,6 +89,7 @@ def judge(
     background: Background = BACKGROUND,
     fit: bool = False,
     on_stage: OnStage = silent,
+    looks: Mapping[str, Look] | None = None,
 ) -> Judged:
     """Measure Gaussians, held in the frame of the scene's cameras, on some of its photos.
 
@@ -98,12 +100,13 @@ def judge(
         views: the photos to measure on.
         background: behind everything, R, G, B.
         fit: also with each camera fitted to the scene.
+        looks: of cameras, by `View.device`: photos of these are measured in them.
 
     Raises:
         ValueError: no Gaussian shows from any of the cameras; or a photo and its mask do not fit.
     """
     judged_scene = replace(scene, test=[*views])
-    renders = held_out_renders(judged_scene, gaussians, background=background)
+    renders = held_out_renders(judged_scene, gaussians, background=background, looks=looks)
     on_stage(Stage("photos measured", 0, len(views)))
     each = measured(renders)
     if views and min(renders.culled()) == len(gaussians):
@@ -122,7 +125,7 @@ def judge(
             lambda done: on_stage(Stage("held-out cameras fitted", done, len(views))),
         )
     fitted = held_out_renders(
-        replace(scene, test=[one.view for one in fits]), gaussians, background=background
+        replace(scene, test=[one.view for one in fits]), gaussians, background=background, looks=looks
     )
     found, seconds = list[Causes | None](), list[float]()
     shown = shown_by(gaussians, [view.camera for view in scene.train])
@@ -154,6 +157,8 @@ def numbers(
     """Metrics as JSON values: their means, half the interval of each, and those of each photo."""
     mean = asdict(mean_metrics([*each]))
     reasons = mean.pop("reasons")
+    if mean["psnr_shown"] is None:
+        del mean["psnr_shown"]
     rows = [{key: value for key, value in asdict(one).items() if key in METRICS} for one in each]
     extra = more or [{} for _ in rows]
     views = {name: row | also for name, row, also in zip(names, rows, extra, strict=True)}

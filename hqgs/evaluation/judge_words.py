@@ -45,6 +45,8 @@ def told(found: dict[str, Any]) -> str:
     shown = [name for name in LABELS if one["mean"][name] is not None]
     lines = [markdown_table(title, ["", *(LABELS[name] for name in shown)], table_rows(found, shown)), ""]
     lines += [interval_words(one)] if count > 1 else []
+    if (shown_psnr := one["mean"].get("psnr_shown")) is not None:
+        lines.append(f"in the look of each photo's camera; as the scene is shown {shown_psnr:.2f} dB PSNR")
     lines += [*not_measured(one), *wrong_frame(one)]
     lines.append(scene_words(one) + ("" if against is None else f"; against {scene_words(against)}"))
     lines += [f"the error comes from: {cause_words(one['causes'])}", *worst(one)]

@@ -1,13 +1,49 @@
-"""The look of a photo, as the report of a run keeps it."""
+"""The looks of photos as a run has learned them: of a photo, and of the cameras that took them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hqgs.evaluation.report import REPORT, read_report
+from hqgs.evaluation.records import LearnedRecord
+from hqgs.evaluation.report import REPORT, read_report, report_in
 from hqgs.photos.look import Look
+from hqgs.scene.scene import View
+
+
+def looks_of_devices(views: Sequence[View], looks: Mapping[str, Look]) -> dict[str, Look]:
+    """By camera (`View.device`), in the mean over its photos, of what was learned of training photos; empty
+    where nothing changes a picture. `looks`: by the photos' names."""
+    photos: dict[str, list[Look]] = {}
+    for view in views:
+        if view.device and not view.face and view.name in looks:
+            photos.setdefault(view.device, []).append(looks[view.name])
+    found = {
+        device: Look(
+            np.exp(np.mean([np.log(look.gains) for look in own], 0)), own[0].vignetting, own[0].response
+        )
+        for device, own in photos.items()
+    }
+    return found if any(look.changes for look in found.values()) else {}
+
+
+def looks_beside(file: Path, views: Sequence[View]) -> dict[str, Look]:
+    """Those of `looks_of_devices` of the run that a scene file lies in; `views`: its training photos."""
+    report = report_in(file.parent)
+    return {} if report is None else looks_of_devices(views, _looks(report["learned"]))
+
+
+def _looks(learned: Sequence[LearnedRecord]) -> dict[str, Look]:
+    return {
+        record["name"]: Look(
+            np.array(record["gains"], np.float64),
+            np.array(record.get("vignetting", np.zeros(2)), np.float64),
+            np.array(record.get("response", np.zeros((2, 3))), np.float64),
+        )
+        for record in learned
+    }
 
 
 def look_of(folder: Path, name: str) -> Look:
@@ -17,17 +53,8 @@ def look_of(folder: Path, name: str) -> Look:
         FileNotFoundError: the folder has no report.
         ValueError: it is damaged, nothing was learned of the photos' looks, or there is no such photo.
     """
-    looks = {
-        record["name"]: Look(
-            np.array(record["gains"], np.float64),
-            np.array(record.get("vignetting", np.zeros(2)), np.float64),
-            np.array(record.get("response", np.zeros((2, 3))), np.float64),
-        )
-        for record in read_report(folder / REPORT)["learned"]
-    }
-    if not any(
-        (one.gains != 1).any() or one.vignetting.any() or one.response.any() for one in looks.values()
-    ):
+    looks = _looks(read_report(folder / REPORT).get("learned", []))
+    if not any(one.changes for one in looks.values()):
         raise ValueError(
             f"{folder}: no gains, vignetting or response of photos were learned: the photos look alike"
         )

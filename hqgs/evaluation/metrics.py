@@ -44,9 +44,10 @@ class ViewMetrics:
     lpips_vgg: float | None  # VGG-16, down
     psnr_aligned: float | None  # dB, up; brightness and tint set aside
     reasons: dict[str, str] = field(default_factory=dict)  # metric -> why it is None
+    psnr_shown: float | None = None  # dB; as the scene is shown, where the others are in a camera's look
 
 
-METRICS = tuple(value.name for value in fields(ViewMetrics) if value.name != "reasons")
+METRICS = tuple(value.name for value in fields(ViewMetrics) if value.name not in ("reasons", "psnr_shown"))
 
 
 def psnr(render: NDArray[Any], photo: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float | None:
@@ -176,7 +177,9 @@ def mean_metrics(views: list[ViewMetrics]) -> ViewMetrics:
         elif missing:
             counted = [f"{missing.count(why)} of {len(views)} views: {why}" for why in sorted(set(missing))]
             reasons[metric] = "; ".join(counted)
-    return ViewMetrics(**means, reasons=reasons)
+    shown = [view.psnr_shown for view in views if view.psnr_shown is not None]
+    as_shown = float(np.mean(shown)) if len(shown) == len(views) else None
+    return ViewMetrics(**means, reasons=reasons, psnr_shown=as_shown)
 
 
 def _without_values(reason: str) -> ViewMetrics:

@@ -50,6 +50,7 @@ class ViewMetricValues(MetricValues):
     """The metrics of a held-out view."""
 
     name: str
+    psnr_shown: NotRequired[float]  # dB; as the scene is shown, where the others are in its camera's look
     picture: str | None  # photo, render, difference: a file in the run's folder; None: nothing was written
 
 
@@ -57,6 +58,7 @@ class MetricsRecord(TypedDict):
     """The held-out views of a run, measured."""
 
     mean: MetricValues
+    psnr_shown: NotRequired[float]  # mean of the views'
     interval: MetricValues  # half of that of each mean; older runs do not tell
     confidence: float  # of the intervals
     views: list[ViewMetricValues]

@@ -141,6 +141,9 @@ def _report(result: RunResult, metrics: list[ViewMetrics], files: list[str] | No
         ],
         "reasons": mean.reasons,
     }
+    for record, of in zip((measured, *measured["views"]), (mean, *metrics), strict=True):
+        if of.psnr_shown is not None:
+            record["psnr_shown"] = of.psnr_shown
     return {"metrics": measured, **result.record, "machine": machine_facts(), "versions": version_facts()}
 
 

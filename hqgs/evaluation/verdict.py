@@ -66,9 +66,12 @@ def judged_by(report: Mapping[str, Any]) -> tuple[float | None, str]:
     how: brightness and tint are set aside then. Reports of older runs know the plain one alone.
     """
     mean = report["metrics"]["mean"]
-    exposed = any(gain != 1 for record in report.get("learned", []) for gain in record["gains"])
+    exposed = len({tuple(record["gains"]) for record in report.get("learned", [])}) > 1
     if exposed and mean.get("psnr_aligned") is not None:
         return mean["psnr_aligned"], "PSNR with each photo's brightness and tint set aside"
+    shown = report["metrics"].get("psnr_shown", mean.get("psnr_shown"))
+    if shown is not None:
+        return mean["psnr"], f"PSNR in the look of the photos' cameras, {shown:.1f} dB as the scene is shown"
     return mean["psnr"], "PSNR"
 
 

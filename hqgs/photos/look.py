@@ -35,6 +35,11 @@ class Look:
     vignetting: NDArray[np.float64]  # [2], k1 and k2
     response: NDArray[np.float64]  # [2, 3], a and b of red, green and blue
 
+    @property
+    def changes(self) -> bool:
+        """Whether it is another than that of the scene."""
+        return bool((self.gains != 1).any() or self.vignetting.any() or self.response.any())
+
     def of(self, image: NDArray[Any], K: NDArray[np.float64]) -> NDArray[np.float64]:
         """A picture [H, W, 3], values of sRGB, in this look; `K` [3, 3] has the axis, px."""
         square = torch.from_numpy(squared_radii(image.shape[0], image.shape[1], K))

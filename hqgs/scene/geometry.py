@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -115,9 +116,9 @@ def resized(view: View, width: int, height: int) -> View:
         pixels = np.dstack([view.image, view.empty]).astype(np.uint8)
         both, mask = area_downscale(pixels, view.mask, width, height)
         image, empty = parts_of(both)
-        return View(view.name, camera, image, mask, empty=empty)
-    image, mask = area_downscale(view.image, view.mask, width, height)
-    return View(view.name, camera, image, mask)
+    else:
+        (image, mask), empty = area_downscale(view.image, view.mask, width, height), None
+    return replace(view, camera=camera, image=image, mask=mask, low=None, film=None, empty=empty)
 
 
 def parts_of(pixels: Pixels) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:

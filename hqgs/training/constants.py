@@ -102,15 +102,6 @@ DEPTHS_ASKED = 0.92, 1.08  # of the scene's: between them other photos are asked
 CONTRADICTED = 0.3  # of a region's cells: so many more look as in the scene than as in the photo
 BORNE_OUT = 0.5  # of them: most look as in the scene; where neither is borne out, photos only fail to agree
 
-# The trial of growth: short runs on small copies of the photos. At 147 px, a quick run's, nothing should grow
-# on a building (+0.5 ± 0.5 dB, +0.014 ± 0.009 SSIM, +0.055 ± 0.024 HaarPSI) and a can on bare tiles (+1.1 ±
-# 0.4, +0.007 ± 0.004, +0.025 ± 0.011), and should on five others and a room. At 480 px the building ends
-# 0.7 dB better so. PSNR alone does not tell it: it forgives blur.
-TRIAL_STEPS, TRIAL_SIDES = 400, (120, 320)  # of each run; px, at least and at most
-TRIAL_PIXELS = 10  # of the photos for each Gaussian, at least, where growth is as it likes
-TRIAL_EACH, TRIAL_OFFSETS = 4, (1, 3)  # every so-manieth photo is held back, from these on
-TRIAL_SHARE = 0.15  # of the pixels that the run trains on: those of the trial
-
 # The guard. Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.
 GUARD_LIMIT = 1e18
 LOG_LIMIT = math.log(2.0**128)  # of the scales' logarithms: exp of more overflows 32 bits

@@ -68,7 +68,7 @@ def run_notes(trainer: Trainer) -> list[str]:
             notes.append(
                 f"cameras darken corners by up to {corners[-1]:.0%}, the slopes of their responses are "
                 f"up to {bends:.0%} off their mean; the scene looks as the mean camera has it, with bright "
-                "corners: held-out photos by these cameras measure it as worse than it is; "
+                "corners: held-out photos by these cameras are measured in their look, and "
                 "`hqgs render --look PHOTO` shows it as a photo's camera would"
             )
     return notes

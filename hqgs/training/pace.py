@@ -15,9 +15,7 @@ def fit_to_seconds(trainer: Trainer) -> None:
     """
     if trainer.asked.seconds is None or trainer.asked.turn is not None:
         return
-    kept = {name: tensor.clone() for name, tensor in trainer.method.state_dict().items()}
     half, full = trainer.ranks.tell([timed(trainer, True), timed(trainer, False)])[0]
-    trainer.method.load_state_dict(kept)
     trainer.begin(trainer.prepared.plan(StepSeconds(full, half)))
 
 

@@ -14,6 +14,7 @@ from hqgs.base.left_out import LeftOut
 from hqgs.base.text import aligned
 from hqgs.base.typed import build
 from hqgs.diagnosis.scene import Diagnosis
+from hqgs.evaluation.constants import SCATTER
 from hqgs.evaluation.records import PlanRowRecord
 from hqgs.photos.formula import ERRORS, LINEAR, NONE, Degradation, parse_formation, undegraded
 from hqgs.training.config import AUTO, FORMATION, TrainConfig
@@ -29,12 +30,20 @@ class StepSeconds:
 
 @dataclass(frozen=True)
 class Tried:
-    """What a run without growth gains over one with it, in short runs on small copies (`tried_growth`)."""
+    """What a run gains by a part, or without it, in short runs on small copies (`hqgs.training.trial`)."""
 
     gain: float  # dB, mean over photos held back
     error: float  # standard error of that mean
     photos: int  # that were held back
-    sure: float  # mean gain over its standard error, the mean for PSNR, SSIM and HaarPSI
+    sure: float  # mean gain over its standard error, the mean over the measures that it goes by
+
+    @property
+    def pays(self) -> bool:
+        """Whether the gain is more than photos scatter."""
+        return self.gain > SCATTER and self.sure > 1
+
+    def __str__(self) -> str:
+        return f"{self.gain:+.2f} ± {self.error:.2f} dB on {self.photos} photos held back from short runs"
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,8 @@ class Facts:
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
     passed: int | None = None  # photos in which somebody passes by; None: not looked at
     passing: float = 0.0  # share of all pixels that these cover
-    tried: Tried | None = None  # whether growth pays; None: not tried
+    tried: Tried | None = None  # what is gained without growth; None: not tried
+    looks: Mapping[str, Tried] = field(default_factory=dict)  # what is gained by parts of the formation
     found: bool = False  # whether its cameras were found from the photos alone
     # What the method tells of the photos (`Method.facts`):
     as_photographed: bool = False  # renders are compared with photos as they are, of any size

@@ -12,8 +12,7 @@ from dataclasses import replace
 from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
-from hqgs.evaluation.constants import SCATTER
-from hqgs.photos.formula import FILM, LEARNED, LINEAR, parse_formation
+from hqgs.photos.formula import FILM, LEARNED, LINEAR, NONE, parse_formation
 from hqgs.training.config import AUTO, AUTOMATIC, ITEMS, OF_PHOTOS, TrainConfig
 from hqgs.training.constants import (
     COARSE_FACTOR,
@@ -68,8 +67,15 @@ def formation(draft: Draft) -> Sequence[Choice]:
         return [Choice(text, "asked for", changes={"hqgs.formation": text})]
     if diagnosis is None:
         raise ValueError("the formation is auto, and nobody has looked at the photos")
-    text = str(parse_formation(diagnosis.formation))
-    found = [f"{name}: {why}" for name, needed, why in diagnosis.needs() if needed]
+    looks = draft.facts.looks
+    out = {name for name, tried in looks.items() if not tried.pays}
+    steps = [str(step) for step in parse_formation(diagnosis.formation).steps if step.kind not in out]
+    text = str(parse_formation("+".join(steps) or NONE))
+    found = [
+        f"{name}: {why}" + (f", {looks[name]}" if name in looks else "")
+        for name, needed, why in diagnosis.needs()
+        if needed and name not in out
+    ]
     why = "what the photos show" if found else "the photos show nothing that must be undone"
     rows = [Choice(text, why, "; ".join(found), changes={"hqgs.formation": text})]
     rows += [
@@ -77,6 +83,12 @@ def formation(draft: Draft) -> Sequence[Choice]:
     ]
     unseen = [(CORRECTION + name, why) for name, needed, why in diagnosis.needs() if not needed]
     rows += [Choice("none", f"not seen: {why}", what=what, left_out=what) for what, why in unseen]
+    why = "photos held back from short runs, in the look of their camera, do not gain by it"
+    rows += [
+        Choice("none", why, str(looks[name]), what=f"a learned {name}", left_out=f"a learned {name}")
+        for name in looks
+        if name in out
+    ]
     return rows
 
 
@@ -286,11 +298,9 @@ def resets(draft: Draft) -> Sequence[Choice]:
 def growth(draft: Draft) -> Sequence[Choice]:
     densify, tried, told = draft.settings.densify, draft.facts.tried, ""
     if tried is not None:
-        gain = f"{tried.gain:+.2f} ± {tried.error:.2f} dB"
-        told = f"without it {gain} on {tried.photos} photos held back from short runs"
-        told += f"; PSNR, SSIM and HaarPSI gain {tried.sure:.1f} times their error"
+        told = f"without it {tried}; PSNR, SSIM and HaarPSI gain {tried.sure:.1f} times their error"
     dense = draft.undegraded and draft.dense
-    if dense and tried is not None and tried.gain > SCATTER and tried.sure > 1:
+    if dense and tried is not None and tried.pays:
         why = "what grows explains each photo alone, and views between photos are worse"
         changes = {f"densify.{name}": value for name, value in no_growth(densify).items()}
         return [Choice("none", why, told, "growth", changes=changes)]

@@ -27,7 +27,7 @@ from hqgs.training.passersby import without_passersby
 from hqgs.training.plan import Draft, Facts, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_overfitting import in_agreement
 from hqgs.training.plan_rules import RULES, plan_run
-from hqgs.training.trial import Begin, calls_for_trial, tried_growth
+from hqgs.training.trial import Begin, calls_for_trial, tried_growth, tried_looks
 
 
 class Prepared:
@@ -62,16 +62,24 @@ class Prepared:
             facts = replace(facts, passed=len(self.passersby), passing=passing / facts.pixels)
         self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
         settings = plan_run(facts, self.diagnosis, asked).settings
-        self.method: Method[Any] = make_method(scene, settings, inspector)
-        self.training_views: TrainingViews = TrainingViews(scene.train, self.method, asked.background)
-        self.facts: Facts = self.method.facts(facts, self.training_views.targets)
-        self.shown_diagnosis: Diagnosis | None = (
-            inspector.last
-        )  # of more photos, where the method asks for it
+        if begin is not None and self.diagnosis is not None and asked.leave_out:
+            facts = replace(facts, looks=tried_looks(scene, settings, begin, inspector.on_stage))
+            settings = plan_run(facts, self.diagnosis, asked).settings
+        self.facts: Facts = facts
+        self._inspector: Inspector = inspector
+        self.form(settings)
+        # Of more photos, where the method asks for it.
+        self.shown_diagnosis: Diagnosis | None = inspector.last
         self._on_stage = inspector.on_stage
         self._points: dict[tuple[int, bool], tuple[Points, Colors, float]] = {}
         self._begin: Begin | None = begin
         self._has_tried: bool = False
+
+    def form(self, settings: TrainConfig) -> None:
+        """Make the method of these settings, which has learned nothing, and what renders are compared to."""
+        self.method: Method[Any] = make_method(self.scene, settings, self._inspector)
+        self.training_views: TrainingViews = TrainingViews(self.scene.train, self.method, settings.background)
+        self.facts = self.method.facts(self.facts, self.training_views.targets)
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
         """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""

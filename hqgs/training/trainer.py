@@ -16,6 +16,7 @@ from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.evaluation.held_out import HeldOutViews, history_entry
+from hqgs.evaluation.looks import looks_of_devices
 from hqgs.evaluation.records import HistoryEntry
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.geometry import photo_pixels
@@ -62,13 +63,16 @@ class Trainer:
         self.prepared: Prepared = Prepared(scene, config, inspector, Trainer if tries else None)
         self.asked: TrainConfig = config
         self.scene: Scene = self.prepared.scene
-        self.method: Method[Any] = self.prepared.method
         self.diagnosis: Diagnosis | None = self.prepared.shown_diagnosis  # None: the method asks for none
         self.lengthened: int | None = None  # the iteration at which a run ended that this one makes longer
-        self.begin(self.prepared.plan())
+        self._stand(self.prepared.plan())
 
     def begin(self, plan: RunPlan) -> None:
-        """Stand before the first step of a run of this plan."""
+        """Stand before the first step of a run of this plan, with a method that has learned nothing."""
+        self.prepared.form(plan.settings)
+        self._stand(plan)
+
+    def _stand(self, plan: RunPlan) -> None:
         self.plan: RunPlan = plan
         self.schedule: Schedule = Schedule.of(plan, len(self.scene.train))
         self.frugality: Frugality = Frugality(self.schedule, self.scene.train, self.shown, self._psnr)
@@ -81,6 +85,10 @@ class Trainer:
         if plan.first_points > len(scene.points):
             why = "so many agree between photos, the reconstruction's own among them"
             state.rows.append(PlanRow("first points found", f"{len(gaussians):,}", why, "", "first_points"))
+
+    @property
+    def method(self) -> Method[Any]:
+        return self.prepared.method
 
     @property
     def config(self) -> TrainConfig:
@@ -172,7 +180,9 @@ class Trainer:
             self.prepared.given.test if numbers is None else [self.prepared.given.test[k] for k in numbers]
         )
         degree = self.schedule.degree(self.iteration)
-        return HeldOutViews(views, self.model(), degree, self.config.background)
+        learned = {photo.name: photo.look for photo in self.method.learned()}
+        looks = looks_of_devices(self.scene.train, learned)
+        return HeldOutViews(views, self.model(), degree, self.config.background, looks)
 
     def evaluate(self, views: HeldOutViews | None = None) -> None:
         """Add the held-out means at this iteration to the history, once. Takes no training time.
@@ -198,6 +208,7 @@ class Trainer:
             "asked": config_values(self.asked),
             "plan": self.plan.values(),
             "tried": self.prepared.facts.tried and asdict(self.prepared.facts.tried),
+            "looks": {name: asdict(tried) for name, tried in self.prepared.facts.looks.items()},
             "scene": checkpoint.scene_fingerprint(self.scene),
         }
         checkpoint.save_checkpoint(path, self.state.tensors() | of_method, meta)
@@ -220,6 +231,8 @@ class Trainer:
             checkpoint.check_same(path, "", meta["asked"], asked, longer)
             if tried := meta.get("tried"):
                 self.prepared.facts = replace(self.prepared.facts, tried=Tried(**tried))
+            looks = {name: Tried(**tried) for name, tried in meta.get("looks", {}).items()}
+            self.prepared.facts = replace(self.prepared.facts, looks=looks)
             if longer:
                 self.begin(self.prepared.plan())
                 meta["decisions"] = decisions | {"length": more, "released": decisions["released"] or done}

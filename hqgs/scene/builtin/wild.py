@@ -100,8 +100,9 @@ def wild_room(
       depths of 2.5 and 8.
     - `true-exposure[:EV]` (1): gains as in `exposure` (`draw_gains`), on the light before the camera's curve.
     - `true-devices[:N]` (4): N cameras take turns, each with corners that its lens darkens and a response of
-      its own (`draw_devices`), each photo with gains as `true-exposure:0.5`. The means of the log gains and
-      of the responses are 0, as no photo can tell them. Views tell which camera took them (`View.device`).
+      its own (`draw_devices`), each photo with gains as `true-exposure:0.5`. The means of the responses, and
+      of the logarithm of what gains and lenses make of light, are 0, as no photo can tell them. Views tell
+      which camera took them (`View.device`).
     - `true-crowd[:N]` (3): 0 to N figures walk through each photo (`draw_walkers`); where they are, and
       nowhere else, it differs from the clean one.
 
@@ -120,9 +121,11 @@ def wild_room(
         for view in clean.train
     }
     if name == "true-devices":
-        truth = _of_devices(truth, np.random.default_rng([seed, len(names)]), int(value))
+        rng = np.random.default_rng([seed, len(names)])
+        truth = _of_devices(truth, rng, int(value), clean.train[0].camera)
     folder = None if cache is None else cache / f"{name}_{value:g}_{seed}"
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
+    made |= {"level": "of gains and lenses"} if name == "true-devices" else {}
     kept = None if folder is None else read_kept(folder, made, list(truth))
     if kept is None:
         photos = {view.name: taken(name, view.camera, truth[view.name]) for view in clean.train}
@@ -173,10 +176,13 @@ def taken(kind: str, camera: Camera, truth: PhotoTruth) -> NDArray[np.uint8]:
     return render_exposure(exposure(kind, camera, truth), truth.gains, passing=passing, device=truth.device)
 
 
-def _of_devices(truth: dict[str, PhotoTruth], rng: np.random.Generator, count: int) -> dict[str, PhotoTruth]:
-    """The same photos by so many cameras, with log gains of mean 0."""
+def _of_devices(
+    truth: dict[str, PhotoTruth], rng: np.random.Generator, count: int, camera: Camera
+) -> dict[str, PhotoTruth]:
+    """The same photos by so many cameras; gains and lenses together leave the mean of log light as it is."""
     devices = draw_devices(rng, len(truth), count)
     mean = np.log([photo.gains for photo in truth.values()]).mean(0)
+    mean += np.mean([np.log(device.shade(camera)).mean() for device in devices])
     return {
         name: photo._replace(gains=photo.gains / np.exp(mean), device=device)
         for (name, photo), device in zip(truth.items(), devices, strict=True)

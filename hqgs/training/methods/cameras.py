@@ -21,7 +21,7 @@ from hqgs.base.elementary import exp
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import nearness_map
 from hqgs.photos.exposure import take_photo
-from hqgs.photos.look import MOST_GAIN
+from hqgs.photos.look import MOST_GAIN, Look
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.constants import (
@@ -65,6 +65,10 @@ class LearnedCamera:
     lens: NDArray[np.float64]  # [2], px: see `hqgs.training.methods.lens`
     vignetting: NDArray[np.float64]  # [2] and
     response: NDArray[np.float64]  # [2, 3], as `hqgs.photos.look` has them
+
+    @property
+    def look(self) -> Look:
+        return Look(self.gains, self.vignetting, self.response)
 
     @property
     def defocus(self) -> float:
@@ -151,9 +155,7 @@ class LearnedCameras:
         near = self._nearness[number] if blurs else None
 
         def develop(render: Tensor) -> Tensor:
-            gains = torch.ones(3, dtype=torch.float64)
-            if self._gains:
-                gains = exp(self._gains[number])
+            gains = self._own_gains(number)
             full = None if near is None else _enlarged(near, size).to(render)
             taken = take_photo(render, size, full, warps, gains)
             if self._devices is not None:
@@ -196,7 +198,7 @@ class LearnedCameras:
             LearnedCamera(
                 name,
                 np.zeros((TRAJECTORY_POINTS, 2)) if self._still[k] else _middle(self._paths[k]).numpy(),
-                self._gains[k].detach().exp().numpy() if self._gains else np.ones(3),
+                self._own_gains(k).detach().numpy(),
                 np.zeros(2) if self._sharp[k] else self._lenses[k].detach().numpy().copy(),
                 *(none if self._devices is None else self._devices.learned(k)),
             )
@@ -233,6 +235,11 @@ class LearnedCameras:
     def _named(self) -> dict[str, list[Tensor]]:
         """What is trained of each photo's camera, as a checkpoint names it."""
         return {"path": self._paths, "lens": self._lenses, "gains": self._gains}
+
+    def _own_gains(self, number: int) -> Tensor:
+        """Of the photo of this number, [3]."""
+        logs = self._gains[number] if self._gains else torch.zeros(3, dtype=torch.float64)
+        return exp(logs if self._devices is None else logs + self._devices.level())
 
     def _blurs(self, number: int) -> bool:
         """Whether a photo's camera moved or was out of focus."""

@@ -1,7 +1,8 @@
 """What the cameras that took the photos do to all of them, learned with the scene: vignetting and response.
 
-See `hqgs.photos.look` for the model. The mean of the responses over photos is that which they start with, 0:
-photos cannot tell it. A scene is shown as that mean camera would, without its vignetting.
+See `hqgs.photos.look` for the model. Photos cannot tell the mean of the responses, which stays 0, nor how
+bright the scene is where lenses are dark: it is shown as the mean camera has it, with bright corners, and as
+bright as the photos are in the mean.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from hqgs.diagnosis.devices import Devices
 from hqgs.photos.look import as_a_lens, as_responses, darken, falloff, respond, squared_radii
 from hqgs.scene.scene import Camera
 
+MEAN_SQUARES = 1 / 3, 0.16  # of r^2 and r^4 over a picture, the latter 0.156 (a square) to 0.168 (16:9)
 KEPT = 8  # maps of squared radii; photos may each have a camera of their own
 
 
@@ -32,8 +34,16 @@ class LearnedDevices:
         self._response = _trained(first.response if response else [])
         counts = np.bincount(first.of_photo[first.of_photo >= 0], minlength=len(first))
         self._shares = torch.from_numpy(counts / max(counts.sum(), 1))
+        self._told = counts.sum() / max(len(first.of_photo), 1)  # share of the photos that have a camera
         self._squares = lru_cache(KEPT)(_squares)
         self.center()
+
+    def level(self) -> Tensor:
+        """The mean of the logarithm of what lenses keep from photos: gains beside it leave their mean."""
+        if not self._vignetting:
+            return torch.zeros((), dtype=torch.float64)
+        means = torch.stack([*self._vignetting]) @ torch.tensor(MEAN_SQUARES, dtype=torch.float64)
+        return self._told * (self._shares * means).sum()
 
     def develop(self, number: int, camera: Camera, taken: Tensor) -> Tensor:
         """The photo of this number of what was taken without its camera's faults, [H, W, 3]."""
