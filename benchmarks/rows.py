@@ -26,7 +26,7 @@ from hqgs.base.machine import machine_facts, version_facts
 Row = Mapping[str, Any]
 RUN = ("scene", "degradation", "row", "seed", "iterations", "downscale", "poses")  # the key of a training run
 KEYS: dict[str, Sequence[str]] = {  # of each table's lines
-    **dict.fromkeys(("quality", "time", "frugality", "features", "endurance"), RUN),
+    **dict.fromkeys(("quality", "time", "frugality", "features", "endurance", "parts"), RUN),
     "moments": (*RUN, "moment"),
     "poses": ("scene", "degradation", "seed", "downscale"),
     "export": ("scene", "file"),
@@ -62,6 +62,7 @@ TEXT = (
         "date",
         "sources",
         "digest",
+        "start",
     ),
 )
 DIGITS = ".7g"
