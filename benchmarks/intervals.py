@@ -19,11 +19,11 @@ from benchmarks.measure import Training
 from benchmarks.pages.figures import listed
 from benchmarks.protocol import Row
 from benchmarks.rows import Table, facts
+from benchmarks.scenes.sparse import ARC, HIGH, LOW, RADIUS, SIDEWAYS, beyond_room, camera_on_arc
 from hqgs.evaluation.held_out import held_out_renders, measured
 from hqgs.evaluation.intervals import half_width
 from hqgs.evaluation.metrics import ViewMetrics
-from hqgs.scene.builtin import render_view
-from hqgs.scene.builtin.sparse import ARC, HIGH, LOW, RADIUS, SIDEWAYS, beyond_room, camera_on_arc
+from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.scene import Scene, View
 
 DRAWN = (2, 3, 4, 6, 10, 20)  # photos

@@ -33,3 +33,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         config.option.numprocesses = min(cores, MOST)
         config.option.dist = "worksteal"
+
+
+def pytest_configure() -> None:
+    """Tests degrade photos in all ways that the benchmarks know."""
+    import benchmarks.scenes.kinds  # noqa: F401  # not before threads are set

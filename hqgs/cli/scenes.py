@@ -46,8 +46,7 @@ class Photos:
 
     scene: SceneName
     """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
-    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-exposure, true-devices,
-    true-crowd or true-panorama."""
+    embedded, a room that is built in."""
     downscale: Factor = None
     """Divide the photos' sides by F."""
 

@@ -16,7 +16,7 @@ from typing import Any
 from hqgs.base.files import CONFIG
 from hqgs.base.stages import OnStage, silent
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin import room
+from hqgs.scene.builtin.scene import HEIGHT, WIDTH, embedded_scene
 from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.film import check_film, film_frames
@@ -57,9 +57,7 @@ def load(
 
     Args:
         path: a folder of photos alone, or a film: COLMAP finds cameras and points. Or a COLMAP, LLFF,
-            Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or a scene that is built in
-            (`hqgs.scene.builtin.room`): "embedded", "sparse", "true-shake", "true-defocus", "true-exposure",
-            "true-devices", "true-crowd" or "true-panorama".
+            Deblur-NeRF, nerfstudio, instant-ngp or Blender folder, or "embedded", a room that is built in.
         downscale: divide the photos' sides by this, at least 1.
         test_every: hold out each view whose place in the sorted names is a multiple of this; 0: none. A
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
@@ -125,8 +123,11 @@ def load(
         if not downscale >= 1:
             raise ValueError(f"downscale must be at least 1, got {downscale}")
         if test_every != TEST_EVERY:
-            raise ValueError(f"test_every is {test_every}, but built-in scenes hold out every {TEST_EVERY}th")
-        scene = room(path, None if kept is None else kept / "scene", downscale, seed)
+            raise ValueError(
+                f"test_every is {test_every}, but the built-in scene holds out every {TEST_EVERY}th"
+            )
+        width, height = round(WIDTH / downscale), round(HEIGHT / downscale)
+        scene = embedded_scene(None if kept is None else kept / "scene", width, height)
     else:
         with ExitStack() as stack:
             notes, name = list[str](), None
@@ -210,9 +211,8 @@ def degrade(scene: Scene, kind: str, *, seed: int = 0) -> Scene:
 
     Args:
         kind: jpeg:QUALITY, noise:SIGMA, lowres:FACTOR, blur[:SIGMA], defocus[:RADIUS], motion[:LENGTH] (white
-            is 255, lengths are in px); shake[:PX], exposure[:EV], phone[:EV], crowd[:N], chat[:SIDE] (each
-            photo in its own way), video[:CRF] (all photos as one film; needs the extra `video`), some:KIND
-            (half of the photos only); several joined by + in their order, mixed, or none.
+            is 255, lengths are in px), some:KIND (half of the photos only); several joined by + in their
+            order, mixed, or none.
         seed: of everything random. Each photo has its own numbers, whatever the others are.
 
     Raises ValueError for an unknown kind, a value out of range or a photo that is too small for it.
