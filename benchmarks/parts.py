@@ -105,12 +105,14 @@ class Parts:
             start = print_of(done.trainer)
             known = self.study.runs.get(self.whole[cell.group])
             if known is not None and known["start"] == start:
-                return {name: float(known[name]) for name in MEASURES} | {"on": False, "start": start}
+                whole = {name: float(known[name]) for name in MEASURES}
+                return whole | {"on": False, "start": start, "lines": lines_of(part)}
             done.steps()
         placed = len(photos.train) + len(photos.test)
         cpu = done.setup_cpu_seconds + done.cpu_seconds
         found = done.judged() | {"cpu_seconds": cpu, "placed": placed}
-        return {name: found[name] for name in MEASURES} | {"on": True, "start": start}
+        whole = {name: found[name] for name in MEASURES}
+        return whole | {"on": True, "start": start, "lines": lines_of(part)}
 
     def placed_anew(self, cell: Cell) -> Scene:
         """The scene with cameras that are found without the part."""
@@ -145,21 +147,22 @@ def gains_of(runs: DataFrame, label: str, value: str = "psnr") -> Any:
 
 
 def parts_table(runs: DataFrame) -> str:
-    """A line for each part that was measured, the largest gain first."""
+    """A line for each part that was measured, the largest gain first; of parts that have left, too."""
     body = list[tuple[float, list[str]]]()
-    for label, part in PARTS.items():
-        mine = pick(runs, row=label)
-        if label == ALL or not len(mine):
+    for label in dict.fromkeys(runs["row"]):
+        mine, part = pick(runs, row=label), PARTS.get(label)
+        if label == ALL:
             continue
         psnr, ssim, seconds, placed = (
             gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
         )
         scenes = mine.groupby("scene")["on"].any()
-        cells = [str(lines_of(part)) if part.modules else "", f"{scenes.sum():.0f} of {len(scenes)}"]
-        cells += [psnr.text(), ssim.text("+.3f"), number(seconds.mean, "+.0f")]
-        cells.append(f"{placed.runs['gain'].sum():+.0f}" if part.poses and placed.count else "")
-        order = psnr.mean if psnr.count else float("-inf")
-        body.append((order, [f"{label}: {part.what}", *cells]))
+        lines = mine["lines"].max()
+        cells = [f"{label}: {part.what}" if part else f"{label} (has left)", number(lines or None, ".0f")]
+        cells += [f"{scenes.sum():.0f} of {len(scenes)}", psnr.text(), ssim.text("+.3f")]
+        cells.append(number(seconds.mean, "+.0f"))
+        cells.append(f"{placed.runs['gain'].sum():+.0f}" if part and part.poses and placed.count else "")
+        body.append((psnr.mean if psnr.count else float("-inf"), cells))
     heads = ("part", "lines", "on in", "PSNR (dB)", "SSIM", "CPU (s)", "photos placed")
     return table(heads, [cells for _, cells in sorted(body, key=lambda one: -one[0])])
 
