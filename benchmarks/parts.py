@@ -58,7 +58,7 @@ PARTS = {part.label: part for part in PROTOCOLS["standard"].rows if isinstance(p
 
 @cache
 def imports() -> grimp.ImportGraph:
-    return grimp.build_graph("hqgs")
+    return grimp.build_graph("hqgs", cache_dir=None)
 
 
 def alone(modules: Sequence[str]) -> set[str]:

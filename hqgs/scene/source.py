@@ -63,7 +63,7 @@ def load(
             folder that names its own held-out views keeps them; so does the embedded scene (every 8th).
         sfm: take cameras and points from the training photos, by COLMAP, in a folder that has its own too.
         degrade: what happens to the training photos first, as `hqgs.degrade` reads it.
-        seed: of the degradation, and of what a built-in camera does.
+        seed: of the degradation.
         restore: weights of an image network that the training photos go through at last.
         skip_unreadable: leave out photos that cannot be read, or are of another shape than their camera, as
             long as half of the photos to train on, and of those held out, remain; `Scene.notes` names them.
