@@ -186,4 +186,5 @@ def run(args: argparse.Namespace) -> list[str]:
     return [*([parts_table(runs)] if len(runs) else []), *missing]
 
 
-BENCHMARK = Benchmark("what each part of hqgs costs and gains", run, PROTOCOLS)
+OPTIONS = {"--degradations": {"nargs": "+", "metavar": "KIND", "help": "done to the photos first (none)"}}
+BENCHMARK = Benchmark("what each part of hqgs costs and gains", run, PROTOCOLS, OPTIONS)
