@@ -84,8 +84,8 @@ def assemble(
         views = [
             View(name, camera, found[f"photo {name}"]) for name, camera in zip(names, cameras, strict=True)
         ]
-        note = str(found["note"])
-        points = SparsePoints(*(found[name] for name in SparsePoints._fields if name != "note"), note)
+        arrays = (found[name] for name in ("points", "colors", "photos", "rows"))
+        points = SparsePoints(*arrays, note=str(found["note"]))
     train = [v for k, v in enumerate(views) if k not in held_out]
     return Scene(
         name=name,
