@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from tiny_scene import tiny_scene
 
-from benchmarks.scenes.video import film
 from benchmarks.scenes.kinds import shake
+from benchmarks.scenes.video import film
 from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.pixels import as_floats, to_uint8
