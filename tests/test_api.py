@@ -28,7 +28,7 @@ from hqgs.training.config import AUTOMATIC, run_config
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A working folder of its own, and the tiny scene in place of the embedded one."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(source, "room", lambda *_: tiny_scene())
+    monkeypatch.setattr(source, "embedded_scene", lambda *_: tiny_scene())
 
 
 def a_model() -> hqgs.Gaussians:

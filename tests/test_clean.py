@@ -66,7 +66,7 @@ def test_a_foreign_file_is_cleaned_in_its_own_frame(
     held.world, held.antialiased = world, True
     foreign = held.in_world(World())
     foreign.save(tmp_path / "foreign.spz")
-    monkeypatch.setattr(scene_source, "room", lambda *_: replace(scene(), world=world))
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: replace(scene(), world=world))
     out, options = tmp_path / "clean.glb", ["--photos", "embedded", "--steps", "200"]
     assert main(["clean", str(tmp_path / "foreign.spz"), "--out", str(out), *options]) == 0
     assert "left out: the antialias flag: a .glb file has no place for it" in capsys.readouterr().out

@@ -211,7 +211,7 @@ def test_the_command_on_a_run_folder(
     g.opacities[0] = -8.0
     run = tmp_path / "run"
     g.save(run / "scene.ply")
-    monkeypatch.setattr(scene_source, "room", lambda *_: scene)
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: scene)
     out = tmp_path / "new" / "a.spz"
     assert call(run, "--out", out, "--scene", "embedded", "--downscale", "2") == 0
     text = capsys.readouterr().out

@@ -36,7 +36,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a scene with three held-out photos, one of them masked."""
     out = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_source, "room", lambda *_: held_out_scene())
+        patch.setattr(scene_source, "embedded_scene", lambda *_: held_out_scene())
         scene = hqgs.load("embedded")
         hqgs.train(scene, out=out, config=tiny_config(40))
     return out
@@ -52,7 +52,7 @@ def held_out_scene() -> Scene:
 
 @pytest.fixture(autouse=True)
 def photos_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_source, "room", lambda *_: held_out_scene())
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: held_out_scene())
 
 
 def judge(*arguments: object) -> int:
@@ -137,7 +137,7 @@ def with_wrong_poses() -> Scene:
 def test_what_poses_cost_is_set_aside(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_source, "room", lambda *_: with_wrong_poses())
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: with_wrong_poses())
     assert judge(run, "--fit-cameras", "--out", tmp_path) == 0
     assert "cameras fitted" in capsys.readouterr().out
     one = json.loads((tmp_path / "judge.json").read_text())["scene"]

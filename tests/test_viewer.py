@@ -466,7 +466,7 @@ def test_train_shows_its_page_and_stays(
 
     shown: list[bool] = []
 
-    monkeypatch.setattr(source, "room", lambda *_: tiny_scene())
+    monkeypatch.setattr(source, "embedded_scene", lambda *_: tiny_scene())
     monkeypatch.setattr(Viewer, "serve", end)
     command = ["train", "embedded", "--out", str(tmp_path), "--iterations", "3", "--view", "--port", "0"]
     assert cli.main(command) == 0
