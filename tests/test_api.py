@@ -190,7 +190,7 @@ def test_wrong_scenes_are_named() -> None:
         hqgs.load("/no/such")
     with pytest.raises(ValueError, match="downscale must be at least 1, got 0"):
         hqgs.load("embedded", downscale=0)
-    with pytest.raises(ValueError, match="test_every is 5, but built-in scenes"):
+    with pytest.raises(ValueError, match="test_every is 5, but the built-in scene"):
         hqgs.load("embedded", test_every=5)
     with pytest.raises(ValueError, match="unknown degradation 'fog'"):
         hqgs.degrade(tiny_scene(), "fog")
