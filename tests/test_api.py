@@ -167,7 +167,7 @@ def test_the_first_ctrl_c_returns_what_there_is() -> None:
 def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, Any]] = []
 
-    def reconstruct(scene: hqgs.Scene, keep: Path | None, on_stage: object, features: str) -> hqgs.Scene:
+    def reconstruct(scene: hqgs.Scene, keep: Path | None, on_stage: object) -> hqgs.Scene:
         calls.append(("sfm", keep))
         assert scene.train[0].image.dtype == np.float32  # the photos are degraded by then
         return scene

@@ -345,7 +345,7 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
     assert (tmp_path / CHECKPOINT).exists()
 
 
-@pytest.mark.parametrize("words", ["--help", "train --help", "plan embedded --downscale 9"])
+@pytest.mark.parametrize("words", ["--help", "train --help"])
 def test_output_that_nobody_reads_is_no_failure(words: str) -> None:
     """As in `hqgs ... | head`, which has read enough."""
     process = subprocess.Popen(
