@@ -85,7 +85,7 @@ def test_sfm_replaces_poses_and_points_once(
     def load(path: str, downscale: float, **_: Any) -> Scene:
         return replace(tiny_scene(), source=form)
 
-    def sfm(scene: Scene, keep: Path, told: Any, features: str) -> Scene:
+    def sfm(scene: Scene, keep: Path, told: Any) -> Scene:
         assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image.dtype)
         return replace(scene, sfm=report, notes=[str(report)])

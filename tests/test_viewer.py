@@ -30,7 +30,7 @@ import hqgs
 from hqgs.cli import main as cli
 from hqgs.cli import view
 from hqgs.evaluation.photo_facts import facts_of_photos
-from hqgs.evaluation.report import read_report
+from hqgs.evaluation.records import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import with_size

@@ -42,5 +42,5 @@ def existing_folder(path: str | Path) -> Path:
 
 
 def is_room(name: str | Path) -> bool:
-    """Whether this names the built-in scene."""
-    return str(name) == EMBEDDED
+    """Whether this names the built-in scene: a folder of that name comes first."""
+    return str(name) == EMBEDDED and not Path(name).exists()
