@@ -183,8 +183,7 @@ def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(source, "restore_scene", restored)
     monkeypatch.setattr(source, "check_weights", lambda weights: calls.append(("check", weights)))
     scene = hqgs.load("embedded", sfm=True, degrade="noise:25", seed=3, restore="w.pth", cache="kept")
-    weights = str(Path("w.pth").resolve())
-    assert calls == [("check", weights), ("sfm", Path("kept/sfm")), ("restore", weights)]
+    assert calls == [("check", "w.pth"), ("sfm", Path("kept/sfm")), ("restore", "w.pth")]
     by_hand = hqgs.degrade(tiny_scene(), "noise:25", seed=3)
     assert all(np.array_equal(a.image, b.image) for a, b in zip(scene.train, by_hand.train, strict=True))
 

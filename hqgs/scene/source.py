@@ -99,7 +99,7 @@ def load(
         sfm=sfm,
         degrade=degrade,
         seed=seed,
-        restore=None if restore is None else str(Path(restore).resolve()),
+        restore=None if restore is None else str(restore),
         skip_unreadable=skip_unreadable,
         longest=longest,
         coarse=coarse,
@@ -143,7 +143,8 @@ def load_as(
     scene = scene if apart is None else in_metres(scene, apart)
     scene = scene if asked.tag_size is None else by_tags(scene, asked.tag_size)
     scene = scene if up is None else as_asked(scene, up)
-    return replace(scene, origin=json.loads(json.dumps(asdict(asked))))
+    kept_as = asdict(asked) | {"restore": asked.restore and str(Path(asked.restore).resolve())}
+    return replace(scene, origin=json.loads(json.dumps(kept_as)))
 
 
 def _room(asked: LoadOptions, kept: Path | None) -> Scene:
