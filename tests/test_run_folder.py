@@ -289,19 +289,25 @@ def test_a_plan_is_of_all_photos(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_a_folder_that_is_called_as_a_built_in_scene_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """COLMAP writes `sparse`; a run of the built-in scene stays one beside such a folder."""
+    """A run of the built-in scene stays one beside such a folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(scene_source, "room", lambda *_: tiny_scene())
-    hqgs.train(hqgs.load("sparse"), out="run", config=tiny_config())
-    write_transforms(make_truth(4), tmp_path / "sparse")
-    for path in ("sparse", "./sparse", Path("sparse"), tmp_path / "sparse"):
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: tiny_scene())
+    hqgs.train(hqgs.load("embedded"), out="run", config=tiny_config())
+    write_transforms(make_truth(4), tmp_path / "embedded")
+    for path in ("embedded", "./embedded", Path("embedded"), tmp_path / "embedded"):
         scene = hqgs.load(path)
         assert scene.source == "transforms"
         assert any("not the built-in scene of that name" in note for note in scene.notes) == (
-            str(path) == "sparse"
+            str(path) == "embedded"
         )
     assert main(["judge", "run"]) == 0
-    assert main(["info", "sparse"]) == 0
+    assert main(["info", "embedded"]) == 0
+
+
+def test_a_built_in_scene_that_is_gone_is_told(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text('{"scene": {"path": "sparse"}}')
+    with pytest.raises(ValueError, match="there is no built-in scene 'sparse'"):
+        RunFolder(tmp_path).photos()
 
 
 @pytest.mark.parametrize("option", [["--frames", "0"], ["--frames", "5"], ["--up", "0", "0", "0"]])

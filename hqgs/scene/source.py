@@ -149,6 +149,8 @@ def load_as(
 
 def _room(asked: LoadOptions, kept: Path | None) -> Scene:
     """The built-in scene."""
+    if asked.path != EMBEDDED:
+        raise ValueError(f"there is no built-in scene {asked.path!r}")
     if not asked.downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {asked.downscale}")
     if asked.test_every != TEST_EVERY:
