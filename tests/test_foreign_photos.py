@@ -54,7 +54,7 @@ def test_colmap_is_given_what_it_reads(tmp_path: Path) -> None:
     found = bare_photos(tmp_path, 1)
     assert found is not None
     photos = readable(found)
-    names = ["a.jpg.jpg", "b.jpg.jpg", "c.jpg", "d.HEIC.jpg"]
+    names = ["a.jpg", "b.jpg", "c.jpg", "d.HEIC.jpg"]
     assert list(photos.colmap_names) == names
     (tmp_path / "out").mkdir()
     photos.write(tmp_path / "out")

@@ -260,7 +260,8 @@ def test_photos_without_a_mask_are_named_where_others_have_one(tmp_path: Path) -
     Image.new("L", (48, 36), 255).save(tmp_path / "masks" / truth.names[0])
     notes = load_scene(tmp_path).notes
     assert any(
-        note.startswith("masks are in masks, but 3 of 4 photos have none, and count") for note in notes
+        note.startswith("1 of 4 photos have a mask, such as ") and "these have none, and count" in note
+        for note in notes
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -101,17 +100,6 @@ def test_photos_of_rarer_suffixes(suffix: str, tmp_path: Path) -> None:
     for path in (tmp_path / "for_colmap").iterdir():
         with Image.open(path) as photo:
             assert (photo.format, photo.size) == ("JPEG", (64, 48))
-
-
-def test_a_name_that_is_no_text(tmp_path: Path) -> None:
-    pictures(tmp_path, 4)
-    try:
-        os.rename(tmp_path / "0.png", os.fsencode(tmp_path) + b"/\xff\xfe.png")
-    except OSError:
-        pytest.skip("this file system has text names alone")
-    photos = looked_at(tmp_path)
-    assert photos.names == ["1.png", "2.png", "3.png"]
-    assert photos.unreadable == {"??.png": "its name is no text in UTF-8: rename it"}
 
 
 def test_two_hundred_megapixels_are_read_and_more_than_memory_are_not(

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import logging
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
+from hqgs.base.text import as_text
+
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
-REPORT, PICTURES = "report.json", "comparison"
-CAMERAS, PHOTOS = "cameras.json", "photos"
 LEARNED, PASSERSBY = "learned.png", "passersby.png"  # of the photos' cameras; of who was masked
+_LACKING = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM}
 PLAN = "plan.json"  # what a number of seconds came to
-RUN_FILES = (PLY, PAGE, REPORT, CAMERAS, LEARNED, PASSERSBY, PLAN, CONFIG, CHECKPOINT)  # what a run writes,
-RUN_FOLDERS = (PHOTOS, PICTURES)  # and where its pictures are
 
 
 @contextmanager
@@ -37,14 +39,35 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     tmp = Path(name)
     try:
         yield tmp
-        with tmp.open("rb+") as f:
-            os.fsync(f.fileno())
+        _flush(tmp)
         umask = os.umask(0)
         os.umask(umask)
-        tmp.chmod(0o666 & ~umask)  # mkstemp makes it private; give it the usual permissions
+        with _where_there_is(f"permissions of files, in {path.parent}"):
+            tmp.chmod(0o666 & ~umask)  # mkstemp makes it private; give it the usual permissions
         tmp.replace(path)
     finally:
         tmp.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    with path.open("rb+") as file, _where_there_is(f"flushing of files to disk, in {path.parent}"):
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def _where_there_is(what: str) -> Iterator[None]:
+    """Go on where a file system (of a network, a phone, a container) does not have what is asked of it."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _LACKING:
+            raise
+        _say_once(f"the file system lacks {what} ({error.strerror}): going on without")
+
+
+@lru_cache
+def _say_once(text: str) -> None:
+    logging.getLogger("hqgs").warning("%s", as_text(text))
 
 
 def check_new_folder(out: Path) -> None:
@@ -75,16 +98,15 @@ def keep_folder(source: Path, target: Path) -> None:
         copy = Path(name) / target.name
         shutil.copytree(source, copy)
         for file in copy.iterdir():
-            with file.open("rb+") as f:
-                os.fsync(f.fileno())
+            _flush(file)
         if not target.exists():
             copy.rename(target)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write `text` (UTF-8) atomically."""
+    """Write `text` (UTF-8) atomically; what of a name on disk is none is escaped, as `as_text` does."""
     with atomic_path(path) as tmp:
-        tmp.write_text(text, encoding="utf-8")
+        tmp.write_text(as_text(text), encoding="utf-8")
 
 
 def write_json(path: str | Path, value: Any) -> None:
@@ -125,7 +147,8 @@ def lock_folder(folder: str | Path) -> Iterator[None]:
         raise PermissionError(f"no right to write into {error.filename}: choose another folder") from None
     lock = FileLock(folder / LOCK)
     try:
-        lock.acquire(timeout=0)
+        with _where_there_is(f"locks, in {folder}: let no other run write there"):
+            lock.acquire(timeout=0)
     except Timeout:
         raise FolderBusyError(f"another run is writing into {folder}") from None
     except PermissionError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import textwrap
 from collections.abc import Sequence
@@ -37,3 +38,8 @@ def aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> str:
 def some(names: list[str]) -> str:
     """The first few names, for messages."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def as_text(name: str) -> str:
+    """A name or text from disk that can be written as UTF-8: bytes that are none become %E9 and such."""
+    return re.sub("[\ud800-\udfff]", lambda found: f"%{ord(found[0]) & 0xFF:02X}", name)

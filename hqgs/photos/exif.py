@@ -21,7 +21,6 @@ _GPS = 0x8825  # another such table, with these:
 _NORTH_OR_SOUTH, _LATITUDE, _EAST_OR_WEST, _LONGITUDE, _BELOW_SEA, _ALTITUDE = range(1, 7)
 _MM = {2: 25.4, 3: 10.0}  # of the units that resolutions come in
 _DIAGONAL = math.hypot(36, 24)  # mm, of 35 mm film
-_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}  # quarter turns clockwise that show a photo upright
 _DRONE = re.compile(
     rb'drone-dji:(RelativeAltitude|GimbalPitchDegree|GimbalRollDegree)(?:="|>)\s*([+-]?\d+\.?\d*)'
 )
@@ -33,7 +32,7 @@ _SHORTEST, _LONGEST = 0.2, 20.0  # focal length in longer sides; what lies beyon
 class Exif:
     """Of a photo. What nothing is known of is 0, or empty."""
 
-    quarter_turns: int = 0  # clockwise, that show the stored pixels upright: 0..3
+    orientation: int = 1  # how the stored pixels are to be shown: 1..8, as they are, mirrored, turned
     camera: tuple[str, ...] = ()  # make, model and focal length: photos with the same ones share a camera
     focal: float = 0.0  # px of the stored photo
     gps: tuple[float, float, float] | None = None  # degrees north and east, m up; nan: no altitude
@@ -41,6 +40,11 @@ class Exif:
     above: float = math.nan  # m above where a drone took off, by its barometer
     pitch: float | None = None  # degrees above level that its gimbal held the camera, upright
     taken: datetime | None = None  # by the camera's clock, whole seconds
+
+    @property
+    def quarter_turns(self) -> int:
+        """Clockwise, that show the stored pixels upright, mirrored or not: 0..3."""
+        return (0, 0, 2, 2, 1, 1, 3, 3)[self.orientation - 1]
 
 
 def read_exif(path: Path) -> Exif:
@@ -54,7 +58,8 @@ def read_exif(path: Path) -> Exif:
             xmp = next((photo.info[key] for key in _XMP if key in photo.info), b"")
     except DECODE_ERRORS:
         return Exif()
-    turn = _TURNS.get(found.get(_ORIENTATION, 1), 0)
+    orientation = found.get(_ORIENTATION, 1)
+    orientation = orientation if orientation in range(1, 9) else 1
     focal = _focal(more, width, height)
     if not _SHORTEST < focal / max(width, height) < _LONGEST:
         focal = 0.0
@@ -64,7 +69,7 @@ def read_exif(path: Path) -> Exif:
     xmp = xmp.encode(errors="replace") if isinstance(xmp, str) else bytes(xmp)
     panorama = _PANORAMA.search(xmp) is not None
     named = (*names, lens) if known else ()
-    return Exif(turn, named, focal, gps, panorama, *_of_drone(xmp), _time(more.get(_TAKEN)))
+    return Exif(orientation, named, focal, gps, panorama, *_of_drone(xmp), _time(more.get(_TAKEN)))
 
 
 def _time(written: Any) -> datetime | None:

@@ -6,6 +6,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from PIL import Image, UnidentifiedImageError
 
 from hqgs.photos.constants import LARGEST
 from hqgs.photos.eight_bits import grey, of_16
+from hqgs.photos.film_colors import toned
+from hqgs.photos.pixels import oriented
+from hqgs.photos.profiles import Colors, colors_of, in_srgb, in_srgb_of_16
 
 HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
 JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe")
@@ -94,6 +98,7 @@ class Glance:
     size: tuple[int, int]  # width and height as stored
     format: str  # Pillow's name of what the file holds
     small: NDArray[np.uint8]  # [GRID, GRID], its brightness: nearly the same for the same picture
+    colors: Colors | None  # as `colors_of` has them
 
 
 def glance(path: Path) -> Glance:
@@ -104,10 +109,10 @@ def glance(path: Path) -> Glance:
         with open_photo(path) as photo:
             if photo.mode == "F":
                 raise UnreadableError(_FLOATS)
-            size = photo.size
+            size, colors = photo.size, colors_of(photo, path)
             photo.draft("L", (max(1, size[0] // 8), max(1, size[1] // 8)))  # a JPEG is quickly read like this
             small = grey(photo).resize((GRID, GRID), Image.Resampling.BOX)
-            return Glance(size, photo.format or "", np.array(small))
+            return Glance(size, photo.format or "", np.array(small), colors)
     except UnidentifiedImageError as error:
         raise UnreadableError("no picture") from error
     except UnreadableError:
@@ -140,6 +145,15 @@ def is_cut_out(path: Path) -> bool | None:
         return None
 
 
+def told_colors(path: Path) -> Colors | None:
+    """What a photo says of its colours, as `colors_of` has it; None also where it cannot be opened."""
+    try:
+        with open_photo(path) as photo:
+            return colors_of(photo, path)
+    except DECODE_ERRORS:
+        return None
+
+
 def decode(
     path: Path, least: tuple[int, int] | None = None, over: tuple[float, float, float] | None = None
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
@@ -151,12 +165,13 @@ def decode(
     `over`: a colour (R, G, B, 1 is white) that shows where the photo is transparent, in place of a mask; a
     fourth channel then has how empty each pixel is, 255 less its alpha.
 
-    Greyscale becomes three equal channels, 16 bits become 8. Colours are as stored: nothing is composited,
-    no colour profile is applied. EXIF orientation is not applied either: the cameras were computed for the
-    pixels as stored, and a turned photo would no longer fit them. Raises UnreadableError.
+    Greyscale becomes three equal channels, 16 bits become 8, colours of another space than sRGB become sRGB
+    (`colors_of`). EXIF orientation is not applied: the cameras were computed for the pixels as stored, and a
+    turned photo would no longer fit them. Raises UnreadableError.
     """
     try:
         with open_photo(path) as photo:
+            colors = colors_of(photo, path)
             if least is not None:
                 photo.draft(None, least)  # pyright: ignore[reportArgumentType]  (None keeps the mode)
             if photo.mode == "F":
@@ -165,13 +180,18 @@ def decode(
                 levels = np.asarray(photo).astype(np.int64)  # 16 bits; older Pillow calls the mode "I"
                 if levels.min() < 0 or levels.max() > 65535:
                     raise ValueError(f"pixel values {levels.min()}..{levels.max()} are not 16 bit")
-                rgb = np.repeat(of_16(levels)[..., None], 3, -1)
+                if colors is not None and colors.profile:
+                    rgb = in_srgb_of_16(levels, colors)
+                else:
+                    rgb = np.repeat(of_16(levels)[..., None], 3, -1)
                 clear = levels == photo.info.get("transparency", -1)  # of PNG: one grey, which is none
                 rgba = np.dstack([rgb, np.where(clear, 0, 255).astype(np.uint8)])
             elif photo.has_transparency_data:
                 rgba = np.array(photo.convert("RGBA"))
+                if colors is not None and colors.known:
+                    rgba[..., :3] = _as_srgb(path, photo, colors)
             else:
-                rgb = np.array(photo.convert("RGB"))
+                rgb = np.array(photo.convert("RGB")) if colors is None else _as_srgb(path, photo, colors)
                 return (rgb if over is None else np.dstack([rgb, np.zeros_like(rgb[..., 0])])), None
             if over is not None:
                 alpha = rgba[..., 3:] / 255
@@ -183,26 +203,61 @@ def decode(
         raise UnreadableError(f"cannot read the photo {path}: {e}") from e
 
 
+def _as_srgb(path: Path, photo: Image.Image, colors: Colors) -> NDArray[np.uint8]:
+    """A photo of other colours as sRGB, [H, W, 3]; of 16 bits a channel all count, which Pillow cuts off."""
+    with open_photo(path) as again:
+        file: Any = again
+        raw = _rawmode(file)
+        if colors.profile and raw is not None:
+            other = raw[:-1] + ("L" if raw[-1] == "B" else "B")
+            file.tile = [
+                tile._replace(args=other if isinstance(tile.args, str) else (other, *tile.args[1:]))
+                for tile in file.tile
+            ]
+            below = np.asarray(again)[..., :3].astype(np.int64)
+            return in_srgb_of_16(np.asarray(photo)[..., :3].astype(np.int64) * 256 + below, colors)
+    found = np.array(in_srgb(photo, colors))
+    if colors.hdr == (0, 0):
+        return found
+    return np.rint(255 * toned(found / 255, colors.hdr[1], colors.hdr[0])).astype(np.uint8)
+
+
+def _rawmode(photo: Any) -> str | None:
+    """Of an opened photo whose three or four channels have 16 bits each; None: of another one."""
+    args = photo.tile[0].args if photo.tile else None
+    raw = args if isinstance(args, str) else args[0] if isinstance(args, tuple) and args else None
+    return raw if isinstance(raw, str) and raw[:-1] in ("RGB;16", "RGBA;16") else None
+
+
 def shrunk(stored: int, decoded: int) -> int:
     """By how much a side of a photo was divided, rounded up, when it was decoded: 1, 2, 4 or 8."""
     return next(factor for factor in (1, 2, 4, 8) if -(-stored // factor) <= decoded)
 
 
-def check_mask(path: Path, width: int, height: int) -> tuple[int, int]:
-    """Width and height of a mask file. ValueError where it has another shape than its photo."""
+def is_shown(path: Path, width: int, height: int, orientation: int = 1) -> bool | None:
+    """Whether a mask is of the photo as EXIF's orientation shows it, not as its `width` x `height` px lie in
+    the file: by its shape. None: that does not tell. ValueError where it has the shape of neither."""
     w, h = stored_size(path, "mask")
-    if abs(w * height - h * width) > width + height:
+    stored = abs(w * height - h * width) <= width + height
+    shown = abs(w * width - h * height) <= width + height if orientation >= 5 else stored
+    if not (stored or shown):
         raise ValueError(f"the mask {path} is {w} x {h}, its photo {width} x {height}: another shape")
-    return w, h
+    return None if stored and shown and orientation > 1 else not stored
 
 
-def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
+def decode_mask(
+    path: Path, width: int, height: int, orientation: int = 1, shown: bool = False
+) -> NDArray[np.bool_]:
     """The mask file as [height, width], True where it counts; the nearest pixel at another size.
 
     What is not zero counts; in a lossy file, which blurs its edges, what is at least half of white. A file
-    whose colours are all one, but whose alpha is not, has its mask in alpha, from half on.
+    whose colours are all one, but whose alpha is not, has its mask in alpha, from half on. A mask of the
+    photo as EXIF's orientation shows it (`shown`, where shapes do not tell) is turned to lie as the photo.
     """
-    w, h = check_mask(path, width, height)
+    told = is_shown(path, width, height, orientation)
+    shown = shown if told is None else told
+    if shown and orientation >= 5:
+        width, height = height, width
     try:
         with open_photo(path) as file:
             lossy = file.format in _LOSSY or (file.format == "WEBP" and _is_lossy_webp(path))
@@ -215,9 +270,10 @@ def decode_mask(path: Path, width: int, height: int) -> NDArray[np.bool_]:
     if alpha is not None and pixels.min() == pixels.max() and alpha.min() < alpha.max():
         pixels, lossy = alpha, True
     counts = pixels >= _HALF if lossy else pixels != 0
+    h, w = counts.shape
     rows = ((np.arange(height) + 0.5) * h / height).astype(np.int64)
     columns = ((np.arange(width) + 0.5) * w / width).astype(np.int64)
-    return counts[rows][:, columns]
+    return oriented(counts[rows][:, columns], {6: 8, 8: 6}.get(orientation, orientation) if shown else 1)
 
 
 def _is_lossy_webp(path: Path) -> bool:

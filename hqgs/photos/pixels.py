@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,15 @@ def floats(photo: Tensor) -> Tensor:
 def upright(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
     """[H, W, 3] or [H, W] after so many quarter turns clockwise; see `View.quarter_turns`."""
     return np.ascontiguousarray(np.rot90(image, -turn))
+
+
+def oriented(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """[H, W, ...] as EXIF's orientation, 1..8, shows it: mirrored in 2, 4, 5 and 7."""
+    if orientation in (5, 7):
+        pixels = pixels.swapaxes(0, 1)
+    turns = {3: 2, 4: 2, 6: 3, 7: 2, 8: 1}.get(orientation, 0)  # counter-clockwise
+    pixels = pixels[:, ::-1] if orientation in (2, 4) else pixels
+    return np.ascontiguousarray(np.rot90(pixels, turns))
 
 
 def to_levels(image: NDArray[np.uint8] | NDArray[np.float32], what: str) -> Floats:

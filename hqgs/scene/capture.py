@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.scene.constants import LARGEST
 from hqgs.scene.faces import Face
-from hqgs.scene.photo_files import MASK_FOLDERS, Named, below
+from hqgs.scene.photo_files import Named, below, masks_among
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.world import World
 
@@ -31,6 +31,7 @@ class Photo:
     mask_path: Path | None = None
     film: float | None = None  # as `View.film`
     face: Face | None = None  # the part of it that is meant; its pose is `viewmat`
+    mask_shown: bool = False  # whether it is of the photo as EXIF shows it, where shapes do not tell
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,10 @@ def viewmat_from_pose(pose: NDArray[np.float64], name: str, *, camera_to_world: 
 
 
 def list_photos(folder: Path) -> list[str]:
-    """Photos below `folder` as relative POSIX paths, sorted; nothing hidden, and nothing that a run wrote."""
-    return sorted(p.relative_to(folder).as_posix() for p in below(folder, PHOTO_SUFFIXES))
+    """Photos below `folder` as relative POSIX paths, sorted; no masks, nothing hidden, nothing of a run."""
+    names = sorted(p.relative_to(folder).as_posix() for p in below(folder, PHOTO_SUFFIXES))
+    masks = masks_among(names)
+    return [name for name in names if name not in masks]
 
 
 def inside(root: Path, name: str, what: str) -> Path:
@@ -165,29 +168,3 @@ def perhaps(root: Path) -> str:
     """The folder above that has photos, where one inside of a scene was given, as advice; or nothing."""
     meant = next((folder for folder in [*root.absolute().parents][:2] if photo_folder(folder, 1.0)), None)
     return "" if meant is None else f"; perhaps {meant} is meant"
-
-
-def mask_folder(root: Path) -> Path | None:
-    """The folder of a scene's masks, `masks` or `mask` however they are spelt; None: there is none."""
-    named = (root / name for name in MASK_FOLDERS)
-    return next((folder for folder in named if folder.is_dir()), None)
-
-
-def find_mask(root: Path, name: str) -> Path | None:
-    """The mask of photo `name` in `masks/`: the same name, with a suffix added, or with another suffix.
-
-    The name may also have "_mask" after it, or "mask_" before it.
-    """
-    masks = mask_folder(root)
-    if masks is None:
-        return None
-    plain = (masks / name).with_suffix("")
-    suffixes = [suffix for own in PHOTO_SUFFIXES for suffix in (own, own.upper())]
-    stems = (
-        masks / name,
-        plain,
-        plain.with_name(f"{plain.name}_mask"),
-        plain.with_name(f"mask_{plain.name}"),
-    )
-    options = (path.with_name(path.name + suffix) for path in stems for suffix in suffixes)
-    return next((path for path in (masks / name, *options) if path.is_file()), None)

@@ -7,7 +7,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,17 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import missing_folders, remove_empty, write_json
+from hqgs.base.files import missing_folders, read_json, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, silent
+from hqgs.base.text import as_text
 from hqgs.photos.blocks import fine_detail
 from hqgs.photos.constants import FPS
-from hqgs.photos.film_colors import HDR, KNEE, as_photo, transfer
+from hqgs.photos.film_colors import KNEE, as_photo, film_colors
 from hqgs.photos.spherical import projection
 from hqgs.photos.video import pyav
 from hqgs.scene.constants import COPY_SIDE, FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST, JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
 from hqgs.scene.photo_files import film_at
 
+_PICTURES = ("mjpeg", "png", "bmp", "gif", "webp")  # codecs of covers, in films that count no frames
 _WIDEST = 4  # times as wide as high are pixels of a film at most, or as high as wide
 
 
@@ -46,30 +49,29 @@ def film_frames(
     around = _is_around(path)
     state = path.stat()
     rule = f"{count} {FRAMES_A_SECOND} {FRAMES_FEWEST} {FRAMES_MOST}"
-    name = f"8 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
-    target = folder / hashlib.sha256(name.encode()).hexdigest()[:16]
+    name = f"9 {path.name} {state.st_size} {state.st_mtime_ns} {rule}"
+    target = folder / hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
     if not target.is_dir():
         new = folder / f".{target.name}"
         shutil.rmtree(new, ignore_errors=True)
         made = missing_folders(folder)
         new.mkdir(parents=True)
         try:
-            details: dict[str, float] = {}
-            for number, frame in _sharpest(av, path, count, on_stage):
+            details, told = dict[str, float](), dict[str, None]()
+            for number, frame in _sharpest(av, path, count, on_stage, told):
                 file = new / f"{number:06d}.jpg"
                 Image.fromarray(frame).save(file, quality=JPEG_QUALITY, subsampling=0)
                 details[file.name] = fine_detail(frame.astype(np.float64))
-            write_details(new, details, around)
+            write_details(new, details, around, [*told])
             new.rename(target)
         finally:
             shutil.rmtree(new, ignore_errors=True)
             remove_empty(made)  # nothing is left of a film that cannot be read
-    note = f"the sharpest {len(list(target.glob('*.jpg')))} frames of {path.name}, one for each interval"
-    if (curve := _transfer(av, path)) in HDR:
-        note += (
-            f"; its high dynamic range ({HDR[curve]}) is toned down to sRGB: light above {KNEE:g} of the "
-            "reference white of 203 cd/m2 is bent to end at white"
-        )
+    frames = len(list(target.glob("*.jpg")))
+    note = f"the sharpest {frames} frames of {as_text(path.name)}, one for each interval"
+    if told := _written(target).get("told"):
+        note = "; ".join([note, *told])
+        on_stage(Stage("frames of the film looked at", frames, frames, note))
     return target, note
 
 
@@ -97,10 +99,12 @@ def _is_around(path: Path) -> bool:
     raise ValueError(f"the film {path} is of 360 degrees, but its {what}: export it as equirectangular, mono")
 
 
-def write_details(folder: Path, details: dict[str, float], around: bool = False) -> None:
-    """Say that photos of a folder are frames of a film: the `fine_detail` of each as it was decoded, and
-    whether they are panoramas."""
-    write_json(folder / FRAMES, {"details": details, "around": around})
+def write_details(
+    folder: Path, details: dict[str, float], around: bool = False, told: Sequence[str] = ()
+) -> None:
+    """Say that photos of a folder are frames of a film: the `fine_detail` of each as it was decoded, whether
+    they are panoramas, and what else was done, in words."""
+    write_json(folder / FRAMES, {"details": details, "around": around, "told": [*told]})
 
 
 def frame_details(folder: Path) -> dict[str, float]:
@@ -120,67 +124,149 @@ def frame_details(folder: Path) -> dict[str, float]:
 
 def frames_around(folder: Path) -> bool:
     """Whether the film whose frames a folder holds said that they are panoramas."""
+    return _written(folder).get("around") is True
+
+
+def _written(folder: Path) -> dict[str, Any]:
+    """What `write_details` wrote; nothing where it is not there, or damaged."""
     try:
-        told = json.loads((folder / FRAMES).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(told, dict) and told.get("around") is True
+        written = read_json(folder / FRAMES)
+    except (OSError, ValueError):
+        written = None
+    return written if isinstance(written, dict) else {}
 
 
 def _sharpest(
-    av: Any, path: Path, count: int | None, on_stage: OnStage
+    av: Any, path: Path, count: int | None, on_stage: OnStage, told: dict[str, None]
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Number and pixels [H, W, 3] of the sharpest frame of each interval, as the film is to be shown."""
+    """Number and pixels [H, W, 3] of the sharpest frame of each interval, as the film is to be shown.
+
+    `told` gets what was done to them, in words.
+    """
+    best, at, best_sharpness = None, 0, -2.0
+    curve, wide, start = 0, None, None
     try:
-        with av.open(str(path), metadata_errors="ignore") as film:
-            if not film.streams.video:
-                raise ValueError(f"{path} holds no pictures, only sound")
-            stream = film.streams.video[0]
+        with _opened(av, path) as film:
+            stream = _best_stream(film, path, told)
             stream.thread_type = "AUTO"
-            curve, wide = transfer(stream.codec_context), stream.sample_aspect_ratio
+            curve = int(getattr(stream.codec_context, "color_trc", 0) or 0)
             seconds = _seconds(film, stream) or _seconds_by_packets(av, path)
             wanted = count or int(np.clip(round(FRAMES_A_SECOND * seconds), FRAMES_FEWEST, FRAMES_MOST))
             interval = seconds / wanted if seconds > 0 else 1 / FRAMES_A_SECOND
-            best, at, best_sharpness = None, 0, -1.0
-            number, start = -1, None
-            for number, frame in enumerate(film.decode(stream)):
-                time = frame.time if frame.time is not None else number / FPS
+            wide = stream.sample_aspect_ratio
+            for number, (time, frame) in enumerate(_progressive(av, _decoded(av, film, stream, told), told)):
+                time = time if time is not None else number / FPS
                 start = time if start is None else start
                 now = min(int((time - start) / interval), wanted - 1)
                 if now > at and best is not None:
-                    yield best[0], _upright(best[1], curve, wide)
-                    best, best_sharpness = None, -1.0
+                    yield best[0], _shown(best[1], curve, wide, told)
+                    best, best_sharpness = None, -2.0
                 at = max(at, now)
-                if (sharpness := _sharpness(frame)) > best_sharpness:
-                    best_sharpness = sharpness
-                    best = number, frame
+                # What a decoder had to make up looks sharp: only where an interval has nothing else.
+                sharpness = -1.0 if frame.is_corrupt else _sharpness(frame)
+                if sharpness > best_sharpness:
+                    best_sharpness, best = sharpness, (number, frame)
                 on_stage(Stage("frames of the film looked at", number + 1, stream.frames or 0))
     except (av.error.FFmpegError, OSError) as error:
         known = error.errno is not None and error.errno in errno.errorcode  # FFmpeg has numbers of its own
         why = os.strerror(error.errno or 0) if known else "it is no film, or damaged"
-        raise ValueError(f"the film {path} cannot be read: {why}") from error
+        if best is None:
+            raise ValueError(f"the film {path} cannot be read: {why}") from error
+        told[f"what comes after frame {best[0]} cannot be read ({why})"] = None
     if best is None:
         raise ValueError(f"the film {path} holds no frame that can be read")
-    yield best[0], _upright(best[1], curve, wide)
+    yield best[0], _shown(best[1], curve, wide, told)
 
 
-def _upright(frame: Any, curve: int, wide: Fraction | None) -> NDArray[np.uint8]:
-    """A frame of a film with this transfer function as it is to be shown, [H, W, 3].
+def _opened(av: Any, path: Path) -> Any:
+    """The film in a file: by a path that FFmpeg takes for no address, as it does `12:30.mp4`."""
+    return av.open(str(path.absolute()), metadata_errors="ignore")
+
+
+def _best_stream(film: Any, path: Path, told: dict[str, None]) -> Any:
+    """The largest pictures that move, of several the default ones: no cover, thumbnail or proxy."""
+    aside = 0x400 | 0x800 | 0x100000  # AV_DISPOSITION_ATTACHED_PIC, TIMED_THUMBNAILS, STILL_IMAGE
+    streams = film.streams.video
+    if not streams:
+        raise ValueError(f"{path} holds no pictures, only sound")
+    ranks = []
+    for stream in streams:
+        flags = int(getattr(stream, "disposition", 0))
+        single = stream.frames == 1 or (stream.frames == 0 and stream.codec_context.name in _PICTURES)
+        ranks.append((not flags & aside, not single, stream.width * stream.height, flags & 1))
+    best = streams[max(range(len(ranks)), key=lambda k: (ranks[k], -k))]
+    if len(streams) > 1:
+        told[f"of its {len(streams)} streams of pictures, that of {best.width} x {best.height} px"] = None
+    return best
+
+
+def _decoded(av: Any, film: Any, stream: Any, told: dict[str, None]) -> Iterator[Any]:
+    """The frames of the packets that can be decoded."""
+    lost = 0
+    for packet in film.demux(stream):
+        try:
+            frames = packet.decode()
+        except av.error.FFmpegError:
+            lost += 1
+            continue
+        yield from frames
+    if lost:
+        told[f"{lost} damaged pieces of it were left out"] = None
+
+
+def _progressive(av: Any, frames: Iterator[Any], told: dict[str, None]) -> Iterator[tuple[float | None, Any]]:
+    """Time and picture of each frame; from the first one of two fields on through FFmpeg's yadif."""
+    graph, times = None, list[float | None]()
+
+    def out() -> Iterator[tuple[float | None, Any]]:
+        with suppress(BlockingIOError, EOFError):
+            while graph is not None:
+                frame = graph.pull()
+                yield times.pop(0), frame
+
+    for frame in frames:
+        if graph is None and not frame.interlaced_frame:
+            yield frame.time, frame
+            continue
+        if graph is None:
+            told["interlaced, and deinterlaced by FFmpeg's yadif"] = None
+            graph = av.filter.Graph()
+            size = {"width": frame.width, "height": frame.height, "format": frame.format}
+            source = graph.add_buffer(**size, time_base=frame.time_base or Fraction(1, 1000))
+            graph.link_nodes(source, graph.add("yadif", "deint=interlaced"), graph.add("buffersink"))
+            graph.configure()
+        times.append(frame.time)
+        graph.push(frame)
+        yield from out()
+    if graph is not None:
+        graph.push(None)
+        yield from out()
+
+
+def _shown(frame: Any, curve: int, wide: Fraction | None, told: dict[str, None]) -> NDArray[np.uint8]:
+    """A frame of a film with this transfer function as a player shows it, [H, W, 3].
 
     `wide`: how wide a pixel is, of its height; None or 0, where the film does not tell, and what no camera
     writes count as 1.
     """
     photo = as_photo(frame, curve)
+    if (colors := film_colors(frame, curve)) is not None:
+        text = f"its colours, {colors.name}, became sRGB"
+        if colors.hdr != (0, 0):
+            text += f": light above {KNEE:g} of the reference white of 203 cd/m2 is bent to end at white"
+        told[text] = None
     if wide and 1 / _WIDEST <= wide <= _WIDEST and (width := round(frame.width * wide)) != frame.width:
         photo = np.asarray(Image.fromarray(photo).resize((width, frame.height), Image.Resampling.LANCZOS))
-    turns = round(getattr(frame, "rotation", 0) / 90)  # counter-clockwise, as rot90 does
-    return np.ascontiguousarray(np.rot90(photo, turns))
-
-
-def _transfer(av: Any, path: Path) -> int:
-    """The number of the film's transfer function."""
-    with av.open(str(path), metadata_errors="ignore") as film:
-        return transfer(film.streams.video[0].codec_context)
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return photo
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()  # (x, y) goes to (ax + cy, bx + dy)
+    across = abs(a) + abs(d) < abs(b) + abs(c)
+    x, y = (c, b) if across else (a, d)
+    if x * y * (-1 if across else 1) < 0:
+        told["mirrored, as it asks players to show it"] = None
+    photo = photo.swapaxes(0, 1) if across else photo
+    return np.ascontiguousarray(photo[:: -1 if y < 0 else 1, :: -1 if x < 0 else 1])
 
 
 def _seconds(film: Any, stream: Any) -> float:
@@ -192,8 +278,8 @@ def _seconds(film: Any, stream: Any) -> float:
 
 def _seconds_by_packets(av: Any, path: Path) -> float:
     """Of a film that does not tell, as browsers record them: between its first picture and its last."""
-    with av.open(str(path), metadata_errors="ignore") as film:
-        stream = film.streams.video[0]
+    with _opened(av, path) as film:
+        stream = _best_stream(film, path, {})
         times = [
             float(packet.pts * stream.time_base) for packet in film.demux(stream) if packet.pts is not None
         ]

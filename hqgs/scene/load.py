@@ -11,8 +11,10 @@ import pycolmap
 
 from hqgs.base.evenly import evenly
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.base.text import some
-from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
+from hqgs.base.text import as_text, some
+from hqgs.photos import profiles
+from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size, told_colors
+from hqgs.scene import masks
 from hqgs.scene.axes import with_true_axes
 from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder
 from hqgs.scene.constants import BACKGROUND, COPY_SIDE, MOST_BYTES
@@ -25,15 +27,7 @@ from hqgs.scene.formats.transforms import SINGLE, TRAIN, read_transforms
 from hqgs.scene.lenses import odd_lenses
 from hqgs.scene.metres import Distance, named_photos
 from hqgs.scene.names import existing_folder
-from hqgs.scene.place import (
-    cut_outs,
-    located,
-    masks_told,
-    placed,
-    without_missing,
-    without_poseless,
-    without_strays,
-)
+from hqgs.scene.place import cut_outs, located, placed, without_missing, without_poseless, without_strays
 from hqgs.scene.random_points import random_points
 from hqgs.scene.refused import above, beside, broken, nothing
 from hqgs.scene.scene import Scene, TrackStatistics, View
@@ -96,10 +90,13 @@ def load_scene(
     degraded = read_degraded_folder(root)
     if degraded is not None:
         capture = replace(capture, notes=[*degraded.notes, *capture.notes])
-    notes = [*inside, *capture.notes, *masks_told(root, capture), *odd_lenses(capture)]
+    notes = [*inside, *capture.notes, *masks.told(root, capture), *odd_lenses(capture)]
+    if capture.source != "photos":  # those were told of when they were looked at
+        notes += profiles.told({photo.name: told_colors(photo.path) for photo in capture.photos})
     test_names = held_out_names(root, capture, test_every, notes, degraded)
     capture = without_poseless(root, without_missing(root, capture, notes), notes)
     capture = placed(without_strays(capture, notes), notes)
+    capture = replace(capture, photos=masks.with_turns(capture.photos, notes))
     names = frozenset(photo.name for photo in capture.photos)
     optional = names if skip_unreadable else frozenset[str]()
     over = BACKGROUND if cut_outs(capture) else None
@@ -159,27 +156,25 @@ def coarsely(longest: int | None, coarse: bool | None = None) -> bool:
 
 
 def load_pictures(
-    path: str | Path, downscale: float = 1.0, most: int = 16, longest: int | None = None, test_every: int = 0
+    path: str | Path, downscale: float = 1.0, most: int = 16, longest: int | None = None
 ) -> Scene | None:
     """Some photos of a folder that holds photos alone, spread over it, as a scene that has no poses.
 
     Each camera is a placeholder: a plausible one at the origin. None where the folder has cameras of its own.
-    `longest` bounds all photos of the folder as `load_scene` does, and those that `test_every` holds out are
-    not among them. `Scene.of` tells how many they were chosen from. ValueError where it holds neither.
+    `longest` bounds all photos of the folder as `load_scene` does. ValueError where it holds neither.
     """
     root, _ = scene_folder(path)
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
     names, details = photos.names, frame_details(photos.folder)
-    trained = [k for k in range(len(names)) if not test_every or k % test_every]
     chosen = []
-    for k in (trained[i] for i in evenly(len(trained), most // len(CUBE) if photos.around else most)):
+    for k in evenly(len(names), most // len(CUBE) if photos.around else most):
         size = photos.sizes[k]
         camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.2 * max(size), *size)
         camera = around(*size) if photos.around else camera
         chosen.append(
-            Photo(names[k], photos.folder / names[k], camera, np.eye(4), film=details.get(names[k]))
+            Photo(as_text(names[k]), photos.folder / names[k], camera, np.eye(4), film=details.get(names[k]))
         )
     shown = with_faces(Capture("photos", chosen, photos.downscale, *no_points()))
     if longest is not None:
@@ -191,9 +186,7 @@ def load_pictures(
     notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
     nothing = no_points()
     points, colors = nothing[0].astype(np.float32), nothing[1]
-    notes = notes if photos.unreadable else []
-    of = len(trained) * (len(CUBE) if photos.around else 1)
-    return Scene(root.name, views, [], points, colors, "photos", notes, of=of)
+    return Scene(root.name, views, [], points, colors, "photos", notes if photos.unreadable else [])
 
 
 def check_names(path: str | Path, downscale: float, distance: Distance) -> None:

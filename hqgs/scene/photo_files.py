@@ -11,22 +11,25 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from functools import cached_property
-from pathlib import Path
+from itertools import chain
+from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 from urllib.parse import unquote
 
-from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PLY, RUN_FILES, RUN_FOLDERS
+from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PAGE, PLAN, PLY
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.scene.names import FILM_SUFFIXES, KEPT
+from hqgs.scene.names import FILM_SUFFIXES, KEPT, is_room
 
 MASKS = "masks"
-MASK_FOLDERS = (MASKS, "mask", "Masks", "Mask", "MASKS")  # as people spell it
 _NO_PHOTOS = re.compile(
     r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
     re.IGNORECASE,
 )
-_Key = tuple[str, ...]
+_FILES = (CHECKPOINT, CONFIG, PAGE, PLAN, PLY, "report.json", "cameras.json", "learned.png")
+_FOLDERS = ("photos", "comparison")  # a run writes pictures into them
+_MARKED = re.compile(r"masks?[._ -](?P<after>.+)|(?P<before>.+)[._ -]masks?", re.IGNORECASE)
+Key = tuple[str, ...]
 
 
 def is_run(folder: Path) -> bool:
@@ -40,6 +43,40 @@ def of_maps(folder: str) -> bool:
     return _NO_PHOTOS.fullmatch(folder) is not None
 
 
+def masks_among(names: Iterable[str]) -> set[str]:
+    """Those of relative paths that are masks of others, by their names or a folder of masks."""
+    names = [*names]
+    photos = {key for name in names for key in photo_keys(name)}
+    return {
+        name
+        for name in names
+        if any(key in photos and key not in photo_keys(name) for key in mask_keys(name))
+    }
+
+
+def is_mask_folder(name: str) -> bool:
+    """Whether a folder is called `masks` or `mask`, however that is spelt."""
+    return name.casefold() in (MASKS, "mask")
+
+
+def photo_keys(name: str) -> list[Key]:
+    """Folders and name of a photo, with and without its suffix."""
+    path = PurePosixPath(name.casefold())
+    return [(*path.parent.parts, path.name), (*path.parent.parts, path.stem)]
+
+
+def mask_keys(name: str) -> list[Key]:
+    """The same of the photos that a file may be the mask of; none where it is no mask."""
+    path = PurePosixPath(name.casefold())
+    folders = tuple(part for part in path.parent.parts if not is_mask_folder(part))
+    marked = _MARKED.fullmatch(path.stem)
+    stems = [] if marked is None else [marked["after"] or marked["before"]]
+    if len(folders) < len(path.parent.parts):
+        stems += [path.name, path.stem]
+    bare = [stem.rpartition(".")[0] for stem in stems if PurePosixPath(stem).suffix in PHOTO_SUFFIXES]
+    return [(*folders, stem) for stem in dict.fromkeys([*stems, *bare])]
+
+
 def strangers(out: Path) -> list[str]:
     """What lies in the folder of a new run, sorted; nothing where a run, or its COLMAP, began there before.
 
@@ -48,8 +85,7 @@ def strangers(out: Path) -> list[str]:
     if not out.is_dir() or is_run(out) or (out / KEPT).exists():
         return []
     names = sorted(path.name for path in out.iterdir() if path.name[0] != ".")
-    held = {name for name in RUN_FOLDERS if name in names and any((out / name).iterdir())}
-    taken = [name for name in names if name in RUN_FILES or name in held]
+    taken = [name for name in names if name in _FILES or (name in _FOLDERS and any((out / name).iterdir()))]
     if taken:
         raise FileExistsError(
             f"{out} holds {some(taken)}, of no run, which a run would write over: name another folder"
@@ -58,16 +94,29 @@ def strangers(out: Path) -> list[str]:
 
 
 def below(folder: Path, suffixes: Iterable[str]) -> list[Path]:
-    """Files below a folder that end so, sorted; nothing hidden, and nothing of a run."""
-    found, wanted = list[Path](), tuple(suffixes)
-    for place, folders, files in os.walk(folder):
-        inner = (name for name in folders if name[0] != "." and name != KEPT)
-        folders[:] = [name for name in inner if not is_run(Path(place, name))]
-        found += [
-            path
-            for name in files
-            if name[0] != "." and name.lower().endswith(wanted) and (path := Path(place, name)).is_file()
-        ]
+    """Files below a folder that end so, sorted; nothing hidden, and nothing of a run.
+
+    Folders that are links count where they lead out of it, once each: not to one above, nor to one seen.
+    """
+    found, wanted, seen, waiting = list[Path](), tuple(suffixes), set[str](), [folder]
+    home = os.path.join(os.path.realpath(folder), "")
+    while waiting:
+        links = list[Path]()
+        for place, folders, files in chain.from_iterable(map(os.walk, sorted(waiting))):
+            real = os.path.realpath(place)
+            if real in seen or (seen and home.startswith(os.path.join(real, ""))):
+                folders.clear()
+                continue
+            seen.add(real)
+            inner = (name for name in folders if name[0] != "." and name != KEPT)
+            folders[:] = [name for name in inner if not is_run(Path(place, name))]
+            links += [path for name in folders if (path := Path(place, name)).is_symlink()]
+            found += [
+                path
+                for name in files
+                if name[0] != "." and name.lower().endswith(wanted) and (path := Path(place, name)).is_file()
+            ]
+        waiting = links
     return sorted(found)
 
 
@@ -76,7 +125,7 @@ def film_at(path: str | Path) -> Path | None:
     path = Path(path).expanduser()
     if path.is_file():
         return path if path.name.lower().endswith(FILM_SUFFIXES) else None
-    if not path.is_dir() or is_run(path) or below(path, PHOTO_SUFFIXES):
+    if is_room(path) or not path.is_dir() or is_run(path) or below(path, PHOTO_SUFFIXES):
         return None
     films = below(path, FILM_SUFFIXES)
     return films[0] if len(films) == 1 else None
@@ -90,8 +139,8 @@ class Named:
         self.by_name: dict[str, Path] = {}  # what was found elsewhere than its name says
 
     @cached_property
-    def _files(self) -> dict[str, list[tuple[_Key, Path]]]:
-        files: dict[str, list[tuple[_Key, Path]]] = {}
+    def _files(self) -> dict[str, list[tuple[Key, Path]]]:
+        files: dict[str, list[tuple[Key, Path]]] = {}
         for path in below(self._root, self._suffixes):
             key = _parts(path.relative_to(self._root).as_posix())
             files.setdefault(_bare(key[-1], self._suffixes), []).append((key, path))
@@ -142,7 +191,7 @@ def _posix(name: str) -> str:
     return name.removeprefix("file://").replace("\\", "/")
 
 
-def _parts(name: str) -> _Key:
+def _parts(name: str) -> Key:
     plain = normalize("NFC", _posix(name)).casefold()
     return tuple(part.strip() for part in plain.split("/") if part not in ("", ".", ".."))
 
@@ -152,7 +201,7 @@ def _bare(name: str, suffixes: tuple[str, ...]) -> str:
     return next((name[: -len(s)] for s in suffixes if name.endswith(s) and len(name) > len(s)), name)
 
 
-def _fit(wanted: _Key, own: _Key) -> tuple[int, bool]:
+def _fit(wanted: Key, own: Key) -> tuple[int, bool]:
     """How many folders agree, from the last one up, and whether the suffix does."""
     folders = 0
     for a, b in zip(reversed(wanted[:-1]), reversed(own[:-1]), strict=False):

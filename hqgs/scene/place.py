@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hqgs.base.text import some
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import is_cut_out
-from hqgs.scene.capture import Capture, Photo, mask_folder
+from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.constants import FAR_OFF, GPS_LEAST, LOOKED_AT, ONE_PLACE, SHOWN
 from hqgs.scene.georeference import Georeference, georeference
 from hqgs.scene.scene import strays
@@ -84,18 +84,6 @@ def without_strays(capture: Capture, notes: list[str]) -> Capture:
             f"and were left out: {some(sorted(gone))}"
         )
     return _without(capture, gone)
-
-
-def masks_told(root: Path, capture: Capture) -> list[str]:
-    """Which photos have no mask, in a sentence, where a folder of masks is there; else nothing."""
-    bare = [photo.name for photo in capture.photos if photo.mask_path is None]
-    folder = mask_folder(root) or (capture.folder and mask_folder(capture.folder))
-    if not bare or folder is None:
-        return []
-    which = "none of them has the name of a photo, and none is used"
-    if len(bare) < len(capture.photos):
-        which = f"{len(bare)} of {len(capture.photos)} photos have none, and count everywhere: {some(bare)}"
-    return [f"masks are in {folder.name}, but {which}"]
 
 
 def cut_outs(capture: Capture) -> bool:

@@ -26,6 +26,7 @@ from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.photos.constants import CUBIC_RADIUS
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
+from hqgs.photos.pixels import oriented
 from hqgs.photos.resize import Pixels, area_downscale
 from hqgs.scene.capture import Photo
 from hqgs.scene.constants import (
@@ -139,10 +140,10 @@ class _Decoded:
 def _decoded(photo: Photo, downscale: float, over: tuple[float, float, float] | None) -> _Decoded:
     camera, stored = photo.camera, stored_size(photo.path)
     exif = read_exif(photo.path)
-    turns, upright = exif.quarter_turns, 0
+    turns, shown = exif.quarter_turns, 1
     if turns % 2 and not fits(camera, *stored) and fits(camera, stored[1], stored[0]):
         # the cameras are those of photos as EXIF shows them
-        stored, turns, upright = (stored[1], stored[0]), 0, turns
+        stored, turns, shown = (stored[1], stored[0]), 0, exif.orientation
     check_size(camera, *stored, photo.name)
     # A mask hides colours that must not be mixed into what it shows: such photos are decoded whole.
     enough = downscale > 1 and photo.mask_path is None
@@ -150,14 +151,16 @@ def _decoded(photo: Photo, downscale: float, over: tuple[float, float, float] | 
         math.ceil(DENSE_SAMPLES * stored[0] / downscale),
         math.ceil(DENSE_SAMPLES * stored[1] / downscale),
     )
-    image, mask = decode(photo.path, ((least[1], least[0]) if upright else least) if enough else None, over)
-    if upright:
-        image = np.ascontiguousarray(np.rot90(image, -upright))
-        mask = None if mask is None else np.ascontiguousarray(np.rot90(mask, -upright))
-    height, width = image.shape[:2]
+    least = least if shown == 1 else (least[1], least[0])
+    image, mask = decode(photo.path, least if enough else None, over)
     if photo.mask_path is not None:
-        counts = decode_mask(photo.mask_path, width, height)
+        height, width = image.shape[:2]
+        counts = decode_mask(photo.mask_path, width, height, exif.orientation, photo.mask_shown)
         mask = counts if mask is None else mask & counts
+    if shown != 1:
+        image = oriented(image, shown)
+        mask = None if mask is None else oriented(mask, shown)
+    height, width = image.shape[:2]
     if photo.face is not None and camera.model.name != AROUND and not (light := lit(image[..., :3])).all():
         mask = light if mask is None else mask & light
     alike = f"{camera.model.name} {camera.params.tolist()} {stored[0]} x {stored[1]}"

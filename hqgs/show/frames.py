@@ -35,6 +35,8 @@ from hqgs.show.trust import Trust
 
 SHOWN = ("color", "depth", "alpha", "trust")
 FILMS = (".mp4", ".gif")
+_BT709 = 1  # its matrix, primaries and transfer in H.273; as FFmpeg's range: that of video
+_EXACT = 0x4 | 0x2000 | 0x40000  # SWS_BICUBIC, SWS_FULL_CHR_H_INT, SWS_ACCURATE_RND
 CRF = "18"  # of x264: no difference that an eye finds
 OTHERS = (*FILM_SUFFIXES, *PHOTO_SUFFIXES)  # names of files that are not written
 Picture = NDArray[np.uint8]
@@ -280,13 +282,20 @@ def written_size(out: Path, width: int, height: int) -> tuple[int, int]:
 def _write_mp4(av: Any, path: Path, pictures: Iterator[Picture], fps: float) -> None:
     first = next(pictures)
     width, height = written_size(path, first.shape[1], first.shape[0])
-    with av.open(str(path), "w", options={"movflags": "+faststart"}) as film:
+    # Absolute: FFmpeg takes "walk:1.mp4" for an address.
+    with av.open(str(path.absolute()), "w", options={"movflags": "+faststart"}) as film:
         stream = film.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": CRF, "preset": "veryfast"}
+        # Players take films without tags for BT.601 or BT.709, by their size.
+        coded = stream.codec_context
+        coded.colorspace = coded.color_primaries = coded.color_trc = coded.color_range = _BT709
 
         def encode(picture: Picture) -> None:
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture[:height, :width]), format="rgb24")
+            frame = frame.reformat(
+                format="yuv420p", dst_colorspace=_BT709, dst_color_range=_BT709, interpolation=_EXACT
+            )
             for packet in stream.encode(frame):
                 film.mux(packet)
 

@@ -142,10 +142,9 @@ def plan_of_photos(scene: Scene, asked: TrainConfig) -> tuple[RunPlan, list[str]
 def facts_of(scene: Scene, unused: list[LeftOut] | None = None) -> Facts:
     """What a scene tells before a method has looked at its photos; `unused`: photos it does without."""
     cameras = [view.camera for view in scene.train]
-    photos = scene.of or len(cameras)
     return Facts(
-        photos=photos,
-        pixels=sum(camera.width * camera.height for camera in cameras) * photos // len(cameras),
+        photos=len(cameras),
+        pixels=sum(camera.width * camera.height for camera in cameras),
         shortest_side=min(min(camera.width, camera.height) for camera in cameras),
         points=len(scene.points),
         linked=scene.seen is not None,

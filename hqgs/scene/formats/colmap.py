@@ -10,22 +10,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.text import some
-from hqgs.scene.capture import (
-    NO_POSE,
-    Capture,
-    Photo,
-    find_mask,
-    keep_finite,
-    list_photos,
-    no_points,
-    viewmat_from_pose,
-)
+from hqgs.scene.capture import NO_POSE, Capture, Photo, keep_finite, list_photos, no_points, viewmat_from_pose
 from hqgs.scene.film import frame_details
-from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model
-from hqgs.scene.formats.colmap_mended import NEEDED, POINTS, kind_of, mended, whole_names
+from hqgs.scene.formats.colmap_binary import cameras_file_size, check_binary_model, image_names
+from hqgs.scene.formats.colmap_mended import NEEDED, POINTS, kind_of, mended, of_windows, whole_names
 from hqgs.scene.formats.colmap_photos import photos_of
 from hqgs.scene.formats.point_files import read_ply_points
 from hqgs.scene.geometry import project
+from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, listed_split, names_by_any
 from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
@@ -112,10 +104,7 @@ def read_colmap(root: Path, downscale: float) -> Capture:
             f"{len(models) + 1} COLMAP models: took the largest, {path.relative_to(root)}, with "
             f"{len(_registered(model))} photos (photos in the others: {others})"
         )
-    try:
-        by_name = sorted((image.name, image.image_id) for image in _registered(model))
-    except UnicodeDecodeError as e:
-        raise ValueError(f"{path}: a photo name is not UTF-8: {e}") from e
+    by_name = sorted((image.name, image.image_id) for image in _registered(model))
     if not by_name:
         raise ValueError(f"{path}: the COLMAP model has no registered photo")
     names = [name for name, _ in by_name]
@@ -124,7 +113,7 @@ def read_colmap(root: Path, downscale: float) -> Capture:
         raise ValueError(f"{path}: photo names appear more than once: {some(twice)}")
 
     folder, left, files = photos_of(names, root, path, downscale, notes)
-    details = frame_details(folder)
+    details, masks = frame_details(folder), masks_of(root, folder, names)
     photos = []
     for name, image_id in by_name:
         image = model.images[image_id]
@@ -138,7 +127,7 @@ def read_colmap(root: Path, downscale: float) -> Capture:
         if file is not None and file.is_relative_to(folder):
             film = details.get(file.relative_to(folder).as_posix())
         absent = folder / name if file is None else file
-        photos.append(Photo(name, absent, camera, viewmat, find_mask(root, name), film))
+        photos.append(Photo(name, absent, camera, viewmat, masks.get(name), film))
     used = set(files.values())
     if len(used) < len(files):
         shared = [n for n, p in files.items() if list(files.values()).count(p) > 1]
@@ -205,11 +194,10 @@ def _read_whole(folder: Path, binary: bool) -> pycolmap.Reconstruction:
             model.read_binary(folder)
         else:
             model.read_text(folder)
-            for image_id, name in whole_names(folder / "images.txt").items():
-                if any("\ud800" <= letter <= "\udfff" for letter in name):
-                    raise ValueError(f"the name of image {image_id} is no text in UTF-8: {name!r}")
-                if image_id in model.images:
-                    model.images[image_id].name = name
+        names = image_names(folder / "images.bin") if binary else whole_names(folder / "images.txt")
+        for image_id, name in names.items():
+            if image_id in model.images:
+                model.images[image_id].name = of_windows(name)
     except (ValueError, IndexError, RuntimeError) as e:
         raise ValueError(f"{folder}: COLMAP cannot read its model there: {e}") from e
     if binary:

@@ -92,6 +92,18 @@ def check_binary_model(folder: Path) -> None:
                 raise ValueError(f"{path} is damaged: it {problem} ({len(data)} bytes)")
 
 
+def image_names(path: Path) -> dict[int, str]:
+    """The photos' names in a whole images.bin by their ids; bytes that are no UTF-8 are escaped."""
+    names, at = dict[int, str](), 8
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for _ in range(_read(_U64, data, 0)):
+            start = at + _IMAGE_HEAD
+            name = data[start : data.find(b"\0", start)]
+            names[_read(_U32, data, at)] = name.decode("utf-8", "surrogateescape")
+            at = _skip_image(data, at)
+    return names
+
+
 def cameras_file_size(param_counts: list[int]) -> int:
     """Bytes of a cameras.bin whose cameras have these numbers of parameters."""
     return 8 + sum(24 + 8 * n for n in param_counts)

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hqgs.base.text import some
+from hqgs.base.text import as_text, some
 
 NEEDED, POINTS = ("cameras", "images"), "points3D"
 _RIGGED = ("frames", "rigs")  # from COLMAP 3.12 on, of no use without each other
@@ -77,20 +77,18 @@ def mended(folder: Path, notes: list[str]) -> Iterator[Path]:
 
 
 def whole_names(path: Path) -> dict[int, str]:
-    """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces.
-
-    What is no UTF-8 was written by an older Windows.
-    """
+    """The photos' names in an images.txt by their ids, as far as the line goes: with their spaces."""
     words = (line.strip().split(None, HEAD) for line in _decoded(path.read_bytes()) if _is_photo(line))
-    return {int(found[0]): _of_windows(found[HEAD]) for found in words}
+    return {int(found[0]): found[HEAD] for found in words}
 
 
-def _of_windows(name: str) -> str:
+def of_windows(name: str) -> str:
+    """A name as text: what is no UTF-8 was written by an older Windows, or is escaped."""
     raw = name.encode("utf-8", "surrogateescape")
     for code in ("utf-8", "cp1252"):
         with suppress(UnicodeDecodeError):
             return raw.decode(code)
-    return name
+    return as_text(name)
 
 
 def _decoded(text: bytes) -> list[str]:

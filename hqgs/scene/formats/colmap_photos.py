@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from hqgs.base.text import some
+from hqgs.base.text import as_text, some
 from hqgs.scene.capture import found_inside, inside, list_photos, perhaps, photo_folder
-from hqgs.scene.photo_files import MASK_FOLDERS, Named, is_run, of_maps
+from hqgs.scene.formats.colmap_mended import of_windows
+from hqgs.scene.photo_files import Named, is_mask_folder, is_run, of_maps
 
 INPUT = "input"  # 3DGS's convert.py: photos as they were before they were undistorted
 
@@ -37,7 +38,7 @@ def photos_of(
     options = [p for p in dict.fromkeys(options) if p.is_dir() and p.is_relative_to(root)]
     best = _fullest(options, names) or (root if found is None else found[0])
     files = match_some(names, root, best, notes) if list_photos(best) else {}
-    called = _fullest([p for p in maps if p.name not in MASK_FOLDERS], names)
+    called = _fullest([p for p in maps if not is_mask_folder(p.name)], names)
     if not files and called is not None:  # photos after all
         best, files = called, match_some(names, root, called, notes)
     if not files and not list_photos(best):
@@ -77,7 +78,8 @@ def match_some(names: list[str], root: Path, folder: Path, notes: list[str]) -> 
     present = list_photos(folder)
     by_stem: dict[str, list[str]] = {}
     for n in present:
-        by_stem.setdefault(stem(n), []).append(n)
+        for written in {n, as_text(n), of_windows(n)}:
+            by_stem.setdefault(stem(written), []).append(n)
     files: dict[str, Path] = {}
     for name in names:
         if "\0" in name:

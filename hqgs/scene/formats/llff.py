@@ -10,16 +10,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from hqgs.scene.capture import (
-    Capture,
-    Photo,
-    find_mask,
-    list_photos,
-    no_points,
-    photo_folder,
-    viewmat_from_pose,
-)
+from hqgs.scene.capture import Capture, Photo, list_photos, no_points, photo_folder, viewmat_from_pose
 from hqgs.scene.constants import LARGEST, MOST_SIDE
+from hqgs.scene.masks import masks_of
 
 POSES = "poses_bounds.npy"
 
@@ -39,6 +32,7 @@ def read_llff(root: Path, downscale: float) -> Capture:
     names = list_photos(folder)
     if len(names) != len(rows):
         raise ValueError(f"{root / POSES} has {len(rows)} cameras, {folder} has {len(names)} photos")
+    masks = masks_of(root, folder, names)
     photos, near_far = [], {}
     for name, row in zip(names, rows, strict=True):
         pose, (height, width, focal) = row[:15].reshape(3, 5)[:, :4], row[[4, 9, 14]]
@@ -56,7 +50,7 @@ def read_llff(root: Path, downscale: float) -> Capture:
             params=[focal, focal, width / 2, height / 2],
         )
         viewmat = viewmat_from_pose(opencv, name, camera_to_world=True)
-        photos.append(Photo(name, folder / name, camera, viewmat, find_mask(root, name)))
+        photos.append(Photo(name, folder / name, camera, viewmat, masks.get(name)))
         near_far[name] = (near, far)
     notes.append(f"cameras from {POSES}: there is no COLMAP model with photos")
     return Capture("llff", photos, left, *no_points(), folder=folder, near_far=near_far, notes=notes)

@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,20 +17,12 @@ from numpy.typing import NDArray
 
 from hqgs.base.files import read_json
 from hqgs.photos.files import PHOTO_SUFFIXES, UnreadableError, stored_size
-from hqgs.scene.capture import (
-    Capture,
-    Photo,
-    find_mask,
-    found_inside,
-    inside,
-    keep_finite,
-    no_points,
-    viewmat_from_pose,
-)
+from hqgs.scene.capture import Capture, Photo, found_inside, inside, keep_finite, no_points, viewmat_from_pose
 from hqgs.scene.constants import MOST_SIDE, SMALLEST_SIDE
 from hqgs.scene.faces import AROUND, around
 from hqgs.scene.formats.intrinsics import MATRICES, under, with_matrix
 from hqgs.scene.formats.point_files import read_ply_points
+from hqgs.scene.masks import masks_of
 from hqgs.scene.named_split import held_out, lists_in, names_by_any
 from hqgs.scene.photo_files import MASKS, Named, below
 
@@ -150,7 +143,7 @@ def _read_frames(
         c2w[:, :3] *= _OPENGL_TO_OPENCV
         viewmat = viewmat_from_pose(c2w, name, camera_to_world=True)
         mask = frame.get("mask_path")
-        mask_path = find_mask(root, name.removeprefix("images/"))
+        mask_path = None
         if mask not in (None, ""):
             mask_path = _mask_path(root, _text(mask, "mask_path", where))
             if mask_path is None and os.path.lexists(path):
@@ -160,6 +153,8 @@ def _read_frames(
         except UnreadableError:
             camera = UNKNOWN_CAMERA
         photos.append(Photo(name, path, camera, viewmat, mask_path))
+    masks = masks_of(root, root, [photo.name for photo in photos])
+    photos = [replace(photo, mask_path=photo.mask_path or masks.get(photo.name)) for photo in photos]
     return photos, called
 
 

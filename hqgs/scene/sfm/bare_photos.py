@@ -14,7 +14,8 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.base.text import some
+from hqgs.base.text import as_text, some
+from hqgs.photos import profiles
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import PHOTO_SUFFIXES, Glance, UnreadableError, decode, glance, needs_heic
 from hqgs.scene.capture import photo_folder
@@ -22,7 +23,7 @@ from hqgs.scene.constants import JPEG_QUALITY, MAX_WORKERS
 from hqgs.scene.faces import CUBE, face_name
 from hqgs.scene.film import frames_around
 from hqgs.scene.names import FRAMES, KEPT
-from hqgs.scene.photo_files import MASK_FOLDERS, MASKS, is_run
+from hqgs.scene.photo_files import is_mask_folder, is_run, masks_among
 from hqgs.scene.sfm.constants import FOLDERS_DEEP
 from hqgs.scene.sfm.front_door import (
     cameras_beside,
@@ -39,7 +40,6 @@ from hqgs.scene.sfm.panoramas import all_around, colmap_faces, write_faces
 from hqgs.scene.sfm.run import Guess
 
 COLMAP_FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP")  # what files of those suffixes hold
-_MASK = "_mask"  # at the end of a name
 FOR_COLMAP = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")  # other photos are converted for it
 
 
@@ -55,7 +55,7 @@ class BarePhotos:
     unreadable: dict[str, str] = field(default_factory=dict)  # others, and why
     notes: list[str] = field(default_factory=list)
     strays: dict[str, str] = field(default_factory=dict)  # what seems not to be of their camera, and why
-    others: frozenset[str] = frozenset()  # whose files hold what COLMAP does not read, whatever their suffix
+    others: frozenset[str] = frozenset()  # what COLMAP cannot read as it is, by content or colours
     around: bool = False  # each shows 360 x 180 degrees, and is given to COLMAP as the faces of a cube
 
     @property
@@ -66,9 +66,10 @@ class BarePhotos:
         """
         found, own = dict[str, str](), {name.casefold() for name in self.names}
         for name in self.names:
-            plain = re.sub(r"\s|^#", "_", name)
+            plain = re.sub(r"\s|^#", "_", as_text(name))
             while True:
-                seen = [plain if self.as_it_is(name) else f"{plain}.jpg"]
+                jpeg = self.as_it_is(name) or plain.lower().endswith((".jpg", ".jpeg"))
+                seen = [plain if jpeg else f"{plain}.jpg"]
                 if self.around:
                     seen = [f"{face_name(plain, face)}.jpg" for face in CUBE]
                 others = own - {name.casefold()}  # a file system may take names of other case for one
@@ -160,13 +161,8 @@ def bare_photos(root: Path, downscale: float) -> BarePhotos | None:
         notes += photos_below(root, [f"{k}/{name}" for k, v in found.items() for name in v], rest)
         if others:
             notes.append(f"not taken for photos, by the names of their folders: {some([*others])}")
-    stems = {Path(name).stem for name in names}
-    masks = [
-        name for name in names if (stem := Path(name).stem).endswith(_MASK) and stem[: -len(_MASK)] in stems
-    ]
-    if masks:
-        names = [name for name in names if name not in masks]
-        notes.append(f"{len(masks)} masks among the photos are not read: move them to {MASKS}: {some(masks)}")
+    masks = masks_among(names)
+    names = [name for name in names if name not in masks]
     if not names:
         return None
     notes += [*films_beside(folder, names), *cameras_beside(root, folder), *not_here(folder)]
@@ -190,8 +186,6 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     unreadable: dict[str, str] = {}
 
     def look(name: str) -> Glance | str:
-        if any("\ud800" <= letter <= "\udfff" for letter in name):
-            return "its name is no text in UTF-8: rename it"
         try:
             return glance(photos.folder / name)
         except UnreadableError as error:
@@ -200,7 +194,7 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
     with ThreadPoolExecutor(min(MAX_WORKERS, os.cpu_count() or 1)) as pool:
         for k, (name, found) in enumerate(zip(photos.names, pool.map(look, photos.names), strict=True)):
             if isinstance(found, str):
-                unreadable[name.encode(errors="replace").decode()] = found
+                unreadable[as_text(name)] = found
             else:
                 looked[name] = found
             on_stage(Stage("photos looked at", k + 1, len(photos.names)))
@@ -231,7 +225,10 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         looked, tags = {name: looked[name] for name in names}, {name: tags[name] for name in names}
     if not film or sphere:
         notes.insert(0, understood([*tags.values()], names, len(twice), sphere))
-        told = maybe_two([*tags.values()], names)
+        told = [
+            *profiles.told({name: seen.colors for name, seen in looked.items()}),
+            *maybe_two([*tags.values()], names),
+        ]
         for note in (notes[0], *told):
             on_stage(Stage("photos looked at", len(photos.names), len(photos.names), note))
         notes += told
@@ -243,7 +240,11 @@ def readable(photos: BarePhotos, on_stage: OnStage = silent) -> BarePhotos:
         unreadable=unreadable,
         notes=notes,
         strays={} if film or sphere else strays(looked, tags),
-        others=frozenset(name for name, seen in looked.items() if seen.format not in COLMAP_FORMATS),
+        others=frozenset(
+            name
+            for name, seen in looked.items()
+            if seen.format not in COLMAP_FORMATS or (seen.colors is not None and seen.colors.known)
+        ),
         around=sphere,
     )
 
@@ -265,7 +266,9 @@ def _photos_below(folder: Path, deepest: bool = False) -> dict[str, list[str]]:
     for _ in range(FOLDERS_DEEP):
         inner = (p for place in level for p in place.iterdir() if p.is_dir())
         level = sorted(
-            p for p in inner if p.name not in (*MASK_FOLDERS, KEPT) and p.name[0] != "." and not is_run(p)
+            p
+            for p in inner
+            if not (is_mask_folder(p.name) or p.name == KEPT or p.name[0] == "." or is_run(p))
         )
         level = [p for p in level if os.access(p, os.R_OK | os.X_OK)]  # not a card's lost+found
         found |= {p.relative_to(folder).as_posix(): names for p in level if (names := _photos_in(p))}

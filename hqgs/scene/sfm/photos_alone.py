@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hqgs.base.stages import OnStage, silent
+from hqgs.base.text import as_text
 from hqgs.photos.exif import Exif
-from hqgs.photos.files import check_mask
-from hqgs.scene.capture import Capture, Photo, find_mask, keep_finite
+from hqgs.photos.files import is_shown
+from hqgs.scene.capture import Capture, Photo, keep_finite
 from hqgs.scene.faces import around
 from hqgs.scene.film import frame_details
 from hqgs.scene.formats.colmap import model_points, registered, seen_points
+from hqgs.scene.masks import masks_of
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import SfmReport, TrackStatistics
 from hqgs.scene.sfm.bare_photos import BarePhotos, readable, ups
@@ -61,14 +63,14 @@ def find_cameras(root: Path, photos: BarePhotos, search: Search) -> FoundCameras
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(upright), np.zeros(3)))
     report = SfmReport(
         photos=len(files),
-        not_registered=[name for name in photos.names if name not in poses],
+        not_registered=[as_text(name) for name in photos.names if name not in poses],
         points=model.num_points3D(),
         track_length=model.compute_mean_track_length(),
         reprojection_error_px=model.compute_mean_reprojection_error(),
         unreadable=photos.unreadable,
         first_pass=ran.first_pass,
         advice=ran.advice(),
-        lost={name: why for name, why in ran.lost().items() if name not in poses},
+        lost={as_text(name): why for name, why in ran.lost().items() if name not in poses},
         sure_px=_together(sureness(model), names),
     )
     return FoundCameras(photos, model, report)
@@ -84,10 +86,10 @@ def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
     ValueError where COLMAP cannot make a model of half of the photos.
     """
     photos = readable(photos, search.on_stage)
-    masks = {name: find_mask(root, name) or find_mask(photos.folder, name) for name in photos.names}
-    for name, size in zip(photos.names, photos.sizes, strict=True):
-        if (mask := masks[name]) is not None:
-            check_mask(mask, *size)
+    masks = masks_of(root, photos.folder, photos.names)
+    for name, size, exif in zip(photos.names, photos.sizes, photos.exif, strict=True):
+        if name in masks:
+            is_shown(masks[name], *size, exif.orientation)
     cameras = find_cameras(root, photos, search)
     model, names, folder = cameras.model, cameras.photos.colmap_names, cameras.photos.folder
     of_image = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
@@ -99,7 +101,9 @@ def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
         name = names[file]
         if file == files[name]:
             camera = around(*sizes[name]) if cameras.photos.around else of_image[file]
-            found[name] = Photo(name, folder / name, camera, viewmat, masks[name], details.get(name))
+            found[name] = Photo(
+                as_text(name), folder / name, camera, viewmat, masks.get(name), details.get(name)
+            )
     placed = set(found)
     notes = [str(cameras.report), *cameras.photos.notes, *tell_strays(cameras.photos.strays, placed)]
     points, colors = keep_finite(*model_points(model), notes)
@@ -108,7 +112,7 @@ def read_photos(root: Path, photos: BarePhotos, search: Search) -> Capture:
         parts: dict[str, list[NDArray[np.intp]]] = {}
         for file, rows in seen_points(model).items():
             parts.setdefault(names[file], []).append(rows)
-        seen = {name: np.unique(np.concatenate(rows)) for name, rows in parts.items()}
+        seen = {as_text(name): np.unique(np.concatenate(rows)) for name, rows in parts.items()}
     return Capture(
         "photos",
         [photo for _, photo in sorted(found.items())],
@@ -127,7 +131,7 @@ def _together(sure: dict[str, float], names: dict[str, str]) -> dict[str, float]
     """`sureness` by photo from that by file: what the faces of a panorama tell of its pose adds up."""
     told: dict[str, list[float]] = {}
     for file, px in sure.items():
-        told.setdefault(names[file], []).append(px)
+        told.setdefault(as_text(names[file]), []).append(px)
     return {
         name: float(np.square(np.reciprocal(px)).sum() ** -0.5) if len(px) > 1 else px[0]
         for name, px in told.items()
