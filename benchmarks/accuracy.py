@@ -28,7 +28,7 @@ from benchmarks.speed.timing import interleaved, quartiles
 from hqgs.base.threads import one_torch_thread
 from hqgs.base.typed import build
 from hqgs.model.render import render_view
-from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.scene import Scene
 from hqgs.training.methods.base import photo_tensors
 from hqgs.training.methods.photometric import photometric_loss

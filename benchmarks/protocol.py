@@ -12,15 +12,15 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.scenes.rooms import is_room, room
 from hqgs.base.typed import build
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.builtin import embedded_scene, room
+from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.formats.degradation_json import FILE
 from hqgs.scene.formats.llff import hold_marker
 from hqgs.scene.known_points import with_points
 from hqgs.scene.load import load_scene
-from hqgs.scene.names import is_room
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_leave_out
 from hqgs.training.frugality import RULES

@@ -26,11 +26,10 @@ from hqgs.base.machine import machine_facts, version_facts
 Row = Mapping[str, Any]
 RUN = ("scene", "degradation", "row", "seed", "iterations", "downscale", "poses")  # the key of a training run
 KEYS: dict[str, Sequence[str]] = {  # of each table's lines
-    **dict.fromkeys(("quality", "time", "frugality", "features", "endurance"), RUN),
+    **dict.fromkeys(("quality", "time", "endurance", "parts"), RUN),
     "moments": (*RUN, "moment"),
     "poses": ("scene", "degradation", "seed", "downscale"),
     "export": ("scene", "file"),
-    "intervals": ("scene", "photos"),
     "accuracy": ("inputs", "knob", "value"),
     "speed": ("part", "case", "threads"),
     "stability": ("case", "dtype"),
@@ -62,6 +61,7 @@ TEXT = (
         "date",
         "sources",
         "digest",
+        "start",
     ),
 )
 DIGITS = ".7g"

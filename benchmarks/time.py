@@ -14,8 +14,7 @@ from benchmarks.study import Cell, finished
 from hqgs.evaluation.held_out import held_out_means
 from hqgs.evaluation.metrics import haarpsi
 from hqgs.scene.scene import Scene
-from hqgs.training.config import TrainConfig
-from hqgs.training.settings import with_iterations
+from hqgs.training.config import TrainConfig, with_iterations
 
 PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"))
 SHOWN = {

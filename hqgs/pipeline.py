@@ -13,9 +13,7 @@ from hqgs import __version__
 from hqgs.base.files import (
     CHECKPOINT,
     CONFIG,
-    LEARNED,
     PAGE,
-    PASSERSBY,
     PLAN,
     PLY,
     atomic_path,
@@ -33,7 +31,8 @@ from hqgs.evaluation.held_out import HeldOutViews, RenderedView
 from hqgs.evaluation.passing import save_masks
 from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
-from hqgs.evaluation.report import REPORT, RunResult, measure, write_report
+from hqgs.evaluation.report import RunResult, measure, write_report
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.camera_files import save_cameras
 from hqgs.scene.photo_files import strangers
@@ -199,8 +198,7 @@ def open_run(
             with _for_all(checkpoint, ranks) as path:
                 trainer.restore(path)
         elif checkpoint is not None and checkpoint.exists():  # another run's scene beside these cameras
-            for file in (REPORT, PAGE, PLY, PLAN, LEARNED, PASSERSBY, CHECKPOINT):
-                (checkpoint.parent / file).unlink(missing_ok=True)
+            RunFolder(checkpoint.parent).remove()
         if ranks.count > 1:
             ranks.agree(scene_fingerprint(trainer.scene), "the scene")
             ranks.agree(trainer.plan, "the plan")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import signal
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,17 @@ import hqgs
 from hqgs.base.files import CHECKPOINT, PLY
 from hqgs.base.stages import Stage
 from hqgs.cli import main as cli
-from hqgs.evaluation.report import read_report
+from hqgs.evaluation.records import read_report
 from hqgs.scene import source
-from hqgs.training.config import AUTOMATIC, run_config
+from hqgs.scene.options import LoadOptions, PhotoOptions
+from hqgs.training.config import AUTOMATIC, TrainOptions, run_config
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A working folder of its own, and the tiny scene in place of the embedded one."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(source, "room", lambda *_: tiny_scene())
+    monkeypatch.setattr(source, "embedded_scene", lambda *_: tiny_scene())
 
 
 def a_model() -> hqgs.Gaussians:
@@ -57,15 +58,17 @@ def test_a_bare_configuration_has_the_defaults_too() -> None:
     assert run_config(leave_out="none").leave_out == ()
 
 
-def test_train_and_run_config_have_the_same_options() -> None:
-    """They are written out twice, so that signatures show them."""
-    train, config = (inspect.signature(f).parameters for f in (hqgs.train, run_config))
-    assert {name: (p.annotation, p.default) for name, p in config.items()} == {
-        name: (p.annotation, p.default) for name, p in train.items() if name in config
-    }
-    assert set(train) - set(config) == {
-        "scene", "out", "seconds", "config", "resume", "overwrite", "progress", "on_stage", "ranks"
-    }  # fmt: skip
+def test_what_a_user_says_of_a_run_has_the_same_names_and_defaults_everywhere() -> None:
+    """`hqgs.train` writes them out, so that its signature shows them."""
+    train = inspect.signature(hqgs.train).parameters
+    options = {field.name for field in fields(TrainOptions)}
+    assert options - set(train) == {"preset"}
+    assert run_config(**{name: train[name].default for name in options & set(train)}) == run_config()
+    load = inspect.signature(hqgs.load).parameters
+    defaults = {field.name: field.default for field in fields(LoadOptions)}
+    assert set(load) - set(defaults) == {"cache", "points", "on_stage"}
+    assert all(load[name].default == default for name, default in defaults.items() if name != "path")
+    assert {field.name for field in fields(PhotoOptions)} <= set(defaults)
 
 
 def test_without_a_folder_nothing_is_written(tmp_path: Path) -> None:
@@ -167,7 +170,7 @@ def test_the_first_ctrl_c_returns_what_there_is() -> None:
 def test_load_goes_through_the_stages_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[str, Any]] = []
 
-    def reconstruct(scene: hqgs.Scene, keep: Path | None, on_stage: object, features: str) -> hqgs.Scene:
+    def reconstruct(scene: hqgs.Scene, keep: Path | None, on_stage: object) -> hqgs.Scene:
         calls.append(("sfm", keep))
         assert scene.train[0].image.dtype == np.float32  # the photos are degraded by then
         return scene
@@ -190,7 +193,7 @@ def test_wrong_scenes_are_named() -> None:
         hqgs.load("/no/such")
     with pytest.raises(ValueError, match="downscale must be at least 1, got 0"):
         hqgs.load("embedded", downscale=0)
-    with pytest.raises(ValueError, match="test_every is 5, but built-in scenes"):
+    with pytest.raises(ValueError, match="test_every is 5, but the built-in scene"):
         hqgs.load("embedded", test_every=5)
     with pytest.raises(ValueError, match="unknown degradation 'fog'"):
         hqgs.degrade(tiny_scene(), "fog")

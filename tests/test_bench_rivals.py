@@ -15,11 +15,10 @@ from scipy.interpolate import BSpline
 
 from benchmarks.measure import train
 from benchmarks.protocol import Row, narrowed
-from benchmarks.quality import rivals
+from benchmarks.quality import deblur
 from benchmarks.quality import run as quality
-from benchmarks.quality.rivals import RivalRow, deblur, nerf
+from benchmarks.quality.deblur import RivalRow
 from benchmarks.study import Study, digest_of, grid
-from hqgs.evaluation.metrics import psnr
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import scene_fingerprint
 from hqgs.training.config import DensifyConfig, TrainConfig
@@ -102,48 +101,8 @@ def test_growth_goes_by_the_sum_over_the_renders(monkeypatch: pytest.MonkeyPatch
     assert torch.equal(many.count, one.count)
 
 
-def small_nerf(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"RAYS": 128, "COARSE": 12, "FINE": 8, "WIDTH": 32}.items():
-        monkeypatch.setattr(nerf, name, value)
-
-
-def test_nerf_sees_more_than_a_mean_colour(monkeypatch: pytest.MonkeyPatch) -> None:
-    small_nerf(monkeypatch)
-    scene = tiny_scene()
-    done = nerf.NerfTraining(scene, config(150))
-    (view,) = done.held_out()
-    mean = np.mean([photo.image for photo in scene.train], axis=(0, 1, 2)) / 255
-    flat = psnr(np.broadcast_to(mean.astype(np.float32), view.render.shape), view.photo)
-    found = psnr(view.render, view.photo)
-    assert flat is not None
-    assert found is not None
-    assert found > flat + 3
-    assert done.history[-1]["psnr"] == pytest.approx(found)
-    assert 1 / done._nearest < DEPTH < 1 / done._farthest
-
-
-def test_same_seed_same_field(monkeypatch: pytest.MonkeyPatch) -> None:
-    small_nerf(monkeypatch)
-    first, same, other = (nerf.NerfTraining(tiny_scene(), config(3, seed=seed)) for seed in (0, 0, 1))
-    (a, b, c) = (run.held_out()[0].render for run in (first, same, other))
-    assert np.array_equal(a, b)
-    assert not np.array_equal(a, c)
-
-
-def test_only_pixels_that_count_are_learned() -> None:
-    view = tiny_scene().train[0]
-    mask = np.zeros((HEIGHT, WIDTH), bool)
-    mask[3, 5] = True
-    colors, rays = nerf._pixels(replace(view, mask=mask))
-    np.testing.assert_allclose(colors.numpy(), view.image[None, 3, 5] / 255, rtol=1e-6)
-    end = rays[0, :3] + DEPTH * rays[0, 3:]  # [5.5, 3.5] px at the plane
-    wanted = view.camera.center + DEPTH * np.array([(5.5 - WIDTH / 2) / 20, (3.5 - HEIGHT / 2) / 20, 1])
-    np.testing.assert_allclose(end.numpy(), wanted, atol=1e-5)
-
-
-def test_rows_are_measured_as_all_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small_nerf(monkeypatch)
-    rows = ["3dgs", "deblur", "nerf"]
+def test_rows_are_measured_as_all_others(tmp_path: Path) -> None:
+    rows = ["3dgs", "deblur"]
     protocol = narrowed(quality.PROTOCOLS["wild"], rows=rows, degradations=["none"], seeds=[0], iterations=5)
     args = argparse.Namespace(
         out=tmp_path, validate=False, sfm=False, fit_cameras=False, pictures=1, known=False, finished=False
@@ -155,7 +114,6 @@ def test_rows_are_measured_as_all_others(tmp_path: Path, monkeypatch: pytest.Mon
     runs = bench.study.frame()
     assert list(runs["row"]) == rows
     assert runs[["psnr", "ssim", "seconds", "cpu_seconds", "render_ms"]].notna().to_numpy().all()
-    assert [bool(count) for count in runs["gaussians"]] == [True, True, False]
     assert len(list((tmp_path / "pictures").iterdir())) == 1
 
 
@@ -167,14 +125,13 @@ def test_digests_hold_the_form_of_a_rival_and_leave_the_others_alone(
     cells = {cell.row.label: cell for cell in grid(protocol, [scene])}
     prints = scene_fingerprint(scene)
     keys = {label: digest_of(cell, prints) for label, cell in cells.items()}
-    assert len(set(keys.values())) == len(keys) == 5
+    assert len(set(keys.values())) == len(keys) == 4
     for label in ("3dgs", "gains alone", "hqgs"):
         row = cells[label].row
         assert isinstance(row, RivalRow)
         assert row.more == Row(label).more == {}  # as before there were rivals
-    for name in ("deblur", "nerf"):
-        (tmp_path / f"{name}.py").write_text("another form", encoding="utf-8")
-    monkeypatch.setattr(rivals, "__file__", str(tmp_path / "__init__.py"))
+    (tmp_path / "deblur.py").write_text("another form", encoding="utf-8")
+    monkeypatch.setattr(deblur, "__file__", str(tmp_path / "deblur.py"))
     for cell in grid(protocol, [scene]):
         same = digest_of(cell, prints) == keys[cell.row.label]
-        assert same == (cell.row.label not in rivals.RIVALS)
+        assert same == (cell.row.label != "deblur")

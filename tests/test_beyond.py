@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hqgs
 from benchmarks.protocol import fewer_photos
 from benchmarks.quality.cell import fall
-from hqgs.scene.builtin.sparse import BETWEEN, BEYOND, TABLE, between_and_beyond, sparse_cameras
+from benchmarks.scenes.rooms import room
+from benchmarks.scenes.sparse import BETWEEN, BEYOND, TABLE, between_and_beyond, sparse_cameras
 from hqgs.scene.scene import Scene, View
 
 
@@ -36,13 +36,13 @@ def test_held_out_cameras_stand_between_and_beyond() -> None:
 
 def test_the_room_beyond_its_cameras(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="wanted beyond:N with the number of photos, got 'x'"):
-        hqgs.load("beyond:x")
+        room("beyond:x")
     with pytest.raises(ValueError, match="photos is 1, wanted at least 2"):
-        hqgs.load("beyond:1")
-    scene = hqgs.load("beyond:3", downscale=16, cache=tmp_path)
+        room("beyond:1")
+    scene = room("beyond:3", tmp_path, 16)
     assert (scene.name, len(scene.train), len(scene.test)) == ("beyond-3", 3, BETWEEN + BEYOND)
     assert {view.name.partition("_")[0] for view in scene.test} == {"between", "beyond"}
-    again = hqgs.load("beyond:3", downscale=16, cache=tmp_path)
+    again = room("beyond:3", tmp_path, 16)
     np.testing.assert_array_equal(again.test[-1].image, scene.test[-1].image)
 
 

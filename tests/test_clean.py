@@ -13,6 +13,7 @@ import torch
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.cli.main import main
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source as scene_source
 from hqgs.scene.scene import Scene
@@ -66,7 +67,7 @@ def test_a_foreign_file_is_cleaned_in_its_own_frame(
     held.world, held.antialiased = world, True
     foreign = held.in_world(World())
     foreign.save(tmp_path / "foreign.spz")
-    monkeypatch.setattr(scene_source, "room", lambda *_: replace(scene(), world=world))
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: replace(scene(), world=world))
     out, options = tmp_path / "clean.glb", ["--photos", "embedded", "--steps", "200"]
     assert main(["clean", str(tmp_path / "foreign.spz"), "--out", str(out), *options]) == 0
     assert "left out: the antialias flag: a .glb file has no place for it" in capsys.readouterr().out
@@ -112,7 +113,7 @@ def test_nothing_is_written_where_the_file_does_not_gain(
     """Of a run: on its own photos, before its own background; a lossy file counts as it is read."""
     foggy().save(tmp_path / "scene.ply")
     (tmp_path / "config.json").write_text('{"train": {"background": [1.0, 0.5, 0.0]}}')
-    monkeypatch.setattr(scene_source, "load_again", lambda *_, **__: scene())
+    monkeypatch.setattr(RunFolder, "photos", lambda *_: scene())
     asked, gains = [], [-1.0, 0.5]
 
     def cleaned(gaussians: Gaussians, _: Scene, *rest: object) -> Cleaned:

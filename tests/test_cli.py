@@ -29,11 +29,11 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The tiny scene in place of the embedded one; the list gets the arguments that it was asked with."""
     calls: list[dict[str, Any]] = []
 
-    def room(name: str, cache: Path | None, downscale: float, seed: int) -> Scene:
-        calls.append({"name": name, "cache": cache, "downscale": downscale})
+    def embedded(cache: Path | None, width: int, height: int) -> Scene:
+        calls.append({"cache": cache, "size": (width, height)})
         return tiny_scene()
 
-    monkeypatch.setattr(source, "room", room)
+    monkeypatch.setattr(source, "embedded_scene", embedded)
     return calls
 
 
@@ -55,7 +55,7 @@ def test_train_the_embedded_scene(
     options = ["--iterations", "20", "--seed", "3", "--max-gaussians", "55", "--eval-every", "7"]
     options += ["--method", "3dgs"]
     assert call("train", "embedded", "--out", out, "--downscale", "2", *options) == 0
-    assert asked == [{"name": "embedded", "cache": out / "scene", "downscale": 2.0}]
+    assert asked == [{"cache": out / "scene", "size": (252, 189)}]
     report = json.loads((out / "report.json").read_text())
     assert (report["iterations"], report["seed"], report["method"]) == (20, 3, "3dgs")
     assert report["config"]["densify"]["max_gaussians"] == 55
@@ -85,7 +85,7 @@ def test_sfm_replaces_poses_and_points_once(
     def load(path: str, downscale: float, **_: Any) -> Scene:
         return replace(tiny_scene(), source=form)
 
-    def sfm(scene: Scene, keep: Path, told: Any, features: str) -> Scene:
+    def sfm(scene: Scene, keep: Path, told: Any) -> Scene:
         assert keep == tmp_path / "sfm"
         seen.append(scene.train[0].image.dtype)
         return replace(scene, sfm=report, notes=[str(report)])
@@ -113,7 +113,7 @@ def test_degrade_writes_a_scene_that_trains(
     bad = tmp_path / "bad"
     command = ["degrade", "embedded", "--kind", "lowres:2+jpeg:30", "--out", bad, "--downscale", "2"]
     assert call(*command, "--seed", "4") == 0
-    assert asked == [{"name": "embedded", "cache": None, "downscale": 2.0}]
+    assert asked == [{"cache": None, "size": (252, 189)}]
     assert capsys.readouterr().out == f"{bad}: 5 training photos with lowres:2+jpeg:30, 1 held out\n"
     assert json.loads((bad / "degradation.json").read_text())["seed"] == 4
     assert call("train", bad, "--iterations", "2", "--out", tmp_path / "run") == 0
@@ -129,7 +129,7 @@ def test_diagnose_prints_and_writes_what_it_found(
 ) -> None:
     out = tmp_path / "diagnosis.json"
     assert call("diagnose", "embedded", "--downscale", "2", "--out", out) == 0
-    assert asked == [{"name": "embedded", "cache": None, "downscale": 2.0}]
+    assert asked == [{"cache": None, "size": (252, 189)}]
     printed, written = capsys.readouterr().out, json.loads(out.read_text())
     assert len(written["photos"]) == 5
     assert [part["name"] for part in written["parts"]] == [
@@ -345,7 +345,7 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
     assert (tmp_path / CHECKPOINT).exists()
 
 
-@pytest.mark.parametrize("words", ["--help", "train --help", "plan embedded --downscale 9"])
+@pytest.mark.parametrize("words", ["--help", "train --help"])
 def test_output_that_nobody_reads_is_no_failure(words: str) -> None:
     """As in `hqgs ... | head`, which has read enough."""
     process = subprocess.Popen(
@@ -372,7 +372,7 @@ def test_ctrl_c_while_the_scene_is_read_is_exit_code_130(
     def interrupting(*arguments: Any) -> Scene:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(source, "room", interrupting)
+    monkeypatch.setattr(source, "embedded_scene", interrupting)
     assert call("train", "embedded", "--out", tmp_path) == 130
 
 

@@ -21,13 +21,13 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import clock, plan_length
 from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
-from hqgs.training.config import DensifyConfig, TrainConfig, run_config
+from hqgs.training.config import DensifyConfig, TrainConfig, run_config, with_iterations
 from hqgs.training.constants import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.notes import run_notes
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
 from hqgs.training.schedule import Schedule
-from hqgs.training.settings import plan_values, with_iterations, with_plan
+from hqgs.training.settings import plan_values, with_plan
 from hqgs.training.trainer import Trainer
 
 N, STOP = 300, 200

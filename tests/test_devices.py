@@ -15,6 +15,7 @@ from test_learned_cameras import assert_same, run
 from tiny_scene import tiny_scene
 
 import hqgs
+from benchmarks.scenes.devices import draw_devices
 from hqgs.cli.main import main
 from hqgs.diagnosis.constants import PAYS
 from hqgs.diagnosis.devices import Devices, device_signs, grouped
@@ -25,7 +26,6 @@ from hqgs.evaluation.looks import look_of, looks_of_devices
 from hqgs.evaluation.metrics import psnr
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.look import STEEPEST, Look, as_a_lens, darken, falloff, respond, squared_radii
-from hqgs.scene.builtin.devices import draw_devices
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.methods.cameras import LearnedCameras
 from hqgs.training.methods.devices import KEPT, LearnedDevices

@@ -21,7 +21,7 @@ from hqgs.model.formats.spz import encode_spz
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene import source as scene_source
-from hqgs.scene.camera_files import save_cameras
+from hqgs.scene.camera_files import load_cameras, save_cameras
 from hqgs.scene.scene import Camera
 from hqgs.show.export import along_a_curve, export, file_degree, needed_degrees, reduce_gaussians
 from hqgs.show.export_change import measure
@@ -211,7 +211,7 @@ def test_the_command_on_a_run_folder(
     g.opacities[0] = -8.0
     run = tmp_path / "run"
     g.save(run / "scene.ply")
-    monkeypatch.setattr(scene_source, "room", lambda *_: scene)
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: scene)
     out = tmp_path / "new" / "a.spz"
     assert call(run, "--out", out, "--scene", "embedded", "--downscale", "2") == 0
     text = capsys.readouterr().out
@@ -246,7 +246,7 @@ def test_what_a_file_changes_is_measured_in_the_cameras_of_its_run(tmp_path: Pat
     scene, g = tiny_scene(), some_gaussians(40, 0)
     other = g.like(g.named() | {"sh0": g.sh0 + torch.tensor([0.3, 0.0, 0.0])})
     save_cameras(tmp_path, scene)
-    change = measure(g, other, tmp_path)
+    change = measure(g, other, load_cameras(tmp_path))
     pairs = [[255 * x.render(view.camera).clamp(0, 1).double() for x in (g, other)] for view in scene.test]
     away = [(a - b).abs() for a, b in pairs]
     flat = torch.cat([x.flatten() for x in away])

@@ -29,7 +29,7 @@ from test_foreign_scenes import ksplat
 from test_ply import random_gaussians
 from tiny_scene import tiny_config, tiny_scene
 
-from hqgs.evaluation.report import read_report
+from hqgs.evaluation.records import read_report
 from hqgs.model.formats.sog_writer import encode_sog
 from hqgs.model.formats.spz import write_spz
 from hqgs.model.gaussians import Gaussians

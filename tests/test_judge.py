@@ -17,12 +17,14 @@ from scipy.ndimage import gaussian_filter
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
-from hqgs.cli.judge import background_of
+from hqgs._rust import EPS2D
 from hqgs.cli.main import main
 from hqgs.evaluation.causes import PARTS, Maps, causes, pixel_maps, shares, shown_by
+from hqgs.evaluation.constants import CONFIDENCE
 from hqgs.evaluation.held_out import RenderedView
 from hqgs.evaluation.judge import flat_psnr
 from hqgs.evaluation.metrics import METRICS
+from hqgs.evaluation.protocol import VERSION
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene import source as scene_source
 from hqgs.scene.geometry import median_depth
@@ -36,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a scene with three held-out photos, one of them masked."""
     out = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_source, "room", lambda *_: held_out_scene())
+        patch.setattr(scene_source, "embedded_scene", lambda *_: held_out_scene())
         scene = hqgs.load("embedded")
         hqgs.train(scene, out=out, config=tiny_config(40))
     return out
@@ -52,7 +54,7 @@ def held_out_scene() -> Scene:
 
 @pytest.fixture(autouse=True)
 def photos_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_source, "room", lambda *_: held_out_scene())
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: held_out_scene())
 
 
 def judge(*arguments: object) -> int:
@@ -109,13 +111,6 @@ def test_two_scenes_are_compared_photo_by_photo(
     assert "(not sure)" in capsys.readouterr().out
 
 
-def test_a_run_is_judged_before_its_own_background(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text('{"train": {"background": [1.0, 0.5, 0.0]}}')
-    for source in (tmp_path, tmp_path / "scene.ply"):
-        assert background_of(source) == (1.0, 0.5, 0.0)
-    assert background_of(tmp_path / "other.ply") == (0.0, 0.0, 0.0)
-
-
 def test_a_bright_photo_of_many_pixels_is_flat_to_all_digits() -> None:
     view, rng = tiny_scene().test[0], np.random.default_rng(0)
     values = rng.integers(240, 252, (1500, 1000, 3)).astype(np.uint8)
@@ -137,7 +132,7 @@ def with_wrong_poses() -> Scene:
 def test_what_poses_cost_is_set_aside(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_source, "room", lambda *_: with_wrong_poses())
+    monkeypatch.setattr(scene_source, "embedded_scene", lambda *_: with_wrong_poses())
     assert judge(run, "--fit-cameras", "--out", tmp_path) == 0
     assert "cameras fitted" in capsys.readouterr().out
     one = json.loads((tmp_path / "judge.json").read_text())["scene"]
@@ -165,7 +160,7 @@ def test_the_page_is_one_file(run: Path, tmp_path: Path) -> None:
         ({"sizes": [[24, 16], [9, 9], [24, 16]]}, "the sizes of the photos differ, [24, 16] here and [9, 9]"),
         ({"pixels": "0"}, "the photos' pixels or masks (their digest) differ"),
         ({"background": [1.0, 1.0, 1.0]}, "the backgrounds differ, 0.0 here and 1.0 there"),
-        ({"rules": {"psnr": "other"}}, "the rules of measuring differ"),
+        ({"version": 0}, "the rules of measuring differ, 1 here and 0 there"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_by_name(
@@ -180,6 +175,17 @@ def test_what_cannot_be_compared_is_refused_by_name(
     told = capsys.readouterr().err
     assert words in told
     assert told.count("\n") == 1
+
+
+def test_other_words_for_the_same_rules_are_compared(run: Path, tmp_path: Path) -> None:
+    """As in a judge.json of before, which has no version; the version stands for these numbers."""
+    assert (1, pytest.approx(0.3), 0.9) == (VERSION, EPS2D, CONFIDENCE)
+    assert judge(run, "--out", tmp_path) == 0
+    known = json.loads((tmp_path / "judge.json").read_text())
+    known["protocol"]["rules"]["psnr"] = "said otherwise"
+    del known["protocol"]["version"]
+    (tmp_path / "older.json").write_text(json.dumps(known))
+    assert judge(run, "--against", tmp_path / "older.json") == 0
 
 
 def test_mistakes_get_a_sentence(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

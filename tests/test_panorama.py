@@ -15,12 +15,12 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 from test_diagnose import clean_photo
 
+from benchmarks.scenes.panorama import panorama_room
 from hqgs.base.stages import Stage
 from hqgs.diagnosis.constants import TURNED
 from hqgs.diagnosis.differences import unlike_sharpness
 from hqgs.evaluation.metrics import psnr
 from hqgs.scene import views
-from hqgs.scene.builtin.panorama import panorama_room
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
 from hqgs.scene.geometry import project
 from hqgs.scene.load import load_scene

@@ -12,17 +12,18 @@ from PIL import Image
 from tiny_scene import tiny_config, tiny_scene
 
 import hqgs
+from benchmarks.scenes.wild import WildRoom, wild_room
 from hqgs.evaluation.passing import passing_picture
 from hqgs.model.consistency import Agreement
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.pixels import as_floats
-from hqgs.scene.builtin import render_depth, wild_room
 from hqgs.scene.builtin import scene as builtin
-from hqgs.scene.builtin.points import SparsePoints, surface_points
-from hqgs.scene.builtin.wild import WildRoom
+from hqgs.scene.builtin.scene import surface_points
+from hqgs.scene.builtin.shading import render_depth
 from hqgs.scene.capture import find_mask
 from hqgs.scene.degrade import degrade_scene
 from hqgs.scene.scene import Scene, View
+from hqgs.scene.sfm.triangulated import SparsePoints
 from hqgs.training import passersby
 from hqgs.training.frame import Frame
 from hqgs.training.passersby import without_passersby

@@ -21,13 +21,13 @@ from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import open_run
 from hqgs.scene.degrade import write_degraded_scene
 from hqgs.training import plan_length
-from hqgs.training.config import HQGSConfig, run_config
+from hqgs.training.config import PRESETS, HQGSConfig, run_config, with_iterations
 from hqgs.training.constants import FEW_STEPS, PIXELS
 from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, plan_by
 from hqgs.training.plan_budget import first_points_wanted
 from hqgs.training.plan_rules import RULES, plan_run
 from hqgs.training.prepare import Prepared, facts_of
-from hqgs.training.settings import PRESETS, plan_values, with_iterations, with_plan
+from hqgs.training.settings import plan_values, with_plan
 from hqgs.training.trainer import Trainer
 from hqgs.training.trial import _settings
 

@@ -19,8 +19,8 @@ from hqgs.base import machine
 from hqgs.evaluation import report
 from hqgs.evaluation.held_out import RenderedView, measured
 from hqgs.evaluation.metrics import METRICS, evaluate_view
-from hqgs.evaluation.records import RunRecord
-from hqgs.evaluation.report import RunResult, read_report, write_report
+from hqgs.evaluation.records import RunRecord, read_report
+from hqgs.evaluation.report import RunResult, write_report
 
 HEIGHT, WIDTH = 40, 60
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,12 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.base.files import CHECKPOINT, CONFIG
 from hqgs.cli.main import COMMANDS, main
-from hqgs.cli.train import Train, Whole, config_of, read
+from hqgs.cli.train import Train, Whole, config_of, loading, read
 from hqgs.evaluation.verdict import verdict
 from hqgs.pipeline import train
-from hqgs.training.config import TrainConfig, run_config
-from hqgs.training.settings import PRESETS, config_values, read_config, with_iterations
+from hqgs.scene.options import LoadOptions
+from hqgs.training.config import PRESETS, TrainConfig, run_config, with_iterations
+from hqgs.training.settings import config_values, read_config
 
 
 def options(*arguments: str | Path) -> Train:
@@ -92,6 +93,28 @@ def test_the_most_that_a_run_might_have_had_can_be_asked_for(tmp_path: Path, sec
     assert config_of(replace(resumed, iterations=None)).seconds == seconds
 
 
+@pytest.mark.parametrize("before", [run_config(), run_config(iterations=600), run_config(leave_out="none")])
+def test_what_is_said_again_changes_nothing(tmp_path: Path, before: TrainConfig) -> None:
+    """On resume, and with the configuration of another run; only what differs is asked anew."""
+    file = tmp_path / CONFIG
+    loaded = LoadOptions(path="photos", test_every=5, longest=480)
+    file.write_text(json.dumps({"train": config_values(before), "scene": asdict(loaded)}))
+    (tmp_path / CHECKPOINT).touch()
+    same = ["--method", "auto", "--seed", "0", "--batch", "1"]
+    same += ["--leave-out", "auto"] if before.leave_out else ["--leave-out", "none"]
+    same += [] if "iterations" in before.leave_out else ["--iterations", str(before.iterations)]
+    for resumed in (True, False):
+        given = [*same, "--out", tmp_path, "--resume"] if resumed else [*same, "--config", file]
+        assert config_of(options(*given)) == before
+    resumed = [*same, "--out", tmp_path, "--resume"]
+    asked = loading(options(*resumed), before)
+    assert (asked["test_every"], asked["longest"]) == (5, 480)
+    asked = loading(options(*resumed, "--test-every", "8", "--preset", "standard"), before)
+    assert (asked["test_every"], asked["longest"]) == (8, 1600)
+    asked = loading(options(*resumed, "--test-every", "0", "--downscale", "1"), before)
+    assert (asked["test_every"], asked["longest"], asked["downscale"]) == (0, None, 1.0)
+
+
 def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main(["train", "--help-all"])
@@ -124,7 +147,11 @@ def test_every_field_of_the_configuration_is_an_option(capsys: pytest.CaptureFix
         ),
         (["train", "x", "z", "--out", "y"], "one argument too many: z (hqgs train --help)"),
         (["train", "x"], "missing: --out DIR"),
-        (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: 'quick',"),
+        (["train", "x", "--out", "y", "--preset", "fast"], "--preset is fast, wanted one of: quick, "),
+        (["view", "x", "--port", "a"], "--port is a, wanted a whole number"),
+        (["export", "x", "--out", "y", "--sh-bits", "8", "q"], "--sh-bits is 8 q, wanted two whole numbers"),
+        (["render", "x", "--out", "y", "--up", "0", "q", "0"], "--up is 0 q 0, wanted three numbers"),
+        (["train", "x", "--out", "y", "--config.lr-sh0", "q"], "--config.lr-sh0 is q, wanted a number"),
         (["--iterations", "3"], "there is no option '--iterations'"),
         (["diagnose", "x.zip"], "there is no scene folder"),
     ],

@@ -9,19 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
 from hqgs.scene import known_points
-from hqgs.scene.builtin import embedded_cameras, embedded_scene, render_depth, render_view, scene, shading
-from hqgs.scene.builtin.points import SparsePoints, sfm_points, surface_points
+from hqgs.scene.builtin import scene, shading
 from hqgs.scene.builtin.raycast import Box, Cylinder, Ellipsoid, Panel, Shape, Surface, Torus, nearest
-from hqgs.scene.builtin.scene import look_at
+from hqgs.scene.builtin.scene import embedded_cameras, embedded_scene, look_at, sfm_points, surface_points
+from hqgs.scene.builtin.shading import render_depth, render_view
 from hqgs.scene.builtin.studio import studio
 from hqgs.scene.known_points import with_points
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.scene.sfm import triangulated
 from hqgs.scene.sfm.constants import PARTNERS
-from hqgs.scene.sfm.triangulated import pairs_of
+from hqgs.scene.sfm.triangulated import SparsePoints, pairs_of
 
 Points3 = NDArray[np.float64]
 
@@ -327,13 +326,13 @@ def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert cost == 0
     assert same_scene(first, second)
 
-    points, photo, key = (tmp_path / "cache" / name for name in ("points.npz", "view_03.png", "key.json"))
+    file = tmp_path / "cache" / "room.npz"
     damages: list[Callable[[], object]] = [
-        lambda: photo.write_bytes(photo.read_bytes()[:-30]),
-        lambda: Image.new("RGB", (40, 30)).save(photo),
-        lambda: points.unlink(),
-        lambda: key.write_text("{", encoding="utf-8"),
-        lambda: key.write_bytes(b"[\xff]"),
+        lambda: file.write_bytes(file.read_bytes()[:-30]),
+        lambda: file.write_bytes(file.read_bytes()[:400] + b"-" + file.read_bytes()[401:]),
+        lambda: np.savez(file, points=np.zeros(3)),
+        lambda: file.unlink(),
+        lambda: file.write_bytes(b""),
     ]
     for damage in damages:
         damage()

@@ -22,7 +22,7 @@ from hqgs.base.interrupt import ENDINGS
 from hqgs.evaluation import held_out
 from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import open_run, run_to_end, train
-from hqgs.scene.builtin import embedded_scene
+from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.scene import Scene, View
 from hqgs.training import forward
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from hqgs.scene.builtin import render_view
 from hqgs.scene.builtin.scene import embedded_cameras
+from hqgs.scene.builtin.shading import render_view
 from hqgs.scene.formats.colmap import write_colmap
 from hqgs.scene.georeference import Georeference
 from hqgs.scene.paths import scene_up

@@ -30,7 +30,7 @@ import hqgs
 from hqgs.cli import main as cli
 from hqgs.cli import view
 from hqgs.evaluation.photo_facts import facts_of_photos
-from hqgs.evaluation.report import read_report
+from hqgs.evaluation.records import read_report
 from hqgs.scene import source
 from hqgs.scene.camera_files import load_cameras, load_path
 from hqgs.scene.paths import with_size
@@ -466,7 +466,7 @@ def test_train_shows_its_page_and_stays(
 
     shown: list[bool] = []
 
-    monkeypatch.setattr(source, "room", lambda *_: tiny_scene())
+    monkeypatch.setattr(source, "embedded_scene", lambda *_: tiny_scene())
     monkeypatch.setattr(Viewer, "serve", end)
     command = ["train", "embedded", "--out", str(tmp_path), "--iterations", "3", "--view", "--port", "0"]
     assert cli.main(command) == 0

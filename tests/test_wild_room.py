@@ -12,18 +12,19 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from hqgs.photos.shake import path_points
-from hqgs.photos.walkers import draw_figure
-from hqgs.scene.builtin import scene, shading, sparse_room, wild, wild_room
-from hqgs.scene.builtin.crowd import Walker, draw_walkers
-from hqgs.scene.builtin.exposure import Exposure, path_viewmats, shaken, spread, still, through_lens
-from hqgs.scene.builtin.points import SparsePoints, surface_points
-from hqgs.scene.builtin.scene import embedded_cameras
+from benchmarks.scenes import wild
+from benchmarks.scenes.crowd import Walker, draw_walkers
+from benchmarks.scenes.exposure import Exposure, path_viewmats, shaken, spread, still, through_lens
+from benchmarks.scenes.shake import path_points
+from benchmarks.scenes.sparse import TABLE, sparse_cameras, sparse_room
+from benchmarks.scenes.walkers import draw_figure
+from benchmarks.scenes.wild import DISTANCE, TRUE_KINDS, PhotoTruth, parse_true_kind, wild_room
+from hqgs.scene.builtin import scene, shading
+from hqgs.scene.builtin.scene import embedded_cameras, surface_points
 from hqgs.scene.builtin.shading import render_depth, render_exposure, render_view, sample_pattern
-from hqgs.scene.builtin.sparse import TABLE, sparse_cameras
 from hqgs.scene.builtin.studio import studio
-from hqgs.scene.builtin.wild import DISTANCE, TRUE_KINDS, PhotoTruth, parse_true_kind
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.sfm.triangulated import SparsePoints
 
 Floats = NDArray[np.float64]
 ONE = np.array([[0.5, 0.5]])

@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 from tiny_scene import tiny_scene
 
-from hqgs.photos.degrade import degrade_image, shake
+from benchmarks.scenes.kinds import shake
+from benchmarks.scenes.video import film
+from hqgs.photos.degrade import degrade_image
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.photos.video import film
 from hqgs.scene.degrade import degrade_scene, degraded_views, write_degraded_scene
 from hqgs.scene.formats.degradation_json import read_degraded_folder
 from hqgs.scene.load import load_scene

@@ -32,7 +32,6 @@ def charts(tables: dict[str, DataFrame]) -> dict[str, Figure]:
         "quality_gains": (gain_map, main),
         "wild_gains": (gain_map, wild),
         "error_against_seconds": (against_seconds, tables["time"]),
-        "frugality": (saved, tables["frugality"]),
         "accuracy_trained": (error_against_time, trained),
         "stability_errors": (case_errors, tables["stability"]),
     }
@@ -93,24 +92,6 @@ def against_seconds(times: DataFrame) -> Figure:
         axes.set_xticks([3, 10, 30, 60, 180, 600], ["3", "10", "30", "60", "180", "600"])
         axes.set_title(str(scene), fontsize=10, loc="left", parse_math=False)
         axes.legend(**LEGEND)
-    return figure
-
-
-def saved(runs: DataFrame, base: str = "none") -> Figure:
-    """PSNR gained against the share of the CPU time, and against the share of the bytes; a mark a run."""
-    figure, grid = panels(9, 4.2, 1, 2, sharey=True)
-    rows = [row for row in dict.fromkeys(runs["row"]) if row != base]
-    for axes, (value, label) in zip(grid, (("cpu_seconds", "CPU time"), ("bytes", "bytes")), strict=True):
-        for k, row in enumerate(rows):
-            psnr = gain(runs, row, base).runs["gain"]
-            shares = gain(runs, row, base, value=value, ratio=True).runs["gain"]
-            axes.scatter(shares, psnr, label=str(row), s=60 if row == "auto" else 30, color=color(k))
-        axes.axhline(0, color=GREY, linewidth=0.8)
-        axes.axvline(1, color=GREY, linewidth=0.8)
-        axes.set_xlabel(f"{label}, nothing left out = 1")
-        axes.set_xlim(left=0)
-    grid[0].set_ylabel("held-out PSNR gained (dB)")
-    grid[0].legend(title="left out", **LEGEND)
     return figure
 
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pandas import DataFrame
 
-from benchmarks.pages.figures import NOTHING, Gain, and_list, gain, number, pick, records, table
+from benchmarks.pages.figures import NOTHING, and_list, number, pick, records, table
 from benchmarks.rows import pairs_of
 from benchmarks.speed.timing import exponent
-
-LIMIT_DB = 0.05  # what a feature that is on by default may cost
 
 
 def stages_table(passes: DataFrame) -> str:
@@ -67,33 +65,6 @@ def unbeaten_default(accuracy: DataFrame) -> str:
     if better:
         return f"Better than the default in error and in time: {and_list(better)}."
     return "No setting is better than the default in error and in time."
-
-
-def features_table(runs: DataFrame) -> str:
-    """What each feature costs, with half its interval, and by how much a step is faster with it."""
-    body = []
-    for row in dict.fromkeys(runs["row"]):
-        if row == "default":
-            continue
-        whole, grown = gain(runs, "default", row), gain(runs, "default", row, value="refined_psnr")
-        ratios = pick(runs, row=row)["step_ratio"].dropna()
-        times = ", ".join(f"{ratio:.2f}" for ratio in ratios) or NOTHING
-        body.append([row, _cost(whole), _cost(grown), times, verdict(whole, grown)])
-    return table(["feature", "cost (dB)", "grown once (dB)", "times as fast", "verdict"], body)
-
-
-def _cost(found: Gain) -> str:
-    """The negative of a gain."""
-    return Gain(found.runs.assign(gain=0.0 - found.runs["gain"])).text("+.3f") if found.count else NOTHING
-
-
-def verdict(whole: Gain, grown: Gain) -> str:
-    """Whether a feature may be on: whole runs fail it where they are sure to be over the limit, and leave it
-    open where they are not sure; Gaussians that were grown once scatter little, and decide where they are."""
-    sure = -whole.mean - (whole.error or 0.0)
-    if sure > LIMIT_DB or (grown.count and -grown.mean > LIMIT_DB):
-        return "FAIL"
-    return "open" if not grown.count and -whole.mean > LIMIT_DB else "pass"
 
 
 def families(stability: DataFrame) -> str:

@@ -146,24 +146,6 @@ def levels(times: DataFrame, scenes: Sequence[str], base: str = BASE) -> str:
     return table(["", f"`{base}` at its end, less {SHORT} (dB)", "`hqgs` (s)", f"`{base}` (s)"], body)
 
 
-def left_out(runs: DataFrame, rows: Sequence[str], base: str = "none") -> str:
-    """What leaving out costs and saves: differences and ratios to the runs that left nothing out."""
-    body = []
-    for row in rows:
-        psnr = gain(runs, row, base)
-        if not psnr.count:
-            continue
-        worst = min(float(part["gain"].mean()) for _, part in psnr.runs.groupby("scene"))
-        shares = [share(runs, row, name, base) for name in ("cpu_seconds", "bytes", "gaussians")]
-        body.append([row, psnr.text(), f"{worst:+.2f}", *shares])
-    return table(["left out", "PSNR (dB)", "worst scene", "CPU time", "bytes", "Gaussians"], body)
-
-
-def share(runs: DataFrame, row: str, value: str, base: str = "none") -> str:
-    """The mean of the ratios to the runs that left nothing out."""
-    return f"{gain(runs, row, base, value=value, ratio=True).mean:.2f}"
-
-
 def files(export: DataFrame) -> str:
     """Size of each file and what it costs in held-out PSNR."""
     body = []

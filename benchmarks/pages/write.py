@@ -9,6 +9,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from benchmarks import parts
 from benchmarks.pages import charts, figures, rasterizing, sections
 from benchmarks.protocol import read_toml
 from benchmarks.rows import KEYS, Table
@@ -20,7 +21,7 @@ DOCS = HERE.parents[1] / "docs"
 HELP = "write the pages of results from their tables"
 RESULTS = Path("results")  # in the folder of the documentation: pages and tables
 INDEX = "results.md"
-HELPERS = (figures, rasterizing, sections)  # whose functions the templates call
+HELPERS = (figures, parts, rasterizing, sections)  # whose functions the templates call
 
 
 def tables(folder: Path) -> dict[str, Any]:

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.measure import MEASURED, Run, Training, train
+from benchmarks.measure import MEASURED, Run, train
 from benchmarks.protocol import degraded_view
-from benchmarks.quality.rivals import RIVALS
+from benchmarks.quality.deblur import train_deblur
 from benchmarks.study import Cell
 from hqgs.base.evenly import middles
 from hqgs.base.files import atomic_path
@@ -35,7 +35,6 @@ from hqgs.training.trainer import Trainer
 CONTACTS, CONTACT_SIDE, CONTACT_COLORS = 4, 232, 128  # of a small sheet: views, their longest side in px
 RENDERS = 3  # times that each held-out view is rendered
 METRICS = ("psnr", "ssim", "haarpsi", "psnr_aligned")  # that the table has
-FITTED = ("psnr_fitted", "ssim_fitted", "moved_px")  # with held-out cameras fitted, and their median move
 
 
 def run_cell(
@@ -53,22 +52,19 @@ def run_cell(
     best too, and `keep` gets a line of each.
     Raises ValueError as `Trainer` does, and TrainingError.
     """
-    rival = cell.more.get("rival")
-    done = RIVALS[rival](photos, cell.config) if rival else train(photos, cell.config, moments=moments)
+    rival = bool(cell.more.get("rival"))
+    done = train_deblur(photos, cell.config) if rival else train(photos, cell.config, moments=moments)
     views = list(done.held_out())
     mean = asdict(mean_metrics([evaluate_view(view.render, view.photo, view.mask) for view in views]))
     for view, path in zip(views, pictures, strict=False):
         with atomic_path(path) as tmp:
             Image.fromarray(to_uint8(view.render)).save(tmp)
-    facts = _facts(done.trainer, cell) if isinstance(done, Training) else {}
-    if fit:
-        fitted = _fitted(done.trainer) if isinstance(done, Training) else {}
-        facts |= {name: fitted.get(name) for name in FITTED}
-    if moments and isinstance(done, Training):
+    facts = _facts(done.trainer, cell) | (_fitted(done.trainer) if fit else {})
+    if done.moments:
         keep(done.moments)
         facts |= {f"best_{name}": best_of(done.moments, name) for name in MEASURED}
-    history = done.trainer.history if isinstance(done, Training) else done.history
-    fell = {"fall": facts["best_psnr"] - mean["psnr"] if facts.get("best_psnr") else fall(history)}
+    best = facts.get("best_psnr")
+    fell = {"fall": best - mean["psnr"] if best else fall(done.trainer.history)}
     run = {name: mean[name] for name in METRICS} | fell
     return run | done.record() | facts | {"peak_mb": done.peak_rss_mb()}
 

@@ -12,7 +12,7 @@ from benchmarks.measure import Run
 from benchmarks.pages.figures import crossed, gains
 from benchmarks.protocol import read_protocols
 from benchmarks.quality.cell import reconstruction, run_cell, write_contacts, write_sheet
-from benchmarks.quality.rivals import RivalRow
+from benchmarks.quality.deblur import RivalRow
 from benchmarks.rows import Table, facts
 from benchmarks.study import Cell, Study, begin
 from hqgs.scene.scene import Scene

@@ -21,9 +21,13 @@ from hqgs.base.text import as_text
 LOCK = ".lock"
 SAFETENSORS_TMP = ".tmp??????"  # a file of such a name is what safetensors writes before it renames it
 CHECKPOINT, PLY, CONFIG, PAGE = "checkpoint.safetensors", "scene.ply", "config.json", "report.html"
+REPORT, PICTURES = "report.json", "comparison"
+CAMERAS, PHOTOS = "cameras.json", "photos"
 LEARNED, PASSERSBY = "learned.png", "passersby.png"  # of the photos' cameras; of who was masked
 _LACKING = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM}
 PLAN = "plan.json"  # what a number of seconds came to
+RUN_FILES = (PLY, PAGE, REPORT, CAMERAS, LEARNED, PASSERSBY, PLAN, CONFIG, CHECKPOINT)  # what a run writes,
+RUN_FOLDERS = (PHOTOS, PICTURES)  # and where its pictures are
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypedDict, cast
 if TYPE_CHECKING:
     from typing_extensions import NotRequired  # typing has it from Python 3.11 on
 
+PHOTO = "training photo "  # and its name
 CORRECTION = "a correction for "  # and the step of the formation, of what the photos do not show
 
 

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from hqgs.base.options import Factor, Number
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.judge import background_of, check_source, read_photos
+from hqgs.cli.judge import check_source
 from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Number, tell_read
+from hqgs.cli.scenes import measured_scene, tell_read
 from hqgs.model.formats.files import FORMATS, format_of
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Clean:
     downscale: Factor = None
     """Divide the sides of the photos of --photos by F."""
     test_every: Number = None
-    """Hold out every N-th photo of --photos (8, unless the scene has a split)."""
+    """Hold out every N-th photo of --photos (as the run did; 8, unless the scene has a split)."""
     steps: Number = None
     """Training views to see (600)."""
 
@@ -50,15 +51,19 @@ def run(options: Clean) -> int:
         source = check_source(options.source, options.photos)
         if options.out.exists() and options.out.samefile(source):
             raise ValueError(f"--out is the source {source} itself; what is removed would be lost")
-        from hqgs.model.gaussians import Gaussians  # here: they load torch
+        from hqgs.evaluation.run_folder import RunFolder  # here: they load torch
+        from hqgs.model.gaussians import Gaussians
         from hqgs.training.cleaning import check_steps, clean, held_out_psnrs
         from hqgs.training.constants import CLEANING_STEPS
 
         steps = CLEANING_STEPS if options.steps is None else options.steps
         check_steps(steps)
-        background = background_of(options.source)
+        run = RunFolder.open(options.source)
+        background = run.background
         with LoadingScreen() as screen:
-            scene = read_photos(options.source, options.photos, options.downscale, options.test_every, screen)
+            scene = measured_scene(
+                run, options.source, options.photos, options.downscale, options.test_every, screen
+            )
             gaussians = Gaussians.load(source)
             done = clean(gaussians.in_world(scene.world), scene, steps, background, screen.stage)
         cleaned = done.gaussians.in_world(gaussians.world)  # in the frame of the source

@@ -8,10 +8,12 @@ from typing import Annotated
 import tyro
 
 from hqgs.base.files import check_new_folder
+from hqgs.base.options import Folder
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Folder, Kind, Photos, load, ready
+from hqgs.cli.scenes import Photos, load, ready
 from hqgs.photos.formula import parse_degradation
+from hqgs.scene.options import KINDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +22,7 @@ class Degrade(Photos):
 
     out: Folder
     """Folder for the new scene; missing or empty."""
-    kind: Kind
+    kind: Annotated[str, tyro.conf.arg(metavar="KIND", help=f"What happens to the training photos: {KINDS}.")]
     seed: Annotated[int, tyro.conf.arg(metavar="S")] = 0
     """Of everything random."""
 

@@ -13,7 +13,7 @@ from hqgs.base.files import write_json
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_out_file
 from hqgs.cli.scenes import Photos, ready
-from hqgs.training.settings import longest_side
+from hqgs.training.config import longest_side
 
 
 @dataclass(frozen=True, kw_only=True)

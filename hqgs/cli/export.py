@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.files import PLY
+from hqgs.base.options import Factor, Flag, values
 from hqgs.base.text import markdown_table
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.judge import background_of, read_photos
 from hqgs.cli.out_folder import check_above
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Flag, Photos, cameras_beside, config_part, load, ready, tell_read
+from hqgs.cli.scenes import Photos, load, measured_scene, ready, tell_read
 from hqgs.model.formats.files import FORMATS, WRITTEN, format_of, scene_file
 from hqgs.scene.names import is_room
 from hqgs.show.export_options import ExportOptions
 
 if TYPE_CHECKING:
+    from hqgs.evaluation.run_folder import RunFolder
     from hqgs.model.gaussians import Gaussians
     from hqgs.scene.scene import Scene
     from hqgs.show.export import Export
@@ -41,7 +41,7 @@ class ExportScene:
     ] = None
     sh_degree: Annotated[int, tyro.conf.arg(metavar="D")] = DEFAULTS.sh_degree
     """Of the harmonics, at most."""
-    sh_bits: Annotated[tuple[int, int], tyro.conf.arg(metavar="B B")] = DEFAULTS.sh_bits
+    sh_bits: Annotated[tuple[int, int], values("B B", "two whole numbers", int, int)] = DEFAULTS.sh_bits
     """SPZ: of the harmonics of degree 1, and of degrees 2 and 3."""
     spz_version: Annotated[int, tyro.conf.arg(metavar="V")] = DEFAULTS.spz_version
     """SPZ: 3, which more programs read, or 4, which is smaller and which newer ones ask for."""
@@ -77,21 +77,22 @@ def run(args: ExportScene) -> int:
             places = " and ".join(f".{name}" for name, format in FORMATS.items() if format.errors)
             raise ValueError(f"--trust: a .{options.format} file has no place for it; {places} files have")
         from hqgs.evaluation.held_out import held_out_psnr, held_out_renders  # here: they load torch
+        from hqgs.evaluation.run_folder import RunFolder
         from hqgs.model.gaussians import Gaussians
         from hqgs.show.export import export
         from hqgs.show.export_change import measure
 
-        gaussians = Gaussians.load(source)
-        scene = None if args.scene is None else _held_out_photos(args.source, args.scene, args.downscale)
+        gaussians, run = Gaussians.load(source), RunFolder.open(args.source)
+        scene = None if args.scene is None else _held_out_photos(run, args)
         if args.trust:
             from hqgs.show.trust import trust_of
 
-            gaussians.errors = trust_of(gaussians, cameras_beside(args.source)).errors.clamp(max=1)
+            gaussians.errors = trust_of(gaussians, run.cameras).errors.clamp(max=1)
 
         def held_out(shown: Gaussians) -> float | None:
             if scene is None:
                 return None
-            renders = held_out_renders(scene, shown, background=background_of(args.source))
+            renders = held_out_renders(scene, shown, background=run.background)
             return held_out_psnr(scene, renders)
 
         before = held_out(gaussians)
@@ -99,7 +100,7 @@ def run(args: ExportScene) -> int:
         back = Gaussians.load(args.out, options.format)
         after = held_out(back)
         try:
-            changed = f"measured: {measure(gaussians, back, source.parent if source.name == PLY else None)}"
+            changed = f"measured: {measure(gaussians, back, run.cameras)}"
         except ValueError as error:
             changed = f"not measured: {error}"
     except BAD_INPUT as error:
@@ -128,14 +129,14 @@ def _check_together(args: ExportScene, format: str) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is for spz, and {asked} says {format}")
 
 
-def _held_out_photos(source: Path, photos: str, downscale: float | None) -> Scene:
+def _held_out_photos(run: RunFolder, args: ExportScene) -> Scene:
     """The photos of `--scene` in the frame of the scene file, those held out that its run held out."""
+    photos = str(args.scene)
     ready(photos)
     with LoadingScreen() as screen:
         if is_room(photos):
-            return load(Photos(scene=photos, downscale=downscale), screen)
-        asked = config_part(source if source.is_dir() else source.parent, "scene")
-        return read_photos(source, photos, downscale, asked.get("test_every"), screen)
+            return load(Photos(scene=photos, downscale=args.downscale), screen)
+        return measured_scene(run, args.source, photos, args.downscale, None, screen)
 
 
 def _table(

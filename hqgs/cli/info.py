@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from hqgs.base.files import CONFIG, PLY
+from hqgs.base.files import CONFIG, PLY, REPORT
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import duration
-from hqgs.cli.scenes import config_part
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import judged_by, verdict
 from hqgs.model.formats.files import FORMATS, has_format, scene_file
 from hqgs.scene.photo_files import is_run
@@ -70,26 +70,25 @@ def _file(path: Path) -> list[str]:
 
 def _run(path: Path) -> list[str] | None:
     """Of a run that has ended; None where the folder has no report, or another program's report.json."""
-    from hqgs.evaluation.report import REPORT, report_in  # here: it loads torch
-
+    run = RunFolder(path)
     try:
-        report: Any = report_in(path)
-        return None if report is None else _told(path, report)
+        return None if run.report is None else _told(run, run.report)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        if is_run(path):
+        if run.is_run:
             raise ValueError(f"{path / REPORT} is damaged: {error!r}") from error
         return None
 
 
 def _not_ended(path: Path) -> str:
-    origin = config_part(path, "scene").get("path")
+    origin = RunFolder(path).loaded.get("path")
     if origin is None:
         return f"{path}: a run that has not ended: hqgs.train(..., resume=True) goes on"
     command = shlex.join(["hqgs", "train", str(origin), "--out", str(path), "--resume"])
     return f"{path}: a run that has not ended: {command} goes on"
 
 
-def _told(path: Path, report: Any) -> list[str]:
+def _told(run: RunFolder, report: Any) -> list[str]:
+    path = run.folder
     mean, steps = report["metrics"]["mean"], f"{report['iterations']:,} of {report['length']:,} iterations"
     word, why = verdict(judged_by(report)[0], report["metrics"])
     numbers = ", ".join(f"{name} {value:.4g}" for name, value in mean.items() if value is not None)
@@ -100,7 +99,7 @@ def _told(path: Path, report: Any) -> list[str]:
     ]
     lines += [f"  {note}" for note in report["notes"]]
     if (path / CONFIG).is_file():
-        lines.append(f"trained on {config_part(path, 'scene').get('path', 'a scene made in Python')}")
+        lines.append(f"trained on {run.loaded.get('path', 'a scene made in Python')}")
     lines.append(f"the scene: {scene_file(path)}; the configuration: {path / CONFIG}")
     return lines
 

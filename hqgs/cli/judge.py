@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs import __version__
-from hqgs.base.files import CONFIG, PLY, write_json
+from hqgs.base.files import CONFIG, write_json
+from hqgs.base.options import Color, Factor, Number
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_out_folder
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Factor, Number, check_background, config_part, ready
+from hqgs.cli.scenes import check_background, measured_scene, ready
 from hqgs.evaluation.judge_words import told
 from hqgs.evaluation.verdict import judged_by
 from hqgs.model.formats.files import format_of, scene_file
-from hqgs.scene.constants import TEST_EVERY
-from hqgs.scene.names import is_room
-from hqgs.scene.photo_files import film_at
-from hqgs.training.settings import longest_side
 
 if TYPE_CHECKING:
     from hqgs.evaluation.judge import Judged
@@ -44,12 +41,10 @@ class Judge:
     views: Annotated[str, tyro.conf.arg(metavar="WHICH")] = "test"
     """The photos to measure on: test (held out), train, all, or names with commas."""
     test_every: Number = None
-    """Hold out every N-th photo (8, unless the scene has a split)."""
+    """Hold out every N-th photo of --photos (as the run did; 8, unless the scene has a split)."""
     downscale: Factor = None
     """Divide the sides of the photos by F (a longer side of at most 1600 px)."""
-    background: Annotated[
-        tuple[float, float, float] | None, tyro.conf.arg(metavar="R G B", help_behavior_hint="")
-    ] = None
+    background: Color = None
     """Behind everything; 1 is white (that of the run, or black)."""
     fit_cameras: bool = False
     """Also measure with each camera fitted to the scene, some 10 s a photo: what poses cost is set aside."""
@@ -78,7 +73,9 @@ def run(options: Judge) -> int:
         source, other, known = check_source(options.source, options.photos), None, None
         from hqgs.evaluation.judge import compared
         from hqgs.evaluation.protocol import check_comparable, chosen_views, protocol_of, read_judgement
-        from hqgs.evaluation.report import report_in
+        from hqgs.evaluation.run_folder import RunFolder
+
+        run = RunFolder.open(options.source)
 
         if (
             options.against is not None
@@ -89,9 +86,11 @@ def run(options: Judge) -> int:
         elif options.against is not None:
             other = scene_file(options.against)
         with LoadingScreen() as screen:
-            scene = read_photos(options.source, options.photos, options.downscale, options.test_every, screen)
+            scene = measured_scene(
+                run, options.source, options.photos, options.downscale, options.test_every, screen
+            )
             views = chosen_views(scene, options.views)
-            background = background_of(options.source) if options.background is None else options.background
+            background = run.background if options.background is None else options.background
             protocol = protocol_of(scene, options.views, views, background)
             if known is not None:
                 check_comparable(protocol, known["protocol"], str(options.against))
@@ -104,8 +103,7 @@ def run(options: Judge) -> int:
         if known is not None or other is not None:
             found["against"] = known["scene"] if known is not None else judged[1].json()
             found["difference"] = compared(found["scene"], found["against"])
-        report = report_in(options.source) or {}
-        psnr, name = judged_by({**report, "metrics": {"mean": found["scene"]["mean"]}})
+        psnr, name = judged_by({**(run.report or {}), "metrics": {"mean": found["scene"]["mean"]}})
         found["judged_by"] = {"psnr": psnr, "name": name}
         if options.out is not None:
             from hqgs.show.page.judge_page import write_judge_page
@@ -164,54 +162,6 @@ def check_source(source: Path, photos: str | None) -> Path:
         )
     ready(str(source) if photos is None else photos)
     return file
-
-
-def read_photos(
-    source: Path, photos: str | None, downscale: float | None, test_every: int | None, screen: LoadingScreen
-) -> Scene:
-    """The photos with their cameras: those of --photos, or those that the run was trained on."""
-    from hqgs.scene.load import formats_of, scene_folder  # here: they load torch
-    from hqgs.scene.same_run import check_same
-    from hqgs.scene.source import finding, load, load_again
-
-    if photos is None:
-        if downscale is not None or test_every is not None:
-            raise ValueError(
-                f"{source} is measured on its own photos: another size or split needs them named"
-            )
-        return load_again(source, on_stage=screen.stage)
-    run = source if source.is_dir() else source.parent
-    run = run if (run / CONFIG).is_file() else None
-    bare = film_at(photos) is not None or not (
-        is_room(photos) or formats_of(scene_folder(photos)[0], downscale or 1.0)
-    )
-    if bare and run is None:
-        raise ValueError(
-            f"{photos} has no cameras: those that would be found anew are in another frame than {source}; "
-            "give the COLMAP or nerfstudio folder that it was trained on"
-        )
-    scene = load(
-        photos,
-        downscale=1.0 if downscale is None else downscale,
-        longest=longest_side("standard", downscale),
-        test_every=TEST_EVERY if test_every is None else test_every,
-        skip_unreadable=False,
-        points=False,
-        cache=run,
-        on_stage=screen.stage,
-        **(finding(config_part(run, "scene"), photos) if bare and run is not None else {}),
-    )
-    if bare and run is not None:
-        check_same(scene, run, split=False)
-    return scene
-
-
-def background_of(source: Path) -> tuple[float, float, float]:
-    """What a run, named by its folder or its scene, was trained on, or black."""
-    from hqgs.scene.constants import BACKGROUND
-
-    trained = config_part(source.parent if source.name == PLY else source, "train")
-    return tuple(trained.get("background", BACKGROUND))
 
 
 def judge_file(

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import tyro
 
+from hqgs.base.options import PLAIN
 from hqgs.cli.errors import fail
 
 T = TypeVar("T")
@@ -25,22 +26,8 @@ WORDS = {  # tyro's, and ours
     r"Perhaps you meant:": "- did you mean",
     r"(?<=\S) (?=there is no option|missing:)": "; ",
     r"(there is no option --?[\w-]+)(?:,? [^-\s;]+)+": r"\1",  # what followed it is none of its own
-    r"Error parsing (\S+): no type matching \{?(.+?)\}? could be .*? from \['?(.*?)'?\]\.": (
-        r"\1 is \3, wanted \2"
-    ),
-    r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*?)\)\.": (
-        r"\2 is \1, wanted one of: \3"
-    ),
-    r"Error parsing (\S+): invalid literal for int.*?: '(.*?)'": r"\1 is \2, wanted INT",
-    r"Error parsing (\S+): could not convert string to float: '(.*?)'": r"\1 is \2, wanted FLOAT",
-    r"wanted INT INT": "wanted two whole numbers",
-    r"wanted STR STR FLOAT": "wanted two names and a number",
-    r"', '(?=[^']*, wanted (?:two|three))": " ",  # between values that were given
-    r"(\d)', '(?=[\d.-])": r"\1 ",
-    r"wanted FLOAT FLOAT FLOAT": "wanted three numbers",
-    r"wanted INT": "wanted a whole number",
-    r"wanted FLOAT": "wanted a number",
-    r"Error parsing \S+: (?!no type)": "",
+    r"Error parsing (\S+):(?= is )": r"\1",
+    r"Error parsing \S+: ": "",
 }
 GPU = ("--device", "--cuda", "--gpu", "--gpus")
 OF_3DGS = ("-s", "--source_path", "-m", "--model_path")
@@ -66,6 +53,7 @@ def parse(options: type[T], command: str, about: str, arguments: Sequence[str], 
                 description=f"{about[0].upper()}{about[1:]}.",
                 args=list(arguments),
                 config=MARKERS,
+                registry=PLAIN,
                 **more,
             )
     except SystemExit as end:

@@ -4,38 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from hqgs.base.options import Number, Unsaid
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen
-from hqgs.cli.scenes import Number, Photos, config_part, ready
+from hqgs.cli.scenes import Photos, ready
+from hqgs.evaluation.run_folder import RunFolder
+from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import KEPT
 from hqgs.scene.photo_files import is_run
-from hqgs.training.config import AUTO, FORMATION, METHODS, run_config
-from hqgs.training.settings import longest_side
+from hqgs.training.config import TrainOptions, longest_side
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanOptions(Photos):
+class PlanOptions(TrainOptions, Photos):
     """Options of `hqgs plan`."""
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder of a run on these photos, whose poses are used."""
-    method: Annotated[
-        str, tyro.conf.arg(metavar="NAME", help_behavior_hint="", help=f"One of {', '.join(METHODS)} (auto).")
-    ] = AUTO
-    formation: Annotated[str, tyro.conf.arg(metavar="KIND", help_behavior_hint="")] = AUTO
-    """What hqgs takes for the photos' degradation (auto: it looks)."""
-    guidance: Annotated[
-        Literal["formation", "paper"],
-        tyro.conf.arg(help="Of hqgs: formation, or paper, its published form.", help_behavior_hint=""),
-    ] = FORMATION
-    leave_out: Annotated[str, tyro.conf.arg(metavar="LIST", help_behavior_hint="")] = AUTO
+    test_every: Number = None
     """As that of train."""
-    iterations: Number = None
-    """Training views to see (as many as pay)."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR"), Unsaid] = None
+    """Folder of a run on these photos, whose poses are used."""
 
 
 OPTIONS = PlanOptions
@@ -44,13 +35,7 @@ OPTIONS = PlanOptions
 def run(options: PlanOptions) -> int:
     """Print the plan; return the exit code (0 done, 2 bad input)."""
     try:
-        config = run_config(
-            iterations=options.iterations,
-            method=options.method,
-            leave_out=options.leave_out,
-            guidance=options.guidance,
-            formation=options.formation,
-        )
+        config = options.resolved()
         posed = options.out is not None and (options.out / KEPT).exists()
         if options.out is not None and not posed and not is_run(options.out):
             raise ValueError(
@@ -63,19 +48,21 @@ def run(options: PlanOptions) -> int:
         from hqgs.training.trainer import Trainer
 
         downscale = 1.0 if options.downscale is None else options.downscale
-        longest = longest_side("standard", options.downscale)
+        test_every = TEST_EVERY if options.test_every is None else options.test_every
+        longest = longest_side(options.preset, options.downscale)
         with LoadingScreen() as screen:
             if posed and options.out is not None:
                 scene = load(
                     options.scene,
                     downscale=downscale,
                     longest=longest,
+                    test_every=test_every,
                     cache=options.out,
                     on_stage=screen.stage,
-                    **finding(config_part(options.out, "scene"), options.scene),
+                    **finding(RunFolder(options.out).loaded, options.scene),
                 )
             else:
-                scene = pictures(options.scene, downscale=downscale, longest=longest)
+                scene = pictures(options.scene, downscale=downscale, longest=longest, test_every=TEST_EVERY)
             later: list[str] = []
             if len(scene.points):
                 plan = Prepared(Frame.of(scene), config, begin=Trainer).plan()
@@ -83,7 +70,9 @@ def run(options: PlanOptions) -> int:
                 plan, later = plan_of_photos(scene, config)
     except BAD_INPUT as error:
         return fail(2, error)
-    print(f"{scene.name}: {len(scene.train)} photos, {len(scene.points):,} points")
+    photos = f"{scene.of or len(scene.train)} photos to train on"
+    looked = f" ({len(scene.train)} of them looked at)" if scene.of not in (None, len(scene.train)) else ""
+    print(f"{scene.name}: {photos}{looked}, {len(scene.points):,} points")
     print(plan)
     if later:
         print(

@@ -7,20 +7,21 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from hqgs.base.options import Color, Factor, Number, Size, Unsaid, Vector, choice
 from hqgs.base.text import some
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_above
-from hqgs.cli.scenes import Factor, Number, cameras_beside, check_background, config_part, tell_read
+from hqgs.cli.scenes import check_background, tell_read
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.formats.files import scene_file
 from hqgs.photos.files import PHOTO_SUFFIXES
 
 if TYPE_CHECKING:
     from hqgs.model.gaussians import Gaussians
-    from hqgs.photos.look import Look
     from hqgs.scene.scene import Camera
     from hqgs.show.trust import Trust
     from hqgs.show.trust_measured import Predicted
@@ -47,18 +48,17 @@ class Render:
     """Frames of a path that is made here (240)."""
     fps: Factor = None
     """Frames per second (30, or what the path file says)."""
-    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
+    size: Size = None
     """In pixels (as the cameras have)."""
-    show: Literal["color", "depth", "alpha", "trust"] = "color"
-    """What the pictures show. trust: the error that 9 of 10 pixels stay below, by the run's photos."""
+    show: Annotated[str, choice("color", "depth", "alpha", "trust"), Unsaid] = "color"
+    """What the pictures show (color). trust: the error that 9 of 10 pixels stay below, by the run's
+    photos."""
     look: Annotated[str | None, tyro.conf.arg(metavar="PHOTO", help_behavior_hint="")] = None
     """In the look of this photo of the run: its gains, its camera's vignetting and response, where those were
     learned (that of the mean photo)."""
-    background: Annotated[tuple[float, float, float], tyro.conf.arg(metavar="R G B")] = (0.0, 0.0, 0.0)
-    """Behind everything; 1 is white."""
-    up: Annotated[
-        tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")
-    ] = None
+    background: Color = None
+    """Behind everything; 1 is white (that of the run, or black)."""
+    up: Vector = None
     """Where up is, of an orbit (that of the cameras; 0 -1 0 in a scene file without)."""
 
 
@@ -69,24 +69,25 @@ def run(options: Render) -> int:
     """Render, and say what was written; return the exit code (0 done, 1 failed, 2 bad input)."""
     source, out, size = options.source, options.out, options.size
     try:
-        _check(options)
-        file = scene_file(source)
+        file, run = scene_file(source), RunFolder.open(source)
+        _check(options, run)
+        from hqgs.evaluation.looks import look_of
         from hqgs.model.gaussians import Gaussians
         from hqgs.scene.paths import with_size
         from hqgs.show.frames import check_frames, render_frames, written_size  # here: they load torch
 
         gaussians = Gaussians.load(file)
         tell_read(gaussians)
-        names, cameras, rate = _cameras(options, gaussians)
+        names, cameras, rate = _cameras(options, gaussians, run)
         if size is not None:
             cameras = [with_size(camera, *size) for camera in cameras]
         if out.suffix.lower() == ".png" and options.views is None:
             cameras = cameras[:1]
         fps = rate if options.fps is None else options.fps
         check_frames(cameras, out, fps, options.show)
-        look = None if options.look is None else _look(source, options.look)
-        trust = _trust(options, gaussians) if options.show == "trust" else None  # it may take minutes
-        predicted = _predicted(options, gaussians, cameras, trust)
+        look = None if options.look is None else look_of(run.folder, options.look)
+        trust = _trust(options, gaussians, run) if options.show == "trust" else None  # it may take minutes
+        predicted = None if options.views is not None else _predicted(run, gaussians, cameras, trust)
         started = time.perf_counter()
         render_frames(
             gaussians,
@@ -94,7 +95,7 @@ def run(options: Render) -> int:
             out,
             fps=fps,
             show=options.show,
-            background=options.background,
+            background=run.background if options.background is None else options.background,
             names=names,
             progress=_progress if sys.stderr.isatty() else None,
             trust=trust,
@@ -114,31 +115,35 @@ def run(options: Render) -> int:
     return 0
 
 
-def _check(options: Render) -> None:
+def _check(options: Render, run: RunFolder) -> None:
     """What the options alone tell. ValueError."""
-    of_paths = {"path": options.path != PATHS[0], "frames": options.frames, "up": options.up}
+    of_paths = {"path": options.path != PATHS[0], "frames": options.frames is not None}
+    of_paths["up"] = options.up is not None
     for name, given in of_paths.items():
-        if options.views is not None and given not in (None, False):
+        if options.views is not None and given:
             raise ValueError(f"--{name} is of paths, and --views has the run's own cameras: give one of them")
     if options.look is not None and options.show != "color":
         raise ValueError(f"--look is of colours, and --show is {options.show}")
-    check_background(options.background)
+    if options.background is not None:
+        check_background(options.background)
     check_above(options.out)
-    _check_folder(options.source, options.out)
+    _check_folder(run, options.out)
 
 
-def _check_folder(source: Path, out: Path) -> None:
+def _check_folder(run: RunFolder, out: Path) -> None:
     """ValueError where pictures would lie among photos: the next run on these would take them for some."""
     if not out.is_dir():
         return
     held = sorted(path.name for path in out.iterdir() if path.suffix.lower() in PHOTO_SUFFIXES)
-    path = config_part(source if source.is_dir() else source.parent, "scene").get("path")
+    path = run.loaded.get("path")
     own = path is not None and out.resolve() in (Path(path), Path(path, "images"))
     if photos := [name for name in held if own or not PICTURE.fullmatch(name)]:
         raise ValueError(f"--out {out} holds photos ({some(photos)}): name another folder for pictures")
 
 
-def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, list[Camera], float]:
+def _cameras(
+    options: Render, gaussians: Gaussians, run: RunFolder
+) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
     from hqgs.model.orbit import orbit
     from hqgs.photos.constants import FPS
@@ -146,7 +151,7 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     from hqgs.scene.paths import UP, camera_path
 
     source, views, path, frames = options.source, options.views, options.path, options.frames
-    known = cameras_beside(source)
+    known = run.cameras
     count = FRAMES if frames is None else frames
     if views is not None:
         if known is None:
@@ -172,12 +177,12 @@ def _cameras(options: Render, gaussians: Gaussians) -> tuple[list[str] | None, l
     return None, made, FPS
 
 
-def _trust(options: Render, gaussians: Gaussians) -> Trust:
+def _trust(options: Render, gaussians: Gaussians, run: RunFolder) -> Trust:
     """What the photos of the run say; prints how right that is on held-out ones."""
     from hqgs.show.trust import trust_of
     from hqgs.show.trust_measured import measure_trust
 
-    known = cameras_beside(options.source)
+    known = run.cameras
     if known is None and gaussians.errors is None:
         raise ValueError(
             f"--show trust: {options.source} has no cameras.json and photos/, as a run has, nor errors "
@@ -192,22 +197,15 @@ def _trust(options: Render, gaussians: Gaussians) -> Trust:
     return trust
 
 
-def _look(source: Path, name: str) -> Look:
-    """What the run in a folder, or beside a scene file, has learned of a photo's look."""
-    from hqgs.evaluation.looks import look_of
-
-    return look_of(source if source.is_dir() else source.parent, name)
-
-
 def _predicted(
-    options: Render, gaussians: Gaussians, cameras: list[Camera], trust: Trust | None
+    run: RunFolder, gaussians: Gaussians, cameras: list[Camera], trust: Trust | None
 ) -> Predicted | None:
     """What photos from a path would show of a run that held some out; None of anything else."""
     from hqgs.show.trust import trust_of
     from hqgs.show.trust_measured import predict_psnr
 
-    known = cameras_beside(options.source)
-    if options.views is not None or len(cameras) < 2 or known is None:
+    known = run.cameras
+    if len(cameras) < 2 or known is None:
         return None
     kept = [view.held_out for view in known.views if view.photo is not None and view.photo.is_file()]
     if len(set(kept)) < 2 or len(kept) < len(known.views):

@@ -11,33 +11,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hqgs.base.files import CONFIG, read_json
 from hqgs.base.interrupt import ENDINGS
+from hqgs.base.options import Factor
+from hqgs.base.text import some
 from hqgs.cli.errors import fail
-from hqgs.photos.formula import grammar
+from hqgs.scene.constants import TEST_EVERY
 from hqgs.scene.names import existing_folder, is_room
 from hqgs.scene.photo_files import film_at
+from hqgs.training.config import longest_side
 
 if TYPE_CHECKING:
     from hqgs.cli.progress import LoadingScreen
+    from hqgs.evaluation.run_folder import RunFolder
     from hqgs.model.gaussians import Gaussians
-    from hqgs.scene.camera_files import RunCameras
     from hqgs.scene.scene import Scene
 
 SceneName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
-Factor = Annotated["float | None", tyro.conf.arg(metavar="F", help_behavior_hint="")]
-Number = Annotated["int | None", tyro.conf.arg(metavar="N", help_behavior_hint="")]
-Apart = Annotated["tuple[str, str, float] | None", tyro.conf.arg(metavar="A B METRES", help_behavior_hint="")]
-Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
-KINDS = (
-    f"{grammar()}, some:KIND (half of the photos only), several joined by + in their order, mixed, or none"
-)
-Kind = Annotated[str, tyro.conf.arg(metavar="KIND", help=f"what happens to the training photos: {KINDS}")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +39,7 @@ class Photos:
 
     scene: SceneName
     """A folder with photos, a film, a scene that other programs made (COLMAP, LLFF, nerfstudio, ...), or
-    a scene that is built in: embedded, sparse, true-shake, true-defocus, true-exposure, true-devices,
-    true-crowd or true-panorama."""
+    embedded, a room that is built in."""
     downscale: Factor = None
     """Divide the photos' sides by F."""
 
@@ -98,27 +90,62 @@ def tell_read(gaussians: Gaussians) -> None:
         print(f"read: {note}", flush=True)
 
 
-def cameras_beside(source: Path) -> RunCameras | None:
-    """The cameras of a run's folder, or of the folder that a scene file lies in; None where none are."""
-    from hqgs.scene.camera_files import CAMERAS, load_cameras
-
-    folder = source if source.is_dir() else source.parent
-    return load_cameras(folder) if (folder / CAMERAS).is_file() else None
-
-
-def config_part(folder: Path, name: str) -> dict[str, Any]:
-    """A part of config.json in a run's folder; empty where none is, or it is another program's."""
-    path = folder / CONFIG
-    config = read_json(path) if path.is_file() else None
-    part = config.get(name) if isinstance(config, dict) else None
-    return part if isinstance(part, dict) else {}
-
-
 def check_background(background: Sequence[float]) -> None:
     """ValueError for what is no colour, such as levels of 255."""
     if not all(0 <= value <= 1 for value in background):
         given = " ".join(f"{value:g}" for value in background)
         raise ValueError(f"--background is {given}, wanted three numbers in 0..1; 1 is white")
+
+
+def measured_scene(
+    run: RunFolder,
+    source: Path,
+    photos: str | None,
+    downscale: float | None,
+    test_every: int | None,
+    screen: LoadingScreen,
+) -> Scene:
+    """The photos that a scene file is measured with: `photos`, or those that its run was trained on.
+
+    Where `test_every` is not said, those are held out that the run held out.
+    """
+    from hqgs.evaluation.run_folder import check_same  # here: they load torch
+    from hqgs.scene.load import formats_of, scene_folder
+    from hqgs.scene.source import finding, load
+
+    if photos is None:
+        if downscale is not None or test_every is not None:
+            raise ValueError(
+                f"{source} is measured on its own photos: another size or split needs them named"
+            )
+        return run.photos(screen.stage)
+    bare = film_at(photos) is not None or not (
+        is_room(photos) or formats_of(scene_folder(photos)[0], downscale or 1.0)
+    )
+    if bare and not run.config:
+        raise ValueError(
+            f"{photos} has no cameras: those that would be found anew are in another frame than {source}; "
+            "give the COLMAP or nerfstudio folder that it was trained on"
+        )
+    scene = load(
+        photos,
+        downscale=1.0 if downscale is None else downscale,
+        longest=longest_side("standard", downscale),
+        test_every=run.loaded.get("test_every", TEST_EVERY) if test_every is None else test_every,
+        skip_unreadable=False,
+        points=False,
+        cache=run.folder if run.config else None,
+        on_stage=screen.stage,
+        **(finding(run.loaded, photos) if bare else {}),
+    )
+    if bare:
+        check_same(scene, run, split=False)
+    split = run.split(scene)
+    if test_every is None:
+        return split
+    if seen := sorted({view.name for view in scene.test} & {view.name for view in split.train}):
+        screen.say(f"held out by --test-every, though the run was trained on them: {some(seen)}")
+    return scene
 
 
 def load(photos: Photos, screen: LoadingScreen) -> Scene:

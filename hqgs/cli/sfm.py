@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hqgs.base.files import check_new_folder
+from hqgs.base.options import Folder, Number
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.progress import LoadingScreen, duration
-from hqgs.cli.scenes import Folder, Number, SceneName, ready
+from hqgs.cli.scenes import SceneName, ready
 
 
 @dataclass(frozen=True, kw_only=True)

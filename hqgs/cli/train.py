@@ -2,128 +2,70 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 import hqgs
-from hqgs.base.files import CHECKPOINT, CONFIG, PAGE, PLY
+from hqgs.base.files import CHECKPOINT, PAGE, PLY
 from hqgs.base.left_out import format_left_out
+from hqgs.base.options import Flag, Folder, Number, Unsaid
 from hqgs.base.ranks import RankError, Ranks, joined
 from hqgs.cli.errors import BAD_INPUT, fail
 from hqgs.cli.out_folder import check_out
 from hqgs.cli.parse import parse
 from hqgs.cli.progress import LoadingScreen, Times, TrainingScreen, duration
 from hqgs.cli.ranks import restarted, told_by_the_first
-from hqgs.cli.scenes import Apart, Factor, Flag, Folder, Kind, Number, Photos, ready, tell_notes
+from hqgs.cli.scenes import Photos, ready, tell_notes
 from hqgs.cli.view import LiveView, Open, Port
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.evaluation.verdict import judged_by, overdone, told, verdict
 from hqgs.photos.formula import parse_degradation
-from hqgs.scene.names import KEPT
+from hqgs.scene.names import KEPT, is_room
+from hqgs.scene.options import LoadOptions, PhotoOptions
 from hqgs.show.constants import PORT
 from hqgs.show.viewer.guard import check
-from hqgs.training.config import AUTO, ITEMS, METHODS, NONE, TrainConfig, run_config
-from hqgs.training.settings import (
-    PRESETS,
-    config_of_values,
-    config_values,
-    longest_side,
-    read_config,
-    with_iterations,
-    with_plan,
-)
+from hqgs.training.config import TrainConfig, TrainOptions, longest_side
+from hqgs.training.settings import config_of_values, config_values, read_config, with_plan
 
 if TYPE_CHECKING:
     from hqgs.pipeline import Run
     from hqgs.training.progress import Progress
 
 EXPERT = "--config."
-# Options that shape the scene.
-LOADING = ("downscale", "test_every", "sfm", "degrade", "restore", "frames", "distance", "tag_size", "up")
 VIEWERS = "SuperSplat (superspl.at/editor) and other viewers of 3DGS files"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(Photos):
-    """Options of `hqgs train`. None: as the preset, the file of --config or the resumed run says."""
-
+class _Into(Photos):
     out: Folder
     """Folder for the scene, the report and what is needed to go on."""
-    preset: Literal["quick", "standard", "best"] = "standard"
-    """quick: 1,000 iterations on small photos, a first look. standard: as long as it pays,
-    photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
-    iterations: Number = None
-    """Training views to see (standard: 150 for each clean photo, 4,000 at least, at most 30,000, fewer where
-    the scene has stopped improving)."""
-    batch: Number = None
-    """Views in a step (1). Several processes of torchrun share them out: docs/machines.md."""
-    seconds: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
-    """Train for S seconds, in place of --iterations: the best scene that this machine makes in them."""
-    plan: Annotated[Path | None, tyro.conf.arg(metavar="RUN", help_behavior_hint="")] = None
-    """Repeat what the seconds of another run came to, bit for bit: its folder, or its plan.json."""
-    method: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="NAME", help_behavior_hint="", help=f"One of {', '.join(METHODS)} (auto)."),
-    ] = None
-    downscale: Factor = None
-    """Divide the photos' sides by F (as the preset says)."""
-    test_every: Annotated[int, tyro.conf.arg(metavar="N")] = 8
-    """Hold out every Nth photo to measure with; 0: train on all photos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(PhotoOptions, TrainOptions, _Into):
+    """Options of `hqgs train`. None: as the preset, the file of --config or the resumed run says."""
+
     resume: Flag = False
     """Go on with the run in DIR; with a larger --iterations also where it has come to its end."""
     overwrite: Flag = False
     """Begin anew in a folder that holds a run."""
-    sfm: Flag = False
-    """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
-    frames: Number = None
-    """Frames to take from a film (two a second, 30 to 90)."""
-    distance: Apart = None
-    """Metres between the cameras of the photos A and B, or points x,y,z: the scene is written in metres."""
-    tag_size: Annotated[float | None, tyro.conf.arg(metavar="METRES", help_behavior_hint="")] = None
-    """Width of printed tags (AprilTag 36h11, ArUco) in the scene: it is written in metres, upright."""
-    up: Annotated[
-        tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")
-    ] = None
-    """Where up is, in the frame of the photos' cameras (as upright edges, tags, GPS or EXIF tell it)."""
-    degrade: Kind = "none"
-    restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS", help_behavior_hint="")] = None
-    """Send the training photos through this restoration network first."""
-    formation: Annotated[str | None, tyro.conf.arg(metavar="KIND", help_behavior_hint="")] = None
-    """What hqgs takes for the photos' degradation (auto: it looks)."""
-    guidance: Annotated[
-        Literal["formation", "paper"] | None,
-        tyro.conf.arg(help="Of hqgs: formation, or paper, its published form.", help_behavior_hint=""),
-    ] = None
-    leave_out: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="LIST",
-            help_behavior_hint="",
-            help=f"What the run may do without where the scene does not need it: {AUTO}, {NONE}, or some of "
-            f"{','.join(ITEMS)} ({AUTO}); a list without iterations trains all of them.",
-        ),
-    ] = None
-    max_gaussians: Number = None
-    """Bounds the memory (1,000,000)."""
-    eval_every: Number = None
-    """Iterations between evaluations (a tenth of the run, 50 at least)."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE"), Unsaid] = None
+    """Train with the configuration in this file: config.json of another run."""
+    plan: Annotated[Path | None, tyro.conf.arg(metavar="RUN"), Unsaid] = None
+    """Repeat what the seconds of another run came to, bit for bit: its folder, or its plan.json."""
     view: Flag = False
     """Show the scene in a browser while it trains, and afterwards until Ctrl-C."""
     port: Port = PORT
     open: Open = False
     threads: Number = None
     """CPU threads (all cores; the result does not depend on it)."""
-    seed: Annotated[int | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
-    """Another seed gives another run of the same quality (0)."""
-    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """Train with the configuration in this file: config.json of another run."""
     help_all: Flag = False
     """Show every number of the training too: --config.densify.grad-threshold and so on."""
 
@@ -154,57 +96,28 @@ def read(options: type[Train], command: str, about: str, arguments: Sequence[str
 
 def config_of(options: Train) -> TrainConfig:
     """The configuration that the options ask for. ValueError for a bad one."""
-    preset = PRESETS[options.preset]
-    kept = options.out / CONFIG
-    file = options.config
-    if file is None and options.resume and kept.is_file() and (options.out / CHECKPOINT).exists():
-        file = kept
-    iterations = options.iterations
-    given = [name for name in ("iterations", "seconds", "plan") if getattr(options, name) is not None]
-    if len(given) > 1:
+    if len(given := [n for n in ("iterations", "seconds", "plan") if getattr(options, n) is not None]) > 1:
         raise ValueError(f"only one of --{' and --'.join(given)} can be given")
-    if file is not None:
-        config = read_config(file)
-        # Else the checkpoint alone knows how long the run was.
-        known = "iterations" not in config.leave_out and config.seconds is None
-        if known and file == kept and iterations is not None and iterations < config.iterations:
+    before = _before(options)
+    file = options.config or (None if before is None else before.folder)
+    kept = None if file is None else read_config(file)
+    asked = options.resolved(kept)
+    # Where it ends when it no longer pays, or by the clock, the checkpoint alone knows how long the run was.
+    if kept is not None and "iterations" not in kept.leave_out and kept.seconds is None:
+        shorter = asked.iterations < kept.iterations
+        if shorter and before is not None and options.config is None:
             raise ValueError(
-                f"iterations is {iterations}, and the run in {options.out} has {config.iterations}: --resume "
-                "can make it longer, not shorter"
+                f"iterations is {asked.iterations}, and the run in {options.out} has {kept.iterations}: "
+                "--resume can make it longer, not shorter"
             )
-        if iterations is not None and (iterations != config.iterations or not known):
-            config = replace(with_iterations(config, iterations), seconds=None, turn=None, timed=None)
-    else:
-        length = preset.iterations if iterations is None else iterations
-        config = run_config(iterations=length, leave_out=options.leave_out or AUTO)
-    asked = run_config(iterations=config.iterations, leave_out=options.leave_out or AUTO)
-    changes: dict[str, Any] = {
-        name: value
-        for name in ("method", "seed", "eval_every", "batch")
-        if (value := getattr(options, name)) is not None
-    }
-    if options.leave_out is not None and file is not None:
-        changes["leave_out"] = asked.leave_out
-    if options.max_gaussians is not None:
-        changes["densify"] = replace(config.densify, max_gaussians=options.max_gaussians)
-    of_hqgs = {
-        name: value for name in ("guidance", "formation") if (value := getattr(options, name)) is not None
-    }
-    if options.seconds is not None:
-        changes["seconds"] = options.seconds
-    config = replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
-    return config if options.plan is None else with_plan(config, options.plan)
+    return asked if options.plan is None else with_plan(asked, options.plan)
 
 
-def scene_of_run(out: Path) -> dict[str, Any]:
-    """What the run in a folder asked `hqgs.load` for; empty where nothing tells."""
-    if not ((out / CONFIG).is_file() and (out / CHECKPOINT).is_file()):
-        return {}
-    try:
-        origin = json.loads((out / CONFIG).read_text(encoding="utf-8")).get("scene") or {}
-    except (ValueError, AttributeError):
-        return {}
-    return {name: value for name, value in origin.items() if name in (*LOADING, "longest")}
+def _before(options: Train) -> RunFolder | None:
+    """The run that goes on."""
+    run = RunFolder(options.out)
+    goes_on = options.resume and run.config and (options.out / CHECKPOINT).exists()
+    return run if goes_on else None
 
 
 def run(options: Train) -> int:
@@ -250,15 +163,14 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
     elif ranks.local > 1:
         hqgs.set_num_threads(max(1, hqgs.get_num_threads() // ranks.local))
     ready(options.scene)
-    from hqgs.scene.next_photos import told_next  # here: it loads scenes
+    from hqgs.scene.next_photos import told_next  # here: they load torch
+    from hqgs.scene.source import load_as
 
-    asked = ranks.tell(_asked(options, config) if ranks.first else None)[0]
+    asked = ranks.tell(loading(options, config) if ranks.first else None)[0]
     with LoadingScreen() as screen:
         if not ranks.first:
             ranks.tell(None)  # what COLMAP finds for the first one, the others read
-        scene = hqgs.load(
-            **asked, skip_unreadable="photos" in config.leave_out, cache=options.out, on_stage=screen.stage
-        )
+        scene = load_as(LoadOptions(**asked), options.out, on_stage=screen.stage)
         if ranks.first:
             ranks.tell(None)
     tell_notes(scene)
@@ -295,7 +207,7 @@ def _train(options: Train, ranks: Ranks) -> tuple[Run, LiveView | None, LoadingS
 def _checked(options: Train) -> TrainConfig:
     """The configuration of options that can be used."""
     config = options.expert if isinstance(options, Whole) else config_of(options)
-    parse_degradation(options.degrade)
+    parse_degradation(options.degrade or "none")
     for line in check_out(options.out, options.scene, options.resume, options.overwrite):
         print(line, flush=True)
     if options.view:
@@ -303,19 +215,17 @@ def _checked(options: Train) -> TrainConfig:
     return config
 
 
-def _asked(options: Train, config: TrainConfig) -> dict[str, Any]:
-    """What `hqgs.load` is to give; where a run goes on, as it was, but for what the options say otherwise."""
-    asked: dict[str, Any] = {
-        name: value for name in LOADING if (value := getattr(options, name)) != getattr(Train, name)
-    }
-    sized = options.downscale is not None or options.preset != Train.preset
-    before = scene_of_run(options.out) if options.resume else {}
-    if sized or not before:
-        asked["longest"] = longest_side(options.preset, options.downscale)
+def loading(options: Train, config: TrainConfig) -> dict[str, Any]:
+    """What `load_as` is to give, as JSON values; where a run goes on, as it was, but for what is said."""
+    run = _before(options)
+    before = {} if run is None else dict(run.loaded)
+    if options.downscale is not None or options.preset is not None or not before:
+        before["longest"] = longest_side(options.preset, options.downscale)
         before.pop("downscale", None)
-    if "restore" in asked:
-        asked["restore"] = str(asked["restore"])
-    return before | asked | {"path": options.scene, "seed": config.seed}
+    unreadable = "photos" in config.leave_out
+    path = str(options.scene if is_room(options.scene) else Path(options.scene).expanduser().resolve())
+    said = options.said() | {"path": path, "seed": config.seed, "skip_unreadable": unreadable}
+    return before | said
 
 
 def _summary(options: Train, done: Run, colmap: float, times: Times) -> None:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from hqgs.cli.errors import BAD_INPUT, fail
-from hqgs.cli.scenes import cameras_beside, heed_endings, tell_read
+from hqgs.cli.scenes import heed_endings, tell_read
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.model.formats.files import scene_file
 from hqgs.show.constants import PORT
 from hqgs.show.viewer.guard import ELSEWHERE, check
@@ -49,21 +50,13 @@ def run(options: ViewOptions, seconds: float | None = None) -> int:
         file = scene_file(options.source)
         check(options.port)
         from hqgs.evaluation.photo_facts import facts_of_photos  # here: they load torch
-        from hqgs.evaluation.report import report_in
         from hqgs.model.gaussians import Gaussians
         from hqgs.show.viewer.viewer import Viewer
 
         heed_endings()
-        gaussians = Gaussians.load(file)
-        folder = file.parent
-        report = report_in(folder)
-        viewer = Viewer(
-            cameras_beside(file),
-            folder,
-            port=options.port,
-            title=folder.resolve().name,
-            source=options.source,
-        )
+        gaussians, run = Gaussians.load(file), RunFolder.open(file)
+        report, title = run.report, run.folder.resolve().name
+        viewer = Viewer(run.cameras, run.folder, port=options.port, title=title, source=options.source)
     except BAD_INPUT as error:
         return fail(2, error)
     try:
@@ -97,7 +90,7 @@ class LiveView:
         """
         from hqgs.show.viewer.viewer import Viewer
 
-        viewer = Viewer(cameras_beside(self._out), self._out, port=self._port, title=self._scene.name)
+        viewer = Viewer(RunFolder(self._out).cameras, self._out, port=self._port, title=self._scene.name)
         _tell(viewer.url, self._open)
         return viewer
 
@@ -120,10 +113,9 @@ class LiveView:
     def stay(self) -> None:
         """Go on showing the trained scene, and what the report says of its photos, until Ctrl-C."""
         from hqgs.evaluation.photo_facts import facts_of_photos
-        from hqgs.evaluation.report import report_in
         from hqgs.model.gaussians import Gaussians
 
-        report = report_in(self._out)
+        report = RunFolder(self._out).report
         if self._copied < 0:  # a run that had ended already makes no step
             gaussians = Gaussians.load(self._out)
             self.viewer.set_scene(gaussians, _numbers(report, len(gaussians)))

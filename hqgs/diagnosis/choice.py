@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.evenly import evenly
-from hqgs.base.left_out import LeftOut
+from hqgs.base.left_out import PHOTO, LeftOut
 from hqgs.base.text import some
 from hqgs.diagnosis.constants import (
     CHOICE_LEAST_BLUR,
@@ -85,7 +85,7 @@ def choose_photos(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     if not drops and not notes:
         return scene, []
     train = [view for view in scene.train if not any(view is drop.view for drop in drops)]
-    left_out = [LeftOut(f"training photo {d.view.name}", d.why, d.evidence) for d in drops]
+    left_out = [LeftOut(f"{PHOTO}{d.view.name}", d.why, d.evidence) for d in drops]
     return replace(scene, train=train, notes=[*scene.notes, *notes]), left_out
 
 

@@ -152,7 +152,7 @@ class Inspector:
         jpeg = _jpeg(photos, alone=not any(part.needed for part in (*faults, film)))
         parts = (*own, *faults, jpeg, film)
         text = "+".join(part.step for part in parts if part.step is not None) or NONE
-        passed_over = _passed_over(len(scene.train), len(photos), taken)
+        passed_over = _passed_over(scene.of or len(scene.train), len(photos), taken)
         self.last = Diagnosis(scene.name, str(parse_formation(text)), parts, photos, passed_over)
         return self.last
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hqgs.evaluation.records import LearnedRecord
-from hqgs.evaluation.report import REPORT, read_report, report_in
+from hqgs.base.files import REPORT
+from hqgs.evaluation.records import LearnedRecord, read_report
+from hqgs.evaluation.run_folder import RunFolder
 from hqgs.photos.look import Look
 from hqgs.scene.scene import View
 
@@ -31,8 +32,8 @@ def looks_of_devices(views: Sequence[View], looks: Mapping[str, Look]) -> dict[s
 
 def looks_beside(file: Path, views: Sequence[View]) -> dict[str, Look]:
     """Those of `looks_of_devices` of the run that a scene file lies in; `views`: its training photos."""
-    report = report_in(file.parent)
-    return {} if report is None else looks_of_devices(views, _looks(report["learned"]))
+    report = RunFolder.open(file).report
+    return {} if report is None else looks_of_devices(views, _looks(report.get("learned", [])))
 
 
 def _looks(learned: Sequence[LearnedRecord]) -> dict[str, Look]:

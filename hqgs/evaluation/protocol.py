@@ -21,8 +21,9 @@ COMPARED = {  # what must be equal, in the order in which it is told
     "sizes": "the sizes of the photos",
     "pixels": "the photos' pixels or masks (their digest)",
     "background": "the backgrounds",
-    "rules": "the rules of measuring",
+    "version": "the rules of measuring",
 }
+VERSION = 1  # of RULES: raised where numbers come to differ; a judge.json without one is of the first
 RULES = {
     "color": "sRGB values as the photos store them, white is 1; renders clamped to 0..1, not rounded",
     "cameras": "pinholes; distorted photos undistorted on load",
@@ -53,6 +54,7 @@ def protocol_of(
         "background": [*background],
         "downscale": origin.get("downscale", 1.0),
         "longest": origin.get("longest"),
+        "version": VERSION,
         "rules": RULES,
     }
 
@@ -105,16 +107,13 @@ def read_judgement(path: Path) -> dict[str, Any]:
 def check_comparable(one: Mapping[str, Any], other: Mapping[str, Any], name: str) -> None:
     """ValueError that says by name what keeps the numbers of two protocols from being compared."""
     for key, words in COMPARED.items():
-        here, there = one[key], other.get(key)
+        here, there = one[key], other.get(key, 1 if key == "version" else None)
         if here != there:
             raise ValueError(f"{name} cannot be compared: {words} differ, {_apart(here, there)}")
 
 
 def _apart(here: Any, there: Any) -> str:
     """In what two values of a protocol differ, the first of it."""
-    if isinstance(here, dict) and isinstance(there, dict):
-        rule = next(rule for rule in {**here, **there} if here.get(rule) != there.get(rule))
-        return f"{rule}: {here.get(rule)!r} here and {there.get(rule)!r} there"
     if isinstance(here, list) and isinstance(there, list) and len(here) != len(there):
         return f"{len(here)} here and {len(there)} there"
     if isinstance(here, list) and isinstance(there, list):

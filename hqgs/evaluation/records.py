@@ -1,11 +1,13 @@
-"""What report.json holds, as types."""
+"""What report.json holds, as types, and its reading."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, cast
 
+from hqgs.base.files import read_json
 from hqgs.base.left_out import LeftOutRecord
 from hqgs.base.machine import MachineFacts
 
@@ -176,3 +178,15 @@ class Report(RunRecord):
     metrics: MetricsRecord
     machine: MachineFacts
     versions: dict[str, str | None]
+
+
+def read_report(path: str | Path) -> Report:
+    """Read a report.json. Raises FileNotFoundError, or ValueError where the file is no report."""
+    path = Path(path)
+    report = read_json(path)
+    if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
+        raise ValueError(f"{path} is no hqgs report: it has no metrics")
+    missing = {"mean", "views", "reasons"} - report["metrics"].keys()
+    if missing:
+        raise ValueError(f"{path} is no hqgs report: its metrics lack {', '.join(sorted(missing))}")
+    return cast(Report, report)

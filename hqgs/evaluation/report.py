@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 from PIL import Image
 
-from hqgs.base.files import read_json, write_json
+from hqgs.base.files import PICTURES, REPORT, write_json
 from hqgs.base.machine import machine_facts, version_facts
 from hqgs.evaluation.constants import AMPLIFICATION, CONFIDENCE, MASKED, PNG_LEVEL
 from hqgs.evaluation.held_out import RenderedView, measured, names_of
@@ -25,8 +25,6 @@ from hqgs.evaluation.records import MetricsRecord, MetricValues, Report, RunReco
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.photos.sheet import printable, sheet
-
-REPORT, PICTURES = "report.json", "comparison"
 
 
 @dataclass(frozen=True)
@@ -89,23 +87,6 @@ def _written(out_dir: Path, result: RunResult) -> Report:
         for file in (*(f"{PICTURES}/{file}" for file in files), REPORT):
             (stage / file).replace(out_dir / file)
     return report
-
-
-def read_report(path: str | Path) -> Report:
-    """Read a report.json. Raises FileNotFoundError, or ValueError where the file is no report."""
-    path = Path(path)
-    report = read_json(path)
-    if not isinstance(report, dict) or not isinstance(report.get("metrics"), dict):
-        raise ValueError(f"{path} is no hqgs report: it has no metrics")
-    missing = {"mean", "views", "reasons"} - report["metrics"].keys()
-    if missing:
-        raise ValueError(f"{path} is no hqgs report: its metrics lack {', '.join(sorted(missing))}")
-    return cast(Report, report)
-
-
-def report_in(folder: Path) -> Report | None:
-    """Of the run in a folder; None where there is none. ValueError where it is damaged."""
-    return read_report(folder / REPORT) if (folder / REPORT).is_file() else None
 
 
 def comparison_picture(view: RenderedView, metrics: ViewMetrics) -> Image.Image:

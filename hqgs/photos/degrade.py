@@ -1,8 +1,8 @@
 """How photos get bad, as pure functions of photos and generators.
 
 Photos are sRGB as stored, scaled to [0, 1]. JPEG, noise, low resolution, blur, defocus and motion happen to
-these values and nothing is linearised, as in the field's benchmarks; what a hand or a camera does happens in
-linear light (shake, exposure, phone).
+these values and nothing is linearised, as in the field's benchmarks. What else happens to photos, the
+benchmarks add to `OPERATORS`, `FILES` and `FILMS`.
 """
 
 from __future__ import annotations
@@ -16,18 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.threads import one_torch_thread
-from hqgs.photos.camera import draw_gains, expose
-from hqgs.photos.constants import CHAT_QUALITIES, FULL_WELL, KERNEL_REACH
+from hqgs.photos.constants import KERNEL_REACH
 from hqgs.photos.formula import KINDS, Degradation, DegradationStep, small_side
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.kernels import disc_kernel, motion_kernel
-from hqgs.photos.light import to_linear, to_srgb
-from hqgs.photos.phone import phone_jpeg
 from hqgs.photos.pixels import Float32, as_floats
 from hqgs.photos.resize import resize
-from hqgs.photos.shake import draw_path, draw_strength, path_length, shake_kernel
-from hqgs.photos.video import film
-from hqgs.photos.walkers import walk_in
 
 Record = dict[str, Any]  # what one step did to one photo: "kind", "value" and the kind's own values, for JSON
 
@@ -52,19 +46,11 @@ def degrade_image(
 
     Low-res makes the photo small; later steps then happen to the small photo, and at the end bicubic
     resizing brings it back to H x W. What is random comes from `rng`, in the order of the steps. A `some`
-    step happens with `factor` times its value, and not at all without one. A video is a film of this one
-    photo; `degrade_sequence` is for more. ValueError for a photo of another type or shape, one that is not
-    finite, or a blur too wide for it.
+    step happens with `factor` times its value, and not at all without one. ValueError for a photo of another
+    type or shape, one that is not finite, or a blur too wide for it.
 
     What the records hold beside "kind" and "value" (the step's, with its factor):
-    motion: "direction" (radians from x towards y, which points down);
-    shake: "extent" and "length" of the path in px, and "path", its four knots [[x, y], ...] in px
-    (`hqgs.photos.shake`); the extent is uniform in [0.2, 1] times the value;
-    exposure: "gains" of red, green and blue in linear light (`hqgs.photos.camera`);
-    crowd: "walkers", each with place and looks (`hqgs.photos.walkers`);
-    chat: "size" of the small photo [width, height] and "quality";
-    phone: "electrons" of white;
-    video, video265, videorate: "frame" (its type: I, P or B) and "bytes" of the compressed frame.
+    motion: "direction" (radians from x towards y, which points down).
     """
     return degrade_sequence([image], degradation, [rng], [factor])[0]
 
@@ -86,12 +72,10 @@ def degrade_sequence(
         if KINDS[step.kind].film:
             value = all_steps[0][k].value or 0
             value = int(value) if KINDS[step.kind].integer else value
-            frames = film([photo.now for photo in photos], value, step.kind)
-            for photo, frame in zip(photos, frames, strict=True):
-                photo.now, photo.jpeg = frame.image, None
-                photo.records.append(
-                    {"kind": step.kind, "value": value, "frame": frame.kind, "bytes": frame.bytes}
-                )
+            frames = FILMS[step.kind]([photo.now for photo in photos], value)
+            for photo, (image, own) in zip(photos, frames, strict=True):
+                photo.now, photo.jpeg = image, None
+                photo.records.append({"kind": step.kind, "value": value, **own})
             continue
         for photo, steps, factor in zip(photos, all_steps, factors, strict=True):
             if not step.some:
@@ -118,15 +102,13 @@ class _Photo:
         """One step that has a value and concerns this photo alone."""
         value, self.jpeg = step.value or 0.0, None
         own: Record = {}
-        if step.kind == "jpeg":
-            self._store(encode_jpeg(self.now, int(value)))
-        elif step.kind == "phone":
-            self._store(phone_jpeg(self.now, value, self._rng))
-            own = {"electrons": FULL_WELL / 2**value}
+        if step.kind in FILES:
+            self.jpeg, own = FILES[step.kind](self.now, value, self._rng)
+            self.now = decode_jpeg(self.jpeg)
         elif step.kind == "lowres":
             self.now, self.small = shrink(self.now, int(value)), True
         else:
-            self.now, own = _OPERATORS[step.kind](self.now, value, self._rng)
+            self.now, own = OPERATORS[step.kind](self.now, value, self._rng)
         self.records.append({"kind": step.kind, "value": step.value, **own})
 
     def degraded(self) -> Degraded:
@@ -134,9 +116,6 @@ class _Photo:
             width, height = self.size
             return Degraded(resize(self.now, height, width), self.now, self.jpeg, self.records)
         return Degraded(self.now, None, self.jpeg, self.records)
-
-    def _store(self, jpeg: bytes) -> None:
-        self.now, self.jpeg = decode_jpeg(jpeg), jpeg
 
 
 def add_noise(image: Float32, sigma: float, rng: np.random.Generator) -> Float32:
@@ -185,75 +164,28 @@ def convolve(image: Float32, kernel: NDArray[np.float64]) -> Float32:
     return fftconvolve(padded, kernel[..., None], mode="valid", axes=(0, 1)).astype(np.float32)
 
 
-def shake(image: Float32, knots: NDArray[np.float64]) -> Float32:
-    """The mean over the exposure, in linear light, of the photo [H, W, 3] moved along a path in px.
-
-    `knots` [4, 2] (x right, y down) are those of `shake_kernel`: a point of light draws its path into the
-    photo. ValueError if the photo is smaller than the path reaches.
-    """
-    return to_srgb(convolve(to_linear(image), shake_kernel(knots)))
+Own = tuple[Float32, Record]  # the photo, and what its record gets
 
 
-def chat(image: Float32, side: int, quality: int) -> Float32:
-    """What a messenger makes of a photo [H, W, 3], at its size.
-
-    Antialiased bicubic shrinking until the longest side has `side` px (a photo that is no larger keeps its
-    size), the other side rounded; a JPEG of this quality with 4:2:0 chroma; bicubic enlarging.
-    """
-    height, width = image.shape[:2]
-    small = resize(image, *_chat_size(height, width, side))
-    return resize(decode_jpeg(encode_jpeg(small, quality)), height, width)
-
-
-def _chat_size(height: int, width: int, side: int) -> tuple[int, int]:
-    share = min(side / max(height, width), 1)
-    return max(round(height * share), 1), max(round(width * share), 1)
-
-
-_Own = tuple[Float32, Record]  # the photo, and what its record gets
-
-
-def _plain(operator: Callable[[Float32, float, np.random.Generator], Float32]) -> Callable[..., _Own]:
+def _plain(operator: Callable[[Float32, float, np.random.Generator], Float32]) -> Callable[..., Own]:
     return lambda image, value, rng: (operator(image, value, rng), {})
 
 
-def _motion(image: Float32, length: float, rng: np.random.Generator) -> _Own:
+def _motion(image: Float32, length: float, rng: np.random.Generator) -> Own:
     direction = rng.uniform(0, math.pi)
     return convolve(image, motion_kernel(length, direction)), {"direction": direction}
 
 
-def _shake(image: Float32, longest: float, rng: np.random.Generator) -> _Own:
-    extent = longest * draw_strength(rng)
-    knots = draw_path(rng, extent)
-    return shake(image, knots), {"extent": extent, "length": path_length(knots), "path": knots.tolist()}
-
-
-def _exposure(image: Float32, stops: float, rng: np.random.Generator) -> _Own:
-    gains = draw_gains(rng, stops)
-    return expose(image, gains), {"gains": gains.tolist()}
-
-
-def _crowd(image: Float32, most: float, rng: np.random.Generator) -> _Own:
-    photo, walkers = walk_in(image, int(most), rng)
-    return photo, {"walkers": walkers}
-
-
-def _chat(image: Float32, side: float, rng: np.random.Generator) -> _Own:
-    quality = int(rng.integers(CHAT_QUALITIES[0], CHAT_QUALITIES[1] + 1))
-    height, width = _chat_size(image.shape[0], image.shape[1], int(side))
-    return chat(image, int(side), quality), {"size": [width, height], "quality": quality}
-
-
-_OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], _Own]] = {
+OPERATORS: dict[str, Callable[[Float32, float, np.random.Generator], Own]] = {
     "noise": _plain(add_noise),
     "blur": _plain(lambda image, sigma, rng: gaussian_blur(image, sigma)),
     "defocus": _plain(lambda image, radius, rng: convolve(image, disc_kernel(radius))),
     "motion": _motion,
-    "shake": _shake,
-    "exposure": _exposure,
-    "crowd": _crowd,
-    "chat": _chat,
-}
+}  # by the kind: of a photo, the value and the photo's generator
+FILES: dict[str, Callable[[Float32, float, np.random.Generator], tuple[bytes, Record]]] = {
+    "jpeg": lambda image, quality, rng: (encode_jpeg(image, int(quality)), {})
+}  # that make a JPEG file of a photo
+FILMS: dict[str, Callable[[Sequence[Float32], float], list[Own]]] = {}  # of all photos at once
 
 
 def _check_fits(image: Float32, radius: int, what: str) -> None:

@@ -39,19 +39,10 @@ KINDS = {
     "vignetting": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "response": Kind(0, math.inf, "no value", default=0, some=False, own="camera"),
     "grain": Kind(0, math.inf, "no value", default=0, some=False, own="found"),
-    "chat": Kind(
-        8, 10000, "the longest side in px", "SIDE", integer=True, at_504=252, formation=False, longest=True
-    ),
-    "phone": Kind(0, 12, "stops of light that are missing", "EV", default=4, formation=False, file=True),
     "video": Kind(
         0, 51, "a constant rate factor", "CRF", integer=True, default=36, some=False, film=True, own="found"
     ),
-    "crowd": Kind(1, 99, "the most walkers in a photo", "N", integer=True, default=3, formation=False),
-}
-KINDS["video265"] = replace(KINDS["video"], formation=False, own=None)
-KINDS["videorate"] = Kind(
-    0.01, 8, "bits a pixel", "BITS", default=0.1, formation=False, some=False, film=True
-)
+}  # the benchmarks have more
 NONE, MIXED, SOME = "none", "mixed", "some"
 DEVICES = tuple(name for name, kind in KINDS.items() if kind.own == "camera")  # in all photos of a camera
 LEARNED = tuple(name for name, kind in KINDS.items() if kind.own in ("photo", "camera"))
@@ -60,14 +51,11 @@ LINEAR = frozenset({"blur", "defocus", "motion", "lowres"})  # they take fine de
 ERRORS = frozenset({"noise", "jpeg"})  # all photos show what is not there
 FILM = frozenset({"video"})  # the kinds of a film of which its codec alone is told
 NOT_MADE = {
-    "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; the built-in "
-    "scene true-defocus is photographed through a lens, and defocus:R blurs the whole photo",
-    **dict.fromkeys(
-        DEVICES,
-        "it is of each camera, and photos do not tell which one took them; the built-in scene true-devices "
-        "is photographed by several",
-    ),
+    "focus": "focus goes by the depth of what a photo shows, which the photo does not tell; "
+    "defocus:R blurs the whole photo",
+    **dict.fromkeys(DEVICES, "it is of each camera, and photos do not tell which one took them"),
     "grain": "grain says that each photo has noise of its own; some:noise:SIGMA makes such photos",
+    **dict.fromkeys(("shake", "exposure", "video"), "hqgs undoes it; only its benchmarks make such photos"),
 }  # what a method can be told of only, and what to write for photos
 
 
@@ -173,19 +161,11 @@ def parse_degradation(text: str) -> Degradation:
     |---|---|---|
     | `jpeg:Q`, `noise:S`, `lowres:N` | a quality, sigma in levels, a factor | `degrade_image` |
     | `blur[:SIGMA]`, `defocus[:R]`, `motion[:LENGTH]` | one kernel, in px, on the values as stored | same |
-    | `shake[:PX]` | a curved path of its own in each photo, in linear light | `hqgs.photos.shake` |
-    | `exposure[:EV]` | gain and white balance of its own in each photo | `hqgs.photos.camera` |
-    | `crowd[:N]` | 0 to N people walk through each photo | `hqgs.photos.walkers` |
-    | `chat[:SIDE]` | a messenger: shrunk, JPEG, enlarged | `hqgs.photos.degrade` |
-    | `phone[:EV]` | a phone in low light: mosaic, noise, its processing, JPEG | `hqgs.photos.phone` |
-    | `video[:CRF]`, `video265[:CRF]` | H.264 or H.265 over all photos, sorted by name | `hqgs.photos.video` |
-    | `videorate[:BITS]` | H.264 at a rate that varies below a bound, in bits a pixel | same |
     | `mixed` | `blur+lowres:2+noise:10+jpeg:20` | |
     | `some:STEP` | the step in half of the training photos only, at mixed strengths | `hqgs.scene.degrade` |
 
-    Without a value, blur, defocus, motion and shake take 2.5, 5, 15 and 12 px for a width of 504 px and scale
-    with the photo's width; chat takes half of the longest side, exposure 1, crowd 3, phone 4, videos 36
-    and 0.1 bits. ValueError names what is wrong and the values there are.
+    Without a value, blur, defocus and motion take 2.5, 5 and 15 px for a width of 504 px and scale with the
+    photo's width. ValueError names what is wrong and the values there are.
     """
     degradation = _parsed(text)
     for step in degradation.steps:

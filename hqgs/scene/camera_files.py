@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path, read_json, write_json
+from hqgs.base.files import CAMERAS, PHOTOS, atomic_path, read_json, write_json
 from hqgs.photos.constants import FPS, LARGEST
 from hqgs.photos.pixels import as_floats, to_uint8, upright
 from hqgs.scene.constants import BACKGROUND, KEPT_SIDE, MOST_FRAMES
@@ -20,7 +20,6 @@ from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene
 from hqgs.scene.world import World
 
-CAMERAS, PHOTOS = "cameras.json", "photos"
 _FLIP = np.diag([1.0, -1.0, -1.0])  # OpenGL's camera axes (y up, z back) to OpenCV's
 
 

@@ -156,20 +156,22 @@ def coarsely(longest: int | None, coarse: bool | None = None) -> bool:
 
 
 def load_pictures(
-    path: str | Path, downscale: float = 1.0, most: int = 16, longest: int | None = None
+    path: str | Path, downscale: float = 1.0, most: int = 16, longest: int | None = None, test_every: int = 0
 ) -> Scene | None:
     """Some photos of a folder that holds photos alone, spread over it, as a scene that has no poses.
 
     Each camera is a placeholder: a plausible one at the origin. None where the folder has cameras of its own.
-    `longest` bounds all photos of the folder as `load_scene` does. ValueError where it holds neither.
+    `longest` bounds all photos of the folder as `load_scene` does, and those that `test_every` holds out are
+    not among them. `Scene.of` tells how many they were chosen from. ValueError where it holds neither.
     """
     root, _ = scene_folder(path)
     if formats_of(root, downscale) or (found := bare_photos(root, downscale)) is None:
         return None
     photos = readable(found)
     names, details = photos.names, frame_details(photos.folder)
+    trained = [k for k in range(len(names)) if not test_every or k % test_every]
     chosen = []
-    for k in evenly(len(names), most // len(CUBE) if photos.around else most):
+    for k in (trained[i] for i in evenly(len(trained), most // len(CUBE) if photos.around else most)):
         size = photos.sizes[k]
         camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 1.2 * max(size), *size)
         camera = around(*size) if photos.around else camera
@@ -186,7 +188,9 @@ def load_pictures(
     notes = [f"cannot be read ({len(photos.unreadable)}): {some(sorted(photos.unreadable))}"]
     nothing = no_points()
     points, colors = nothing[0].astype(np.float32), nothing[1]
-    return Scene(root.name, views, [], points, colors, "photos", notes if photos.unreadable else [])
+    notes = notes if photos.unreadable else []
+    of = len(trained) * (len(CUBE) if photos.around else 1)
+    return Scene(root.name, views, [], points, colors, "photos", notes, of=of)
 
 
 def check_names(path: str | Path, downscale: float, distance: Distance) -> None:

@@ -5,19 +5,7 @@ from __future__ import annotations
 from difflib import get_close_matches
 from pathlib import Path
 
-EMBEDDED, SPARSE, BEYOND, PANORAMA = "embedded", "sparse", "beyond", "true-panorama"
-# In the place of a scene folder: what is built in. From the fourth on they may have a value, `true-shake:8`.
-ROOMS = (
-    EMBEDDED,
-    SPARSE,
-    PANORAMA,
-    BEYOND,
-    "true-shake",
-    "true-defocus",
-    "true-exposure",
-    "true-devices",
-    "true-crowd",
-)
+EMBEDDED = "embedded"  # in the place of a scene folder: the room that is built in
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mts")
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 SCENE_SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf")
@@ -37,7 +25,7 @@ def existing_folder(path: str | Path) -> Path:
             names = [entry.name for entry in folder.parent.iterdir() if entry.is_dir()]
             alike = get_close_matches(folder.name, names, n=1)
             near = f"; did you mean {folder.parent / alike[0]}?" if alike else ""
-        if not near and (alike := get_close_matches(str(path), ROOMS, n=1)):
+        if not near and (alike := get_close_matches(str(path), [EMBEDDED], n=1)):
             near = f"; did you mean the built-in {alike[0]}?"
         raise FileNotFoundError(f"there is no scene folder {folder}{near}")
     if folder.is_dir():
@@ -54,5 +42,5 @@ def existing_folder(path: str | Path) -> Path:
 
 
 def is_room(name: str | Path) -> bool:
-    """Whether this names a built-in scene."""
-    return str(name).partition(":")[0] in ROOMS
+    """Whether this names the built-in scene: a folder of that name comes first."""
+    return str(name) == EMBEDDED and not Path(name).exists()

@@ -16,18 +16,16 @@ from pathlib import Path, PurePosixPath
 from unicodedata import normalize
 from urllib.parse import unquote
 
-from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PAGE, PLAN, PLY
+from hqgs.base.files import CHECKPOINT, CONFIG, LOCK, PLY, RUN_FILES, RUN_FOLDERS
 from hqgs.base.text import some
 from hqgs.photos.files import PHOTO_SUFFIXES
-from hqgs.scene.names import FILM_SUFFIXES, KEPT, is_room
+from hqgs.scene.names import FILM_SUFFIXES, KEPT
 
 MASKS = "masks"
 _NO_PHOTOS = re.compile(
     r"(depths?|confidence|normals?|masks?|segmentations?|semantics?|labels|thumb(nail)?s)([_-]?(maps?|images?))?",
     re.IGNORECASE,
 )
-_FILES = (CHECKPOINT, CONFIG, PAGE, PLAN, PLY, "report.json", "cameras.json", "learned.png")
-_FOLDERS = ("photos", "comparison")  # a run writes pictures into them
 _MARKED = re.compile(r"masks?[._ -](?P<after>.+)|(?P<before>.+)[._ -]masks?", re.IGNORECASE)
 Key = tuple[str, ...]
 
@@ -85,7 +83,8 @@ def strangers(out: Path) -> list[str]:
     if not out.is_dir() or is_run(out) or (out / KEPT).exists():
         return []
     names = sorted(path.name for path in out.iterdir() if path.name[0] != ".")
-    taken = [name for name in names if name in _FILES or (name in _FOLDERS and any((out / name).iterdir()))]
+    held = {name for name in RUN_FOLDERS if name in names and any((out / name).iterdir())}
+    taken = [name for name in names if name in RUN_FILES or name in held]
     if taken:
         raise FileExistsError(
             f"{out} holds {some(taken)}, of no run, which a run would write over: name another folder"
@@ -125,7 +124,7 @@ def film_at(path: str | Path) -> Path | None:
     path = Path(path).expanduser()
     if path.is_file():
         return path if path.name.lower().endswith(FILM_SUFFIXES) else None
-    if is_room(path) or not path.is_dir() or is_run(path) or below(path, PHOTO_SUFFIXES):
+    if not path.is_dir() or is_run(path) or below(path, PHOTO_SUFFIXES):
         return None
     films = below(path, FILM_SUFFIXES)
     return films[0] if len(films) == 1 else None

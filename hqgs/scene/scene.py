@@ -91,6 +91,7 @@ class Scene:
     origin: dict[str, Any] | None = None  # what `hqgs.load` was asked for, JSON values; None: made otherwise
     world: World = field(default_factory=World)  # the frame of its files, where that is another
     guessed: bool = False  # whether its points lie at random depths
+    of: int | None = None  # training photos that those here were chosen from; None: they are all
 
     @property
     def place(self) -> Georeference | None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
 from hqgs.base.evenly import evenly
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.orbit import orbit
-from hqgs.scene.camera_files import CAMERAS, load_cameras
+from hqgs.scene.camera_files import RunCameras
 from hqgs.scene.constants import KEPT_SIDE
 from hqgs.scene.geometry import shrunk_camera
 from hqgs.scene.scene import Camera
@@ -38,13 +37,12 @@ class Change:
         )
 
 
-def measure(before: Gaussians, after: Gaussians, run: Path | None) -> Change:
-    """Renders of both by a few cameras of the run in a folder, held-out ones where there are some.
+def measure(before: Gaussians, after: Gaussians, known: RunCameras | None) -> Change:
+    """Renders of both by a few cameras of a run, held-out ones where there are some.
 
-    Without a folder, or cameras in it, by some around the scene. ValueError for a scene of which nothing can
-    be seen, or cameras that are damaged.
+    Without any by some around the scene. ValueError for a scene of which nothing can be seen.
     """
-    said, cameras = _cameras(before, run)
+    said, cameras = _cameras(before, known)
     after = after.in_world(before.world)
     squares, total, count, worst = 0.0, 0.0, 0, (0.0, ("", 0, 0))
     with torch.no_grad():
@@ -60,9 +58,9 @@ def measure(before: Gaussians, after: Gaussians, run: Path | None) -> Change:
     return Change(said, psnr, total / count, *worst)
 
 
-def _cameras(gaussians: Gaussians, run: Path | None) -> tuple[str, list[tuple[str, Camera]]]:
-    if run is not None and (run / CAMERAS).is_file():
-        views = load_cameras(run).views
+def _cameras(gaussians: Gaussians, known: RunCameras | None) -> tuple[str, list[tuple[str, Camera]]]:
+    if known is not None:
+        views = known.views
         kind = "held-out views" if any(view.held_out for view in views) else "training views"
         views = [view for view in views if view.held_out] or views
         chosen = [views[k] for k in evenly(len(views), CHANGE_VIEWS)]

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
+import tyro
+
+from hqgs.base.options import Number, Seconds, Seed, Unsaid, choice
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.constants import BACKGROUND
@@ -29,8 +32,25 @@ ITEMS = {
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
 OF_PHOTOS = ("photos", "passersby")  # what is left out before a run starts; the rest is left out of the run
+STANDARD = "standard"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 Loss = Literal["l1", "l1+dssim", "l1+scs"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How long to train, and on photos of which size."""
+
+    iterations: int | None  # None: as many as pay, 30,000 at most
+    longest: int | None  # px: photos with a longer side are scaled down; None: as they are
+
+
+PRESETS = {"quick": Preset(1_000, 480), STANDARD: Preset(None, 1600), "best": Preset(30_000, None)}
+
+
+def longest_side(preset: str | None, downscale: float | None) -> int | None:
+    """Px that a side of the photos may have: as the preset says, where no `downscale` is asked for."""
+    return PRESETS[preset or STANDARD].longest if downscale is None else None
 
 
 def parse_leave_out(text: str) -> tuple[str, ...]:
@@ -273,35 +293,103 @@ class TrainConfig:
         )
 
 
-def run_config(
-    *,
-    iterations: int | None = None,
-    batch: int = 1,
-    method: str = AUTO,
-    leave_out: str = AUTO,
-    seed: int = 0,
-    max_gaussians: int = DensifyConfig.max_gaussians,
-    guidance: str = FORMATION,
-    formation: str = AUTO,
-    eval_every: int | None = None,
-) -> TrainConfig:
-    """The configuration of a run as users ask for it: these are the options of `hqgs.train`.
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """What a user says of a run, as `hqgs.train` and the command line take it; None: not said."""
 
-    The schedule is fitted to the length; without `eval_every` evaluations are at least EVALUATIONS_APART
-    iterations apart. ValueError for a name that there is not, or a number out of range.
+    preset: Annotated[str | None, choice(*PRESETS), Unsaid] = None
+    """quick: 1,000 iterations on small photos, a first look. standard (so it is): as long as it pays,
+    photos of at most 1600 px. best: 30,000 iterations, photos as they are."""
+    iterations: Number = None
+    """Training views to see (standard: 150 for each clean photo, 4,000 at least, at most 30,000, fewer where
+    the scene has stopped improving)."""
+    batch: Number = None
+    """Views in a step (1). Several processes of torchrun share them out: docs/machines.md."""
+    seconds: Seconds = None
+    """Train for S seconds, in place of --iterations: the best scene that this machine makes in them."""
+    method: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME", help=f"One of {', '.join(METHODS)} (auto)."), Unsaid
+    ] = None
+    formation: Annotated[str | None, tyro.conf.arg(metavar="KIND"), Unsaid] = None
+    """What hqgs takes for the photos' degradation (auto: it looks)."""
+    guidance: Annotated[str | None, choice(*GUIDANCES), Unsaid] = None
+    """Of hqgs: formation, or paper, its published form (formation)."""
+    leave_out: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="LIST",
+            help=f"What the run may do without where the scene does not need it: {AUTO}, {NONE}, or some of "
+            f"{','.join(ITEMS)} ({AUTO}); a list without iterations trains all of them.",
+        ),
+        Unsaid,
+    ] = None
+    max_gaussians: Number = None
+    """Bounds the memory (1,000,000)."""
+    eval_every: Number = None
+    """Iterations between evaluations (a tenth of the run, 50 at least)."""
+    seed: Seed = None
+    """Another seed gives another run of the same quality (0)."""
+
+    def resolved(self, before: TrainConfig | None = None) -> TrainConfig:
+        """The configuration that is meant; `before`: of the run that goes on, or is done alike.
+
+        What is not said is as it was before, or as the preset has it. "auto" leaves iterations out where
+        nobody has said how many. ValueError for a name that there is not, or a number out of range.
+        """
+        length = self.iterations
+        if before is None and length is None:
+            length = PRESETS[self.preset or STANDARD].iterations
+        open_end = length is None and (before is None or "iterations" in before.leave_out)
+        config = before or scaled(
+            TrainConfig(iterations=TrainConfig.iterations if length is None else length)
+        )
+        if length is not None and before is not None:
+            known = "iterations" not in before.leave_out and before.seconds is None
+            if length != before.iterations or not known:
+                config = replace(with_iterations(before, length), seconds=None, turn=None, timed=None)
+        changes: dict[str, Any] = {
+            name: value
+            for name in ("batch", "seconds", "method", "eval_every", "seed")
+            if (value := getattr(self, name)) is not None
+        }
+        if self.leave_out is not None or before is None:
+            items = parse_leave_out(self.leave_out or AUTO)
+            open_end = open_end and self.leave_out in (None, AUTO)
+            changes["leave_out"] = (*items, "iterations") if open_end else items
+        if self.max_gaussians is not None:
+            changes["densify"] = replace(config.densify, max_gaussians=self.max_gaussians)
+        of_hqgs = {"guidance": self.guidance, "formation": self.formation}
+        of_hqgs = {name: value for name, value in of_hqgs.items() if value is not None}
+        return replace(config, hqgs=replace(config.hqgs, **of_hqgs), **changes)
+
+
+def run_config(**said: Any) -> TrainConfig:
+    """The configuration of a run of these `TrainOptions`."""
+    return TrainOptions(**said).resolved()
+
+
+def scaled(config: TrainConfig) -> TrainConfig:
+    """With its schedule fitted to its length, and evaluations at least EVALUATIONS_APART iterations apart."""
+    config = config.scaled()
+    return replace(config, eval_every=max(config.eval_every, EVALUATIONS_APART))
+
+
+def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
+    """The configuration for a run of another length; what the user has set of its schedule stays.
+
+    It trains all of that length: the item "iterations" is not left out.
     """
-    items = parse_leave_out(leave_out)
-    if iterations is None and leave_out == AUTO:
-        items = (*items, "iterations")
-    config = TrainConfig(
-        iterations=TrainConfig.iterations if iterations is None else iterations,
-        batch=batch,
-        leave_out=items,
-        method=method,
-        seed=seed,
-        densify=DensifyConfig(max_gaussians=max_gaussians),
-        hqgs=HQGSConfig(guidance=guidance, formation=formation),
-    ).scaled()
+    before, after = (scaled(TrainConfig(iterations=length)) for length in (config.iterations, iterations))
+
+    def fitted(mine: Any, old: Any, new: Any, *names: str) -> dict[str, Any]:
+        same = [name for name in names if getattr(mine, name) == getattr(old, name)]
+        return {name: getattr(new, name) for name in same}
+
+    growth = fitted(config.densify, before.densify, after.densify, "start", "stop", "every")
     return replace(
-        config, eval_every=max(config.eval_every, EVALUATIONS_APART) if eval_every is None else eval_every
+        config,
+        iterations=iterations,
+        leave_out=tuple(item for item in config.leave_out if item != "iterations"),
+        densify=replace(config.densify, **growth),
+        **fitted(config, before, after, "sh_interval", "eval_every", "checkpoint_every"),
     )

@@ -142,9 +142,10 @@ def plan_of_photos(scene: Scene, asked: TrainConfig) -> tuple[RunPlan, list[str]
 def facts_of(scene: Scene, unused: list[LeftOut] | None = None) -> Facts:
     """What a scene tells before a method has looked at its photos; `unused`: photos it does without."""
     cameras = [view.camera for view in scene.train]
+    photos = scene.of or len(cameras)
     return Facts(
-        photos=len(cameras),
-        pixels=sum(camera.width * camera.height for camera in cameras),
+        photos=photos,
+        pixels=sum(camera.width * camera.height for camera in cameras) * photos // len(cameras),
         shortest_side=min(min(camera.width, camera.height) for camera in cameras),
         points=len(scene.points),
         linked=scene.seen is not None,

@@ -1,37 +1,16 @@
-"""Configurations as users keep and change them: presets, files, and runs of another length."""
+"""Configurations in files."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from hqgs.base.files import PLAN, read_json
 from hqgs.base.typed import build
-from hqgs.training.config import TrainConfig, run_config
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How long to train, and on photos of which size."""
-
-    iterations: int | None  # None: as many as pay, 30,000 at most
-    longest: int | None  # px: photos with a longer side are scaled down; None: as they are
-    about: str
-
-
-PRESETS = {
-    "quick": Preset(1_000, 480, "a first look"),
-    "standard": Preset(None, 1600, "as long as it pays"),
-    "best": Preset(30_000, None, "photos as they are, the whole schedule of 3DGS"),
-}
-
-
-def longest_side(preset: str, downscale: float | None) -> int | None:
-    """Px that a side of the photos may have: as the preset says, where no `downscale` is asked for."""
-    return PRESETS[preset].longest if downscale is None else None
+from hqgs.training.config import TrainConfig, with_iterations
 
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
@@ -58,27 +37,6 @@ def read_config(path: str | Path) -> TrainConfig:
 def config_of_values(values: Any, where: str) -> TrainConfig:
     """The configuration of JSON values, of `where`. ValueError that names the field."""
     return build(TrainConfig, values, where)
-
-
-def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:
-    """The configuration for a run of another length; what the user has set of its schedule stays.
-
-    It trains all of that length: the item "iterations" is not left out.
-    """
-    before, after = run_config(iterations=config.iterations), run_config(iterations=iterations)
-
-    def fitted(mine: Any, old: Any, new: Any, *names: str) -> dict[str, Any]:
-        same = [name for name in names if getattr(mine, name) == getattr(old, name)]
-        return {name: getattr(new, name) for name in same}
-
-    growth = fitted(config.densify, before.densify, after.densify, "start", "stop", "every")
-    return replace(
-        config,
-        iterations=iterations,
-        leave_out=tuple(item for item in config.leave_out if item != "iterations"),
-        densify=replace(config.densify, **growth),
-        **fitted(config, before, after, "sh_interval", "eval_every", "checkpoint_every"),
-    )
 
 
 def plan_values(config: TrainConfig, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

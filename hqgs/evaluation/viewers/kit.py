@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hqgs.base.files import atomic_path, check_new_folder, write_json
+from hqgs.base.files import CAMERAS, atomic_path, check_new_folder, write_json
 from hqgs.evaluation.viewers.plain import render
 from hqgs.model.constants import SH_C0
 from hqgs.model.formats.arrays import Arrays
@@ -18,7 +18,6 @@ from hqgs.model.formats.files import format_of, read_scene
 from hqgs.model.formats.ply import write_ply
 from hqgs.model.formats.spz import write_spz
 from hqgs.photos.pixels import to_uint8
-from hqgs.scene.camera_files import CAMERAS
 from hqgs.scene.paths import UP
 from hqgs.scene.scene import Camera
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.files import atomic_path
 from hqgs.photos.constants import GOLDEN
 from hqgs.scene import paths
-from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
-from hqgs.scene.builtin.points import SparsePoints, sfm_points
-from hqgs.scene.builtin.shading import render_view
+from hqgs.scene.builtin.shading import render_depth, render_view
 from hqgs.scene.constants import PATH_SIZE, TEST_EVERY
+from hqgs.scene.geometry import unproject
 from hqgs.scene.scene import Camera, Scene, View
+from hqgs.scene.sfm.constants import TRIANGULATION
+from hqgs.scene.sfm.triangulated import SparsePoints, in_order, triangulated
 
+FORMAT = 2  # raised by hand where other photos or points are made, or kept otherwise
 WIDTH, HEIGHT = PATH_SIZE
 FOCAL = 410.0  # px; other sizes scale the intrinsics
 FOCUS = (0.05, -0.12, 4.4)  # what the cameras look at
@@ -66,17 +72,20 @@ def assemble(
     if names is None:
         names = [f"{held_out.get(k, 'view')}_{k:02d}.png" for k in range(len(cameras))]
     made = {"width": width, "height": height, "num_views": len(cameras), **made}
-    kept = None if cache is None else read_kept(cache, made, names)
-    if kept is None:
-        photos = {name: render_view(camera) for name, camera in zip(names, cameras, strict=True)}
-        views = [View(name, camera, photos[name]) for name, camera in zip(names, cameras, strict=True)]
+    file = None if cache is None else cache / "room.npz"
+    found = None if file is None else kept(file, made)
+    if found is None:
+        views = [View(name, camera, render_view(camera)) for name, camera in zip(names, cameras, strict=True)]
         points = sfm_points([v for k, v in enumerate(views) if k not in held_out])
-        if cache is not None:
-            arrays = {key: value for key, value in points._asdict().items() if key != "note"}
-            write_kept(cache, made, Kept(photos, arrays, points.note))
+        if file is not None:
+            photos = {f"photo {view.name}": view.image for view in views}
+            keep(file, made, points._asdict() | photos)
     else:
-        views = [View(name, camera, kept.photos[name]) for name, camera in zip(names, cameras, strict=True)]
-        points = SparsePoints(**kept.arrays, note=kept.note)
+        views = [
+            View(name, camera, found[f"photo {name}"]) for name, camera in zip(names, cameras, strict=True)
+        ]
+        arrays = (found[name] for name in ("points", "colors", "photos", "rows"))
+        points = SparsePoints(*arrays, note=str(found["note"]))
     train = [v for k, v in enumerate(views) if k not in held_out]
     return Scene(
         name=name,
@@ -88,6 +97,26 @@ def assemble(
         notes=[points.note],
         seen={v.name: np.unique(points.rows[points.photos == k]) for k, v in enumerate(train)},
     )
+
+
+def keep(file: Path, made: Mapping[str, Any], arrays: Mapping[str, Any]) -> None:
+    """Write arrays to a file that `kept` reads.
+
+    `made` says, in JSON values, what they depend on beside FORMAT.
+    """
+    with atomic_path(file) as tmp, tmp.open("wb") as out:
+        np.savez_compressed(out, **arrays, made=json.dumps({"format": FORMAT, **made}))
+
+
+def kept(file: Path, made: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The arrays of a file, or None where it is missing, damaged or made in another way."""
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            if str(data["made"]) != json.dumps({"format": FORMAT, **made}):
+                return None
+            return {name: data[name] for name in data.files if name != "made"}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        return None
 
 
 def embedded_cameras(width: int = WIDTH, height: int = HEIGHT, num_views: int = 24) -> list[Camera]:
@@ -122,3 +151,45 @@ def look_at(
     x, y, z = paths.look_at(center, target).viewmat[:3, :3]
     axes = [math.cos(roll) * x + math.sin(roll) * y, math.cos(roll) * y - math.sin(roll) * x, z]
     return paths.view_matrix(np.array(axes), center)
+
+
+def sfm_points(views: Sequence[View], time_limit: float = TRIANGULATION) -> SparsePoints:
+    """Points of the views by COLMAP.
+
+    COLMAP (SIFT, exhaustive matching, triangulation with the known cameras) runs in its own process and is
+    killed after `time_limit` seconds. Where it fails, is late or finds fewer than 200 points, they come from
+    `surface_points`, and the note says why. Points are sorted by x, y, z. Raises ValueError without views.
+    """
+    if not views:
+        raise ValueError("views must not be empty")
+    found = triangulated(views, time_limit)
+    if isinstance(found, SparsePoints):
+        return found
+    cast = surface_points(views)
+    return cast._replace(note=f"{cast.note}, as COLMAP gave none: {found}")
+
+
+def surface_points(
+    views: Sequence[View], count: int = 4000, noise: float = 0.005, seed: int = 0
+) -> SparsePoints:
+    """`count` points under random pixels of photos of the embedded scene, each seen by its own photo.
+
+    The depth is off by a normal error of standard deviation `noise` times the depth.
+    """
+    rng = np.random.default_rng(seed)
+    points, colors, photos = [], [], []
+    for number, (view, share) in enumerate(
+        zip(views, np.array_split(np.arange(count), len(views)), strict=True)
+    ):
+        camera = view.camera
+        depth = render_depth(camera)
+        rows, cols = np.nonzero(np.isfinite(depth))
+        pick = rng.integers(0, len(rows), len(share))
+        i, j = rows[pick], cols[pick]
+        z = depth[i, j] * (1 + noise * rng.standard_normal(len(pick)))
+        points.append(unproject(camera, np.stack([j, i], 1).astype(np.float64) + 0.5, z))
+        colors.append(view.image[i, j])
+        photos.append(np.full(len(pick), number, np.intp))
+    xyz = np.concatenate(points).astype(np.float32)
+    note = f"{count} points cast onto the surfaces"
+    return in_order(xyz, np.concatenate(colors), np.concatenate(photos), np.arange(count), note)

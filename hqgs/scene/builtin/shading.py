@@ -1,24 +1,63 @@
-"""Light, and the public renderers: `render_view` and `render_exposure` (photos), `render_depth`."""
+"""Light, and the public renderers: `render_view` and `render_exposure` (photos), `render_depth`.
+
+The benchmarks make photos as life makes them by it: by moving cameras, lenses, devices, with walkers.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hqgs.base.evenly import evenly
 from hqgs.photos.light import to_srgb
-from hqgs.scene.builtin.devices import Device
-from hqgs.scene.builtin.exposure import Exposure, still
 from hqgs.scene.builtin.raycast import Array, Surface, Vec, along, dot, in_view, nearest
 from hqgs.scene.builtin.studio import Studio, studio
 from hqgs.scene.scene import Camera
 
 TILE, BLOCK = 64, 8  # pixels: a tile is one job; each surface is tried on the blocks that it may cover
+OUTLINES = 8  # cameras that stand for all when a tile asks what it may see
+MARGIN = 2.0  # px that a tile looks beyond its border for the cameras between them
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A photo as the mean of samples, each through a camera of its own, or all through one.
+
+    Sample s of a pixel is the ray of `cameras[s]` through the pixel's corner + `jitter[s]`.
+    """
+
+    cameras: Sequence[Camera]  # 1 or S
+    jitter: NDArray[np.float64]  # [S, 2], x and y in the unit square
+    outline: Sequence[Camera] = ()  # whose views enclose those of all samples; none: they are found
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the photo."""
+        return self.cameras[0].width, self.cameras[0].height
+
+    def seen_from(self) -> tuple[Sequence[Camera], float]:
+        """Cameras whose views, widened by as many px, enclose what all samples see."""
+        if len(self.cameras) == 1:
+            return self.cameras, 0.0
+        return self.outline or [self.cameras[k] for k in evenly(len(self.cameras), OUTLINES)], MARGIN
+
+
+class Device(Protocol):
+    """What a camera does to all its photos."""
+
+    def shade(self, camera: Camera) -> NDArray[np.float64]:
+        """What arrives of the light at each pixel, [H, W]."""
+        ...
+
+    def respond(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values [..., 3] of 0..1 as this camera writes them."""
+        ...
 
 
 def render_view(camera: Camera, samples: int = 3, threads: int | None = None) -> NDArray[np.uint8]:
@@ -30,7 +69,7 @@ def render_view(camera: Camera, samples: int = 3, threads: int | None = None) ->
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    return render_exposure(still(camera, sample_pattern(samples)), threads=threads)
+    return render_exposure(Exposure([camera], sample_pattern(samples)), threads=threads)
 
 
 def render_exposure(
@@ -79,7 +118,7 @@ def render_depth(camera: Camera) -> NDArray[np.float64]:
         t, _ = nearest(tile.seen, tile.blocks, tile.eye, tile.d)
         depth[tile.rows, tile.cols] = tile.picture(t[:, 0])
 
-    _each_tile(still(camera, np.full((1, 2), 0.5)), np.float64, work, None)
+    _each_tile(Exposure([camera], np.full((1, 2), 0.5)), np.float64, work, None)
     return depth
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,14 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.photos.camera import draw_gains
+from benchmarks.scenes.crowd import Walker, draw_walkers
+from benchmarks.scenes.devices import Device, draw_devices
+from benchmarks.scenes.exposure import Exposure, shaken, still, through_lens
+from benchmarks.scenes.kinds import draw_gains
+from benchmarks.scenes.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
 from hqgs.photos.formula import Kind
-from hqgs.photos.shake import draw_path, draw_strength, knots_mean, path_extent, path_length
-from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
-from hqgs.scene.builtin.crowd import Walker, draw_walkers
-from hqgs.scene.builtin.devices import Device, draw_devices
-from hqgs.scene.builtin.exposure import Exposure, shaken, still, through_lens
-from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene
+from hqgs.scene.builtin.scene import FOCUS, HEIGHT, WIDTH, embedded_scene, keep, kept
 from hqgs.scene.builtin.shading import render_exposure, sample_pattern
 from hqgs.scene.scene import Camera, Scene
 
@@ -123,25 +123,35 @@ def wild_room(
     if name == "true-devices":
         rng = np.random.default_rng([seed, len(names)])
         truth = _of_devices(truth, rng, int(value), clean.train[0].camera)
-    folder = None if cache is None else cache / f"{name}_{value:g}_{seed}"
     made = {"kind": name, "value": value, "seed": seed, "size": [width, height], "num_views": num_views}
-    made |= {"level": "of gains and lenses"} if name == "true-devices" else {}
-    kept = None if folder is None else read_kept(folder, made, list(truth))
-    if kept is None:
-        photos = {view.name: taken(name, view.camera, truth[view.name]) for view in clean.train}
-        kept = Kept(photos, {}, "")
-        if folder is not None:
-            write_kept(folder, made, kept)
+    photos = kept_photos(
+        None if cache is None else cache / f"{name}_{value:g}_{seed}.npz",
+        made,
+        lambda: {view.name: taken(name, view.camera, truth[view.name]) for view in clean.train},
+    )
     note = (
         f"photographed with {name}:{value:g}, seed {seed}: all training photos ({len(clean.train)}), "
         f"ray-cast in linear light; held-out photos ({len(clean.test)}) are clean; points and poses are exact"
     )
     train = [
-        replace(view, image=kept.photos[view.name], device=device.name if device is not None else "")
+        replace(view, image=photos[view.name], device=device.name if device is not None else "")
         for view in clean.train
         for device in [truth[view.name].device]
     ]
     return WildRoom(replace(clean, train=train, notes=[*clean.notes, note]), clean, truth)
+
+
+def kept_photos(
+    file: Path | None, made: Mapping[str, Any], make: Callable[[], dict[str, NDArray[np.uint8]]]
+) -> dict[str, NDArray[np.uint8]]:
+    """Photos by name, from the file where they are there, made as `made` says."""
+    found = None if file is None else kept(file, made)
+    if found is None:
+        found = make()
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            keep(file, made, found)
+    return found
 
 
 def parse_true_kind(text: str, width: int = WIDTH) -> tuple[str, float]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hqgs.photos.walkers import Figure, draw_figure
+from benchmarks.scenes.walkers import Figure, draw_figure
 from hqgs.scene.builtin import textures as tx
 from hqgs.scene.builtin.raycast import Ellipsoid, Material, Surface
 from hqgs.scene.builtin.studio import FLOOR, rotation

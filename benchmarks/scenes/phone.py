@@ -6,19 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve, gaussian_filter
 
-from hqgs.photos.constants import (
-    DENOISE_RADIUS,
-    DENOISE_SIGMA,
-    FULL_WELL,
-    PHONE_QUALITY,
-    PHONE_WHITE_BALANCE,
-    READ_NOISE,
-    SHARPEN_AMOUNT,
-    SHARPEN_SIGMA,
-)
 from hqgs.photos.jpeg import encode_jpeg
 from hqgs.photos.light import to_linear, to_srgb
 from hqgs.photos.pixels import LUMA, Float32
+
+# Typical values, chosen by hand; no one phone was measured.
+FULL_WELL = 6000.0  # photoelectrons of white in green where no light is missing
+READ_NOISE = 2.5  # electrons, standard deviation
+# Gains of red, green and blue: the sensor sees white as 1/1.9, 1, 1/1.6.
+WHITE_BALANCE = (1.9, 1.0, 1.6)
+# A bilateral filter over 5 x 5 pixels; its sigma in px, in deviations of the noise, and of the chroma's blur.
+DENOISE_RADIUS, DENOISE_SIGMA = 2, 1.5
+SHARPEN_SIGMA, SHARPEN_AMOUNT = 1.0, 0.8  # px and gain of the unsharp mask
+QUALITY = 70  # of the JPEG file, 4:2:0
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ _ACROSS = np.array(  # red at blue, blue at red
 def phone_jpeg(image: Float32, stops: float, rng: np.random.Generator) -> bytes:
     """The JPEG file of a photo [H, W, 3] that is taken again with `stops` less light.
 
-    sRGB is decoded to linear light in [0, 1] and the channels divided by PHONE_WHITE_BALANCE;
+    sRGB is decoded to linear light in [0, 1] and the channels divided by WHITE_BALANCE;
     `bayer_mosaic` takes one of them per pixel; a pixel of 1 holds N = FULL_WELL / 2^stops electrons. Each
     value becomes (Poisson(N v) + N(0, READ_NOISE)) / N, clipped at 1; values below 0 stay. Then: white
     balance, clipped at 1; `demosaic`; `denoise`; clipped to [0, 1]; the sRGB curve and no other tone curve,
@@ -47,7 +47,7 @@ def phone_jpeg(image: Float32, stops: float, rng: np.random.Generator) -> bytes:
     (y - G y) with a Gaussian of 1 px; a JPEG of quality 70 with 4:2:0 chroma.
     """
     white = FULL_WELL / 2**stops
-    gains = np.array(PHONE_WHITE_BALANCE)
+    gains = np.array(WHITE_BALANCE)
     light = to_linear(image.astype(np.float64).clip(0, 1))
     electrons = bayer_mosaic(light / gains) * white
     raw = rng.poisson(electrons) + READ_NOISE * rng.standard_normal(electrons.shape)
@@ -56,7 +56,7 @@ def phone_jpeg(image: Float32, stops: float, rng: np.random.Generator) -> bytes:
     srgb = to_srgb(denoise(demosaic(balanced), white).clip(0, 1))
     luma = srgb @ LUMA
     detail = luma - gaussian_filter(luma, SHARPEN_SIGMA, mode="mirror")
-    return encode_jpeg((srgb + SHARPEN_AMOUNT * detail[..., None]).astype(np.float32), PHONE_QUALITY)
+    return encode_jpeg((srgb + SHARPEN_AMOUNT * detail[..., None]).astype(np.float32), QUALITY)
 
 
 def bayer_mosaic(image: Floats) -> Floats:
@@ -93,7 +93,7 @@ def denoise(linear: Floats, white: float) -> Floats:
     photons and reading leave at the local brightness (a Gaussian mean of 2 px). Then the chroma (what is
     left of R, G, B without their luma) is blurred by a Gaussian of 1.5 px.
     """
-    gains = np.array(PHONE_WHITE_BALANCE)
+    gains = np.array(WHITE_BALANCE)
     level = gaussian_filter(linear, (2, 2, 0), mode="mirror").clip(0)
     variance = gains * level / white + (gains * READ_NOISE / white) ** 2
     reach = DENOISE_RADIUS

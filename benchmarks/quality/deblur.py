@@ -11,8 +11,11 @@ in the place of 10, a sample for each 1.5 px of a way of 6 px; and rates for sho
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 from unittest.mock import patch
 
 import torch
@@ -20,6 +23,7 @@ from torch import Tensor
 
 from benchmarks.measure import Training, train
 from benchmarks.patches import RENDER_VIEW
+from benchmarks.protocol import Row
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import RasterizationMeta, rasterization
 from hqgs.scene.scene import Camera, Scene, View
@@ -31,6 +35,21 @@ from hqgs.training.methods.cameras import Shot, no_shot
 VIRTUAL, KNOTS = 5, 4  # renders of a photo; knots of its path
 RATE, LAST_RATE = 2e-3, 2e-4  # of Adam at the beginning and at the end of the run: rad, and scene extents
 FIRST = 1e-5  # standard deviation of the knots at the start: from 0 a path has no direction to grow in
+
+
+@dataclass(frozen=True)
+class RivalRow(Row):
+    """A row that may be of this method; its configuration then is that of 3dgs."""
+
+    rival: Literal["", "deblur"] = ""
+
+    @property
+    def more(self) -> dict[str, Any]:
+        """Runs of another form of it do not count: this file is no part of `sources`."""
+        if not self.rival:
+            return super().more
+        form = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
+        return super().more | {"rival": self.rival, "form": form}
 
 
 class Deblur(ThreeDGS):

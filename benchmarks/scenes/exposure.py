@@ -3,45 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hqgs.base.evenly import evenly
+from benchmarks.scenes.shake import exposure_times, path_points
 from hqgs.photos.constants import GOLDEN
-from hqgs.photos.shake import exposure_times, path_points
+from hqgs.scene.builtin.shading import Exposure
 from hqgs.scene.scene import Camera
 
 Floats = NDArray[np.float64]
-
-OUTLINES = 8  # cameras that stand for all when a tile asks what it may see
-MARGIN = 2.0  # px that a tile looks beyond its border for the cameras between them
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """A photo as the mean of samples, each through a camera of its own, or all through one.
-
-    Sample s of a pixel is the ray of `cameras[s]` through the pixel's corner + `jitter[s]`.
-    """
-
-    cameras: Sequence[Camera]  # 1 or S
-    jitter: Floats  # [S, 2], x and y in the unit square
-    outline: Sequence[Camera] = ()  # whose views enclose those of all samples; none: they are found
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the photo."""
-        return self.cameras[0].width, self.cameras[0].height
-
-    def seen_from(self) -> tuple[Sequence[Camera], float]:
-        """Cameras whose views, widened by as many px, enclose what all samples see."""
-        if len(self.cameras) == 1:
-            return self.cameras, 0.0
-        return self.outline or [self.cameras[k] for k in evenly(len(self.cameras), OUTLINES)], MARGIN
 
 
 def still(camera: Camera, jitter: Floats) -> Exposure:
@@ -85,7 +57,7 @@ def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> E
 def path_viewmats(viewmat: Floats, knots: Floats, times: Floats) -> Floats:
     """World-to-camera matrices [N, 4, 4] at `times` in [-1/2, 1/2] of a camera that moves around `viewmat`.
 
-    The cubic through the four `knots` [4, 6] (`hqgs.photos.shake`) gives a rotation vector w in radians and a
+    The cubic through the four `knots` [4, 6] (`path_points`) gives a rotation vector w in radians and a
     translation v in world units, both in the frame of `viewmat`: a point p of that frame is then at
     exp([w]x) p + v.
     """

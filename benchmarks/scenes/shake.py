@@ -7,9 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hqgs.photos.constants import SAMPLES_PER_PX, SHAKE_TURN, WEAKEST
-
 Floats = NDArray[np.float64]
+
+WEAKEST = 0.2  # of the longest extent: how far the stillest photo moves
+TURN = 0.6  # radians, standard deviation of the turn from one stretch of a path to the next; chosen by hand
+SAMPLES_PER_PX = 8  # along a path, at least; a kernel is a mean over them
 
 
 def draw_path(rng: np.random.Generator, extent: float) -> Floats:
@@ -19,7 +21,7 @@ def draw_path(rng: np.random.Generator, extent: float) -> Floats:
     in [0.5, 1.5] before the whole is scaled. The path's mean over time is (0, 0) and its extent, the largest
     distance between two of its points, is `extent`.
     """
-    headings = rng.uniform(0, 2 * math.pi) + np.cumsum([0.0, *rng.normal(0, SHAKE_TURN, 2)])
+    headings = rng.uniform(0, 2 * math.pi) + np.cumsum([0.0, *rng.normal(0, TURN, 2)])
     lengths = rng.uniform(0.5, 1.5, 3)
     stretches = lengths[:, None] * np.stack([np.cos(headings), np.sin(headings)], -1)
     knots = np.concatenate([np.zeros((1, 2)), np.cumsum(stretches, axis=0)])

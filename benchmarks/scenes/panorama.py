@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from benchmarks.scenes.wild import WildRoom, kept_photos
 from hqgs.photos.light import to_linear, to_srgb
-from hqgs.scene.builtin.cache import Kept, read_kept, write_kept
 from hqgs.scene.builtin.scene import assemble
 from hqgs.scene.builtin.shading import render_view
-from hqgs.scene.builtin.wild import WildRoom
 from hqgs.scene.faces import CUBE, around, face_name, faces_of
 from hqgs.scene.scene import Camera
 from hqgs.scene.views import to_pinhole
@@ -84,19 +83,18 @@ def panorama_room(cache: Path | None = None, width: int = WIDTH, places: int = P
         held_out=held_out,
         names=list(cameras),
     )
-    folder = None if cache is None else cache / "panoramas"
     made = {"kind": "panorama", "width": width, "places": places}
     names = {k: f"panorama_{k:02d}.png" for k in range(places) if k % TEST_EVERY}
-    kept = None if folder is None else read_kept(folder, made, list(names.values()))
-    if kept is None:
-        kept = Kept({name: render_panorama(poses[k], width) for k, name in names.items()}, {}, "")
-        if folder is not None:
-            write_kept(folder, made, kept)
+    panoramas = kept_photos(
+        None if cache is None else cache / "panoramas.npz",
+        made,
+        lambda: {name: render_panorama(poses[k], width) for k, name in names.items()},
+    )
     camera = around(width, width // 2)
     faces = {face.name: to_pinhole(camera, width, width // 2, face=face) for face in faces_of(camera)}
     photos = {
         face_name(name, face): flat.picture(photo)
-        for name, photo in kept.photos.items()
+        for name, photo in panoramas.items()
         for face, flat in faces.items()
     }
     note = f"training views are faces of {len(names)} ray-cast panoramas of {width} x {width // 2} px"

@@ -1,0 +1,190 @@
+"""The benchmark `parts`: what each part of hqgs costs in lines and seconds, and gains on held-out photos.
+
+A run leaves out one part. Where that changes neither plan nor start the part is off, and nothing is trained.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib
+import inspect
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import grimp
+import pandas as pd
+from pandas import DataFrame
+
+from benchmarks.command import Benchmark
+from benchmarks.measure import Run, Training
+from benchmarks.pages.figures import gain, number, pick, table
+from benchmarks.protocol import Row, narrowed, read_protocols
+from benchmarks.study import Cell, Study, begin
+from benchmarks.without import without
+from hqgs.scene.load import load_scene
+from hqgs.scene.scene import Scene
+from hqgs.training.config import AUTO
+from hqgs.training.trainer import Trainer
+
+ALL = "all"
+MEASURES = ("psnr", "ssim", "cpu_seconds", "placed", "gaussians")
+SMALL, AGAIN = 0.3, 1  # dB: a part that gains less is measured with this seed, too
+
+
+@dataclass(frozen=True)
+class Part(Row):
+    """A part, and how a run goes without it."""
+
+    method: str = AUTO
+    leave_out: str = AUTO
+    what: str = ""  # it does
+    modules: tuple[str, ...] = ()  # where it is: `package.module`, `package.module:function`
+    without: dict[str, str] = field(default_factory=dict)  # what its functions become, by their places
+    poses: bool = False  # whether it concerns how cameras are found
+
+    @property
+    def more(self) -> dict[str, Any]:
+        return {**super().more, "without": self.without, "poses": self.poses}
+
+
+PROTOCOLS = read_protocols(Path(__file__).with_suffix(".toml"), Part)
+PARTS = {part.label: part for part in PROTOCOLS["standard"].rows if isinstance(part, Part)}
+
+
+@cache
+def imports() -> grimp.ImportGraph:
+    return grimp.build_graph("hqgs", cache_dir=None)
+
+
+def alone(modules: Sequence[str]) -> set[str]:
+    """The modules, and those that nothing else imports."""
+    graph, found = imports(), set(modules)
+    while more := {
+        below
+        for module in found
+        for below in graph.find_modules_directly_imported_by(module) - found
+        if graph.find_modules_that_directly_import(below) <= found
+    }:
+        found |= more
+    return found
+
+
+def length(place: str) -> int:
+    """Lines of a module or a function."""
+    module, _, name = place.partition(":")
+    found = importlib.import_module(module)
+    return len(inspect.getsource(attrgetter(name)(found) if name else found).splitlines())
+
+
+def lines_of(part: Part) -> int:
+    """Lines that go with the part."""
+    whole = alone([place for place in part.modules if ":" not in place])
+    return sum(map(length, [*whole, *(place for place in part.modules if ":" in place)]))
+
+
+class Parts:
+    """The runs of a study."""
+
+    def __init__(self, study: Study) -> None:
+        self.study = study
+        self.whole = {cell.group: cell for cell in study.cells if cell.row.label == ALL}
+        self.folders = {scene.name: path for scene, path in zip(study.scenes, study.args.scenes, strict=True)}
+
+    def measure(self, cell: Cell, photos: Scene) -> Run:
+        part = cell.row
+        assert isinstance(part, Part)
+        with without(part.without):
+            if part.poses:
+                photos = self.placed_anew(cell)
+            done = Training(photos, cell.config)
+            start = print_of(done.trainer)
+            known = self.study.runs.get(self.whole[cell.group])
+            if known is not None and known["start"] == start:
+                whole = {name: float(known[name]) for name in MEASURES}
+                return whole | {"on": False, "start": start, "lines": lines_of(part)}
+            done.steps()
+        placed = len(photos.train) + len(photos.test)
+        cpu = done.setup_cpu_seconds + done.cpu_seconds
+        found = done.judged() | {"cpu_seconds": cpu, "placed": placed}
+        whole = {name: found[name] for name in MEASURES}
+        return whole | {"on": True, "start": start, "lines": lines_of(part)}
+
+    def placed_anew(self, cell: Cell) -> Scene:
+        """The scene with cameras that are found without the part."""
+        keep = self.study.args.out / "scenes" / f"{cell.scene.name} without {cell.row.label}"
+        longest = self.study.protocol.longest
+        return load_scene(self.folders[cell.scene.name], cell.downscale, keep_sfm=keep, longest=longest)
+
+
+def print_of(trainer: Trainer) -> str:
+    """What a run does follows from: its plan, photos, masks and first Gaussians."""
+    plan = {name: value for name, value in asdict(trainer.plan).items() if name != "rows"}
+    sha = hashlib.sha256(repr(_without_nothing(plan)).encode())
+    for view in trainer.scene.train:
+        sha.update(view.name.encode() + view.camera.viewmat.tobytes())
+        sha.update(b"" if view.mask is None else view.mask.tobytes())
+    for tensor in trainer.gaussians.named().values():
+        sha.update(tensor.detach().numpy().tobytes())
+    return sha.hexdigest()[:8]
+
+
+def _without_nothing(value: Any) -> Any:
+    """Without what is 0, False, empty or None: all say that something is not done."""
+    if isinstance(value, dict):
+        return {name: _without_nothing(one) for name, one in value.items() if one}
+    return value
+
+
+def gains_of(runs: DataFrame, label: str, value: str = "psnr") -> Any:
+    """What a part adds to runs in which it is on."""
+    on = runs.loc[(runs["row"] == ALL) | runs["on"].astype(bool)]
+    return gain(on, ALL, label, value)
+
+
+def parts_table(runs: DataFrame) -> str:
+    """A line for each part that was measured, the largest gain first; of parts that have left, too."""
+    body = list[tuple[float, list[str]]]()
+    for label in dict.fromkeys(runs["row"]):
+        mine, part = pick(runs, row=label), PARTS.get(label)
+        if label == ALL:
+            continue
+        psnr, ssim, seconds, placed = (
+            gains_of(runs, label, name) for name in ("psnr", "ssim", "cpu_seconds", "placed")
+        )
+        scenes = mine.groupby("scene")["on"].any()
+        lines = mine["lines"].max()
+        cells = [f"{label}: {part.what}" if part else f"{label} (has left)", number(lines or None, ".0f")]
+        cells += [f"{scenes.sum():.0f} of {len(scenes)}", psnr.text(), ssim.text("+.3f")]
+        cells.append(number(seconds.mean, "+.0f"))
+        cells.append(f"{placed.runs['gain'].sum():+.0f}" if part and part.poses and placed.count else "")
+        body.append((psnr.mean if psnr.count else float("-inf"), cells))
+    heads = ("part", "lines", "on in", "PSNR (dB)", "SSIM", "CPU (s)", "photos placed")
+    return table(heads, [cells for _, cells in sorted(body, key=lambda one: -one[0])])
+
+
+def run(args: argparse.Namespace) -> list[str]:
+    """Train what is not finished; parts that gain little with a second seed, where they are on."""
+    rows = None if args.rows is None else list(dict.fromkeys([ALL, *args.rows]))
+    study = begin(args, PROTOCOLS, rows=rows)
+    study.train(Parts(study).measure)
+    runs, missing = study.frame(), study.missing()
+    first = pick(runs, seed=study.protocol.seeds[0])
+    found = {label: gains_of(first, label) for label in study.protocol.labels if label != ALL and len(runs)}
+    unsure = [label for label, one in found.items() if one.count and one.mean < SMALL]
+    if unsure and not args.quick and args.seeds is None:
+        protocol = narrowed(study.protocol, rows=[ALL, *unsure], seeds=(AGAIN,))
+        again = Study(args, study.name, protocol, study.scenes)
+        on = {(line["scene"], line["row"]) for _, line in first.loc[first["on"].astype(bool)].iterrows()}
+        again.cells = [cell for cell in again.cells if (cell.scene.name, cell.row.label) in on]
+        again.train(Parts(again).measure)
+        runs, missing = pd.concat([runs, again.frame()]), [*missing, *again.missing()]
+    return [*([parts_table(runs)] if len(runs) else []), *missing]
+
+
+OPTIONS = {"--degradations": {"nargs": "+", "metavar": "KIND", "help": "done to the photos first (none)"}}
+BENCHMARK = Benchmark("what each part of hqgs costs and gains", run, PROTOCOLS, OPTIONS)

@@ -1,0 +1,66 @@
+"""Types of options: what `--help` calls their values, and what is said of a wrong one. None: not said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+Spec = PrimitiveConstructorSpec[Any]
+Unsaid = tyro.conf.arg(help_behavior_hint="")  # whose words tell the default
+KINDS = {int: "a whole number", float: "a number"}
+PLAIN = ConstructorRegistry()  # of how other numbers are read
+
+
+def values(metavar: str, wanted: str, *kinds: Callable[[str], Any]) -> Spec:
+    """As many words become values of these kinds; `wanted` is told where one does not."""
+
+    def read(words: list[str]) -> Any:
+        try:
+            found = [kind(word) for kind, word in zip(kinds, words, strict=True)]
+        except ValueError:
+            raise ValueError(f"is {' '.join(words)}, wanted {wanted}") from None
+        return tuple(found) if len(found) > 1 else found[0]
+
+    def written(value: Any) -> list[str]:
+        return [str(part) for part in (value if isinstance(value, tuple) else (value,))]
+
+    return PrimitiveConstructorSpec(len(kinds), metavar, read, lambda value: value is not None, written)
+
+
+def choice(*names: str) -> Spec:
+    """One of these names."""
+
+    def name(word: str) -> str:
+        return names[names.index(word)]
+
+    return values(f"{{{','.join(names)}}}", f"one of: {', '.join(names)}", name)
+
+
+@PLAIN.primitive_rule
+def plain(info: PrimitiveTypeInfo) -> Spec | None:
+    """A number."""
+    kind: Any = info.type
+    return values(kind.__name__.upper(), KINDS[kind], kind) if kind in KINDS else None
+
+
+Number = Annotated["int | None", values("N", "a whole number", int), Unsaid]
+Seed = Annotated["int | None", values("S", "a whole number", int), Unsaid]
+Factor = Annotated["float | None", values("F", "a number", float), Unsaid]
+Seconds = Annotated["float | None", values("S", "a number", float), Unsaid]
+Metres = Annotated["float | None", values("METRES", "a number", float), Unsaid]
+Size = Annotated["tuple[int, int] | None", values("W H", "two whole numbers", int, int), Unsaid]
+Vector = Annotated[
+    "tuple[float, float, float] | None", values("X Y Z", "three numbers", float, float, float), Unsaid
+]
+Color = Annotated[
+    "tuple[float, float, float] | None", values("R G B", "three numbers", float, float, float), Unsaid
+]
+Apart = Annotated[
+    "tuple[str, str, float] | None", values("A B METRES", "two names and a number", str, str, float), Unsaid
+]
+Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+Flag = Annotated[bool, Unsaid]

@@ -1,0 +1,72 @@
+"""What is asked of the photos of a scene, said once: for `hqgs.load`, `hqgs train` and config.json."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from hqgs.base.options import Apart, Factor, Flag, Metres, Number, Unsaid, Vector
+from hqgs.photos.formula import grammar
+from hqgs.scene.constants import TEST_EVERY
+
+KINDS = (
+    f"{grammar()}, some:KIND (half of the photos only), several joined by + in their order, mixed, or none"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoOptions:
+    """As users give them; None: not said. `hqgs.load` says more of each."""
+
+    downscale: Factor = None
+    """Divide the photos' sides by F (as the preset says)."""
+    test_every: Number = None
+    """Hold out every Nth photo to measure with (8, unless the scene has a split); 0: train on all photos."""
+    sfm: Flag = False
+    """Cameras and points from the training photos, by COLMAP, where the scene has some already."""
+    frames: Number = None
+    """Frames to take from a film (two a second, 30 to 90)."""
+    distance: Apart = None
+    """Metres between the cameras of the photos A and B, or points x,y,z: the scene is written in metres."""
+    tag_size: Metres = None
+    """Width of printed tags (AprilTag 36h11, ArUco) in the scene: it is written in metres, upright."""
+    up: Vector = None
+    """Where up is, in the frame of the photos' cameras (as upright edges, tags, GPS or EXIF tell it)."""
+    degrade: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="KIND", help=f"What happens to the training photos: {KINDS}.", help_behavior_hint=""
+        ),
+    ] = None
+    restore: Annotated[Path | None, tyro.conf.arg(metavar="WEIGHTS"), Unsaid] = None
+    """Send the training photos through this restoration network first."""
+
+    def said(self) -> dict[str, Any]:
+        """Those that were said, as JSON values."""
+        given = {field.name: getattr(self, field.name) for field in fields(PhotoOptions)}
+        if given["restore"] is not None:
+            given["restore"] = str(given["restore"])
+        return {name: value for name, value in given.items() if value is not None and value is not False}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadOptions:
+    """What `hqgs.load` is asked for, as config.json keeps it; `hqgs.load` says what each of it is."""
+
+    path: str  # absolute, or the name of a built-in scene
+    downscale: float = 1.0
+    test_every: int = TEST_EVERY
+    sfm: bool = False
+    degrade: str = "none"
+    seed: int = 0
+    restore: str | None = None
+    skip_unreadable: bool = True
+    longest: int | None = None
+    coarse: bool | None = None
+    frames: int | None = None
+    distance: tuple[str | float, ...] | None = None
+    tag_size: float | None = None
+    up: tuple[float, ...] | None = None
