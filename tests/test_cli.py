@@ -345,12 +345,12 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
     assert (tmp_path / CHECKPOINT).exists()
 
 
-@pytest.mark.parametrize("words", ["--help", "train --help"])
-def test_output_that_nobody_reads_is_no_failure(words: str) -> None:
+@pytest.mark.parametrize("words", ["--help", "train --help", "info scene.ply"])
+def test_output_that_nobody_reads_is_no_failure(words: str, tmp_path: Path) -> None:
     """As in `hqgs ... | head`, which has read enough."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hqgs", *words.split()], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    Gaussians.from_points(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), 0).save(tmp_path / "scene.ply")
+    command = [sys.executable, "-m", "hqgs", *words.split()]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     process.stdout.close()
     _, said = process.communicate()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from hqgs.diagnosis.scene import diagnose_scene
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import area_downscale
+from hqgs.scene.scene import Scene
 from hqgs.training.constants import FILM_NOISE
 from hqgs.training.trainer import Trainer
 from tests.tiny_scene import tiny_config, tiny_scene
@@ -57,9 +59,15 @@ def test_what_is_no_frame_or_was_changed_since_is_not() -> None:
         assert film_detail(levels) is None
 
 
+@cache
+def films() -> list[Scene]:
+    """A good one and a coarse one."""
+    return [degraded_scene(f"video:{crf}") for crf in (12, 40)]
+
+
 def test_the_codec_decides_what_is_left_of_fine_details() -> None:
     """A good film is told and left alone; a coarse one is a part of the formation."""
-    good, coarse = (diagnose_scene(degraded_scene(f"video:{crf}")) for crf in (12, 40))
+    good, coarse = map(diagnose_scene, films())
     assert (good.formation, coarse.formation) == ("none", "video")
     details = [[photo.film for photo in found.photos] for found in (good, coarse)]
     assert all(a is not None and b is not None and a > 1.2 * b for a, b in zip(*details, strict=True))
@@ -72,7 +80,7 @@ def test_the_codec_decides_what_is_left_of_fine_details() -> None:
 def test_frames_of_a_coarse_film_differ_by_its_codec(monkeypatch: pytest.MonkeyPatch) -> None:
     shaken = Finding("shake", True, 0.25, None, "shake", "photos differ by 0.25 in sharpness")
     monkeypatch.setattr(scene, "shake_finding", lambda _: shaken)
-    good, coarse = (diagnose_scene(degraded_scene(f"video:{crf}")) for crf in (12, 40))
+    good, coarse = map(diagnose_scene, films())
     assert (good.formation, coarse.formation) == ("shake", "video")
     assert {name: needed for name, needed, _ in coarse.needs()}["shake"] is False
 

@@ -100,7 +100,7 @@ def test_corners_of_the_eye_chart() -> None:
     chart = next(
         s for s in studio().surfaces if isinstance(s.shape, Panel) and s.shape.size == (1.6, 2.2)
     )  # upright, parallel to the wall
-    for camera in embedded_cameras()[:2]:
+    for camera in embedded_cameras()[1:2]:
         photo, depth = linear(render_view(camera, samples=2)).mean(-1), render_depth(camera)
         for sx, sy in ((-1, -1), (1, -1), (-1, 1)):  # the fourth corner is hidden
             pixels = []
@@ -143,7 +143,7 @@ def test_same_bytes_at_any_thread_count() -> None:
     first = render_view(camera, samples=2, threads=1)
     assert first.shape == (112, 150, 3)
     assert first.dtype == np.uint8
-    for threads in (1, 2, 5, None):
+    for threads in (2, 5):
         assert render_view(camera, samples=2, threads=threads).tobytes() == first.tobytes()
 
 
@@ -166,10 +166,10 @@ def test_highlight_moves_with_the_view_and_paper_does_not() -> None:
     for x in (0.0, 1.0):
         viewmat = look_at(eye + np.array([x, 0, 0]), np.array(scene.FOCUS))
         camera = replace(embedded_cameras()[0], viewmat=viewmat)
-        photo = render_view(camera, samples=1)
+        photo, depth = render_view(camera, samples=1), render_depth(camera)
         for name, point in (("ball", place), ("paper", paper)):
             u, v, z = project(camera, point)
-            assert render_depth(camera)[int(v), int(u)] == pytest.approx(z, rel=0.02)
+            assert depth[int(v), int(u)] == pytest.approx(z, rel=0.02)
             seen[name].append(photo[int(v), int(u)].astype(float))
     assert seen["ball"][0].sum() > seen["ball"][1].sum() + 100
     assert np.ptp(seen["paper"], axis=0).max() < 10
@@ -212,11 +212,15 @@ def depth_error(views: list[View], points: NDArray[np.float32]) -> NDArray[np.fl
     """Relative error of the points' depth against the nearest of the views' depth maps, [P]."""
     error = np.full(len(points), np.inf)
     for view in views:
-        depth = render_depth(view.camera)
-        for k, point in enumerate(points.astype(np.float64)):
-            x, y, z = project(view.camera, point)
-            if 0 <= x < view.camera.width and 0 <= y < view.camera.height and z > 0:
-                error[k] = min(error[k], abs(depth[int(y), int(x)] / z - 1))
+        K, viewmat = view.camera.K, view.camera.viewmat
+        inside = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        z = inside[:, 2]
+        x, y = (inside @ K.T)[:, :2].T / z
+        shown = np.flatnonzero(
+            (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height) & (z > 0)
+        )
+        depth = render_depth(view.camera)[y[shown].astype(int), x[shown].astype(int)]
+        error[shown] = np.minimum(error[shown], np.abs(depth / z[shown] - 1))
     return error
 
 
@@ -311,9 +315,9 @@ def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(scene, "render_view", counting)
     monkeypatch.setattr(scene, "sfm_points", cast)
 
-    def make(width: int = 40) -> tuple[Scene, int]:
+    def make(width: int = 16) -> tuple[Scene, int]:
         before = len(rendered)
-        made = embedded_scene(tmp_path / "cache", width, 30, num_views=10)
+        made = embedded_scene(tmp_path / "cache", width, 12, num_views=10)
         return made, len(rendered) - before
 
     first, cost = make()
@@ -340,9 +344,9 @@ def test_scene_and_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert cost == 10
         assert same_scene(first, remade)
     assert make()[1] == 0
-    other, cost = make(width=44)
+    other, cost = make(width=18)
     assert cost == 10
-    assert other.train[0].image.shape == (30, 44, 3)
+    assert other.train[0].image.shape == (12, 18, 3)
     assert not list((tmp_path / "cache").glob(".*"))  # nothing half written
 
 

@@ -205,7 +205,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def make(kind: str, cache: Path | None = None, seed: int = 0) -> wild.WildRoom:
-    return wild_room(kind, seed, cache, 32, 24, num_views=10)
+    return wild_room(kind, seed, cache, 24, 18, num_views=10)
 
 
 @pytest.mark.parametrize("kind", [*TRUE_KINDS, "true-shake:3"])
@@ -217,11 +217,12 @@ def test_a_wild_room(kind: str, quick: list[int], tmp_path: Path) -> None:
     for view, clean in zip(room.scene.train, room.clean.train, strict=True):
         assert view.camera is clean.camera
         assert view.image.dtype == np.uint8
-        name, _ = parse_true_kind(kind, 32)
+        name, _ = parse_true_kind(kind, 24)
         truth = room.truth[view.name]
         assert (view.image != clean.image).any() == (name != "true-crowd" or bool(truth.walkers))
-        again = wild.taken(name, view.camera, truth)
-        np.testing.assert_array_equal(view.image, again)  # the truth is what made the photo
+        if view in room.scene.train[::4]:
+            again = wild.taken(name, view.camera, truth)
+            np.testing.assert_array_equal(view.image, again)  # the truth is what made the photo
     for view in room.scene.test:
         np.testing.assert_array_equal(view.image, render_view(view.camera))
     assert room.scene.notes[-1].startswith(f"photographed with {kind.partition(':')[0]}:")
