@@ -348,7 +348,7 @@ def test_ctrl_c_is_exit_code_130_with_a_report(
 @pytest.mark.parametrize("words", ["--help", "train --help", "info scene.ply"])
 def test_output_that_nobody_reads_is_no_failure(words: str, tmp_path: Path) -> None:
     """As in `hqgs ... | head`, which has read enough."""
-    Gaussians.from_points(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), 0).save(tmp_path / "scene.ply")
+    Gaussians.from_points(np.eye(4, 3), np.zeros((4, 3), np.uint8), 0).save(tmp_path / "scene.ply")
     command = [sys.executable, "-m", "hqgs", *words.split()]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None

@@ -205,13 +205,13 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def make(kind: str, cache: Path | None = None, seed: int = 0) -> wild.WildRoom:
-    return wild_room(kind, seed, cache, 24, 18, num_views=10)
+    return wild_room(kind, seed, cache, 24, 18, num_views=6)
 
 
 @pytest.mark.parametrize("kind", [*TRUE_KINDS, "true-shake:3"])
 def test_a_wild_room(kind: str, quick: list[int], tmp_path: Path) -> None:
     room = make(kind, tmp_path / "cache")
-    assert len(quick) == 8
+    assert len(quick) == 5
     assert [v.name for v in room.scene.train] == [v.name for v in room.clean.train] == list(room.truth)
     assert room.scene.test == room.clean.test
     for view, clean in zip(room.scene.train, room.clean.train, strict=True):
@@ -226,7 +226,7 @@ def test_a_wild_room(kind: str, quick: list[int], tmp_path: Path) -> None:
     for view in room.scene.test:
         np.testing.assert_array_equal(view.image, render_view(view.camera))
     assert room.scene.notes[-1].startswith(f"photographed with {kind.partition(':')[0]}:")
-    assert "seed 0: all training photos (8)" in room.scene.notes[-1]
+    assert "seed 0: all training photos (5)" in room.scene.notes[-1]
     before = len(quick)
     kept = make(kind, tmp_path / "cache")
     assert len(quick) == before  # read back
