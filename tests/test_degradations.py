@@ -13,8 +13,8 @@ from PIL import Image
 from scipy import ndimage, stats
 
 from hqgs.photos.degrade import Degraded, convolve, degrade_image, gaussian_blur, shrink
+from hqgs.photos.formation import disc_kernel, motion_kernel
 from hqgs.photos.formula import KINDS, MIXED_STEPS, NOT_MADE, Degradation, parse_degradation
-from hqgs.photos.kernels import disc_kernel, motion_kernel
 from hqgs.photos.resize import resize
 
 

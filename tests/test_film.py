@@ -18,7 +18,7 @@ from test_sfm import cards  # noqa: F401
 
 from hqgs.base.stages import Stage
 from hqgs.diagnosis.scene import diagnose_scene
-from hqgs.photos.blocks import fine_detail
+from hqgs.photos.jpeg import fine_detail
 from hqgs.scene.film import film_frames, frame_details
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hqgs.photos.degrade import degrade_image
-from hqgs.photos.formation import blur_matrix, formation
+from hqgs.photos.formation import Kernel, Separable, blur_matrix, formation
 from hqgs.photos.formula import parse_degradation
 from hqgs.photos.jpeg import tables_of_quality
-from hqgs.photos.operators import Kernel, Separable
 from hqgs.photos.resize import resize_matrix
 from hqgs.training.methods.jpeg_cells import JpegCells
 

@@ -14,7 +14,7 @@ from scipy.ndimage import correlate1d
 from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.evaluation.metrics import psnr
-from hqgs.photos.operators import Separable
+from hqgs.photos.formation import Separable
 from hqgs.photos.resize import resize, resize_matrix
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import DensifyConfig, SRGSConfig

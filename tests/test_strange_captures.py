@@ -17,9 +17,9 @@ from test_next_photos import ring
 from test_sfm import cards  # noqa: F401
 from test_synthetic import depth_error, views_of
 
-from hqgs.photos.eight_bits import grey
 from hqgs.photos.exif import Exif, read_exif
 from hqgs.photos.files import UnreadableError, decode_mask, glance
+from hqgs.photos.pixels import grey
 from hqgs.scene import place
 from hqgs.scene.capture import Capture, Photo
 from hqgs.scene.film import film_frames, write_details

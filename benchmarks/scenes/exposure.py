@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.shake import exposure_times, path_points
-from hqgs.photos.constants import GOLDEN
+from hqgs.photos.formation import GOLDEN
 from hqgs.scene.builtin.shading import Exposure
 from hqgs.scene.scene import Camera
 

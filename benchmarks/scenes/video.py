@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
-from hqgs.photos.constants import FPS
 from hqgs.photos.pixels import Float32, as_floats, to_uint8
-from hqgs.photos.video import pyav
+from hqgs.photos.video import FPS, pyav
 
 # The vector code of x264 gives other bits from call to call; without it a film takes 2.5 times as long.
 _X264 = {"x264-params": "asm=0"}

@@ -146,7 +146,7 @@ def _cameras(
 ) -> tuple[list[str] | None, list[Camera], float]:
     """Names of the pictures, if they have any, the cameras, and frames per second."""
     from hqgs.model.orbit import orbit
-    from hqgs.photos.constants import FPS
+    from hqgs.photos.video import FPS
     from hqgs.scene.camera_files import load_path, moved, picked
     from hqgs.scene.paths import UP, camera_path
 

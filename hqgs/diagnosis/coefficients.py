@@ -25,8 +25,7 @@ from hqgs.diagnosis.constants import (
     SHOWS,
     VARIANCES,
 )
-from hqgs.photos.blocks import block_coefficients
-from hqgs.photos.constants import ENOUGH_BLOCKS, MAX_BLOCKS
+from hqgs.photos.jpeg import ENOUGH_BLOCKS, MAX_BLOCKS, block_coefficients
 from hqgs.photos.pixels import LUMA_NOISE, Floats, luma
 
 _GRID = (np.arange(-32, 32) + 0.5) * np.pi / 32  # rad/px

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hqgs.diagnosis.constants import DECODED, FEWEST_LEVELS, FEWEST_PIXELS, LUMA_709, STEP
-from hqgs.photos.blocks import fine_detail
+from hqgs.photos.jpeg import fine_detail
 from hqgs.photos.pixels import LUMA, Floats
 
 

@@ -16,9 +16,7 @@ from hqgs.diagnosis.constants import (
     SPREAD,
     STEPS,
 )
-from hqgs.photos.blocks import block_coefficients
-from hqgs.photos.constants import ENOUGH_BLOCKS
-from hqgs.photos.jpeg import standard_tables
+from hqgs.photos.jpeg import ENOUGH_BLOCKS, block_coefficients, standard_tables
 from hqgs.photos.pixels import Floats, luma
 
 _ROWS, _COLUMNS = np.mgrid[:6, :6]

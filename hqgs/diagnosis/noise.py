@@ -18,8 +18,7 @@ from hqgs.diagnosis.constants import (
     SMALL_LIMIT,
     SMALL_PATCH,
 )
-from hqgs.photos.blocks import blocks_of
-from hqgs.photos.constants import ENOUGH_BLOCKS
+from hqgs.photos.jpeg import ENOUGH_BLOCKS, blocks_of
 from hqgs.photos.pixels import Floats, luma
 
 

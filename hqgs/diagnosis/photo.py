@@ -22,8 +22,8 @@ from hqgs.diagnosis.film_traces import film_detail
 from hqgs.diagnosis.jpeg_traces import Jpeg, find_jpeg
 from hqgs.diagnosis.noise import estimate_noise, neighbour_correlation
 from hqgs.diagnosis.resolution import Enlargement, find_enlargement, undo_enlargement
-from hqgs.photos.constants import MAX_BLOCKS
 from hqgs.photos.formula import small_side
+from hqgs.photos.jpeg import MAX_BLOCKS
 from hqgs.photos.pixels import Floats, to_levels
 
 Table = tuple[tuple[int, ...], ...]

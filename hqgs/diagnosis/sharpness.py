@@ -18,7 +18,7 @@ from hqgs.diagnosis.constants import (
     SPECTRUM_SLOPE,
 )
 from hqgs.diagnosis.spectrum import fit_blurs, power_spectrum, rings, tile_size
-from hqgs.photos.blocks import blocks_of
+from hqgs.photos.jpeg import blocks_of
 from hqgs.photos.pixels import Floats, luma, to_levels
 from hqgs.scene.scene import View
 

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.threads import one_torch_thread
-from hqgs.photos.constants import KERNEL_REACH
+from hqgs.photos.formation import KERNEL_REACH, disc_kernel, motion_kernel
 from hqgs.photos.formula import KINDS, Degradation, DegradationStep, small_side
 from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
-from hqgs.photos.kernels import disc_kernel, motion_kernel
 from hqgs.photos.pixels import Float32, as_floats
 from hqgs.photos.resize import resize
 

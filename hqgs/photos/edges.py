@@ -5,8 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hqgs.photos.constants import SOBEL_ROUNDING
 from hqgs.photos.pixels import floats
+
+# Sobel sums of equal numbers differ by rounding alone up to about this, times the largest |value|. 8-bit
+# photos have steps of at least 1/255, far above it.
+SOBEL_ROUNDING = 1e-5
 
 
 def edge_magnitude(image: Tensor, mask: Tensor | None = None) -> Tensor:

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from hqgs.photos.constants import LARGEST
-from hqgs.photos.eight_bits import grey, of_16
 from hqgs.photos.film_colors import toned
-from hqgs.photos.pixels import oriented
+from hqgs.photos.pixels import grey, of_16, oriented
 from hqgs.photos.profiles import Colors, colors_of, in_srgb, in_srgb_of_16
 
+LARGEST = 1 << 28  # px of a photo: more come from damaged files, and would fill the memory
 HEIC_SUFFIXES = (".heic", ".heif")  # what iPhones write; an extra reads them
 JPEG_SUFFIXES = (".jpg", ".jpeg", ".jfif", ".jpe")
 PHOTO_SUFFIXES = (".png", *JPEG_SUFFIXES, ".tif", ".tiff", ".bmp", ".webp", ".avif", ".jp2", *HEIC_SUFFIXES)

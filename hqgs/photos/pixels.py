@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor  # it takes seconds to load, and files are looked at without
 
 Float32 = NDArray[np.float32]
 Floats = NDArray[np.floating]
@@ -70,7 +72,7 @@ def picture(image: Tensor | Floats | NDArray[np.uint8]) -> Image.Image:
 
     Floats have white at 1 and are clipped. ValueError for another shape.
     """
-    pixels = image.detach().numpy() if isinstance(image, Tensor) else np.asarray(image)
+    pixels = image if isinstance(image, np.ndarray) else image.detach().numpy()
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"image has shape {list(pixels.shape)}, wanted [H, W, 3]")
     whole = pixels if pixels.dtype == np.uint8 else to_uint8(np.nan_to_num(pixels.astype(np.float32)))
@@ -82,3 +84,15 @@ def png(image: Tensor | Floats | NDArray[np.uint8]) -> bytes:
     file = io.BytesIO()
     picture(image).save(file, "PNG")
     return file.getvalue()
+
+
+def of_16(levels: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """The nearest of 256 levels to each of 65,536."""
+    return ((levels + 128) // 257).astype(np.uint8)
+
+
+def grey(photo: Image.Image) -> Image.Image:
+    """A photo in grey, 8 bits; of more bits those above count, which Pillow's own conversion cuts off."""
+    if photo.mode.startswith("I"):
+        return Image.fromarray(of_16(np.asarray(photo).astype(np.int64).clip(0, 65535)))
+    return (photo.convert("RGB") if photo.mode == "LAB" else photo).convert("L")

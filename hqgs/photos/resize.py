@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from hqgs.photos.constants import CUBIC_A, CUBIC_RADIUS, RESIZE_BAND
-
+CUBIC_A = -0.5  # of Keys's cubic: the value at which it reproduces quadratics
+CUBIC_RADIUS = 2  # of the cubic, in samples
+RESIZE_BAND = 8  # new rows at a time: what is between then fits into the caches
 Pixels = NDArray[np.uint8] | NDArray[np.float32]
 
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from hqgs.base.files import CAMERAS, PHOTOS, atomic_path, read_json, write_json
-from hqgs.photos.constants import FPS, LARGEST
+from hqgs.photos.files import LARGEST
 from hqgs.photos.pixels import as_floats, to_uint8, upright
+from hqgs.photos.video import FPS
 from hqgs.scene.constants import BACKGROUND, KEPT_SIDE, MOST_FRAMES
 from hqgs.scene.paths import scene_up, view_matrix
 from hqgs.scene.scene import Camera, Scene

@@ -20,11 +20,10 @@ from PIL import Image
 from hqgs.base.files import missing_folders, read_json, remove_empty, write_json
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.base.text import as_text
-from hqgs.photos.blocks import fine_detail
-from hqgs.photos.constants import FPS
 from hqgs.photos.film_colors import KNEE, as_photo, film_colors
+from hqgs.photos.jpeg import fine_detail
 from hqgs.photos.spherical import projection
-from hqgs.photos.video import pyav
+from hqgs.photos.video import FPS, pyav
 from hqgs.scene.constants import COPY_SIDE, FRAMES_A_SECOND, FRAMES_FEWEST, FRAMES_MOST, JPEG_QUALITY
 from hqgs.scene.names import FRAMES, is_room
 from hqgs.scene.photo_files import film_at

@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 
 from hqgs.base.machine import AT_ONCE, give_back_memory, keep_large_arrays_apart
 from hqgs.base.stages import OnStage, Stage, silent
-from hqgs.photos.constants import CUBIC_RADIUS
 from hqgs.photos.exif import read_exif
 from hqgs.photos.files import UnreadableError, decode, decode_mask, shrunk, stored_size
 from hqgs.photos.pixels import oriented
-from hqgs.photos.resize import Pixels, area_downscale
+from hqgs.photos.resize import CUBIC_RADIUS, Pixels, area_downscale
 from hqgs.scene.capture import Photo
 from hqgs.scene.constants import (
     DENSE_SAMPLES,

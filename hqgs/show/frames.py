@@ -23,10 +23,9 @@ from hqgs.model.formats.rows import curve_order
 from hqgs.model.formats.turned import matrices
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.rasterization import rasterization
-from hqgs.photos.constants import FPS
 from hqgs.photos.files import PHOTO_SUFFIXES
 from hqgs.photos.look import Look
-from hqgs.photos.video import pyav
+from hqgs.photos.video import FPS, pyav
 from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.scene import Camera

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hqgs.base.files import atomic_path
-from hqgs.photos.constants import GOLDEN
+from hqgs.photos.formation import GOLDEN
 from hqgs.scene import paths
 from hqgs.scene.builtin.shading import render_depth, render_view
 from hqgs.scene.constants import PATH_SIZE, TEST_EVERY

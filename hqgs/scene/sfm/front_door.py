@@ -13,9 +13,9 @@ import numpy as np
 from PIL import Image
 
 from hqgs.base.text import some
-from hqgs.photos.eight_bits import grey
 from hqgs.photos.exif import Exif
 from hqgs.photos.files import Glance, UnreadableError, decode, open_photo
+from hqgs.photos.pixels import grey
 from hqgs.scene.names import FILM_SUFFIXES
 from hqgs.scene.photo_files import of_maps
 

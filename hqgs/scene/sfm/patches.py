@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hqgs.base.machine import AT_ONCE
-from hqgs.photos.eight_bits import grey
+from hqgs.photos.pixels import grey
 from hqgs.scene.sfm.constants import (
     COARSER,
     FRONTAL,

@@ -15,7 +15,7 @@ import pycolmap
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from hqgs.photos.eight_bits import grey
+from hqgs.photos.pixels import grey
 from hqgs.scene.constants import JPEG_QUALITY
 
 

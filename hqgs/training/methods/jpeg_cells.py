@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs import _rust
+from hqgs.photos.formation import Separable
 from hqgs.photos.jpeg import Tables
-from hqgs.photos.operators import Separable
 
 BLOCK = 8
 # R, G, B to Y, Cb, Cr (ITU-T T.871, without the offset of the chroma, which no difference sees).

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from hqgs.photos.constants import GOLDEN
+from hqgs.photos.formation import GOLDEN
 from hqgs.training.constants import FEWEST_SAMPLES, FIRST_RADIUS, LENS_FARTHEST, LENS_NEAREST, MOST_SAMPLES
 
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hqgs.photos.operators import Separable
+from hqgs.photos.formation import Separable
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import resize, resize_matrix
 from hqgs.scene.scene import View
