@@ -112,7 +112,7 @@ def train(
         method: "auto" or "hqgs" (the photos' degradation in the loss, none where they show none), "3dgs" or
             "srgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
-            photos, passersby, growth, weight, resolution, iterations, with commas.
+            photos, passersby, growth, resolution, iterations, with commas.
         seed: of everything random.
         max_gaussians: growth stops there; bounds the memory.
         guidance: of hqgs: "formation", or "paper", its published form.

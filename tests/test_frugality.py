@@ -37,9 +37,9 @@ def bits(trainer: Trainer) -> dict[str, bytes]:
 
 
 def test_the_items_by_name() -> None:
-    assert parse_leave_out("auto") == ("photos", "passersby", "growth", "weight")
+    assert parse_leave_out("auto") == ("photos", "passersby", "growth")
     assert parse_leave_out("none") == ()
-    assert parse_leave_out("weight, photos") == ("photos", "weight")
+    assert parse_leave_out("growth, photos") == ("photos", "growth")
     with pytest.raises(ValueError, match="there is no 'colour'; there are: auto, none, or some of photos"):
         parse_leave_out("photos,colour")
     with pytest.raises(ValueError, match="there is no 'colour'"):
@@ -73,7 +73,7 @@ def test_few_photos_are_never_held_back() -> None:
 
 
 def test_degraded_photos_have_a_budget_of_their_own() -> None:
-    scene, items = tiny_scene(VIEWS), ("photos", "passersby", "growth", "weight", "resolution", "iterations")
+    scene, items = tiny_scene(VIEWS), ("photos", "passersby", "growth", "resolution", "iterations")
     noisy = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:20"), leave_out=items)
     assert Trainer(scene, noisy).schedule.items == {"photos", "passersby", "iterations"}
     clean = replace(noisy, hqgs=HQGSConfig(formation="none"))
@@ -103,21 +103,6 @@ def test_the_next_degree_comes_sooner_where_growth_is_left_out(
         2,
         3,
     ]
-
-
-def test_what_no_photo_shows_goes_when_growth_ends() -> None:
-    scene = tiny_scene(VIEWS)
-    behind = scene.points + np.array([0, 0, -50], np.float32)
-    scene = replace(
-        scene,
-        points=np.concatenate([scene.points, behind]),
-        point_colors=np.concatenate([scene.point_colors] * 2),
-    )
-    trainer = run(scene, 60, "weight", densify=replace(STILL, stop=40))
-    assert (trainer.gaussians.means[:, 2] > 0).all()
-    (item,) = trainer.frugality.left_out()
-    assert item.what.endswith("of 80 Gaussians")
-    assert item.bytes == (80 - len(trainer.gaussians)) * 4 * 59
 
 
 def test_the_first_part_is_trained_at_half_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +163,7 @@ def test_photos_of_which_masks_leave_nothing_do_not_count(monkeypatch: pytest.Mo
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plan_rules, "SMALLEST_SIDE", 8)
-    items = ("growth", "weight", "resolution")
+    items = ("growth", "resolution")
     scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
     whole = Trainer(scene, config)
     for k in range(60):
@@ -222,7 +207,7 @@ def test_the_number_of_threads_changes_no_bit() -> None:
     try:
         for threads in (1, 2):
             hqgs.set_num_threads(threads)
-            results.append(bits(run(tiny_scene(VIEWS), 40, "growth", "weight")))
+            results.append(bits(run(tiny_scene(VIEWS), 40, "growth")))
     finally:
         hqgs.set_num_threads(before)
     assert results[0] == results[1]

@@ -40,7 +40,7 @@ from hqgs.training.trainer import Trainer
 ROOT = Path(__file__).parents[1]
 STILL = DensifyConfig(start=10_000, reset_every=10_000)
 CASES: dict[str, dict[str, Any]] = {
-    "3dgs": {"leave_out": ("growth", "weight")},
+    "3dgs": {"leave_out": ("growth",)},
     "tinted": {"method": "tinted"},  # a tensor of its own, and harmonics of which all is sent
     "hqgs": {"method": "hqgs", "hqgs": hqgs.TrainConfig().hqgs.__class__(formation="exposure")},
 }

@@ -15,8 +15,6 @@ import torch
 import hqgs
 from hqgs.model.formats import gltf
 from hqgs.model.formats.rows import curve_order
-from hqgs.model.render import blending_weights
-from hqgs.scene.scene import Camera
 
 
 def some(n: int = 200, **changes: Any) -> hqgs.Gaussians:
@@ -124,17 +122,6 @@ def test_gltf_of_interleaved_rows_and_of_normalized_integers() -> None:
 def test_points_of_a_plane_have_an_order() -> None:
     flat = np.random.default_rng(0).random((50, 3)) * [1, 1, 0]
     assert sorted(curve_order(flat)) == list(range(50))
-
-
-def test_weights_are_those_of_the_render() -> None:
-    scene = some(
-        1, means=torch.tensor([[0.0, 0, 4]]), scales=torch.full((1, 3), -7.0), opacities=torch.tensor([9.0])
-    )
-    camera = Camera(32, 32, np.array([[30.0, 0, 16.5], [0, 30, 16.5], [0, 0, 1]]), np.eye(4))
-    plain = float(blending_weights(scene, camera)[0])
-    scene.antialiased = True
-    assert plain > 0.9
-    assert float(blending_weights(scene, camera)[0]) < 0.1
 
 
 ARGUMENTS: dict[str, Any] = {

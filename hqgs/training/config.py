@@ -25,7 +25,6 @@ ITEMS = {
     "photos": "training photos that are broken, empty or far too blurred",
     "passersby": "what stands in one photo while others contradict it",
     "growth": "Gaussians finer than the photos' pixels",
-    "weight": "Gaussians that no photo shows",
     "resolution": "full resolution in the first part of the run",
     "iterations": "steps that no longer pay",
 }

@@ -53,8 +53,6 @@ SHOWN_PART = 0.05
 REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 # Iterations between looks at whether the run still improves; dB and iterations: when it has stopped.
 CHECKS, BETTER, PATIENCE = 500, 0.05, 2_000
-TOLERANCE, TRIED = 0.02, 8  # dB that leaving Gaussians out may cost; photos that it is tried on, at most
-WEIGHTS = (0.1, 0.05, 0.02, 0.01, 0.005)  # limits of the largest blending weight; the first that costs little
 
 # Few photos. Measured on 25 sets of 3 to 43 photos of 14 captures and rooms, 1,000 iterations at 400 px. With
 # at most 12 photos decay gained in all 10 sets, 0.05 to 1.3 dB. From 13 to 31 it gained 0.3 to 1.4 dB in 8

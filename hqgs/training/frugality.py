@@ -14,12 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from torch import Tensor
-
-from hqgs.base.evenly import middles
 from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
-from hqgs.model.render import largest_weights
 from hqgs.scene.scene import View
 from hqgs.training.constants import (
     BETTER,
@@ -34,9 +30,6 @@ from hqgs.training.constants import (
     PATIENCE,
     REST,
     SMALLEST_SIDE,
-    TOLERANCE,
-    TRIED,
-    WEIGHTS,
 )
 from hqgs.training.plan import PlanRow
 from hqgs.training.schedule import Decisions, Schedule
@@ -44,20 +37,10 @@ from hqgs.training.state import TrainState
 
 RULES: dict[str, object] = {  # what a result depends on beside the configuration
     "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
-    "tolerance": (TOLERANCE, TRIED),
     "growth": FINEST,
     "resolution": (COARSE_PART, COARSE_MOST, COARSE_FACTOR, SMALLEST_SIDE),
-    "weight": WEIGHTS,
     "iterations": (BETTER, PATIENCE, CHECKS, REST),
 }
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What is decided after a step."""
-
-    decisions: Decisions
-    faint: Tensor | None = None  # bool [N]: Gaussians to remove; None: none
 
 
 @dataclass
@@ -93,25 +76,19 @@ class Frugality:
         self._shown, self._psnr = shown, psnr
         self._seconds: deque[float] = deque(maxlen=50)  # of the last steps
 
-    def after_step(self, state: TrainState, refused: int, seconds: float) -> Outcome:
+    def after_step(self, state: TrainState, refused: int, seconds: float) -> Decisions:
         """Note what the step did, and decide what is due at this iteration.
 
         `refused`: Gaussians that were too fine to grow. `seconds`: of the step.
         """
         self._seconds.append(seconds)
         self.memory.refused += refused
-        verdict = Outcome(state.decisions)
-        if not self.schedule.items:
-            return verdict
+        if not self.schedule.holds(state.decisions):
+            return state.decisions
         started = time.perf_counter()
-        if self.schedule.holds(state.decisions):
-            verdict = self._of_held_photos(state)
-        if "weight" in self.schedule.items and state.iteration == self.schedule.densification_end(
-            state.decisions
-        ):
-            verdict = replace(verdict, faint=self._faint(state))
+        decisions = self._of_held_photos(state)
         self.memory.seconds += time.perf_counter() - started
-        return verdict
+        return decisions
 
     @property
     def step_seconds(self) -> float:
@@ -141,7 +118,7 @@ class Frugality:
         """The run goes on after its end: no iterations are left out."""
         self.memory.records = [one for one in self.memory.records if one["item"] != "iterations"]
 
-    def _of_held_photos(self, state: TrainState) -> Outcome:
+    def _of_held_photos(self, state: TrainState) -> Decisions:
         """What the held-back photos say, and whether they come back."""
         schedule, iteration, decisions = self.schedule, state.iteration, state.decisions
         tries = iteration % CHECKS == 0 and not schedule.is_coarse(iteration)
@@ -153,7 +130,7 @@ class Frugality:
             why = "early enough that the scene can grow where only they look"
             row = PlanRow("photos held back", "back", why, "", "held_photos", iteration)
             state.rows.append(row)
-        return Outcome(decisions)
+        return decisions
 
     def _length(self, state: TrainState, shown: Gaussians) -> int | None:
         """Of the run, where the held-back photos have stopped improving; None: they have not."""
@@ -174,57 +151,8 @@ class Frugality:
         self._note("iterations", "length", f"{length:,} iterations", left, state)
         return length
 
-    def _faint(self, state: TrainState) -> Tensor | None:
-        """The Gaussians that no photo shows, bool [N]; None: all are needed."""
-        tried = middles(len(self.views), TRIED)
-        fewer = fewest_gaussians(self._shown(), self.views, lambda g: self._psnr(g, tried))
-        if fewer is None:
-            return None
-        total, count = len(state.gaussians), int(fewer.faint.sum())
-        row = sum(tensor[:1].numel() for tensor in state.gaussians.named().values())
-        left = LeftOut(
-            f"{count} of {total} Gaussians",
-            f"no photo shows them with a blending weight of {fewer.limit:g}",
-            f"on {len(tried)} photos {fewer.evidence}",
-            bytes=4 * row * count,
-            cost_db=fewer.cost,
-        )
-        self._note("weight", "Gaussians", f"{total - count:,} are left", left, state)
-        return fewer.faint
-
     def _note(self, item: str, what: str, value: str, left: LeftOut, state: TrainState) -> None:
         """Keep what is left out by this item, and the row that tells it."""
         self.memory.records.append(asdict(left) | {"item": item})
         row = PlanRow(what, value, left.why, left.evidence or "", item, state.iteration)
         state.rows.append(row)
-
-
-@dataclass
-class FewerGaussians:
-    """A scene with less in it: the PSNR on the photos before, in dB, and what leaving out costs."""
-
-    whole: float
-    cost: float
-    limit: float  # of the largest blending weight
-    faint: Tensor  # bool [N]: those below it
-
-    @property
-    def evidence(self) -> str:
-        return f"{self.whole:.2f} dB with them, {self.whole - self.cost:.2f} dB without"
-
-
-def fewest_gaussians(
-    shown: Gaussians, views: Sequence[View], psnr: Callable[[Gaussians], float]
-) -> FewerGaussians | None:
-    """Without those below the highest of WEIGHTS that loses no more than TOLERANCE; None: there are none."""
-    weights = largest_weights(shown, views)
-    whole = psnr(shown)
-    for limit in WEIGHTS:
-        faint = weights < limit
-        if not 0 < int(faint.sum()) < len(shown):
-            continue
-        rest = shown.rows(~faint)
-        cost = whole - psnr(rest)
-        if cost <= TOLERANCE:
-            return FewerGaussians(whole, cost, limit, faint)
-    return None

@@ -298,10 +298,7 @@ class Trainer:
     def _leave_out(self, densified: Densification, seconds: float) -> None:
         """Do without what the frugality finds to be of no use."""
         state = self.state
-        verdict = self.frugality.after_step(state, densified.refused, seconds)
-        state.decisions = verdict.decisions
-        if verdict.faint is not None:
-            self._remove(verdict.faint)
+        state.decisions = self.frugality.after_step(state, densified.refused, seconds)
 
     def _remove(self, rows: Tensor) -> None:
         """Remove the Gaussians of these rows, bool [N]."""
