@@ -23,7 +23,6 @@ from hqgs.scene.known_points import with_points
 from hqgs.scene.load import load_scene
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import NONE, PAPER, HQGSConfig, TrainConfig, parse_leave_out
-from hqgs.training.frugality import RULES
 from hqgs.training.methods.paper import VARIANTS
 
 if sys.version_info >= (3, 11):
@@ -58,7 +57,7 @@ class Row:
     @property
     def more(self) -> dict[str, Any]:
         """What the result depends on, beside configuration and photos."""
-        return {} if self.leave_out == NONE else {"rules": RULES}
+        return {}
 
     def train_config(self, seed: int, iterations: int, changes: dict[str, Any] | None = None) -> TrainConfig:
         """The run, its schedule fitted to its length. `changes`: of the protocol, before those of the row."""

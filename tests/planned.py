@@ -10,8 +10,8 @@ from tiny_scene import tiny_scene
 from hqgs.scene.scene import View
 from hqgs.training.config import TrainConfig
 from hqgs.training.plan import RunPlan
-from hqgs.training.plan_rules import plan_run
 from hqgs.training.prepare import facts_of
+from hqgs.training.rules import plan_run
 from hqgs.training.schedule import Schedule
 
 

@@ -19,13 +19,13 @@ from hqgs.base.files import CHECKPOINT, CONFIG, PLAN, PLY
 from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.scene.degrade import write_degraded_scene
-from hqgs.training import clock, plan_length
+from hqgs.training import clock, rules
 from hqgs.training.checkpoint import load_checkpoint, save_checkpoint
 from hqgs.training.config import DensifyConfig, TrainConfig, run_config, with_iterations
-from hqgs.training.constants import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.notes import run_notes
 from hqgs.training.pace import fit_to_seconds
 from hqgs.training.plan import StepSeconds
+from hqgs.training.rules import FOR_EACH_PHOTO, GROWS_FROM, LEAST_ENOUGH, PIXELS
 from hqgs.training.schedule import Schedule
 from hqgs.training.settings import plan_values, with_plan
 from hqgs.training.trainer import Trainer
@@ -63,19 +63,13 @@ def test_after_growth_the_rest_of_a_run_follows_the_clock() -> None:
 def test_as_many_iterations_as_fit() -> None:
     """A full step takes 0.1 s, one at half size 0.02 s, before the scene grows."""
     steps = StepSeconds(full=0.1, half=0.02)
-
-    def half_until(iterations: int) -> int:
-        return round(0.6 * iterations)
-
-    fits = plan_length.fitting(60.0, steps, 1.0, half_until)
-    assert (0.6 * 0.02 + 0.4 * 0.1) * plan_length.SLOWER * fits == pytest.approx(60.0, rel=2e-2)
-    dense = plan_length.fitting(60.0, steps, 3.0, half_until)
-    assert dense == pytest.approx(fits * plan_length.SLOWER / plan_length.SLOWER_DENSE, abs=2)
-    assert plan_length.fitting(60.0, steps, 1.0, half_until, most=100) == 100
-    assert plan_length.fitting(1e-3, steps, 1.0, half_until) == plan_length.FEWEST_ITERATIONS
-    assert plan_length.fitting(1e9, steps, 1.0, half_until) == pytest.approx(
-        plan_length.MOST_ITERATIONS, abs=1
-    )
+    fits = rules.fitting(60.0, steps, 1.0, True)
+    assert (0.6 * 0.02 + 0.4 * 0.1) * rules.SLOWER * fits == pytest.approx(60.0, rel=2e-2)
+    dense = rules.fitting(60.0, steps, 3.0, True)
+    assert dense == pytest.approx(fits * rules.SLOWER / rules.SLOWER_DENSE, abs=2)
+    assert rules.fitting(60.0, steps, 1.0, True, most=100) == 100
+    assert rules.fitting(1e-3, steps, 1.0, True) == rules.FEWEST_ITERATIONS
+    assert rules.fitting(1e9, steps, 1.0, True) == pytest.approx(rules.MOST_ITERATIONS, abs=1)
 
 
 @pytest.mark.parametrize("formation", ["none", "exposure", "noise:12"])
@@ -109,8 +103,8 @@ def test_a_resumed_run_of_seconds_knows_how_long_its_steps_take(tmp_path: Path) 
 
 
 def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 30)
-    monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 31)
+    monkeypatch.setattr(rules, "FEWEST_ITERATIONS", 30)
+    monkeypatch.setattr(rules, "MOST_ITERATIONS", 31)
     scene, config = tiny_scene(), run_config(iterations=500, leave_out="none", method="3dgs")
     run = hqgs.train(scene, out=tmp_path / "a", config=config, seconds=0.5)
     plan = json.loads((tmp_path / "a" / PLAN).read_text())
@@ -131,8 +125,8 @@ def test_a_run_of_seconds_is_repeated_bit_for_bit(tmp_path: Path, monkeypatch: p
 def test_a_run_of_seconds_looks_at_each_photo_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although it is prepared twice: to be timed, and to be trained."""
     seen = inspected(monkeypatch)
-    monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 5)
-    monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 6)
+    monkeypatch.setattr(rules, "FEWEST_ITERATIONS", 5)
+    monkeypatch.setattr(rules, "MOST_ITERATIONS", 6)
     scene = tiny_scene()
     hqgs.train(scene, seconds=0.1)
     assert sorted(seen) == sorted(view.name for view in scene.train)
@@ -216,7 +210,7 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     assert noisy.config.iterations == 7_000
     assert "no photo can be held back to tell when to end" in [row.why for row in noisy.rows]
     for name in ("ENOUGH", "LEAST_ENOUGH"):
-        monkeypatch.setattr(f"hqgs.training.plan_rules.{name}", 700)
+        monkeypatch.setattr(f"hqgs.training.rules.{name}", 700)
     many = trainer()
     assert many.config.iterations == FOR_EACH_PHOTO * len(scene.train) == 1_050
     assert "iterations" in many.schedule.items
@@ -230,12 +224,12 @@ def test_clean_photos_are_not_looked_at_more_often_than_pays(monkeypatch: pytest
     assert long.config.iterations == long.plan.clock_most == 1_050
     assert any("more looks at the photos do not pay" in note for note in run_notes(long))
     short_of = timed(1e-3)
-    assert (short_of.config.iterations, short_of.plan.clock_most) == (plan_length.FEWEST_ITERATIONS, 1_050)
+    assert (short_of.config.iterations, short_of.plan.clock_most) == (rules.FEWEST_ITERATIONS, 1_050)
 
 
 def test_a_run_without_a_number_can_be_made_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hqgs.training.plan_rules.LEAST_ENOUGH", 20)
-    monkeypatch.setattr("hqgs.training.plan_rules.FOR_EACH_PHOTO", 1)
+    monkeypatch.setattr("hqgs.training.rules.LEAST_ENOUGH", 20)
+    monkeypatch.setattr("hqgs.training.rules.FOR_EACH_PHOTO", 1)
     scene, out = tmp_path / "desk", tmp_path / "run"
     write_degraded_scene(tiny_scene(), scene, parse_degradation("none"), 0)
     argv = ["train", str(scene), "--out", str(out), "--formation", "none"]

@@ -23,10 +23,9 @@ from hqgs.pipeline import open_run, run_to_end
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import DensifyConfig, ESFGConfig, PaperConfig
-from hqgs.training.constants import SCS_CACHE_BYTES
 from hqgs.training.densify import Densifier
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.paper import VARIANTS, PaperHQGS, ScsWeights, scs_loss
+from hqgs.training.methods.paper import SCS_CACHE_BYTES, VARIANTS, PaperHQGS, ScsWeights, scs_loss
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.trainer import Trainer
 

@@ -19,7 +19,7 @@ from hqgs.photos.jpeg import decode_jpeg, encode_jpeg
 from hqgs.photos.pixels import as_floats
 from hqgs.photos.resize import area_downscale
 from hqgs.scene.scene import Scene
-from hqgs.training.constants import FILM_NOISE
+from hqgs.training.methods.formed import FILM_NOISE
 from hqgs.training.trainer import Trainer
 from tests.tiny_scene import tiny_config, tiny_scene
 

@@ -16,7 +16,7 @@ from hqgs.model.first_points import points_along_edges
 from hqgs.pipeline import run_to_end
 from hqgs.scene.scene import Camera, Scene, View
 from hqgs.training.config import HQGSConfig
-from hqgs.training.constants import PIXELS
+from hqgs.training.rules import PIXELS
 from hqgs.training.trainer import Trainer
 
 NORMAL, OFFSET = np.array([0.3, -0.2, 1.0]), 5.0  # the plane NORMAL . x = OFFSET

@@ -17,7 +17,7 @@ from hqgs.scene.scene import Scene
 # Photos; what they are taken for; iterations; of the held-out views PSNR (dB): floor, lowest and highest of
 # seeds 0 to 3; SSIM: the same three; how far 3dgs stays below (dB): floor, lowest of the seeds.
 # Points as exact as this room's leave nothing for decay of the opacities to clear: blur and lowres lose 0.2
-# and 0.1 dB by it here, and gain on captures (hqgs/training/constants.py).
+# and 0.1 dB by it here, and gain on captures (docs/log.md).
 FLOORS = [
     ("none", "none", 100, (25.5, 25.95, 26.18), (0.910, 0.9168, 0.9201), None),
     ("noise:25", "noise:26", 100, (24.3, 24.58, 24.65), (0.863, 0.8682, 0.8709), (0.9, 1.04)),

@@ -15,9 +15,8 @@ import hqgs.training.frugality as module
 from hqgs.base.left_out import CORRECTION, LeftOut, format_left_out
 from hqgs.pipeline import train
 from hqgs.scene.scene import Scene
-from hqgs.training import plan_rules
+from hqgs.training import rules
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig, parse_leave_out
-from hqgs.training.constants import COARSE_PART
 from hqgs.training.schedule import smaller
 from hqgs.training.trainer import Trainer
 
@@ -106,10 +105,10 @@ def test_the_next_degree_comes_sooner_where_growth_is_left_out(
 
 
 def test_the_first_part_is_trained_at_half_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan_rules, "SMALLEST_SIDE", 8)
+    monkeypatch.setattr(rules, "SMALLEST_SIDE", 8)
     trainer = Trainer(tiny_scene(), tiny_config(20, leave_out=("resolution",)))
     shapes = [tuple(trainer.step().render.shape) for _ in range(20)]
-    end = round(COARSE_PART * 20)
+    end = 12  # 60 %
     assert shapes == [(HEIGHT // 2, WIDTH // 2, 3)] * end + [(HEIGHT, WIDTH, 3)] * (20 - end)
 
 
@@ -162,7 +161,7 @@ def test_photos_of_which_masks_leave_nothing_do_not_count(monkeypatch: pytest.Mo
 
 
 def test_a_resumed_run_is_the_same_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plan_rules, "SMALLEST_SIDE", 8)
+    monkeypatch.setattr(rules, "SMALLEST_SIDE", 8)
     items = ("growth", "resolution")
     scene, config = tiny_scene(VIEWS), tiny_config(60, leave_out=items, sh_interval=6)
     whole = Trainer(scene, config)

@@ -20,8 +20,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.pipeline import train
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
-from hqgs.training.constants import EVENTS_KEPT, GAUSSIANS_LISTED
-from hqgs.training.guard import are_sound, bad_rows
+from hqgs.training.guard import EVENTS_KEPT, GAUSSIANS_LISTED, are_sound, bad_rows
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.trainer import Trainer
 

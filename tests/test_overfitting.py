@@ -12,11 +12,10 @@ from tiny_scene import tiny_config, tiny_scene
 
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.config import TrainConfig, run_config
-from hqgs.training.constants import DECAY, DROPOUT, DROPPED, MANY_PHOTOS, OPAQUE
 from hqgs.training.methods.base import Method
-from hqgs.training.overfitting import decay_opacities, with_dropout
+from hqgs.training.overfitting import DROPPED, OPAQUE, decay_opacities, with_dropout
 from hqgs.training.plan import Facts
-from hqgs.training.plan_rules import plan_run
+from hqgs.training.rules import DECAY, DROPOUT, MANY_PHOTOS, plan_run
 from hqgs.training.trainer import Trainer
 
 

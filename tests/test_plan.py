@@ -20,13 +20,11 @@ from hqgs.cli.main import main
 from hqgs.photos.formula import parse_degradation
 from hqgs.pipeline import open_run
 from hqgs.scene.degrade import write_degraded_scene
-from hqgs.training import plan_length
+from hqgs.training import rules
 from hqgs.training.config import PRESETS, HQGSConfig, run_config, with_iterations
-from hqgs.training.constants import FEW_STEPS, PIXELS
-from hqgs.training.plan import Choice, Draft, Rule, RunPlan, StepSeconds, plan_by
-from hqgs.training.plan_budget import first_points_wanted
-from hqgs.training.plan_rules import RULES, plan_run
+from hqgs.training.plan import RunPlan, StepSeconds
 from hqgs.training.prepare import Prepared, facts_of
+from hqgs.training.rules import PIXELS, RULES, Draft, Rule, first_points_wanted, plan_run
 from hqgs.training.settings import plan_values, with_plan
 from hqgs.training.trainer import Trainer
 from hqgs.training.trial import _settings
@@ -83,7 +81,7 @@ def test_a_run_of_few_steps_starts_from_twice_as_many_points_that_photos_agree_o
     config = run_config(iterations=50, method="hqgs", formation="none")
     facts = replace(Prepared(textured_scene(8, 64), config).facts, points=10)
     usual = facts.pixels // PIXELS
-    longer = replace(config, iterations=FEW_STEPS * facts.photos)
+    longer = replace(config, iterations=20 * facts.photos)
     for agreed, asked, times in ((0.9, config, 2), (0.9, longer, 1), (0.6, config, 1), (None, config, 1)):
         plan = plan_run(replace(facts, agreed=agreed), None, asked)
         assert plan.first_points == times * facts.pixels // PIXELS, (agreed, asked.iterations)
@@ -97,7 +95,7 @@ def test_a_repeat_of_seconds_starts_from_as_many_points(tmp_path: Path) -> None:
     facts = replace(Prepared(textured_scene(8, 64), asked).facts, points=10, agreed=0.9)
     timed = replace(facts, seconds=StepSeconds(1.0, 0.25))
     run = plan_run(timed, None, replace(asked, seconds=1.0))
-    assert run.settings.iterations < FEW_STEPS * facts.photos
+    assert run.settings.iterations < 20 * facts.photos
     (tmp_path / PLAN).write_text(json.dumps(plan_values(run.settings, [])))
     again = plan_run(facts, None, with_plan(asked, tmp_path))
     assert (again.settings.iterations, again.first_points) == (run.settings.iterations, run.first_points)
@@ -125,25 +123,28 @@ def test_without_an_item_of_the_photos_a_run_is_planned_as_before(left: str) -> 
 
 
 def test_a_rule_is_one_entry() -> None:
-    def seed(draft: Draft) -> list[Choice]:
-        return [Choice("7", "for luck", changes={"seed": 7, "densify.every": 3})] if draft.formed else []
+    def seed(draft: Draft) -> None:
+        if draft.formed:
+            draft.set(seed=7)
+            draft.grow(every=3)
+            draft.note("7", "for luck")
 
     facts = facts_of(tiny_scene())
-    rules = (*RULES, Rule("seed", seed, "nowhere"))
+    more = (*RULES, Rule("seed", seed, "nowhere"))
     config = tiny_config(method="auto", hqgs=HQGSConfig(formation="none"))
-    plan = plan_by(rules, facts, None, config)
+    plan = plan_run(facts, None, config, more)
     assert (plan.settings.seed, plan.settings.densify.every) == (7, 3)
     assert plan.rows[-1].rule == "seed: nowhere"
-    assert plan_by(rules, facts, None, tiny_config()).settings.seed == tiny_config().seed
+    assert plan_run(facts, None, tiny_config(), more).settings.seed == tiny_config().seed
 
 
 def test_seconds_are_a_fact_of_the_machine() -> None:
     config = replace(run_config(method="3dgs"), seconds=60.0)
     facts = replace(facts_of(tiny_scene()), as_photographed=True)
     slow, fast = (plan_run(replace(facts, seconds=StepSeconds(s, s / 4)), None, config) for s in (0.1, 0.01))
-    assert slow.settings.iterations == pytest.approx(60 / (0.1 * plan_length.SLOWER), rel=0.01)
-    assert fast.settings.iterations == pytest.approx(60 / (0.01 * plan_length.SLOWER), rel=0.01)
-    assert slow.clock_most == plan_length.MOST_ITERATIONS
+    assert slow.settings.iterations == pytest.approx(60 / (0.1 * rules.SLOWER), rel=0.01)
+    assert fast.settings.iterations == pytest.approx(60 / (0.01 * rules.SLOWER), rel=0.01)
+    assert slow.clock_most == rules.MOST_ITERATIONS
     assert not planned(config, tiny_scene().train).clock_most
 
 
@@ -165,8 +166,8 @@ def test_what_is_decided_later_is_added_and_a_resumed_run_reads_the_same(tmp_pat
 
 def test_a_run_of_seconds_resumes_by_the_same_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped in the middle, and at its end: its length is the one that was planned, not 30,000."""
-    monkeypatch.setattr(plan_length, "FEWEST_ITERATIONS", 40)
-    monkeypatch.setattr(plan_length, "MOST_ITERATIONS", 41)
+    monkeypatch.setattr(rules, "FEWEST_ITERATIONS", 40)
+    monkeypatch.setattr(rules, "MOST_ITERATIONS", 41)
 
     config = replace(run_config(leave_out="none", method="3dgs"), seconds=1e3)
 

@@ -31,9 +31,8 @@ from hqgs.cli.main import main
 from hqgs.training.adam import Adam
 from hqgs.training.batch import Part, Rest, give_harmonics, give_others, part_of, to_rasterize
 from hqgs.training.config import DensifyConfig, TrainConfig
-from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.forward import TrainingViews
-from hqgs.training.guard import Fault
+from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Fault
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.trainer import Trainer
 

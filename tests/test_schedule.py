@@ -19,8 +19,7 @@ from hqgs.model.gaussians import Gaussians
 from hqgs.model.render import render_view
 from hqgs.scene.scene import Camera, View
 from hqgs.training.config import DensifyConfig, HQGSConfig, TrainConfig
-from hqgs.training.constants import FINEST
-from hqgs.training.schedule import Decisions, Schedule, StepPlan, learning_rates, low_pass
+from hqgs.training.schedule import FINEST, Decisions, Schedule, StepPlan, learning_rates, low_pass
 from hqgs.training.trainer import Trainer
 
 DENSIFY = DensifyConfig(start=20, stop=61, every=10, reset_every=25)

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from hqgs.photos.edges import edge_magnitude
-from hqgs.training.constants import DIMMEST
-from hqgs.training.methods.paper import ScsWeights, scs_loss
+from hqgs.training.methods.paper import DIMMEST, ScsWeights, scs_loss
 
 
 def loss_of(render: Tensor, target: Tensor, g: Tensor, mask: Tensor | None = None) -> Tensor:

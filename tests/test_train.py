@@ -26,7 +26,7 @@ from hqgs.scene.builtin.scene import embedded_scene
 from hqgs.scene.scene import Scene, View
 from hqgs.training import forward
 from hqgs.training.config import DensifyConfig, TrainConfig, check_method
-from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
+from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.methods.base import Target, ThreeDGS, photo_tensors
 from hqgs.training.trainer import Trainer, TrainingError
 

@@ -19,7 +19,7 @@ from hqgs.scene.scene import Scene
 from hqgs.training import prepare, trial
 from hqgs.training.config import TrainConfig, run_config
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
-from hqgs.training.plan_rules import plan_run
+from hqgs.training.rules import plan_run
 from hqgs.training.trainer import Trainer
 
 ASKED = run_config(iterations=1000, method="hqgs", formation="none")

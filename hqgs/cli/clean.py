@@ -53,8 +53,7 @@ def run(options: Clean) -> int:
             raise ValueError(f"--out is the source {source} itself; what is removed would be lost")
         from hqgs.evaluation.run_folder import RunFolder  # here: they load torch
         from hqgs.model.gaussians import Gaussians
-        from hqgs.training.cleaning import check_steps, clean, held_out_psnrs
-        from hqgs.training.constants import CLEANING_STEPS
+        from hqgs.training.cleaning import CLEANING_STEPS, check_steps, clean, held_out_psnrs
 
         steps = CLEANING_STEPS if options.steps is None else options.steps
         check_steps(steps)

@@ -29,16 +29,13 @@ from hqgs.scene.constants import BACKGROUND
 from hqgs.scene.scene import Scene, View
 from hqgs.training.adam import Adam
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import (
-    CLEANING_DECAY,
-    CLEANING_STEPS,
-    DROPOUT,
-    FRAME_PHOTOS,
-    MAX_SKIPPED_IN_A_ROW,
-)
-from hqgs.training.guard import coming_gradient, gradient_fault
+from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, coming_gradient, gradient_fault
 from hqgs.training.methods.base import ThreeDGS
 from hqgs.training.overfitting import decay_opacities, with_dropout
+from hqgs.training.rules import DROPOUT
+
+# 300 steps gain 1.0 dB on the room of 8 photos, 600 gain 1.2; half the decay takes twice the steps.
+CLEANING_STEPS, CLEANING_DECAY = 600, 0.01  # the share of the opacities that each step takes away
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,7 @@ def check_frame(gaussians: Gaussians, scene: Scene, background: tuple[float, flo
 
     Fitting would give a scene in another frame the photos' colours, and call that a gain.
     """
-    some = scene.train[:: -(-len(scene.train) // FRAME_PHOTOS)]
+    some = scene.train[:: -(-len(scene.train) // 16)]
     worse = sum(
         psnr is not None and psnr < flat_psnr(view)
         for psnr, view in zip(_psnrs(gaussians, scene, some, background), some, strict=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from hqgs.training.constants import CLOCK_LEAST, CLOCK_MOST
 from hqgs.training.schedule import Decisions, Schedule
 
 
@@ -25,7 +24,7 @@ def turned(
     elif most and config.seconds is not None:
         rest = config.iterations - at
         left = (config.seconds - seconds) / step if step > 0 else rest
-        length = at + round(min(max(left, CLOCK_LEAST * rest), CLOCK_MOST * rest))
+        length = at + round(min(max(left, 0.1 * rest), 4.0 * rest))
         length = min(length, most)
     else:
         return decisions

@@ -12,7 +12,6 @@ from hqgs.base.options import Number, Seconds, Seed, Unsaid, choice
 from hqgs.model.constants import MAX_SH_DEGREE
 from hqgs.photos.formula import parse_formation
 from hqgs.scene.constants import BACKGROUND
-from hqgs.training.constants import EVALUATIONS_APART
 
 AUTO, NONE = "auto", "none"
 METHODS = {
@@ -368,9 +367,9 @@ def run_config(**said: Any) -> TrainConfig:
 
 
 def scaled(config: TrainConfig) -> TrainConfig:
-    """With its schedule fitted to its length, and evaluations at least EVALUATIONS_APART iterations apart."""
+    """With its schedule fitted to its length, and evaluations at least 50 iterations apart."""
     config = config.scaled()
-    return replace(config, eval_every=max(config.eval_every, EVALUATIONS_APART))
+    return replace(config, eval_every=max(config.eval_every, 50))
 
 
 def with_iterations(config: TrainConfig, iterations: int) -> TrainConfig:

@@ -19,7 +19,8 @@ from hqgs.base.elementary import exp
 from hqgs.model.gaussians import Gaussians
 from hqgs.training.adam import select_rows
 from hqgs.training.config import DensifyConfig
-from hqgs.training.constants import SPLIT_CHILDREN
+
+SPLIT_CHILDREN = 2  # of a Gaussian that is split (Kerbl et al. 2023, section 5.2)
 
 
 @dataclass(frozen=True)

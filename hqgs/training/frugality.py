@@ -17,30 +17,12 @@ from typing import Any
 from hqgs.base.left_out import LeftOut
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
-from hqgs.training.constants import (
-    BETTER,
-    CHECKS,
-    COARSE_FACTOR,
-    COARSE_MOST,
-    COARSE_PART,
-    FEWEST_VIEWS,
-    FINEST,
-    HELD_SHARE,
-    MOST_HELD,
-    PATIENCE,
-    REST,
-    SMALLEST_SIDE,
-)
 from hqgs.training.plan import PlanRow
-from hqgs.training.schedule import Decisions, Schedule
+from hqgs.training.schedule import CHECKS, FINEST, REST, Decisions, Schedule
 from hqgs.training.state import TrainState
 
-RULES: dict[str, object] = {  # what a result depends on beside the configuration
-    "held": (HELD_SHARE, MOST_HELD, FEWEST_VIEWS),
-    "growth": FINEST,
-    "resolution": (COARSE_PART, COARSE_MOST, COARSE_FACTOR, SMALLEST_SIDE),
-    "iterations": (BETTER, PATIENCE, CHECKS, REST),
-}
+# dB and iterations: the run has stopped improving where held-back photos gain no more in so many.
+BETTER, PATIENCE = 0.05, 2_000
 
 
 @dataclass

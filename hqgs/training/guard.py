@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,7 +15,12 @@ from hqgs import _rust
 from hqgs.evaluation.records import GuardEvent, GuardRecord
 from hqgs.model.gaussians import Gaussians
 from hqgs.scene.scene import View
-from hqgs.training.constants import EVENTS_KEPT, GAUSSIANS_LISTED, GUARD_LIMIT, LOG_LIMIT
+
+# Larger numbers count as not finite too: Adam keeps their squares, which overflow 32 bits.
+GUARD_LIMIT = 1e18
+LOG_LIMIT = math.log(2.0**128)  # of the scales' logarithms: exp of more overflows 32 bits
+EVENTS_KEPT, GAUSSIANS_LISTED = 20, 10  # the first events, and the first Gaussians that an event names
+MAX_SKIPPED_IN_A_ROW = 20  # steps; one bad view may pass, a broken run should not go on for hours
 
 
 @dataclass

@@ -12,8 +12,8 @@ from hqgs.evaluation.learned import learned_picture
 from hqgs.evaluation.passing import passing_picture
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.evaluation.verdict import overdone
-from hqgs.training.constants import MOST_ITERATIONS
 from hqgs.training.methods.cameras import LearnedCamera
+from hqgs.training.rules import MOST_ITERATIONS
 from hqgs.training.trainer import Trainer
 
 

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from hqgs.base.elementary import log
 from hqgs.model.gaussians import Gaussians
-from hqgs.training.constants import DROPPED, OPAQUE
+
+OPAQUE = 0.999  # opacity that dropout raises a Gaussian to, at most: its logit stays finite
+DROPPED = -20.0  # logit of a dropped one's opacity, 2e-9: no pixel blends it
 
 
 @torch.no_grad()

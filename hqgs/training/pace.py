@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from hqgs.training.constants import TIMED, WARM
 from hqgs.training.plan import StepSeconds
 from hqgs.training.trainer import Trainer
 
@@ -23,9 +22,9 @@ def timed(trainer: Trainer, half_size: bool) -> float:
     """Mean seconds of a step's view at half or at full size."""
     if half_size and not trainer.plan.half_size_until:
         return 0.0
-    for _ in range(WARM):
+    for _ in range(3):  # the first ones start threads and fill caches
         trainer.step(half_size)
     started, before = trainer.seconds, trainer.iteration
-    for _ in range(TIMED):
+    for _ in range(7):
         trainer.step(half_size)
     return (trainer.seconds - started) / (trainer.iteration - before)

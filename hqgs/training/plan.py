@@ -1,23 +1,21 @@
-"""What a run is, decided once: what its plan holds, and how rules come to it. plan_rules.py has the rules.
+"""What a run is, decided once before its first step: the facts that it goes by, and the plan of them.
 
-The plan is all that a run reads, and nothing changes it. What is decided later, by the clock or by photos
-that are held back, is added to the run's rows with the iteration after which it was.
+rules.py makes the plan. It is all that a run reads, and nothing changes it. What is decided later, by the
+clock or by photos that are held back, is added to the run's rows with the iteration after which it was.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.text import aligned
 from hqgs.base.typed import build
-from hqgs.diagnosis.scene import Diagnosis
 from hqgs.evaluation.constants import SCATTER
 from hqgs.evaluation.records import PlanRowRecord
-from hqgs.photos.formula import ERRORS, LINEAR, NONE, Degradation, parse_formation, undegraded
-from hqgs.training.config import AUTO, FORMATION, TrainConfig
+from hqgs.training.config import TrainConfig
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,7 @@ class Facts:
     shortest_side: int  # px, of all photos
     points: int  # of the reconstruction
     linked: bool  # whether it tells which photos see which of its points (`Scene.seen`)
-    agreed: float | None = (
-        None  # share of pixels along edges on whose depth photos agree; None: not looked at
-    )
+    agreed: float | None = None  # share of depths along edges on which photos agree; None: not looked at
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
     passed: int | None = None  # photos in which somebody passes by; None: not looked at
     passing: float = 0.0  # share of all pixels that these cover
@@ -100,11 +96,11 @@ class RunPlan:
 
     settings: TrainConfig  # the one asked for, with what the rules decided
     first_points: int  # Gaussians to start from, as far as photos agree on so many; at least its points
-    found_back: bool  # they are what photos find back in each other; else what they agree on along edges
-    discs: bool  # the first ones are flat, as their neighbours lie; else round
-    held_photos: int  # training photos that are held back at first
-    half_size_until: int  # the last iteration at half the photos' sides; 0: there is none
-    clock_most: int  # iterations that the clock may give the run after growth; 0: it does not look at it
+    found_back: bool = False  # they are what photos find back in each other; else what agrees along edges
+    discs: bool = False  # the first ones are flat, as their neighbours lie; else round
+    held_photos: int = 0  # training photos that are held back at first
+    half_size_until: int = 0  # the last iteration at half the photos' sides; 0: there is none
+    clock_most: int = 0  # iterations that the clock may give the run after growth; 0: it does not look at it
     rows: tuple[PlanRow, ...] = field(default=(), repr=False)
 
     def values(self) -> dict[str, Any]:
@@ -118,86 +114,6 @@ class RunPlan:
 
     def __str__(self) -> str:
         return plan_table(self.rows)
-
-
-@dataclass(frozen=True)
-class Draft:
-    """A plan on its way through the rules."""
-
-    facts: Facts
-    diagnosis: Diagnosis | None
-    asked: TrainConfig
-    plan: RunPlan
-
-    @property
-    def settings(self) -> TrainConfig:
-        return self.plan.settings
-
-    @property
-    def formed(self) -> bool:
-        """Whether the loss knows how the photos were made."""
-        return self.settings.method == "hqgs" and self.settings.hqgs.guidance == FORMATION
-
-    @property
-    def degradation(self) -> Degradation:
-        """What has happened to the photos, as far as the loss knows of it."""
-        known = self.formed and self.settings.hqgs.formation != AUTO
-        return parse_formation(self.settings.hqgs.formation if known else NONE)
-
-    @property
-    def kinds(self) -> frozenset[str]:
-        """Of its steps."""
-        return frozenset(step.kind for step in self.degradation.steps)
-
-    @property
-    def undegraded(self) -> bool:
-        """Photos as photographed, or each with what its own camera did: they bear 3DGS's growth."""
-        return self.formed and undegraded(self.kinds)
-
-    @property
-    def softened(self) -> bool:
-        """Whether all photos lost fine detail, without noise or JPEG beside."""
-        return bool(self.kinds & LINEAR) and not self.kinds & ERRORS
-
-    @property
-    def dense(self) -> bool:
-        """Whether the run starts from more points than the reconstruction has."""
-        return self.plan.first_points > self.facts.points
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What a rule decides; `row` tells it, and the plan has `changes` from then on."""
-
-    value: str
-    why: str
-    evidence: str = ""
-    left_out: str | None = None
-    what: str | None = None  # None: as the rule is called
-    changes: Mapping[str, Any] = field(default_factory=dict)  # by names of RunPlan's and TrainConfig's fields
-
-
-@dataclass(frozen=True)
-class Rule:
-    """How one thing is decided."""
-
-    what: str  # it decides
-    decide: Callable[[Draft], Sequence[Choice]]  # nothing where it does not apply
-    source: str  # paper and equation, or where the measurement is that chose it
-    of_photos: bool = False  # needs no poses
-
-
-def plan_by(rules: Sequence[Rule], facts: Facts, diagnosis: Diagnosis | None, asked: TrainConfig) -> RunPlan:
-    """What the rules make of a run, one after the other: each sees what those before it have decided."""
-    plan = RunPlan(asked, facts.points, False, False, 0, 0, 0)
-    for rule in rules:
-        name = f"{rule.decide.__name__}: {rule.source}"
-        for choice in rule.decide(Draft(facts, diagnosis, asked, plan)):
-            row = PlanRow(
-                choice.what or rule.what, choice.value, choice.why, choice.evidence, name, 0, choice.left_out
-            )
-            plan = replace(_changed(plan, choice.changes), rows=(*plan.rows, row))
-    return plan
 
 
 def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
@@ -223,18 +139,3 @@ def plan_table(rows: Sequence[PlanRow]) -> str:
 def _reason(row: PlanRow) -> str:
     when = f"after iteration {row.iteration}: " if row.iteration else ""
     return f"{when}{row.why}" + (f" ({row.evidence})" if row.evidence else "")
-
-
-def _changed(plan: RunPlan, changes: Mapping[str, Any]) -> RunPlan:
-    """The plan with other values of fields; those of the settings are named after them, `densify.stop`."""
-    for path, value in changes.items():
-        *within, name = path.split(".")
-        if within == [] and name in vars(plan):
-            plan = replace(plan, **{name: value})
-        elif within == []:
-            plan = replace(plan, settings=replace(plan.settings, **{name: value}))
-        else:
-            (part,) = within
-            inner = replace(getattr(plan.settings, part), **{name: value})
-            plan = replace(plan, settings=replace(plan.settings, **{part: inner}))
-    return plan

@@ -24,9 +24,8 @@ from hqgs.training.frame import Frame, Trainable, with_rounded_poses
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
 from hqgs.training.passersby import without_passersby
-from hqgs.training.plan import Draft, Facts, RunPlan, StepSeconds, plan_by
-from hqgs.training.plan_overfitting import in_agreement
-from hqgs.training.plan_rules import RULES, plan_run
+from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
+from hqgs.training.rules import OF_PHOTOS_ALONE, RULES, growth_in_doubt, plan_run
 from hqgs.training.trial import Begin, calls_for_trial, tried_growth, tried_looks
 
 
@@ -82,23 +81,34 @@ class Prepared:
         self.facts = self.method.facts(self.facts, self.training_views.targets)
 
     def plan(self, seconds: StepSeconds | None = None) -> RunPlan:
-        """The plan of the run; `seconds`: what steps take on this machine, where they were timed."""
+        """The plan of the run; `seconds`: what steps take on this machine, where they were timed.
+
+        It is made anew with each fact that a plan asks for: whether photos agree on as many points as it
+        wants, and whether growth pays.
+        """
         facts = replace(self.facts, seconds=seconds)
         plan = plan_run(facts, self.diagnosis, self.asked)
         if plan.first_points > facts.points and self.scene.seen is not None:
             facts = replace(facts, agreed=self._first_points(plan.first_points, plan.found_back)[2])
             plan = plan_run(facts, self.diagnosis, self.asked)
-        draft = Draft(facts, self.diagnosis, self.asked, plan)
-        timed = self.asked.seconds is None or seconds is not None  # else the run's length is not known yet
-        begin = self._begin if timed and "growth" in self.asked.leave_out else None
-        unsure = draft.undegraded and draft.dense and not in_agreement(facts)
-        if begin is not None and unsure and calls_for_trial(self.scene, plan):
-            if not self._has_tried:
-                self._has_tried = True
-                tried = tried_growth(self.scene, plan, begin, self._on_stage)
-                self.facts = replace(self.facts, tried=tried)
-            plan = plan_run(replace(facts, tried=self.facts.tried), self.diagnosis, self.asked)
+        if self._wants_trial(facts, plan):
+            facts = replace(facts, tried=self._tried(plan))
+            plan = plan_run(facts, self.diagnosis, self.asked)
         return plan
+
+    def _wants_trial(self, facts: Facts, plan: RunPlan) -> bool:
+        """Whether a trial is to tell if growth pays; not before the run's length is known."""
+        timed = self.asked.seconds is None or facts.seconds is not None
+        can = self._begin is not None and "growth" in self.asked.leave_out and timed
+        return can and growth_in_doubt(facts, plan) and calls_for_trial(self.scene, plan)
+
+    def _tried(self, plan: RunPlan) -> Tried | None:
+        """What the trial of growth told, once for a run."""
+        if self._begin is not None and not self._has_tried:
+            self._has_tried = True
+            tried = tried_growth(self.scene, plan, self._begin, self._on_stage)
+            self.facts = replace(self.facts, tried=tried)
+        return self.facts.tried
 
     def first_gaussians(self, plan: RunPlan) -> Gaussians:
         """Those that a run of this plan trains."""
@@ -134,9 +144,8 @@ class Prepared:
 def plan_of_photos(scene: Scene, asked: TrainConfig) -> tuple[RunPlan, list[str]]:
     """The plan of photos that have no poses yet, as far as it goes; and what is not decided before that."""
     diagnosis = Inspector().diagnose(scene) if asks_for_diagnosis(asked) else None
-    known = [rule for rule in RULES if rule.of_photos]
-    later = [rule.what for rule in RULES if not rule.of_photos and rule.what != "a photo"]
-    return plan_by(known, facts_of(scene), diagnosis, asked), later
+    later = [rule.what for rule in RULES[1:] if rule not in OF_PHOTOS_ALONE]
+    return plan_run(facts_of(scene), diagnosis, asked, OF_PHOTOS_ALONE), later
 
 
 def facts_of(scene: Scene, unused: list[LeftOut] | None = None) -> Facts:

@@ -13,22 +13,12 @@ from hqgs.base.evenly import middles
 from hqgs.scene.geometry import resized
 from hqgs.scene.scene import Scene, View
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import (
-    BAND_INTERVAL,
-    CHECKS,
-    COARSE_FACTOR,
-    COARSE_MOST,
-    COARSE_PART,
-    EVALUATED,
-    FASTER,
-    FINEST,
-    LAST_OF_FIRST,
-    REST,
-    SHORT,
-    TAIL,
-    TAIL_PART,
-)
 from hqgs.training.plan import RunPlan
+
+COARSE_FACTOR = 2  # of the photos' sides, where a run starts small
+FINEST = 1.7  # px of the photo that sees a Gaussian best: one with a larger standard deviation may still grow
+CHECKS = 500  # iterations between looks at whether the run still improves
+REST = 0.5  # of what came before: the length of what follows; in the first half of it the scene still grows
 
 
 @lru_cache(maxsize=2)
@@ -133,11 +123,12 @@ class Schedule:
         return plan.densifies or iteration in due or ("iterations" in self.items and iteration % CHECKS == 0)
 
     def turn_at(self, decisions: Decisions) -> int:
-        """The iteration after which the clock may give the run another length."""
+        """The iteration after which the clock may give the run another length: some steps after growth, at
+        most a third of the rest, tell what the rest costs."""
         if self.config.turn is not None:
             return self.config.turn[0]
         end = self.densification_end(decisions)
-        return end + min(TAIL, max(1, int(TAIL_PART * (self.config.iterations - end))))
+        return end + min(50, max(1, (self.config.iterations - end) // 3))
 
     def holds(self, decisions: Decisions) -> bool:
         """Whether photos are held back."""
@@ -163,8 +154,8 @@ class Schedule:
     def degree(self, iteration: int) -> int:
         """Of the harmonics that are trained: it rises with the iterations."""
         interval = self.config.sh_interval
-        if "growth" in self.items and self.config.iterations > SHORT:
-            interval = min(interval, max(1, int(BAND_INTERVAL * self.config.iterations)))
+        if "growth" in self.items and self.config.iterations > 3_000:
+            interval = min(interval, max(1, self.config.iterations // 20))
         return min(self.config.sh_degree, iteration // interval)
 
     def densification_end(self, decisions: Decisions) -> int:
@@ -181,11 +172,6 @@ class Schedule:
 
     def is_coarse(self, iteration: int) -> bool:
         return iteration <= self.coarse_end
-
-
-def half_size_end(iterations: int) -> int:
-    """The last iteration at half size, where a run of so many starts with it."""
-    return min(round(COARSE_PART * iterations), COARSE_MOST)
 
 
 def learning_rates(
@@ -206,8 +192,8 @@ def learning_rates(
     faster, farther, last = 1.0, 1.0, config.lr_means_final
     if config.faster_rates:
         shorter = max(1.0, TrainConfig.iterations / config.iterations)
-        faster = min(shorter**0.3, FASTER)
-        last = max(last, min(last * shorter**1.5, LAST_OF_FIRST * config.lr_means))
+        faster = min(shorter**0.3, 2.0)
+        last = max(last, min(last * shorter**1.5, 1 / 3 * config.lr_means))
         if reach is not None:
             farther = max(1.0, min(shorter**0.6, reach / extent))
     means = farther * extent * config.lr_means ** (1 - part) * last**part
@@ -218,12 +204,12 @@ def learning_rates(
 def on_the_way(scene: Scene, every: int) -> list[int]:
     """Numbers of the held-out views that a run measures every so many steps, before its end: evenly spread.
 
-    As many as have EVALUATED of the pixels that it trains on between two evaluations, and at least one. It
+    As many as have a tenth of the pixels that it trains on between two evaluations, and at least one. It
     follows from sizes alone, so that the same run measures the same views on any machine.
     """
     trained = every * np.mean([view.camera.width * view.camera.height for view in scene.train])
     pixels = np.sort([view.camera.width * view.camera.height for view in scene.test])[::-1]
-    count = int((np.cumsum(pixels) <= EVALUATED * trained).sum())
+    count = int((np.cumsum(pixels) <= 0.1 * trained).sum())
     return middles(len(scene.test), max(count, 1))
 
 

@@ -25,12 +25,11 @@ from hqgs.training import checkpoint
 from hqgs.training.adam import Adam, reset_opacities
 from hqgs.training.clock import turned
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import MAX_SKIPPED_IN_A_ROW
 from hqgs.training.densify import Densification, Densifier
 from hqgs.training.frame import Trainable
 from hqgs.training.frugality import Frugality
 from hqgs.training.gradients import Step, gradients_of
-from hqgs.training.guard import Fault, Guard, parameter_fault
+from hqgs.training.guard import MAX_SKIPPED_IN_A_ROW, Fault, Guard, parameter_fault
 from hqgs.training.methods.base import Method
 from hqgs.training.overfitting import decay_opacities
 from hqgs.training.plan import PlanRow, RunPlan, Tried, left_out_of

@@ -27,9 +27,8 @@ from hqgs.photos.formula import NONE, parse_formation
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Scene
 from hqgs.training.config import TrainConfig
-from hqgs.training.constants import MANY_PHOTOS
 from hqgs.training.plan import RunPlan, Tried
-from hqgs.training.plan_budget import no_growth
+from hqgs.training.rules import MANY_PHOTOS, no_growth
 from hqgs.training.settings import with_iterations
 
 LOOKS = "exposure", "vignetting", "response"  # that small copies show, in the order in which they are tried

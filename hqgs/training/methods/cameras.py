@@ -24,27 +24,16 @@ from hqgs.photos.exposure import take_photo
 from hqgs.photos.look import MOST_GAIN, Look
 from hqgs.scene.geometry import median_depth
 from hqgs.scene.scene import Camera, Scene, View
-from hqgs.training.constants import (
-    CAMERA_RATES_LEFT,
-    CAMERAS_BEGIN,
-    DEPTHS_COARSER,
-    DEPTHS_REFRESH,
-    DEVICE_RATE,
-    FIRST_TRAJECTORY,
-    GAIN_RATE,
-    GIVE_UP_AT,
-    LENS_RATE,
-    MOST_MARGIN,
-    MOST_WARPS,
-    NARROW,
-    SATURATED,
-    SHORTEST_TRAJECTORY,
-    TRAJECTORY_POINTS,
-    TRAJECTORY_RATE,
-    WARP_SPACING,
-)
 from hqgs.training.methods.devices import LearnedDevices, groups_of, load_into, state_of
 from hqgs.training.methods.lens import first_lens, lens_warps, samples, sharp_at, widest
+
+# Shares of the run before which trajectories would hide what the scene does not show yet, at which short ones
+# are given up, and of the rates at the end.
+CAMERAS_BEGIN, GIVE_UP_AT, CAMERA_RATES_LEFT = 0.1, (0.5, 0.75), 0.1
+SHORTEST_TRAJECTORY = 0.7  # px, of the picture's middle, and the widest disc: a photo with less is sharp
+FIRST_TRAJECTORY = 1e-3  # of the photo's width, standard deviation: from 0 it has no direction to grow in
+TRAJECTORY_POINTS = 9  # that stand for a trajectory
+MOST_MARGIN = 48  # px around a render
 
 
 @dataclass(frozen=True)
@@ -110,7 +99,7 @@ class LearnedCameras:
         views = scene.train
         self._numbers = {view.name: k for k, view in enumerate(views)}
         self._depths = [median_depth(scene, view) for view in views]
-        self._widths = [max(view.camera.width, NARROW) for view in views]
+        self._widths = [max(view.camera.width, 200) for view in views]
         self._sizes = [(view.camera.height, view.camera.width) for view in views]
         rng, count = np.random.default_rng([seed, 6]), len(views)
         first = FIRST_TRAJECTORY * rng.normal(size=(count, 2, 6)) * np.array([1, 1, 0.2, 0.2, 0.2, 0.2])
@@ -178,8 +167,8 @@ class LearnedCameras:
         if not self._active:
             return
         if self._blurs(number):
-            if self._visits[number] % DEPTHS_REFRESH == 0:
-                near = nearness_map(gaussians, view.camera, DEPTHS_COARSER) * self._depths[number]
+            if self._visits[number] % 8 == 0:
+                near = nearness_map(gaussians, view.camera, coarser=4) * self._depths[number]
                 self._nearness[number] = near.clamp(0.05, 10).to(torch.float16)
             self._visits[number] += 1
         if iteration in self._looks:
@@ -212,8 +201,8 @@ class LearnedCameras:
     def rates(self, part: float) -> dict[str, float]:
         """Learning rates after this part of the run."""
         width, trained = float(np.mean(self._widths)), {group["name"] for group in self.param_groups()}
-        first = {"paths": TRAJECTORY_RATE * width, "lenses": LENS_RATE * width, "gains": GAIN_RATE}
-        first |= {"vignetting": DEVICE_RATE, "response": DEVICE_RATE}
+        first = {"paths": 8e-4 * width, "lenses": 4e-4 * width, "gains": 0.005}
+        first |= {"vignetting": 0.001, "response": 0.001}  # which each photo of a camera moves
         return {name: rate * CAMERA_RATES_LEFT**part for name, rate in first.items() if name in trained}
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -253,7 +242,7 @@ class LearnedCameras:
                 whole = _trajectory_warps(self._paths[number], camera, TRAJECTORY_POINTS)
                 moved = _moved(whole, camera, nearness=1.0)
             extent = max(_longest(moved[:, k]) for k in range(moved.shape[1]))
-            count = min(max(3, math.ceil(extent / WARP_SPACING) + 1), MOST_WARPS)
+            count = min(max(3, math.ceil(extent / 1.5) + 1), 17)  # one for 1.5 px
         if not sharp:
             count = max(count, samples(self._lenses[number]))
         warps = torch.zeros(count, 3, 4, dtype=torch.float64)
@@ -267,7 +256,7 @@ class LearnedCameras:
 def as_held(taken: Tensor, photo: Tensor) -> Tensor:
     """What was taken, [H, W, 3], where the photo is not saturated: what its sensor could not hold may be
     brighter."""
-    saturated = photo >= (SATURATED / 255 if photo.is_floating_point() else SATURATED)
+    saturated = photo >= (254 / 255 if photo.is_floating_point() else 254)
     return torch.where(saturated & (taken > 1), 1.0, taken)
 
 

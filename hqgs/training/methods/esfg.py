@@ -15,9 +15,9 @@ from hqgs.photos.edges import edge_aware_map
 from hqgs.photos.pixels import floats
 from hqgs.scene.scene import View
 from hqgs.training.config import ESFGConfig
-from hqgs.training.constants import ESFG_HIDDEN
 from hqgs.training.methods.base import photo_tensors
 
+ESFG_HIDDEN = 64  # units of the one hidden layer of an MLP; the paper names no size
 XYZ = 3  # F' feeds the sigmoid directly, so every feature has one number for each coordinate
 
 

@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from hqgs.photos.pixels import as_floats
-from hqgs.training.constants import HELD_PIXELS, PLATEAU_STEPS
+
+HELD_PIXELS = 50  # one pixel of so many is held back under noise
+PLATEAU_STEPS = 200  # from one look at them to the next, at least; without a gain the rates are halved
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from hqgs.scene.geometry import photo_pixels
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import HQGSConfig
-from hqgs.training.constants import KNEE, SIZES_REFRESH, STEEPER
 from hqgs.training.methods.base import Method
 from hqgs.training.methods.cameras import LearnedCamera, LearnedCameras, Shot, no_shot
 from hqgs.training.methods.devices import LearnedDevices
@@ -29,6 +28,11 @@ from hqgs.training.methods.held_pixels import HeldPixels, Plateau
 from hqgs.training.methods.photometric import photometric_loss
 from hqgs.training.plan import Facts
 from hqgs.training.state import TrainState
+
+# Standard deviations of the noise up to which differences count by their square (Huber): half as steep there
+# as L1 on average, and growth goes by the gradient, hence STEEPER.
+KNEE, STEEPER = 2.0, 2.0
+SIZES_REFRESH = 100  # steps until the sizes of the smallest Gaussians are computed again
 
 
 class HQGS(Method[FormedTarget]):
@@ -50,7 +54,7 @@ class HQGS(Method[FormedTarget]):
     - A coarse film's codec (video) and nothing else: as noise of FILM_NOISE levels, without held pixels.
     - Short runs have higher rates than 3DGS (`learning_rates`), but for those of JPEG alone.
     - No Gaussian is smaller than half a pixel of the photos: what is finer, no photo has seen.
-    - Growth has a budget, and no resets (plan_budget.py).
+    - Growth has a budget, and no resets (`budget` in rules.py).
     - Where the reconstruction has few points for that number, as it has from bad photos, the run starts from
       more: pixels along the photos' edges, at depths that other photos agree on (`points_along_edges`).
       Gaussians are discs and needles then, as their neighbours lie (`as_discs`); but not under noise, blur,

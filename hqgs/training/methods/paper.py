@@ -15,11 +15,16 @@ from hqgs.photos.edges import edge_magnitude
 from hqgs.scene.scene import Scene, View
 from hqgs.training.checkpoint import part
 from hqgs.training.config import ESFGConfig, PaperConfig
-from hqgs.training.constants import DIMMEST, LAMBDA_DSSIM, SCS_CACHE_BYTES, SCS_WEIGHT
 from hqgs.training.methods.base import Method, Target, photo_tensors
 from hqgs.training.methods.esfg import ESFG
-from hqgs.training.methods.photometric import photometric_loss
+from hqgs.training.methods.photometric import LAMBDA_DSSIM, photometric_loss
 from hqgs.training.state import TrainState
+
+SCS_WEIGHT = 5.0  # in L = L1 + 5 L_SCS
+SCS_CACHE_BYTES = 2**30  # of its weights (12 bytes a pixel); those of further views are computed at each step
+# A render dimmer than this part of its target counts as this bright. The gradient of a cosine grows with
+# 1 / |render|: without a floor one faint Gaussian in a black render would get any gradient at all.
+DIMMEST = 0.01
 
 VARIANTS = {
     "V1": PaperConfig(None, "l1+dssim"),

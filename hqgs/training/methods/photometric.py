@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hqgs import _rust
-from hqgs.training.constants import LAMBDA_DSSIM
+
+LAMBDA_DSSIM = 0.2  # the weight of D-SSIM beside L1 (Kerbl et al. 2023, equation 7)
 
 
 def photometric_loss(
