@@ -28,7 +28,6 @@ from hqgs.base.ranks import ALONE, Ranks
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.diagnosis.scene import Inspector
 from hqgs.evaluation.held_out import HeldOutViews, RenderedView
-from hqgs.evaluation.passing import save_masks
 from hqgs.evaluation.photo_facts import photo_record
 from hqgs.evaluation.records import HistoryEntry, RankRecord, Report, RunRecord, WorldRecord
 from hqgs.evaluation.report import RunResult, measure, write_report
@@ -112,7 +111,7 @@ def train(
         method: "auto" or "hqgs" (the photos' degradation in the loss, none where they show none), "3dgs" or
             "srgs".
         leave_out: what the run may do without where the scene does not need it: "auto", "none", or some of
-            photos, passersby, growth, resolution, iterations, with commas.
+            photos, growth, resolution, iterations, with commas.
         seed: of everything random.
         max_gaussians: growth stops there; bounds the memory.
         guidance: of hqgs: "formation", or "paper", its published form.
@@ -238,8 +237,6 @@ def run_to_end(trainer: Trainer, out: str | Path | None = None, progress: OnProg
     with deferred_interrupt() as interrupted:
         if out is not None:
             save_cameras(out, trainer.prepared.given, config.background)
-            if trainer.prepared.passersby:
-                save_masks(out, trainer.prepared.given.train)
         while trainer.iteration < trainer.length and not any(ranks.tell(interrupted.is_set())):
             before = trainer.iteration
             step = trainer.step()

@@ -53,7 +53,7 @@ def test_a_bare_configuration_has_the_defaults_too() -> None:
     asked = run_config()
     assert replace(asked, leave_out=AUTOMATIC) == hqgs.TrainConfig().scaled()
     assert (asked.method, asked.iterations) == ("auto", 30_000)
-    assert set(asked.leave_out) == {"photos", "passersby", "growth", "iterations"}
+    assert set(asked.leave_out) == {"photos", "growth", "iterations"}
     assert "iterations" not in run_config(iterations=30_000).leave_out
     assert run_config(leave_out="none").leave_out == ()
 

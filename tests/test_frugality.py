@@ -36,7 +36,7 @@ def bits(trainer: Trainer) -> dict[str, bytes]:
 
 
 def test_the_items_by_name() -> None:
-    assert parse_leave_out("auto") == ("photos", "passersby", "growth")
+    assert parse_leave_out("auto") == ("photos", "growth")
     assert parse_leave_out("none") == ()
     assert parse_leave_out("growth, photos") == ("photos", "growth")
     with pytest.raises(ValueError, match="there is no 'colour'; there are: auto, none, or some of photos"):
@@ -72,9 +72,9 @@ def test_few_photos_are_never_held_back() -> None:
 
 
 def test_degraded_photos_have_a_budget_of_their_own() -> None:
-    scene, items = tiny_scene(VIEWS), ("photos", "passersby", "growth", "resolution", "iterations")
+    scene, items = tiny_scene(VIEWS), ("photos", "growth", "resolution", "iterations")
     noisy = tiny_config(30, method="hqgs", hqgs=HQGSConfig(formation="noise:20"), leave_out=items)
-    assert Trainer(scene, noisy).schedule.items == {"photos", "passersby", "iterations"}
+    assert Trainer(scene, noisy).schedule.items == {"photos", "iterations"}
     clean = replace(noisy, hqgs=HQGSConfig(formation="none"))
     assert Trainer(scene, clean).schedule.items == set(items) - {"resolution"}  # too small for that
 

@@ -20,7 +20,6 @@ import hqgs
 from hqgs.cli.main import main
 from hqgs.cli.view import ViewOptions
 from hqgs.cli.view import run as view
-from hqgs.evaluation.passing import save_masks
 from hqgs.evaluation.records import read_report
 from hqgs.evaluation.run_folder import RunFolder, check_same, moved_px
 from hqgs.scene import load as loading
@@ -255,17 +254,12 @@ def test_what_an_older_run_wrote_is_gone_after_overwrite(tmp_path: Path) -> None
     scene = tiny_scene(9)
     lit = [replace(view, mask=np.ones(view.image.shape[:2], bool)) for view in scene.train]
     hqgs.train(replace(scene, train=lit), out=tmp_path, config=tiny_config(2))
-    save_masks(tmp_path, lit)  # as where somebody passed by
-    (tmp_path / "passersby.png").touch()
-    (tmp_path / "masks" / "mine.png").touch()
     (tmp_path / "sfm").mkdir()
     small = replace(scene, train=scene.train[:3], test=scene.train[3:4])
     hqgs.train(small, out=tmp_path, config=tiny_config(2), overwrite=True)
     assert sorted(path.name for path in (tmp_path / "photos").iterdir()) == [f"0000{k}.jpg" for k in range(4)]
     assert [path.name for path in (tmp_path / "comparison").iterdir()] == ["view4.png"]
-    assert [path.name for path in (tmp_path / "masks").iterdir()] == ["mine.png"]
     assert (tmp_path / "sfm").is_dir()
-    assert not (tmp_path / "passersby.png").exists()
 
 
 def test_a_plan_is_of_all_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

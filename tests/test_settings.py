@@ -79,6 +79,9 @@ def test_options_of_the_configuration_go_over_what_the_others_come_to(tmp_path: 
     assert config_of(options("--config", file, "--iterations", "900")) == run_config(iterations=900, seed=5)
     assert config_of(options("--config", file, "--leave-out", "none")) == replace(wanted, leave_out=())
     assert config_of(options("--leave-out", "photos,growth")) == run_config(leave_out="photos,growth")
+    older = config_values(wanted) | {"leave_out": ["photos", "passersby", "growth", "weight"]}
+    file.write_text(json.dumps(older))  # items that there are no more
+    assert config_of(options("--config", file)) == replace(wanted, leave_out=("photos", "growth"))
 
 
 @pytest.mark.parametrize("seconds", [None, 60.0])

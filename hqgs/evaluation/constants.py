@@ -42,4 +42,3 @@ MASKED = 150, 158, 170  # difference where the mask leaves the photo out: no gre
 SHEET_PHOTOS = 12  # on a sheet or in judge.html, at most
 TILE_SIDE = 260  # px, of a photo on a sheet
 CAPTION = 18  # px
-RED, PAINT = (220, 30, 30), 0.6  # of the masked part, and its share

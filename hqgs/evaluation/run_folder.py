@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hqgs.base.files import CAMERAS, CONFIG, PASSERSBY, PHOTOS, PICTURES, REPORT, RUN_FILES, read_json
+from hqgs.base.files import CAMERAS, CONFIG, PHOTOS, PICTURES, REPORT, RUN_FILES, read_json
 from hqgs.base.left_out import PHOTO
 from hqgs.base.stages import OnStage, silent
 from hqgs.base.text import some
 from hqgs.evaluation.records import Report, read_report
 from hqgs.scene.constants import BACKGROUND, SAME_POSE
 from hqgs.scene.options import LoadOptions
-from hqgs.scene.photo_files import MASKS, is_run
+from hqgs.scene.photo_files import is_run
 from hqgs.scene.scene import Camera, Scene
 
 if TYPE_CHECKING:
@@ -120,13 +120,8 @@ class RunFolder:
 
     def remove(self) -> None:
         """What a run wrote, before another one writes there; COLMAP's result and a film's frames stay."""
-        from hqgs.scene.capture import inside  # here: it loads COLMAP
-
         patterns = (f"{PHOTOS}/?????.jpg", f"{PHOTOS}/?????.mask.png", f"{PICTURES}/*.png")
         pictures = [path for pattern in patterns for path in self.folder.glob(pattern)]
-        if self.cameras is not None and (self.folder / PASSERSBY).is_file():
-            names = [view.name for view in self.cameras.views if not view.held_out]
-            pictures += [inside(self.folder / MASKS, f"{name}.png", "the photo's name") for name in names]
         for name in (*pictures, *RUN_FILES):
             (self.folder / name).unlink(missing_ok=True)
         for folder in sorted({path.parent for path in pictures}, reverse=True):

@@ -68,40 +68,28 @@ class Agreement:
         return (first + [k for k in order if k not in first])[:most]
 
     def depths(
-        self,
-        number: int,
-        pixels: Floats,
-        ranges: Floats,
-        others: Sequence[int] | None = None,
-        grey: NDArray[np.float32] | None = None,
+        self, number: int, pixels: Floats, ranges: Floats, others: Sequence[int] | None = None
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """Depths [M] of pixels [M, 2] of a view, each within its range [M, 2], and where others agree.
 
-        `others`: who is asked, None: `asked`. `grey`: what is compared with them in place of the view's own,
-        [h, w] of its small photo.
+        `others`: who is asked, None: `asked`.
         """
         others = self.asked(number) if others is None else others
         if len(others) < AGREEING:
             return ranges[:, 0], np.zeros(len(ranges), bool)
-        depths, scores = self._swept(number, pixels, ranges, others, AGREEING, grey)
+        depths, scores = self._swept(number, pixels, ranges, others, AGREEING)
         return depths, scores >= AGREED
 
     def depths_by(self, number: int, pixels: Floats, ranges: Floats, other: int) -> tuple[Floats, Floats]:
         """Depths [M] as `depths` has them by one other photo alone, and the correlations [M]; -1: none."""
-        return self._swept(number, pixels, ranges, [other], 1, None)
+        return self._swept(number, pixels, ranges, [other], 1)
 
     def _swept(
-        self,
-        number: int,
-        pixels: Floats,
-        ranges: Floats,
-        others: Sequence[int],
-        agreeing: int,
-        grey: NDArray[np.float32] | None,
+        self, number: int, pixels: Floats, ranges: Floats, others: Sequence[int], agreeing: int
     ) -> tuple[Floats, Floats]:
         look = self.looks[number]
         return _rust.agreed_depths(
-            look.grey if grey is None else grey,
+            look.grey,
             [self.looks[k].grey for k in others],
             np.stack([pixel_map(look.camera, self.looks[k].camera) for k in others]),
             np.ascontiguousarray(pixels * look.scale),

@@ -22,14 +22,13 @@ METHODS = {
 }
 ITEMS = {
     "photos": "training photos that are broken, empty or far too blurred",
-    "passersby": "what stands in one photo while others contradict it",
     "growth": "Gaussians finer than the photos' pixels",
     "resolution": "full resolution in the first part of the run",
     "iterations": "steps that no longer pay",
 }
 ASKED_FOR = ("resolution", "iterations")  # automatic only where a run's start, or no number, asks for it
 AUTOMATIC = tuple(item for item in ITEMS if item not in ASKED_FOR)
-OF_PHOTOS = ("photos", "passersby")  # what is left out before a run starts; the rest is left out of the run
+LEFT = ("passersby", "weight")  # items of former versions, which configurations may still name
 STANDARD = "standard"
 FORMATION, PAPER = GUIDANCES = ("formation", "paper")
 Loss = Literal["l1", "l1+dssim", "l1+scs"]

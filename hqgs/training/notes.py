@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from hqgs.base.files import LEARNED, PASSERSBY
+from hqgs.base.files import LEARNED
 from hqgs.evaluation.learned import learned_picture
-from hqgs.evaluation.passing import passing_picture
 from hqgs.evaluation.records import LearnedRecord
 from hqgs.evaluation.verdict import overdone
 from hqgs.training.methods.cameras import LearnedCamera
@@ -75,14 +74,9 @@ def run_notes(trainer: Trainer) -> list[str]:
 
 
 def run_pictures(trainer: Trainer, learned: Sequence[LearnedRecord]) -> dict[str, Image.Image]:
-    """Pictures of what was learned of the photos' cameras and of who passed by, by file name; none where
-    there is nothing to show."""
-    views, passing, pictures = trainer.scene.train, trainer.prepared.passersby, dict[str, Image.Image]()
-    if learned:
-        pictures[LEARNED] = learned_picture([view.image for view in views], learned)
-    if passing:
-        pictures[PASSERSBY] = passing_picture(views, passing)
-    return pictures
+    """The picture of what was learned of the photos' cameras, by file name; none where nothing was."""
+    photos = [view.image for view in trainer.scene.train]
+    return {LEARNED: learned_picture(photos, learned)} if learned else {}
 
 
 def learned_record(learned: LearnedCamera) -> LearnedRecord:

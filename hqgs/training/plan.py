@@ -55,8 +55,6 @@ class Facts:
     linked: bool  # whether it tells which photos see which of its points (`Scene.seen`)
     agreed: float | None = None  # share of depths along edges on which photos agree; None: not looked at
     unused: tuple[LeftOut, ...] = ()  # photos that teach nothing
-    passed: int | None = None  # photos in which somebody passes by; None: not looked at
-    passing: float = 0.0  # share of all pixels that these cover
     tried: Tried | None = None  # what is gained without growth; None: not tried
     looks: Mapping[str, Tried] = field(default_factory=dict)  # what is gained by parts of the formation
     found: bool = False  # whether its cameras were found from the photos alone
@@ -122,7 +120,7 @@ def left_out_of(rows: Sequence[PlanRow]) -> list[LeftOut]:
 
 
 ESSENTIAL = ("method", "formation", "loss", "budget", "first points", "length")
-WHERE_USED = ("passers-by", "opacity decay", "dropout of Gaussians")  # essential where they are
+WHERE_USED = ("opacity decay", "dropout of Gaussians")  # essential where they are
 
 
 def essential(plan: RunPlan) -> str:

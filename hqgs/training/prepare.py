@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hqgs.base.left_out import LeftOut
 from hqgs.base.threads import one_torch_thread
@@ -23,7 +22,6 @@ from hqgs.training.forward import TrainingViews
 from hqgs.training.frame import Frame, Trainable, with_rounded_poses
 from hqgs.training.methods import make_method
 from hqgs.training.methods.base import Method
-from hqgs.training.passersby import without_passersby
 from hqgs.training.plan import Facts, RunPlan, StepSeconds, Tried
 from hqgs.training.rules import OF_PHOTOS_ALONE, RULES, growth_in_doubt, plan_run
 from hqgs.training.trial import Begin, calls_for_trial, tried_growth, tried_looks
@@ -49,16 +47,10 @@ class Prepared:
         unused = list[LeftOut]()
         if "photos" in asked.leave_out:
             scene, unused = choose_photos(scene)
-        self.passersby: dict[str, NDArray[np.bool_]] = {}  # by the photo's name, [H, W]: where they are
-        if "passersby" in asked.leave_out:
-            scene, self.passersby = without_passersby(scene, asked.seed, inspector.on_stage)
         self.scene: Scene = scene
         self.given: Scene = scene if self._frame is None else self._frame.outward(scene)
         self.asked: TrainConfig = asked
         facts = facts_of(scene, unused)
-        if "passersby" in asked.leave_out:
-            passing = sum(int(mask.sum()) for mask in self.passersby.values())
-            facts = replace(facts, passed=len(self.passersby), passing=passing / facts.pixels)
         self.diagnosis: Diagnosis | None = inspector.diagnose(scene) if asks_for_diagnosis(asked) else None
         settings = plan_run(facts, self.diagnosis, asked).settings
         if begin is not None and self.diagnosis is not None and asked.leave_out:

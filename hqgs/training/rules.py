@@ -18,15 +18,7 @@ from hqgs.base.left_out import CORRECTION
 from hqgs.base.text import some
 from hqgs.diagnosis.scene import Diagnosis
 from hqgs.photos.formula import ERRORS, FILM, LEARNED, LINEAR, NONE, Degradation, parse_formation, undegraded
-from hqgs.training.config import (
-    AUTO,
-    FORMATION,
-    ITEMS,
-    OF_PHOTOS,
-    DensifyConfig,
-    TrainConfig,
-    with_iterations,
-)
+from hqgs.training.config import AUTO, FORMATION, ITEMS, DensifyConfig, TrainConfig, with_iterations
 from hqgs.training.methods.formed import noise_of
 from hqgs.training.methods.held_pixels import HELD_PIXELS
 from hqgs.training.methods.hqgs import KNEE
@@ -121,18 +113,6 @@ class Draft:
 def unused_photos(draft: Draft) -> None:
     for item in draft.facts.unused:
         draft.note("left out", item.why, item.evidence or "", item.what, item.what)
-
-
-def passersby(draft: Draft) -> None:
-    facts = draft.facts
-    if facts.passed is None:
-        return
-    if not facts.passed:
-        draft.note("none", "nothing stands in one photo while others contradict it")
-        return
-    value = f"masked in {facts.passed} of {facts.photos} photos, {facts.passing:.1%} of all pixels"
-    why = "other photos show what is behind them, and not them"
-    draft.note(value, why, left_out=f"passers-by in {facts.passed} of {facts.photos} photos")
 
 
 def method(draft: Draft) -> None:
@@ -456,9 +436,9 @@ def noise_rates(draft: Draft) -> None:
 def needless(draft: Draft) -> None:
     items, facts = set(draft.settings.leave_out), draft.facts
     if draft.kinds & set(LEARNED):
-        items &= set(OF_PHOTOS)
+        items &= {"photos"}
     elif not facts.as_photographed:  # hqgs grows few Gaussians then: less of them saves no time
-        items &= {*OF_PHOTOS, "iterations"}
+        items &= {"photos", "iterations"}
     left = tuple(item for item in ITEMS if item in items)
     draft.set(leave_out=left)
     if "growth" in items:
@@ -490,7 +470,6 @@ OF_PHOTOS_ALONE = (  # they need no poses
 )
 RULES = (
     Rule("a photo", unused_photos, "what a broken or an empty photo teaches is wrong"),
-    Rule("passers-by", passersby, "limits and what chose them: hqgs/training/passersby.py"),
     *OF_PHOTOS_ALONE,
     Rule("budget", budget, "Candes and Donoho 2004; Mip-Splatting, Yu et al. 2024; " + CHOSEN),
     Rule("first points", first_points, f"one for each {PIXELS} pixels, or the budget: {CHOSEN}"),

@@ -10,7 +10,7 @@ from typing import Any
 
 from hqgs.base.files import PLAN, read_json
 from hqgs.base.typed import build
-from hqgs.training.config import TrainConfig, with_iterations
+from hqgs.training.config import LEFT, TrainConfig, with_iterations
 
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
@@ -36,6 +36,8 @@ def read_config(path: str | Path) -> TrainConfig:
 
 def config_of_values(values: Any, where: str) -> TrainConfig:
     """The configuration of JSON values, of `where`. ValueError that names the field."""
+    if isinstance(values, dict) and isinstance(items := values.get("leave_out"), list):
+        values = values | {"leave_out": [item for item in items if item not in LEFT]}
     return build(TrainConfig, values, where)
 
 

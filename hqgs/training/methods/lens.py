@@ -13,7 +13,10 @@ import torch
 from torch import Tensor
 
 from hqgs.photos.formation import GOLDEN
-from hqgs.training.constants import FEWEST_SAMPLES, FIRST_RADIUS, LENS_FARTHEST, LENS_NEAREST, MOST_SAMPLES
+
+FIRST_RADIUS = 0.0015  # of the photo's width: from 0 it has no direction to grow in
+LENS_NEAREST, LENS_FARTHEST = 2.0, 0.3  # nearness of what photos show, as far as sizes of discs go
+FEWEST_SAMPLES, MOST_SAMPLES = 6, 24  # of the aperture
 
 
 def first_lens(width: float) -> Tensor:
