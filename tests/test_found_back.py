@@ -9,8 +9,7 @@ from test_learned_cameras import textured_scene
 
 import hqgs
 from hqgs.model.consistency import Agreement
-from hqgs.model.first_points import points_along_edges
-from hqgs.model.found_back import points_found_back
+from hqgs.model.first_points import points_along_edges, points_found_back
 from hqgs.scene.scene import View
 
 SCENE = textured_scene(8, 96)  # a plane at depth 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +13,12 @@ from scipy.sparse import csr_array
 from scipy.spatial.distance import cdist
 
 from hqgs import _rust
-from hqgs.model.constants import AGREE_LONGEST, AGREE_SMOOTH, AGREED, AGREEING, APART, ASKED
+from hqgs._rust import get_num_threads
 from hqgs.photos.pixels import as_floats
 from hqgs.scene.geometry import shrunk
 from hqgs.scene.scene import Camera, View
 
+AGREEING, AGREED = 2, 0.6  # photos that must agree, and the correlation of patches
 Floats = NDArray[np.float64]
 
 
@@ -30,11 +32,11 @@ class SmallPhoto:
     scale: Floats  # [2]: what takes a pixel (x, y) of the view to one of this photo
 
     @classmethod
-    def of(cls, view: View, longest: int = AGREE_LONGEST) -> SmallPhoto:
+    def of(cls, view: View, longest: int = 800) -> SmallPhoto:
         whole = view.camera
         view = shrunk(view, longest)
         camera, grey = view.camera, as_floats(view.image).mean(2, dtype=np.float32)
-        smooth = np.ascontiguousarray(gaussian_filter(grey, AGREE_SMOOTH), np.float32)
+        smooth = np.ascontiguousarray(gaussian_filter(grey, 1.0), np.float32)
         scale = np.array([camera.width / whole.width, camera.height / whole.height])
         return cls(camera, smooth, view.mask, scale)
 
@@ -45,7 +47,8 @@ class Agreement:
     def __init__(self, views: Sequence[View], seen: Mapping[str, NDArray[np.intp]]) -> None:
         """`seen`: by the view's name, which points it sees. Views that share most are asked first, but of
         those from one place, as of a burst, one."""
-        self.looks: list[SmallPhoto] = [SmallPhoto.of(view) for view in views]
+        with ThreadPoolExecutor(get_num_threads()) as pool:
+            self.looks: list[SmallPhoto] = list(pool.map(SmallPhoto.of, views))
         rows = [np.unique(seen.get(view.name, np.zeros(0, np.intp))) for view in views]
         ends = np.cumsum([0, *map(len, rows)])
         points = 1 + max((int(some[-1]) for some in rows if len(some)), default=0)
@@ -54,9 +57,9 @@ class Agreement:
         np.fill_diagonal(self._shared, -1)
         centers = np.stack([view.camera.center for view in views])
         far = cdist(centers, centers)
-        self._apart: NDArray[np.bool_] = far > APART * np.median(far)
+        self._apart: NDArray[np.bool_] = far > 0.01 * np.median(far)  # nearer ones are from one place
 
-    def asked(self, number: int, most: int = ASKED) -> list[int]:
+    def asked(self, number: int, most: int = 4) -> list[int]:
         """Numbers of the photos that share most points with a view, at most so many, and apart from it."""
         order = [int(k) for k in np.argsort(-self._shared[number], kind="stable") if self._apart[number, k]]
         first = list[int]()

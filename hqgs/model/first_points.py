@@ -1,26 +1,38 @@
-"""More points to start from: between those of the reconstruction, along the photos' edges."""
+"""More points to start from, between those of the reconstruction: pixels at depths on which photos agree.
+
+`points_along_edges` takes what two other photos agree on. `points_found_back`, for few photos, seeks twice:
+what is found at first, and found back by other photos, tells more closely where to look; so does it where no
+two others agree, and one alone must. Numbers were chosen on held-back photos.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import sobel
 from scipy.spatial import KDTree
 
+from hqgs._rust import get_num_threads
 from hqgs.base.stages import OnStage, Stage, silent
 from hqgs.model.consistency import Agreement, SmallPhoto
-from hqgs.model.constants import AROUND, FLAT, LEAST_AROUND, STRAY, WIDENED
 from hqgs.photos.pixels import as_floats, to_uint8
-from hqgs.scene.geometry import project, unproject
+from hqgs.scene.geometry import in_frame, project, unproject
 from hqgs.scene.scene import View
+
+WIDENED = 1.6  # what widens a range of depths between points around a pixel
+LEAST_AROUND = 3  # points that a view needs
+ALONE = 0.8  # the correlation that one photo alone must have
+STAGE = "first points, from photos"
 
 Points = NDArray[np.float32]
 Colors = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Found = tuple[int, Floats, Floats]  # the number of a view, pixels [M, 2] of it, and their depths [M]
-STAGE = "first points, from photos"
+T = TypeVar("T")
 
 
 def points_along_edges(
@@ -49,12 +61,64 @@ def points_along_edges(
             not find are left out.
         on_stage: hears of each view.
     """
+    surfaces, each = Surfaces(views, points, seen), shares(count, len(views))
     found = list[Found]()
-    for each in first_look(Surfaces(views, points, seen), shares(count, len(views)), seed, agreement):
-        found.append(each)
+    for one in _of_each(lambda k: first_look(surfaces, k, each[k], seed, agreement), len(views)):
+        found.append(one)
         on_stage(Stage(STAGE, len(found), len(views)))
     agreeing = sum(len(depths) for _, _, depths in found)
     return *gathered(views, found), agreeing / max(count, 1)
+
+
+def points_found_back(
+    views: Sequence[View],
+    points: Points,
+    seen: Mapping[str, NDArray[np.intp]],
+    count: int,
+    seed: int,
+    agreement: Agreement,
+    on_stage: OnStage = silent,
+) -> tuple[Points, Colors, float]:
+    """At most `count` points, as `points_along_edges` has them, and the share of a first look at so many
+    pixels at which photos agree.
+
+    A pixel counts where two others agree and one of them finds it back, or where one alone agrees much and
+    finds it back: at the depth that it has there, within a pixel.
+    """
+    surfaces = Surfaces(views, points, seen)
+    each, looks, found = shares(count, len(views)), 2 * len(views), list[Found]()
+
+    def first(number: int) -> tuple[int, Found]:
+        _, pixels, depths = first_look(surfaces, number, each[number], seed, agreement)
+        asked = agreement.asked(number)
+        by_two = _found_back(agreement, surfaces, number, pixels, depths, asked, 2)
+        return len(depths), (number, pixels[by_two], depths[by_two])
+
+    def second(number: int) -> Found:
+        if not each[number] or not surfaces.known(number):
+            return number, np.zeros((0, 2)), np.zeros(0)
+        rng = np.random.default_rng([seed, number, 1])
+        pixels = drawn(agreement.looks[number], each[number], rng)
+        depths, kept = _borne_out(agreement, surfaces, number, pixels)
+        return number, pixels[kept], depths[kept]
+
+    agreeing, sure = 0, list[Found]()
+    for agreed, one in _of_each(first, len(views)):
+        agreeing += agreed
+        sure.append(one)
+        on_stage(Stage(STAGE, len(sure), looks))
+    for one in sure:
+        surfaces.add(*one)
+    for one in _of_each(second, len(views)):
+        found.append(one)
+        on_stage(Stage(STAGE, len(views) + len(found), looks))
+    return *gathered(views, found), agreeing / max(count, 1)
+
+
+def _of_each(work: Callable[[int], T], count: int) -> Iterable[T]:
+    """What work gives of each view, in their order; several at a time."""
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        yield from pool.map(work, range(count))
 
 
 def shares(count: int, views: int) -> list[int]:
@@ -62,15 +126,13 @@ def shares(count: int, views: int) -> list[int]:
     return [count * (k + 1) // views - count * k // views for k in range(views)]
 
 
-def first_look(surfaces: Surfaces, counts: Sequence[int], seed: int, agreement: Agreement) -> Iterator[Found]:
-    """Of each view those of so many pixels at which others agree; none where too little is known."""
-    for k, share in enumerate(counts):
-        if not share or not surfaces.known(k):
-            yield k, np.zeros((0, 2)), np.zeros(0)
-            continue
-        pixels = drawn(agreement.looks[k], share, np.random.default_rng([seed, k]))
-        depths, agreed = agreement.depths(k, pixels, surfaces.ranges(k, pixels))
-        yield k, pixels[agreed], depths[agreed]
+def first_look(surfaces: Surfaces, number: int, count: int, seed: int, agreement: Agreement) -> Found:
+    """Of a view those of so many pixels at which others agree; none where too little is known."""
+    if not count or not surfaces.known(number):
+        return number, np.zeros((0, 2)), np.zeros(0)
+    pixels = drawn(agreement.looks[number], count, np.random.default_rng([seed, number]))
+    depths, agreed = agreement.depths(number, pixels, surfaces.ranges(number, pixels))
+    return number, pixels[agreed], depths[agreed]
 
 
 class Surfaces:
@@ -84,6 +146,7 @@ class Surfaces:
             pixels, depths = project(view.camera, points[rows].astype(np.float64))
             self._pixels.append(pixels[depths > 0])
             self._depths.append(depths[depths > 0])
+        self._trees: list[KDTree | None] = [None] * len(views)
 
     def known(self, number: int) -> bool:
         """Whether enough is known of a view to tell ranges."""
@@ -93,19 +156,17 @@ class Surfaces:
         """More pixels [M, 2] of a view, and their depths [M]."""
         self._pixels[number] = np.concatenate([self._pixels[number], pixels])
         self._depths[number] = np.concatenate([self._depths[number], depths])
+        self._trees[number] = None
 
     def ranges(self, number: int, pixels: Floats, widened: float = WIDENED) -> Floats:
         """Between which depths [M, 2] the surface at `pixels` [M, 2] is sought: those of what is known
         nearest in the picture, times and over `widened`."""
         depths = self._depths[number]
-        _, nearest = KDTree(self._pixels[number]).query(pixels, min(AROUND, len(depths)))
+        tree = self._trees[number] or KDTree(self._pixels[number])
+        self._trees[number] = tree
+        _, nearest = tree.query(pixels, min(6, len(depths)))
         around = depths[nearest]
         return np.stack([around.min(1) / widened, around.max(1) * widened], axis=1)
-
-    def bounds(self, number: int) -> Floats:
-        """The nearest and the farthest depth [2] at which anything of a view is sought, but for strays."""
-        ends = np.quantile(self._depths[number], (STRAY, 1 - STRAY)) if self.known(number) else np.ones(2)
-        return ends * (1 / WIDENED, WIDENED)
 
 
 def gathered(views: Sequence[View], found: Sequence[Found]) -> tuple[Points, Colors]:
@@ -123,8 +184,8 @@ def drawn(look: SmallPhoto, count: int, rng: np.random.Generator) -> NDArray[np.
     grey = look.grey
     mask = np.ones(grey.shape, bool) if look.mask is None else look.mask
     edges = np.where(mask, np.hypot(sobel(grey, 0), sobel(grey, 1)), 0.0)
-    weights = np.where(mask, FLAT / max(mask.sum(), 1), 0.0)
-    weights += (1 - FLAT) * edges / max(edges.sum(), np.finfo(float).tiny)
+    weights = np.where(mask, 0.2 / max(mask.sum(), 1), 0.0)  # all pixels alike get a fifth
+    weights += 0.8 * edges / max(edges.sum(), np.finfo(float).tiny)
     weights = weights.ravel()
     count = min(count, int(np.count_nonzero(weights)))
     # The largest of u^(1 / w): a draw without repetition in proportion to w (Efraimidis and Spirakis 2006).
@@ -133,3 +194,79 @@ def drawn(look: SmallPhoto, count: int, rng: np.random.Generator) -> NDArray[np.
     chosen = np.sort(np.argpartition(-keys, max(count - 1, 0))[:count])
     lines, columns = np.divmod(chosen, look.camera.width)
     return (np.stack([columns, lines], 1) + 0.5) / look.scale
+
+
+def _borne_out(
+    agreement: Agreement, surfaces: Surfaces, number: int, pixels: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Depths [M] of a view's pixels [M, 2], and which of them others bear out."""
+    others = agreement.asked(number, 8)
+    depths, kept = agreement.depths(number, pixels, surfaces.ranges(number, pixels, 1.15), others)
+    kept[kept] = _found_back(agreement, surfaces, number, pixels[kept], depths[kept], others, 1)
+    best, ranges = np.full(len(pixels), ALONE), surfaces.ranges(number, pixels)
+    for other in others:
+        rows = np.flatnonzero(~kept)
+        there, scores = agreement.depths_by(number, pixels[rows], ranges[rows], other)
+        better = scores > best[rows]
+        rows, there, scores = rows[better], there[better], scores[better]
+        back = _seen_alike(agreement, number, other, pixels[rows], there)
+        rows = rows[back]
+        depths[rows], best[rows] = there[back], scores[back]
+    return depths, kept | (best > ALONE)
+
+
+def _found_back(
+    agreement: Agreement,
+    surfaces: Surfaces,
+    number: int,
+    pixels: Floats,
+    depths: Floats,
+    others: Sequence[int],
+    wanted: int,
+) -> NDArray[np.bool_]:
+    """Whether at least `wanted` of the others find pixels [M, 2] of a view back from `depths`."""
+    counts = np.zeros(len(pixels), np.intp)
+    for other in others:
+        rows = np.flatnonzero(counts < wanted)
+        if not surfaces.known(other) or not len(rows):
+            continue
+        at, far, inside = _shown(agreement, number, other, pixels[rows], depths[rows])
+        rows, at, far = rows[inside], at[inside], far[inside]
+        ranges = surfaces.ranges(other, at)
+        ranges = np.stack(
+            [np.minimum(ranges[:, 0], far / WIDENED), np.maximum(ranges[:, 1], far * WIDENED)], 1
+        )
+        there, agreed = agreement.depths(other, at, ranges)
+        counts[rows] += agreed & _back(agreement, number, other, pixels[rows], at, there)
+    return counts >= wanted
+
+
+def _seen_alike(
+    agreement: Agreement, number: int, other: int, pixels: Floats, depths: Floats
+) -> NDArray[np.bool_]:
+    """Whether the other photo, by the view alone, finds its pixels [M, 2] at `depths` back."""
+    at, far, inside = _shown(agreement, number, other, pixels, depths)
+    rows = np.flatnonzero(inside)
+    ranges = np.stack([far[rows] / WIDENED, far[rows] * WIDENED], 1)
+    there, scores = agreement.depths_by(other, at[rows], ranges, number)
+    inside[rows] = (scores > ALONE) & _back(agreement, number, other, pixels[rows], at[rows], there)
+    return inside
+
+
+def _shown(
+    agreement: Agreement, number: int, other: int, pixels: Floats, depths: Floats
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Where the other photo shows pixels [M, 2] of a view at `depths`, how far away, and whether."""
+    look, camera = agreement.looks[number], agreement.looks[other].camera
+    points = unproject(look.camera, pixels * look.scale, depths)
+    at, far = project(camera, points)
+    return at / agreement.looks[other].scale, far, in_frame(camera, points)
+
+
+def _back(
+    agreement: Agreement, number: int, other: int, pixels: Floats, at: Floats, depths: Floats
+) -> NDArray[np.bool_]:
+    """Whether pixels `at` [M, 2] of the other photo, at `depths`, lie where the view has its `pixels`."""
+    look, there = agreement.looks[number], agreement.looks[other]
+    again, _ = project(look.camera, unproject(there.camera, at * there.scale, depths))
+    return np.linalg.norm(again - pixels * look.scale, axis=1) < 1.0

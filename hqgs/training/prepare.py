@@ -12,8 +12,7 @@ from hqgs.base.threads import one_torch_thread
 from hqgs.diagnosis.choice import choose_photos
 from hqgs.diagnosis.scene import Diagnosis, Inspector
 from hqgs.model.consistency import Agreement
-from hqgs.model.first_points import Colors, Points, points_along_edges
-from hqgs.model.found_back import points_found_back
+from hqgs.model.first_points import Colors, Points, points_along_edges, points_found_back
 from hqgs.model.gaussians import Gaussians
 from hqgs.model.shapes import as_discs
 from hqgs.scene.scene import Scene
